@@ -23,16 +23,16 @@ from benchmarks.drawn_machine import (
     stated,
 )
 from benchmarks.row import Row, between, shown
-from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
 from omsm_ros.core.correction.budget import scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanFields, scan_fields
 from omsm_ros.core.correction.uncertainty import ErrorSources
-from omsm_ros.core.form.analyse import Form, analyse_form
+from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.kinematics import Geometry
-from omsm_ros.core.registration.placement import Portion
+from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.part import FigureError
@@ -53,8 +53,8 @@ FITS = (("piston",), ("piston", "tip", "tilt"))
 class Scan:
     """A corrected scan, the form that it tells, and the true one."""
 
-    measured: Form
-    true: Form
+    measured: FormResult
+    true: FormResult
 
 
 def scans(seed: int, feed: float = FEED_M) -> list[Scan]:
@@ -75,10 +75,10 @@ def _judged(
     acting = fields.at(0, len(points.x))
     rows = (points.x, points.y, points.height, *acting)
     x, y, height, *systematic = (row[::EVERY] for row in rows)
-    portion = Portion(x, y, height, np.reshape(systematic, (-1, len(x))))
+    portion = PointBatch(x, y, height, np.reshape(systematic, (-1, len(x))))
     measured = _form(portion, fitted, fields)
     x, y = _everywhere(measured.aperture.radius)
-    true = Portion(x, y, part.height(x, y), np.empty((0, len(x))))
+    true = PointBatch(x, y, part.height(x, y), np.empty((0, len(x))))
     return Scan(measured, _form(true, fitted, NONE))
 
 
@@ -114,12 +114,14 @@ def _calibrated(machine: int) -> Calibration:
     test = planned_test_of(Scenario(seed=1000 + machine), drawn(machine, 0).quiet)
     made = identify(test.motion_record(), settings={"priors": PRIORS}).calibration
     lag = made.dynamics.low_frequency_delay
-    latency = declared(lag, LATENCY_S, LATENCY_UNCERTAINTY_S, "measured with a light switch")
+    latency = declared_latency(
+        lag, LATENCY_S, LATENCY_UNCERTAINTY_S, "measured with a light switch"
+    )
     return with_latency(made, latency)
 
 
 def _corrected(calibration: Calibration, made: Recording) -> tuple[SurfacePoints, ScanFields]:
-    sources = replace(ErrorSources.of(calibration), **stated().of_points())
+    sources = replace(ErrorSources.of(calibration), **stated().point_uncertainties())
     # The pitch is declared for its arm, which no correction of the points uses.
     geometry = Geometry(abbe_arm=ABBE_ARM_M)
     options = CorrectionOptions(sources=sources, accept_other_rate=True, geometry=geometry)
@@ -134,7 +136,7 @@ def _corrected(calibration: Calibration, made: Recording) -> tuple[SurfacePoints
     return points, scan_fields(budget.fields, corrector.trace.every, budget.bounds)
 
 
-def _form(portion: Portion, fitted: Sequence[str], fields: ScanFields) -> Form:
+def _form(portion: PointBatch, fitted: Sequence[str], fields: ScanFields) -> FormResult:
     return analyse_form(
         PAPER_MIRROR, lambda: [portion], fitted, sources=fields.names, bounds=fields.bounds
     )
@@ -144,12 +146,12 @@ def deviations(scan: Scan) -> dict[str, tuple[float, float]]:
     """By figure, its error and its stated standard uncertainty [m]."""
     found: dict[str, tuple[float, float]] = {}
     for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
-        told, true = scan.measured.deviation[name], scan.true.deviation[name]
-        found[name] = told.value - true.value, told.uncertainty
-    told_terms, true_terms = scan.measured.zernike, scan.true.zernike
-    errors = told_terms.coefficients - true_terms.coefficients
+        stated_figure, true = scan.measured.deviation[name], scan.true.deviation[name]
+        found[name] = stated_figure.value - true.value, stated_figure.uncertainty
+    reported_terms, true_terms = scan.measured.zernike, scan.true.zernike
+    errors = reported_terms.coefficients - true_terms.coefficients
     for k in range(TERMS):
-        found[f"zernike {k + 1}"] = float(errors[k]), float(told_terms.uncertainty[k])
+        found[f"zernike {k + 1}"] = float(errors[k]), float(reported_terms.uncertainty[k])
     return found
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.correction import identified_calibration
 from benchmarks.row import Row, at_least, at_most, shown
-from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
@@ -38,7 +38,7 @@ def _calibration() -> Calibration:
     """Whose latency is known: else a lag of either kind hides tens of nanometres of astigmatism."""
     made = identified_calibration()
     lag = made.dynamics.low_frequency_delay
-    return with_latency(made, declared(lag, 0.0, 2e-6, "the twin's probe is prompt"))
+    return with_latency(made, declared_latency(lag, 0.0, 2e-6, "the twin's probe is prompt"))
 
 
 def scanned(folder: Path, part: FigureError, way: tuple[float, float], seed: int) -> Path:

@@ -17,7 +17,7 @@ from benchmarks.identification import record_once
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.model_errors.undetected import PAPER_SCAN
+from omsm_ros.core.model_errors.undetected import PAPER_SCAN_LINES
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
@@ -43,7 +43,7 @@ _PLACES = {
     "_DRIFT_DEGREES": f"{_ROOT}.families",
     "_LINES_TRIED": f"{_ROOT}.families",
     "_NOISE_HALF_GAP": f"{_ROOT}.families",
-    "_IMITATED": f"{_ROOT}.residual_diagnostics",
+    "_COLLINEAR_SHARE": f"{_ROOT}.residual_diagnostics",
     "_LEAST_LINES": f"{_ROOT}.residual_diagnostics",
     "_HALF_WIDTH": f"{_ROOT}.residual_diagnostics",
     "FALSE_ALARM": f"{_ROOT}.residual_diagnostics",
@@ -99,7 +99,7 @@ def _outcome(case: Case) -> Outcome:
         found = identify(case.motion).calibration
     except OmsmError:
         return Outcome("refused", float("nan"))
-    frequency, rms = np.array(PAPER_SCAN).T
+    frequency, rms = np.array(PAPER_SCAN_LINES).T
     verdict = str(found.certificate["verdict"]).partition(",")[0]
     off = found.dynamics.response(frequency) - case.truth.response(frequency)
     return Outcome(verdict, float(np.sqrt(np.sum((np.abs(off) * rms) ** 2))))

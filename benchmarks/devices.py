@@ -79,19 +79,19 @@ def _decoding() -> Iterator[Row]:
 # Drivers.
 
 
-def _serve(name: str, link: str, told: multiprocessing.Queue[str], stop: Event) -> None:
+def _serve(name: str, link: str, link_queue: multiprocessing.Queue[str], stop: Event) -> None:
     with line_for(link) as line:
-        told.put(line.path)
+        link_queue.put(line.path)
         _EMULATORS[name](line).serve(stop)  # type: ignore[arg-type]
 
 
 def read(name: str, link: str, period: float, seconds: float) -> dict[str, float]:
     """Read an emulator in another process for ``seconds``; what became of its samples."""
     context = multiprocessing.get_context("spawn")
-    told, stop = context.Queue(), context.Event()
-    process = context.Process(target=_serve, args=(name, link, told, stop), daemon=True)
+    link_queue, stop = context.Queue(), context.Event()
+    process = context.Process(target=_serve, args=(name, link, link_queue, stop), daemon=True)
     process.start()
-    values = {"device": name, "port": told.get(timeout=30.0), "sample_period": period}
+    values = {"device": name, "port": link_queue.get(timeout=30.0), "sample_period": period}
     values |= {"block_size": max(100, round(0.01 / period)), "encoders": "XYZUV"}
     values |= {"signals": " ".join(map(str, SIGNALS))}
     scales = {k: v for k, v in emulated(name).driver.items() if k.endswith("counts_per_unit")}

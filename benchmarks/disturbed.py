@@ -23,7 +23,7 @@ from omsm_ros.core.calibration.calibration import REJECTED, Calibration
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
-from omsm_ros.core.model_errors.undetected import PAPER_SCAN
+from omsm_ros.core.model_errors.undetected import PAPER_SCAN_LINES
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
 from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together
@@ -136,17 +136,17 @@ def outcome(name: str, disturbances: Disturbances, seed: int) -> Outcome:
     return Outcome(name, verdict, "; ".join(map(str, reasons)), error, sigmas, stated)
 
 
-_SCAN_HZ, _SCAN_M = np.array(PAPER_SCAN).T
+_SCAN_HZ, _SCAN_M = np.array(PAPER_SCAN_LINES).T
 
 
 def _on_scan(found: Calibration, truth: np.ndarray) -> tuple[float, float]:  # type: ignore[type-arg]
     off = np.abs(found.dynamics.response(_SCAN_HZ) - truth)
     band = response_band(found.dynamics, found.covariance, _SCAN_HZ)
     stated = np.hypot(band.gain, band.phase)
-    beside = float(str(found.certificate["motion_error_m"]))
+    motion_error = float(str(found.certificate["motion_error_m"]))
     return (
         float(np.linalg.norm(off * _SCAN_M)),
-        float(np.hypot(np.linalg.norm(stated * _SCAN_M), beside)),
+        float(np.hypot(np.linalg.norm(stated * _SCAN_M), motion_error)),
     )
 
 

@@ -21,11 +21,11 @@ import numpy as np
 
 from benchmarks.row import Row, at_least, at_most, not_compared, shown
 from omsm_ros.core.correction.surface_points import SurfacePoints
-from omsm_ros.core.form.analyse import Form, analyse_form
+from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.part_figures import without_second_order
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.registration.placement import Aperture, Portion
+from omsm_ros.core.registration.placement import Aperture, PointBatch
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import (
@@ -41,14 +41,14 @@ from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.core.surface.zernike_terms import first_terms, zernike_values
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import PlyWriter
-from omsm_ros.twin.part import PartPose, posed
+from omsm_ros.twin.part import PartPose, mounted_surface
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 RADIUS, NOISE = PAPER_MIRROR_RADIUS_M, 10 * NANOMETRE_M
 POINTS, PAPER_POINTS = 60_000, 254_000
 ASTIGMATISM, COMA = 50 * NANOMETRE_M, 15 * NANOMETRE_M
 DUST, DUST_SHARE = 5e-6, 1e-3
-FREEDOMS = ("x", "y", "piston", "tip", "tilt", "clocking")
+DEGREES_OF_FREEDOM = ("x", "y", "piston", "tip", "tilt", "clocking")
 SHIFT, TURN = 0.5 * MILLIMETRE_M, 0.5 * DEGREE_RAD
 MAPS = Path(__file__).parents[2] / "shared" / "data" / "surfaces"
 
@@ -73,7 +73,7 @@ def spiral(points: int) -> tuple[FloatArray, FloatArray]:
 
 def measured(
     part: Surface, pose: Pose, seed: int, dust: float = 0.0, points: int = POINTS
-) -> Portion:
+) -> PointBatch:
     """Points of a part in a pose."""
     x, y = spiral(points)
     rng = np.random.default_rng(seed)
@@ -81,12 +81,12 @@ def measured(
         x_m=pose.x, y_m=pose.y, z_m=pose.piston,
         tilt_x_rad=pose.tip, tilt_y_rad=pose.tilt, clocking_rad=pose.clocking,
     )  # fmt: skip
-    height = posed(part, sits).height(x, y) + rng.normal(0, NOISE, points)
+    height = mounted_surface(part, sits).height(x, y) + rng.normal(0, NOISE, points)
     height = height + DUST * (rng.random(points) < dust)
-    return Portion(x, y, height, np.empty((0, points)))
+    return PointBatch(x, y, height, np.empty((0, points)))
 
 
-def judged(nominal: Surface, portion: Portion, *asked: str) -> Form:
+def judged(nominal: Surface, portion: PointBatch, *asked: str) -> FormResult:
     """The form of these points."""
     return analyse_form(nominal, lambda: [portion], asked or ("auto",), aperture=Aperture(RADIUS))
 
@@ -97,10 +97,10 @@ def poses(seed: int) -> Iterator[Pose]:
     yield Pose(x=SHIFT * sign[0], y=SHIFT * sign[1])
     yield Pose(tip=TURN * sign[3], tilt=TURN * sign[4])
     sizes = np.repeat([SHIFT, TURN], 3) * sign
-    yield Pose(**dict(zip(FREEDOMS, map(float, sizes), strict=True)))
+    yield Pose(**dict(zip(DEGREES_OF_FREEDOM, map(float, sizes), strict=True)))
 
 
-def bent(seed: int) -> ZernikeSurface:
+def low_order_error(seed: int) -> ZernikeSurface:
     """A known astigmatism and coma, each in a direction by chance."""
     a, b = np.random.default_rng(seed).uniform(0, 2 * np.pi, 2)
     sizes = (ASTIGMATISM * np.cos(a), ASTIGMATISM * np.sin(a), COMA * np.cos(b), COMA * np.sin(b))
@@ -125,7 +125,7 @@ def _poses(runs: int) -> list[Row]:
             portion = measured(PAPER_MIRROR, pose, seed, points=PAPER_POINTS)
             found = judged(PAPER_MIRROR, portion)
             registration = found.registration
-            for name in FREEDOMS:
+            for name in DEGREES_OF_FREEDOM:
                 spread = registration.uncertainty(name)
                 off = registration.placement.value(name) - getattr(pose, name)
                 held.append(spread is not None and abs(off) <= 2 * spread)
@@ -142,7 +142,7 @@ def _poses(runs: int) -> list[Row]:
     ]
 
 
-def _smooth_extent(found: Form) -> float:
+def _smooth_extent(found: FormResult) -> float:
     height = found.zernike.height(found.map.x, found.map.y)
     return float(np.ptp(height))
 
@@ -151,7 +151,7 @@ def _terms(runs: int) -> list[Row]:
     held: dict[str, list[bool]] = {"piston, tip, tilt": [], "auto": []}
     errors: dict[str, list[float]] = {name: [] for name in held}
     for seed in range(runs):
-        error = bent(seed)
+        error = low_order_error(seed)
         pose = Pose(piston=1e-4, tip=1e-3, tilt=-2e-3)
         portion = measured(Part(PAPER_MIRROR, error), pose, seed)
         known = dict(zip(first_terms(8), error.coefficients, strict=True))
@@ -172,14 +172,14 @@ def _terms(runs: int) -> list[Row]:
         table += [
             at_least(f"37 terms within k = 2, {label}", 100 * np.mean(held[name]), "%", 93.0,
                      runs=runs),
-            (at_most if name != "auto" else _shown_beside)(
+            (at_most if name != "auto" else _compared_with)(
                 f"map of 37 terms against the truth, rms, {label}",
                 np.median(errors[name]) / NANOMETRE_M, "nm", 3.0, runs=runs),
         ]  # fmt: skip
     return table
 
 
-def _shown_beside(name: str, value: float, unit: str, limit: float, runs: int) -> Row:
+def _compared_with(name: str, value: float, unit: str, limit: float, runs: int) -> Row:
     """What a free pose takes of the form, for whoever reads the others: nothing can tell it."""
     del limit
     return shown(name, value, unit, runs=runs)
@@ -188,7 +188,7 @@ def _shown_beside(name: str, value: float, unit: str, limit: float, runs: int) -
 def _dust(runs: int) -> list[Row]:
     worst = 0.0
     for seed in range(runs):
-        part = Part(PAPER_MIRROR, bent(seed))
+        part = Part(PAPER_MIRROR, low_order_error(seed))
         clean, dusty = (
             judged(
                 PAPER_MIRROR, measured(part, Pose(tip=1e-3), seed, dust), "piston", "tip", "tilt"
@@ -217,7 +217,7 @@ def _surfaces() -> list[Row]:
     pose = Pose(piston=1e-4, tip=2e-3, tilt=-3e-3)
     for surface, refused in known.values():
         found = judged(surface, measured(surface, pose, 1))
-        right.append(set(found.registration.freedoms.refused) == refused)
+        right.append(set(found.registration.dofs.refused) == refused)
         added.append(_smooth_extent(found))
     return [
         at_least("surfaces whose freedoms were found", sum(right), "1", len(known)),
@@ -231,7 +231,7 @@ def _map() -> list[Row]:
     if not file.is_file():
         return [not_compared(name, "nm", "1.52", "the measured map is not here")]
     points = read_points(file)
-    portion = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
+    portion = PointBatch(points.x, points.y, points.height, np.empty((0, len(points))))
     found = analyse_form(Flat(), lambda: [portion], ("piston", "tip", "tilt"), even=True)
     table = []
     for figure, value, bar in (
@@ -249,7 +249,7 @@ def _map() -> list[Row]:
 def _zernike_speed() -> list[Row]:
     """Processor time, for the machine is not ours alone; both on one core."""
     x, y = spiral(PAPER_POINTS)
-    value = bent(1).height(x, y) + np.random.default_rng(1).normal(0, NOISE, len(x))
+    value = low_order_error(1).height(x, y) + np.random.default_rng(1).normal(0, NOISE, len(x))
     terms, disc = first_terms(37), Aperture(RADIUS)
 
     def ours() -> FloatArray:
@@ -338,6 +338,6 @@ def _cloud(x: FloatArray, y: FloatArray, first: int) -> SurfacePoints:
     near = tuple(np.float64(np.float32(v)) for v in (x, y))
     return SurfacePoints(
         sample=first + np.arange(len(x)), x=near[0], y=near[1],
-        height=Part(PAPER_MIRROR, bent(1)).height(*near) + rng.normal(0, NOISE, len(x)),
+        height=Part(PAPER_MIRROR, low_order_error(1)).height(*near) + rng.normal(0, NOISE, len(x)),
         dynamic_error=nothing, uncertainty=nothing, intensity=nothing.astype(np.float32),
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 Each test is of the same machine with noise of its own; each calibration corrects the same motion
 without noise, so that all of the error is of the dynamics. ``dynamics`` of the budget is what it is
-said to scatter by; ``could_hide`` bounds what no test of this machine would show, and is apart.
+said to scatter by; ``undetected_error`` bounds what no test of this machine would show, and is apart.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Found:
 
     error: float
     dynamics: float
-    could_hide: float
+    undetected_error: float
 
 
 def rows(full: bool) -> Iterator[Row]:
@@ -59,7 +59,7 @@ def rows(full: bool) -> Iterator[Row]:
     for name, motion, barred in (("paper's scan", _scan(), True), ("6 and 31 Hz", _fast(), False)):
         found = [_judged(each, motion) for each in calibrations]
         ratio = np.array([each.error / each.dynamics for each in found])
-        held = [each.error / np.hypot(each.dynamics, each.could_hide) for each in found]
+        held = [each.error / np.hypot(each.dynamics, each.undetected_error) for each in found]
         stated = float(np.sqrt(np.mean([each.dynamics**2 for each in found]))) / NANOMETRE_M
         label, rms = f"step tests, {name}: error / stated", float(np.sqrt(np.mean(ratio**2)))
         if barred:

@@ -20,7 +20,7 @@ from benchmarks.against_truth import (
 from benchmarks.cramer_rao import response_bounds
 from benchmarks.row import Row, at_least, at_most, shown
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.estimation.covariance import hidden_motion_covariance
+from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Motion, StepPlan, StepTest, plan_steps
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
@@ -111,8 +111,10 @@ def scatter(calibration: Calibration) -> FloatArray:
     """
     shape = calibration.covariance.shape
     noise = np.reshape(np.asarray(calibration.certificate["noise_covariance"]), shape)
-    hidden = float(str(calibration.certificate["inter_sample_delay_bound_s"]))
-    allowed = hidden_motion_covariance(calibration.dynamics, hidden, calibration.sample_period)
+    delay_bound = float(str(calibration.certificate["inter_sample_delay_bound_s"]))
+    allowed = inter_sample_motion_covariance(
+        calibration.dynamics, delay_bound, calibration.sample_period
+    )
     return np.asarray(noise + allowed)
 
 
@@ -134,7 +136,7 @@ def bounds() -> tuple[FloatArray, FloatArray]:
     noise = np.hypot(cell.probe.noise, cell.probe.resolution / np.sqrt(12))
     noise = float(np.hypot(noise, PAPER_STATIC_GAIN * cell.encoder_noise))
     return response_bounds(
-        Plant().dynamics, PAPER_STATIC_GAIN, moved.carriage, cell.sample_period, noise, FREQUENCIES
+        Plant().dynamics, PAPER_STATIC_GAIN, moved.slide, cell.sample_period, noise, FREQUENCIES
     )
 
 

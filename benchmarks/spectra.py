@@ -10,9 +10,9 @@ import numpy as np
 
 from benchmarks.mixtures import MadeScan, Mixture, TrueLine, mixture
 from benchmarks.row import Row, at_least, at_most, not_compared, shown
-from omsm_ros.core.ripple.accelerometer import felt
-from omsm_ros.core.ripple.density import folded_frequency
-from omsm_ros.core.ripple.ripple_guard import Named, name_lines, study_all
+from omsm_ros.core.ripple.accelerometer import acceleration_lines
+from omsm_ros.core.ripple.density import aliased_frequency
+from omsm_ros.core.ripple.ripple_guard import NamedLine, analyse_scans, name_lines
 from omsm_ros.core.ripple.scan_signal import scan_signal
 from omsm_ros.core.ripple.source_hypotheses import (
     ARTEFACT,
@@ -65,7 +65,7 @@ def _mixtures(runs: int) -> Iterator[Row]:
 
 def judged(made: Mixture) -> Counter[str]:
     """Count what the guard says of a mixture against what is true."""
-    studied = study_all([_as_signal(scan) for scan in made.scans])
+    studied = analyse_scans([_as_signal(scan) for scan in made.scans])
     counted: Counter[str] = Counter()
     for scan, own, named in zip(made.scans, studied, name_lines(studied), strict=True):
         for row in named:
@@ -95,7 +95,7 @@ def _as_signal(scan: MadeScan):  # type: ignore[no-untyped-def]
     )
     if scan.acceleration is None:
         return signal, None
-    return signal, felt(1 / scan.acceleration_rate, {"z": scan.acceleration})
+    return signal, acceleration_lines(1 / scan.acceleration_rate, {"z": scan.acceleration})
 
 
 def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
@@ -108,7 +108,7 @@ def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
         return {SYNCHRONOUS}
     in_time = line.frequency * span / (len(place) / scan.rate)
     if line.what == "vibration":
-        image = float(folded_frequency(in_time, scan.rate))
+        image = float(aliased_frequency(in_time, scan.rate))
         if image * len(place) / scan.rate < 6:
             return set()
         return {FOLDED} if in_time > scan.rate / 2 else {VIBRATION}
@@ -119,7 +119,7 @@ def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
     return {PART}
 
 
-def _is(line: TrueLine, scan: MadeScan, own: StudiedScan, row: Named) -> bool:
+def _is(line: TrueLine, scan: MadeScan, own: StudiedScan, row: NamedLine) -> bool:
     """True if a row is at the place of a true line, within two resolutions."""
     name = _COORDINATE[line.over]
     coordinate = own.coordinates.get(name)
@@ -131,12 +131,12 @@ def _is(line: TrueLine, scan: MadeScan, own: StudiedScan, row: Named) -> bool:
             return True
     if not coordinate.proportional_to_time or "time" not in row.line.possible:
         return False
-    image = float(folded_frequency(line.frequency * coordinate.pace, scan.rate))
+    image = float(aliased_frequency(line.frequency * coordinate.pace, scan.rate))
     return abs(row.line.possible["time"] - image) * own.signal.duration < 2
 
 
 def _true_line(
-    lines: list[TrueLine], scan: MadeScan, own: StudiedScan, row: Named
+    lines: list[TrueLine], scan: MadeScan, own: StudiedScan, row: NamedLine
 ) -> TrueLine | None:
     """The true line at a row's place; of several the one of the row's own size."""
     near = [line for line in lines if _is(line, scan, own, row)]
@@ -170,20 +170,20 @@ def image_errors(counts: np.ndarray, rate: float, every: int) -> Iterator[tuple[
     slow = rate / every
     for axis in range(counts.shape[1]):
         values = counts[:, axis]
-        whole = felt(1 / rate, {"z": values})
-        folded = felt(every / rate, {"z": values[::every]})
+        whole = acceleration_lines(1 / rate, {"z": values})
+        aliased = acceleration_lines(every / rate, {"z": values[::every]})
         resolution = rate / len(values)
         for line in whole.lines:
             # Weak lines may drown in what else folds onto them.
-            floor = _noise_of(values[::every], folded)
+            floor = _noise_of(values[::every], aliased)
             if line.acceleration < 4 * floor:
                 continue
-            place = float(folded_frequency(line.frequency, slow))
+            place = float(aliased_frequency(line.frequency, slow))
             if not 5 * resolution < place < slow / 2 - resolution:
                 continue
             if _crowded(whole, line.frequency, slow, place, resolution):
                 continue
-            seen = [f.frequency for f in folded.lines]
+            seen = [f.frequency for f in aliased.lines]
             seen.append(_seen_near(values[::every], every / rate, place))
             yield axis, min(abs(f - place) for f in seen) / resolution
 
@@ -205,4 +205,4 @@ def _noise_of(values: np.ndarray, found) -> float:  # type: ignore[no-untyped-de
 def _crowded(whole, frequency: float, slow: float, place: float, resolution: float) -> bool:  # type: ignore[no-untyped-def]
     """True if another line folds to within two bins: their images cannot be told apart."""
     others = [f.frequency for f in whole.lines if f.frequency != frequency]
-    return any(abs(float(folded_frequency(f, slow)) - place) < 2 * resolution for f in others)
+    return any(abs(float(aliased_frequency(f, slow)) - place) < 2 * resolution for f in others)

@@ -22,7 +22,11 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.sampled_choice import MAX_ORDER, choose_sampled
-from omsm_ros.core.estimation.sampled_fit import DiscreteScaled, DiscreteStarts, HeldProblem
+from omsm_ros.core.estimation.sampled_fit import (
+    DiscreteStarts,
+    ScaledDiscreteStructure,
+    ZeroOrderHoldProblem,
+)
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.discretisation import discretise
@@ -99,11 +103,13 @@ def _choice_factor() -> tuple[float, str, float, str]:
     used = np.arange(1200) < 600
 
     def plain() -> None:
-        problem = HeldProblem(u, np.where(used, y, 0.0), used, 0.1, np.ones((1200, 1)), 5.0)
+        problem = ZeroOrderHoldProblem(
+            u, np.where(used, y, 0.0), used, 0.1, np.ones((1200, 1)), 5.0
+        )
         starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_ORDER)
         for order in range(1, MAX_ORDER + 1):
             structure = Structure(order, order, False)
-            scaled = DiscreteScaled(structure, problem.rate)
+            scaled = ScaledDiscreteStructure(structure, problem.rate)
             fit(problem, structure, [scaled.of_discrete(starts.arx(order))])
 
     chosen = _seconds(lambda: choose_sampled(u, y, used, 0.1), 2)

@@ -50,9 +50,9 @@ def cell(context: LaunchContext) -> list[Node]:
     driver: dict[str, object] = {"device": given["device"]} if given["device"] else {}
     nodes = []
     if given["emulated"] == "true":
-        played, driver, beside = twin(given["namespace"], given["device"] or "six_channel")
+        played, driver, companion = twin(given["namespace"], given["device"] or "six_channel")
         nodes.append(node(given, "cell_emulator", played))
-        nodes += [node(given, name, parameters) for name, parameters in beside.items()]
+        nodes += [node(given, name, parameters) for name, parameters in companion.items()]
     nodes += [
         node(given, "confocal_driver", driver),
         node(given, "calibrator", {}),
@@ -111,11 +111,11 @@ def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str,
     port = tcp if known.tcp else serial
     played = {"device": device, "link": port}
     driver = {"device": device, "port": port, **known.driver}
-    if known.beside is None:
+    if known.companion is None:
         return played, driver, {}
-    second = tcp if known.beside.tcp else f"{serial}_beside"
+    second = tcp if known.companion.tcp else f"{serial}_beside"
     played["link_beside"] = second
-    return played, driver, {known.beside.node: {"port": second, **known.beside.driver}}
+    return played, driver, {known.companion.node: {"port": second, **known.companion.driver}}
 
 
 def rviz(namespace: str) -> Node:

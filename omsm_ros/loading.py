@@ -24,7 +24,7 @@ def one_thread_of_blas() -> None:
 
 
 @contextmanager
-def nothing_to_undo(
+def exit_on_signal_while_loading(
     numbers: Collection[signal.Signals], code: int = 0, said: str = ""
 ) -> Iterator[None]:
     """Let each of the signals ``numbers`` end the process at once, while it only loads.

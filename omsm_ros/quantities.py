@@ -46,7 +46,7 @@ class Quantity:
         if type(value) is (int if self.whole else float) and self.low <= value <= self.high:  # type: ignore[operator]
             return value  # what nearly all values are, without further ado
         number = _number(value, self.whole)
-        if number is None or not self._holds(number):
+        if number is None or not self._in_range(number):
             raise error(self._refusal(value, name))
         return number
 
@@ -60,7 +60,7 @@ class Quantity:
             raise error(self._refusal(values[place].item(), f"{name or self.name}[{place}]"))
         return values
 
-    def or_lost(self, values: NDArray[Any]) -> NDArray[Any]:
+    def nan_if_implausible(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return an array (n,) with NaN, which means "lost", where a number is not plausible.
 
         A single corrupt reading must not cost the scan that it is in; it is counted as invalid.
@@ -86,7 +86,7 @@ class Quantity:
         sign, unit = "±" if self.signed else "", f" {self.unit}" if self.unit else ""
         return f"from {sign}{self.low:g} to {sign}{self.high:g}{unit}"
 
-    def _holds(self, number: float) -> bool:
+    def _in_range(self, number: float) -> bool:
         return self.low <= (abs(number) if self.signed else number) <= self.high
 
     def _refusal(self, value: object, name: str) -> str:

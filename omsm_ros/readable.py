@@ -32,7 +32,7 @@ _LEAST_PROBABILITY = 1e-4
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def counted(counts: Mapping[str, int]) -> str:
+def counts_text(counts: Mapping[str, int]) -> str:
     """Return counts in words, those of none left out: ``3 not ok, 1 duplicate``."""
     words = [f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n]
     return ", ".join(words) or "none"
@@ -115,7 +115,7 @@ def plain(value: object, digits: int = 3) -> str:
     if 1e-3 <= abs(known) < 10**digits:
         return f"{known:#.{digits}g}".rstrip(".")
     mantissa, _, power = f"{known:.{digits - 1}e}".partition("e")
-    return f"{mantissa} · 10{raised(int(power))}"
+    return f"{mantissa} · 10{superscript(int(power))}"
 
 
 def percent(share: object, digits: int = 2) -> str:
@@ -140,13 +140,13 @@ def probability(value: object) -> str:
     return f"< {least:g}" if known < least else f"{known:.3g}"
 
 
-def chance(value: object) -> str:
+def p_value_text(value: object) -> str:
     """Return a p-value for a sentence: ``p = 0.23``, ``p < 0.0001``."""
     text = probability(value)
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
-def raised(power: int) -> str:
+def superscript(power: int) -> str:
     """Return a power as a superscript."""
     return str(power).translate(_SUPERSCRIPTS)
 
@@ -183,14 +183,14 @@ def days(seconds: object) -> str:
     return NOTHING if known is None else quantity(known / DAY_S, "d", 2)
 
 
-def moment(when: datetime) -> str:
+def date_text(when: datetime) -> str:
     """Return a date and time for a page, "2026-01-31 23:59 UTC"; ``when`` knows its time zone."""
     return when.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
-def moment_of(stamp_ns: object) -> str:
+def date_text_of_stamp(stamp_ns: object) -> str:
     """Return a ROS time [ns] as :func:`moment` does; what is no number gives a dash."""
     known = number(stamp_ns)
     if known is None:
         return NOTHING
-    return moment(datetime.fromtimestamp(known / NANOSECONDS_PER_S, tz=timezone.utc))
+    return date_text(datetime.fromtimestamp(known / NANOSECONDS_PER_S, tz=timezone.utc))

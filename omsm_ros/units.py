@@ -101,11 +101,11 @@ _ALSO_ANGLES = {
     "arcsec": DEGREE_RAD / 3600,
 }
 _ALSO_TIMES = {"sec": 1.0, "msec": MILLISECOND_S, "μs": MICROSECOND_S, "min": 60.0, "h": 3600.0}
-_OF_NO_CHANNEL = (
+_UNRELATED_UNITS = (
     *("V", "mV", "µV", "uV", "A", "mA", "N", "Pa", "bar", "g", "K", "°C", "°F", "Hz", "kHz", "rpm"),
     *("count", "counts", "digit", "digits", "LSB", "raw"),
 )
-_SAID = {
+_STATED_UNITS = {
     channel: {
         **units,
         **(_ALSO_LENGTHS if "mm" in units else {}),
@@ -114,7 +114,7 @@ _SAID = {
     }
     for channel, units in UNITS.items()
 }
-WORDS = frozenset[str]().union(*_SAID.values(), _OF_NO_CHANNEL) - {"1"}
+WORDS = frozenset[str]().union(*_STATED_UNITS.values(), _UNRELATED_UNITS) - {"1"}
 """What a file may call a unit, of whatever it is; log[1] is a place."""
 
 _TIME_NAME = re.compile(r"(?:t|time|zeit)\s*(?:[_/]|[\[(]|\s)\s*(\w+)\s*[\])]?", re.IGNORECASE)
@@ -122,16 +122,16 @@ _TIME_NAME = re.compile(r"(?:t|time|zeit)\s*(?:[_/]|[\[(]|\s)\s*(\w+)\s*[\])]?",
 # One turn in each unit that it may be counted in.
 _TURNS = {"deg": 360.0, "rad": 2 * np.pi, "mrad": 2000 * np.pi, "turn": 1.0}
 # A reading falls short of a whole turn by its own step at most.
-_NEARLY = 0.9
+_TURN_TOLERANCE = 0.9
 
 
-def is_other(stated: str, unit: str, channel: str) -> bool:
+def contradicts_unit(stated: str, unit: str, channel: str) -> bool:
     """Return whether ``stated``, a file's own word, is another unit than ``unit`` of the map.
 
     A word that is no unit says nothing, and a raw ``count`` is what the map says it is.
     """
     known = unit in UNITS[channel] and stated in WORDS
-    return known and _SAID[channel].get(stated) != UNITS[channel][unit]
+    return known and _STATED_UNITS[channel].get(stated) != UNITS[channel][unit]
 
 
 def seconds_of(name: str) -> float | None:
@@ -166,7 +166,7 @@ def check_turns(values: NDArray[np.float64], unit: str, axis: str) -> None:
         return
     step, extent = float(np.median(steps)), float(np.ptp(finite))
     back = float(np.max(-np.sign(step) * steps))
-    fits = [u for u, turn in _TURNS.items() if _NEARLY * turn < back and extent <= turn]
+    fits = [u for u, turn in _TURNS.items() if _TURN_TOLERANCE * turn < back and extent <= turn]
     if fits and unit not in fits and 0 < 10 * abs(step) < back:
         raise DataError(
             f"{axis} falls back by {back:.6g} while it turns, as one counted in {fits[0]} does, "

@@ -10,14 +10,14 @@ import numpy as np
 
 from omsm_ros.core.ripple.coordinates import Coordinate
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
-from omsm_ros.core.ripple.spectral_line import Line
+from omsm_ros.core.ripple.spectral_line import SpectralLine
 
 NM = 1e-9
 
 
 def scan(
     rate=1000.0, pace=0.04, turning=0.5, seconds=20.0, lines=(), path_like=TIME, sigma=0.1 * NM,
-    feed=1e-4, name="A", felt=None, on_circle=False,
+    feed=1e-4, name="A", acceleration_lines=None, on_circle=False,
     rings=(0.0, 0.0),
 ):  # fmt: skip
     """``pace`` [m/s] along the path, ``turning`` [turns/s], ``feed`` [m/turn], so many ``seconds``.
@@ -56,19 +56,19 @@ def scan(
         formless=SimpleNamespace(degree=2, on_circle=on_circle),
         spectrum=SimpleNamespace(sigma_at=lambda frequency: sigma, noise=5 * NM),
         resolution=lambda name: coordinates[name].resolution,
-        felt=felt,
+        acceleration_lines=acceleration_lines,
     )
 
 
 def line(frequency, amplitude=5 * NM, uncertainty=1e-4, coordinate=TIME, **possible):
     """Of so many waves a unit of ``coordinate``, and of others in which it may be one."""
-    return Line(
+    return SpectralLine(
         coordinate=coordinate, frequency=frequency, cosine=amplitude, sine=0.0,
         frequency_uncertainty=uncertainty, possible={coordinate: frequency, **possible},
     )  # fmt: skip
 
 
-def folded(frequency, rate):
+def aliased(frequency, rate):
     """The lowest frequency with the same samples, by looking at all its images."""
     return min(abs(frequency - k * rate) for k in range(int(frequency / rate) + 2))
 
@@ -79,7 +79,7 @@ def seen_by(one, over, frequency, amplitude=5 * NM):
     in_time = frequency * one.coordinates[name].pace
     if over != "t":  # a sample averages over its period
         amplitude *= abs(np.sinc(in_time * one.signal.period))
-    at = folded(in_time, one.signal.rate)
+    at = aliased(in_time, one.signal.rate)
     return line(
         at, amplitude, **{n: at / one.coordinates[n].pace for n in one.coordinates if n != TIME}
     )

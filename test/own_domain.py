@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.io.folders import claimed, runtime_folder
+from omsm_ros.io.folders import exclusive_lock, runtime_folder
 
 
 @contextmanager
@@ -14,7 +14,7 @@ def own_domain():
     """Its number, as long as it is needed."""
     for k in range(100):
         domain = 102 + (os.getpid() + k) % 100
-        with suppress(ConfigurationError), claimed(runtime_folder() / f"domain_{domain}"):
+        with suppress(ConfigurationError), exclusive_lock(runtime_folder() / f"domain_{domain}"):
             yield domain
             return
     pytest.fail("no free ROS_DOMAIN_ID")

@@ -85,8 +85,8 @@ def value_of(text):
 
 def says(text, value, digits=3):
     """Whether a cell says ``value``, rounded to so many digits."""
-    told = value_of(text)
-    if told is None or value is None:
-        return told is value
+    reported = value_of(text)
+    if reported is None or value is None:
+        return reported is value
     # A digit more is no lie: a probe of half a unit in the last place, and of binary fractions.
-    return abs(told - value) <= 0.5001 * 10.0 ** (1 - digits) * abs(value) + 1e-300
+    return abs(reported - value) <= 0.5001 * 10.0 ** (1 - digits) * abs(value) + 1e-300

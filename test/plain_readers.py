@@ -63,8 +63,8 @@ def x3p(path):
         main = archive.read("main.xml")
         root = ElementTree.fromstring(main)
         data = archive.read(root.find("Record3/DataLink/PointDataLink").text)
-        told = root.find("Record3/DataLink/MD5ChecksumPointData").text
-        assert told.lower() == hashlib.md5(data).hexdigest()
+        reported = root.find("Record3/DataLink/MD5ChecksumPointData").text
+        assert reported.lower() == hashlib.md5(data).hexdigest()
         checksum = archive.read(root.find("Record4/ChecksumFile").text).split()[0]
         assert checksum.decode().lower() == hashlib.md5(main).hexdigest()
     axes = {

@@ -110,8 +110,8 @@ def test_a_band_too_narrow_fails_however_many_runs_are_rejected(true_calibration
         )
         return [one] * count
 
-    narrow, wide = (1e-5) ** 2, (1e-3) ** 2
-    found = calibrations(4, "accepted", narrow) + calibrations(6, REJECTED, wide)
+    narrow, broad = (1e-5) ** 2, (1e-3) ** 2
+    found = calibrations(4, "accepted", narrow) + calibrations(6, REJECTED, broad)
     rows = {row["name"]: row for row in band_held("it", found, dynamics)}
     assert rows["rejected, it"]["value"] == 60.0
     assert rows["band held where accepted, it"]["value"] == 0.0

@@ -65,8 +65,8 @@ def test_arguments_reach_the_nodes(launch):
 
 def test_nodes_end_with_a_launch_that_cannot_tell_them(launch):
     """It is killed, or was before they had begun to listen for that."""
-    told = {made.additional_env[LAUNCHED_BY] for made in launch(record="x").values()}
-    assert told == {str(os.getpid())}
+    reported = {made.additional_env[LAUNCHED_BY] for made in launch(record="x").values()}
+    assert reported == {str(os.getpid())}
     node = (
         "from omsm_ros.nodes.start import end_with_launch; end_with_launch(); import time;"
         "print('begins', flush=True); time.sleep(10); print('left alone')"
@@ -80,8 +80,8 @@ def test_nodes_end_with_a_launch_that_cannot_tell_them(launch):
         assert made.stdout.readline() == b"begins\n"
         made.kill()
         assert made.stdout.read() == b""
-    told = os.environ | {LAUNCHED_BY: str(made.pid)}
-    late = subprocess.run([sys.executable, "-c", node], env=told, cwd=ROOT, capture_output=True)
+    reported = os.environ | {LAUNCHED_BY: str(made.pid)}
+    late = subprocess.run([sys.executable, "-c", node], env=reported, cwd=ROOT, capture_output=True)
     assert late.returncode == 1
     assert b"has ended" in late.stderr
 
@@ -90,7 +90,7 @@ def test_nodes_end_with_a_launch_that_cannot_tell_them(launch):
     ("argument", "hint"),
     [("recrod:=scan.mcap", "did you mean record:=?"), ("xyz:=1", "--show-args tells them all")],
 )
-def test_an_argument_that_nobody_takes_is_told(launch, caplog, argument, hint):
+def test_an_unknown_argument_is_reported(launch, caplog, argument, hint):
     """Else a scan would not be recorded, or a real device be driven, for a letter."""
     launch(argv=[argument])
     (said,) = caplog.messages

@@ -48,7 +48,7 @@ def test_a_value_is_in_its_range_or_refused_on_one_line(quantity: Quantity, valu
 def test_what_is_not_plausible_is_lost_and_nothing_else(values: list[float]) -> None:
     given_ = np.array(values)
     with np.errstate(all="ignore"):
-        kept = quantities.POSITION.or_lost(given_)
+        kept = quantities.POSITION.nan_if_implausible(given_)
     for before, after in zip(values, kept.tolist(), strict=True):
         plausible = math.isfinite(before) and abs(before) <= 100
         assert after == before if plausible else math.isnan(after)

@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 
 from omsm_ros.readable import (
     NOTHING,
-    chance,
     count,
+    date_text,
     expanded,
     figure,
     measured,
-    moment,
     number,
+    p_value_text,
     percent,
     plain,
     probability,
     quantity,
-    raised,
+    superscript,
 )
 
 FACTORS = {"n": 1e-9, "µ": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3, "M": 1e6}
@@ -66,7 +66,7 @@ def test_reads_as_it_should(value, uncertainty, unit, expected):
         (None, 1e-9, False, "–"),
     ],
 )
-def test_of_what_cannot_be_negative_a_bound_is_told(value, uncertainty, signed, expected):
+def test_a_bound_is_reported_for_non_negative_quantities(value, uncertainty, signed, expected):
     assert expanded(value, uncertainty, "m", signed) == expected
 
 
@@ -125,7 +125,7 @@ def test_only_finite_numbers_are_numbers():
 
 
 def test_powers_are_raised():
-    assert raised(-12) == "⁻¹²"
+    assert superscript(-12) == "⁻¹²"
 
 
 @pytest.mark.parametrize(
@@ -195,13 +195,13 @@ def test_a_share_in_per_cent(share, digits, text):
 
 
 def test_a_chance_in_a_sentence():
-    assert chance(0.234567) == "p = 0.235"
-    assert chance(1e-300) == "p < 0.0001"
+    assert p_value_text(0.234567) == "p = 0.235"
+    assert p_value_text(1e-300) == "p < 0.0001"
 
 
 def test_a_moment_is_given_in_utc():
     summer = timezone(timedelta(hours=2))
-    assert moment(datetime(2026, 7, 1, 1, 30, tzinfo=summer)) == "2026-06-30 23:30 UTC"
+    assert date_text(datetime(2026, 7, 1, 1, 30, tzinfo=summer)) == "2026-06-30 23:30 UTC"
 
 
 def test_the_largest_of_all_numbers_is_shown_and_not_rounded_up_to_infinity():

@@ -85,9 +85,9 @@ def test_what_a_command_reads_at_run_time_is_in_it(wheel):
 def test_it_installs_every_command(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (points,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
-        told = archive.read(points).decode()
+        reported = archive.read(points).decode()
     nodes = {path.stem.removesuffix("_node") for path in ROOT.glob("omsm_ros/nodes/*_node.py")}
-    assert set(re.findall(r"^(\w+) = ", told, re.MULTILINE)) == {
+    assert set(re.findall(r"^(\w+) = ", reported, re.MULTILINE)) == {
         "omsm",
         "replay",  # the player, under the name that others know
         *nodes,
@@ -130,9 +130,9 @@ def licence(package):
     ],
 )
 def test_no_required_package_is_under_the_gpl(package):
-    told = licence(package)[:400]
-    assert told, f"{package} states no licence"
-    assert not re.search(r"(?<!L)GPL|(?<!Lesser )General Public", told)
+    reported = licence(package)[:400]
+    assert reported, f"{package} states no licence"
+    assert not re.search(r"(?<!L)GPL|(?<!Lesser )General Public", reported)
     listed = (ROOT / "docs" / "licences.md").read_text(encoding="utf-8")
     assert f"| {package} |" in listed
 

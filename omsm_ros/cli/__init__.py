@@ -13,7 +13,7 @@ import signal
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 
-from omsm_ros.loading import nothing_to_undo, one_thread_of_blas
+from omsm_ros.loading import exit_on_signal_while_loading, one_thread_of_blas
 
 INTERRUPTED = 130
 INTERRUPTION = "interrupted; no unfinished file was left"
@@ -33,4 +33,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def interruptible() -> AbstractContextManager[None]:
     """Let Ctrl-C while something only loads end the command as it does later."""
-    return nothing_to_undo((signal.SIGINT,), INTERRUPTED, f"omsm: {INTERRUPTION}\n")
+    return exit_on_signal_while_loading((signal.SIGINT,), INTERRUPTED, f"omsm: {INTERRUPTION}\n")

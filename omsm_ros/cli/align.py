@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, cell_of, number
-from omsm_ros.cli.command import Command, Facts, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.cli.correct import CALIBRATION, geometry_of
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import save_geometry
@@ -72,4 +72,4 @@ def _show_align(facts: Facts) -> None:
     table([*rows, written([facts["file"]])])
 
 
-COMMANDS = (Command("align", _declare_align, _align, _show_align),)
+COMMANDS = (CliCommand("align", _declare_align, _align, _show_align),)

@@ -13,9 +13,9 @@ import numpy as np
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_by_stamps, add_trigger, cell_of, number, trigger_of
 from omsm_ros.cli.command import (
-    Command,
+    CliCommand,
     Facts,
-    kept_at,
+    output_path_for,
     progress_bar,
     rejected,
     say,
@@ -25,7 +25,11 @@ from omsm_ros.cli.command import (
 )
 from omsm_ros.core.calibration.calibration import verdict_of
 from omsm_ros.core.calibration.calibration_set import calibration_set
-from omsm_ros.core.calibration.repeatability import Repeatability, compare, repeatability
+from omsm_ros.core.calibration.repeatability import (
+    Repeatability,
+    compare_calibrations,
+    repeatability,
+)
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
@@ -112,7 +116,7 @@ def _compare(args: argparse.Namespace) -> Facts:
     calibrations = [load_calibration(path) for path in (args.old, args.new, *args.more)]
     if len(calibrations) > 2:
         return _repeatability_facts(repeatability(calibrations))
-    change = compare(*calibrations)
+    change = compare_calibrations(*calibrations)
     return asdict(change) | {"text": change.text()}
 
 
@@ -217,7 +221,7 @@ def _calset(args: argparse.Namespace) -> Facts:
     placed = [(position, load_calibration(path)) for path, _, position in args.placed]
     made = calibration_set(axes[0], placed)
     verdict, reasons = verdict_of(made)
-    path = kept_at(args.out, verdict)
+    path = output_path_for(args.out, verdict)
     save_calibration(path, made)
     return {
         "along": made.along,
@@ -246,8 +250,8 @@ def _show_calset(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("plan", _declare_plan, _plan, _show_plan),
-    Command("verify", _declare_verify, _verify, _show_verify),
-    Command("compare", _declare_compare, _compare, lambda facts: say_lines(facts["text"])),
-    Command("calset", _declare_calset, _calset, _show_calset, rejected),
+    CliCommand("plan", _declare_plan, _plan, _show_plan),
+    CliCommand("verify", _declare_verify, _verify, _show_verify),
+    CliCommand("compare", _declare_compare, _compare, lambda facts: say_lines(facts["text"])),
+    CliCommand("calset", _declare_calset, _calset, _show_calset, rejected),
 )

@@ -12,7 +12,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import (
     ADDRESS,
-    Command,
+    CliCommand,
     Facts,
     declare_catalogue,
     progress_bar,
@@ -66,7 +66,7 @@ def _options(args: argparse.Namespace) -> list[str]:
     be of another calibration than their page says.
     """
     for word in args.passed_on:
-        if taken := next((o for o in _DECIDED if _stands_for(word, o)), None):
+        if taken := next((o for o in _DECIDED if _is_abbreviation(word, o)), None):
             raise ConfigurationError(
                 f"{taken} stands after '--' as {shown(word)}; give it before, once for all bags"
             )
@@ -75,7 +75,7 @@ def _options(args: argparse.Namespace) -> list[str]:
     return [*args.passed_on, "--catalogue", args.catalogue]
 
 
-def _stands_for(word: str, option: str) -> bool:
+def _is_abbreviation(word: str, option: str) -> bool:
     """Return whether a ``word`` of the command line is ``option``, or short for it."""
     name, _, _ = word.partition("=")
     return len(name) > _LEAST_SHORT and option.startswith(name)
@@ -83,10 +83,10 @@ def _stands_for(word: str, option: str) -> bool:
 
 def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path) -> None:
     # Here, because drawing takes long to load.
-    from omsm_ros.report.campaign import Measurement, render
+    from omsm_ros.report.campaign import CampaignEntry, render
 
     measurements = [
-        Measurement(
+        CampaignEntry(
             e.bag, e.state, e.said, e.recorded_ns,
             _link(out, e), load_summary(out, e) if e.state == DONE else {},
         )
@@ -122,4 +122,4 @@ def _undone(facts: Facts) -> str:
     )
 
 
-COMMANDS = (Command("batch", _declare_batch, _batch, _show_batch, _undone),)
+COMMANDS = (CliCommand("batch", _declare_batch, _batch, _show_batch, _undone),)

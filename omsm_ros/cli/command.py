@@ -19,7 +19,7 @@ Facts: TypeAlias = "dict[str, Any]"
 
 
 @dataclass(frozen=True)
-class Command:
+class CliCommand:
     """One word after ``omsm``; its place in the list and its line of help are in ``words``.
 
     declare: adds its arguments;  act: does it and returns facts in SI for ``--json``
@@ -52,7 +52,7 @@ def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[P
         yield advance
 
 
-def kept_at(out: Path, verdict: str) -> Path:
+def output_path_for(out: Path, verdict: str) -> Path:
     """Return where to write a result: a rejected one never takes the place of a good one."""
     return out.parent / f"{out.stem}.rejected.json" if verdict == REJECTED else out
 

@@ -35,11 +35,11 @@ from omsm_ros.errors import (
     too_many_open_files,
 )
 from omsm_ros.io import json_and_yaml
-from omsm_ros.pipelines.progress import beside, tick
+from omsm_ros.pipelines.progress import refresh_in_thread, tick
 from omsm_ros.quantities import shown
 
 if TYPE_CHECKING:
-    from omsm_ros.cli.command import Command, Facts
+    from omsm_ros.cli.command import CliCommand, Facts
 
 
 # Seconds on the terminal, where a command works for long and nobody can tell how long.
@@ -49,7 +49,7 @@ _PATIENCE_S = 1.0
 
 
 @contextmanager
-def at_work(title: str, quiet: bool) -> Iterator[None]:
+def progress_in_background(title: str, quiet: bool) -> Iterator[None]:
     """Count the seconds on stderr, with ``title``; silent for programs, in pipes and at first.
 
     Bars of what can be counted stand below it.
@@ -57,7 +57,7 @@ def at_work(title: str, quiet: bool) -> Iterator[None]:
     if quiet or not sys.stderr.isatty():
         yield
         return
-    with beside(partial(_show, title)):
+    with refresh_in_thread(partial(_show, title)):
         yield
 
 
@@ -77,7 +77,7 @@ def _show(title: str, done: Event) -> None:
 _ASKED = (signal.SIGTERM, signal.SIGHUP)
 
 
-class AskedToEndError(KeyboardInterrupt):
+class TerminationRequestedError(KeyboardInterrupt):
     """The signal ``number`` came; like Ctrl-C it is no error of what is being done."""
 
     def __init__(self, number: int) -> None:
@@ -86,15 +86,15 @@ class AskedToEndError(KeyboardInterrupt):
 
 
 @contextmanager
-def interrupted_when_asked() -> Iterator[None]:
-    """Raise AskedToEndError where a signal would end the process at once; the second one does."""
+def interrupt_on_signal() -> Iterator[None]:
+    """Raise TerminationRequestedError where a signal would end the process at once; the second one does."""
     if threading.current_thread() is not threading.main_thread():
         yield  # signals are the main thread's
         return
 
     def asked(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_DFL)
-        raise AskedToEndError(number)
+        raise TerminationRequestedError(number)
 
     # What is ignored stays so, as SIGHUP below nohup.
     ours = [one for one in _ASKED if signal.getsignal(one) is signal.SIG_DFL]
@@ -107,7 +107,7 @@ def interrupted_when_asked() -> Iterator[None]:
             signal.signal(one, signal.SIG_DFL)
 
 
-def end_as_asked(number: int) -> None:
+def end_by_signal(number: int) -> None:
     """End this process by the signal ``number``, so that who waits for it sees by what it ended."""
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)
@@ -178,12 +178,12 @@ _WIDTH, _INDENT = 79, 14
 DEMO = "demo"
 
 # What stands after "--" is for the command that these run in turn.
-PASS_ON = ("batch",)
+FORWARD_ARGUMENTS = ("batch",)
 
 
 # What the system says of a disk, without a name where it is said while reading.
-_OF_A_DISK = (errno.EIO, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.ESTALE)
-_WHAT_NEXT = """\
+_DISK_ERRORS = (errno.EIO, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.ESTALE)
+_NEXT_STEPS = """\
 omsm: measure optics on the machine that cut them, the dynamic error corrected.
 
   is this computer ready?       omsm doctor
@@ -201,7 +201,7 @@ omsm: measure optics on the machine that cut them, the dynamic error corrected.
 'omsm --help' has all commands, 'omsm COMMAND --help' its options."""
 
 
-def _command(word: str) -> Command:
+def _command(word: str) -> CliCommand:
     """Return the command ``word``; nothing is loaded but what its module needs."""
     with interruptible():
         module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
@@ -294,7 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     _make_writable()
     if not given:
-        say_lines(_WHAT_NEXT)
+        say_lines(_NEXT_STEPS)
         return DONE
     try:
         _check_words(given)
@@ -304,24 +304,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         args.passed_on = passed_on
         return _run(args)
     except OmsmError as err:
-        _complain(too_many_open_files(err) or str(err))
+        _warn(too_many_open_files(err) or str(err))
         return BAD_INPUT
     except KeyboardInterrupt as err:
-        _complain(INTERRUPTION)
-        if isinstance(err, AskedToEndError):
-            end_as_asked(err.number)
+        _warn(INTERRUPTION)
+        if isinstance(err, TerminationRequestedError):
+            end_by_signal(err.number)
         return INTERRUPTED
     except BrokenPipeError:
         # Who read our output has enough of it; nothing more may be flushed to it at exit.
-        os.dup2(_nowhere(), sys.stdout.fileno())
+        os.dup2(_null_device(), sys.stdout.fileno())
         return DONE
     except MemoryError as err:
-        _complain(f"memory is short: {err or 'none is left'}; give less at once")
+        _warn(f"memory is short: {err or 'none is left'}; give less at once")
         return BAD_INPUT
     except Exception as err:
         if os.environ.get(DEBUG):
             raise
-        return _unforeseen(err)
+        return _report_internal_error(err)
 
 
 def _make_writable() -> None:
@@ -329,22 +329,22 @@ def _make_writable() -> None:
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by who has started this
-            setattr(sys, name, os.fdopen(_nowhere(), "w"))
+            setattr(sys, name, os.fdopen(_null_device(), "w"))
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
 
 
-def _unforeseen(err: Exception) -> int:
+def _report_internal_error(err: Exception) -> int:
     """Say what nobody foresaw; return the exit status."""
     if short := too_many_open_files(err):
-        _complain(short)
+        _warn(short)
         return BAD_INPUT
-    if isinstance(err, OSError) and (err.filename is not None or err.errno in _OF_A_DISK):
+    if isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
         # Of a place that the system refuses: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))
-        _complain(f"{path}: {err.strerror}; check the path, its permissions and the disk")
+        _warn(f"{path}: {err.strerror}; check the path, its permissions and the disk")
         return BAD_INPUT
-    _complain(defect(err))
+    _warn(defect(err))
     return DEFECT
 
 
@@ -359,7 +359,7 @@ def _check_words(given: list[str]) -> None:
 
 def _split(given: list[str]) -> tuple[list[str], list[str]]:
     """Return the arguments before and after "--", where the command passes the latter on."""
-    if given[0] not in PASS_ON or "--" not in given:
+    if given[0] not in FORWARD_ARGUMENTS or "--" not in given:
         return given, []
     place = given.index("--")
     return given[:place], given[place + 1 :]
@@ -369,11 +369,11 @@ def _run(args: argparse.Namespace) -> int:
     check_outputs(args)
     if args.command == DEMO:
         return _demo(args)
-    with interrupted_when_asked(), at_work(f"omsm {args.command}", args.json):
+    with interrupt_on_signal(), progress_in_background(f"omsm {args.command}", args.json):
         facts = args.run.act(args)
     _tell(args, facts)
     if refusal := args.run.refusal(facts):
-        _complain(refusal)
+        _warn(refusal)
         return BAD_INPUT
     return DONE
 
@@ -388,19 +388,19 @@ def _tell(args: argparse.Namespace, facts: Facts) -> None:
     except OSError as err:
         if isinstance(err, BrokenPipeError) or err.filename is not None:
             raise
-        os.dup2(_nowhere(), sys.stdout.fileno())  # what waits to be printed fails again at exit
+        os.dup2(_null_device(), sys.stdout.fileno())  # what waits to be printed fails again at exit
         raise FileError(
             f"standard output takes no more: {err.strerror}; the command was carried out; make "
             "room there, or send it elsewhere"
         ) from err
 
 
-def _complain(text: str) -> None:
+def _warn(text: str) -> None:
     try:
         print("omsm:", one_line(text), file=sys.stderr, flush=True)
     except OSError:  # nobody can be told, but the exit status is right
-        os.dup2(_nowhere(), sys.stderr.fileno())
+        os.dup2(_null_device(), sys.stderr.fileno())
 
 
-def _nowhere() -> int:
+def _null_device() -> int:
     return os.open(os.devnull, os.O_WRONLY)

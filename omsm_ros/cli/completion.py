@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from omsm_ros.cli.command import Command, Facts, say_lines
+from omsm_ros.cli.command import CliCommand, Facts, say_lines
 from omsm_ros.errors import ConfigurationError
 
 SHELLS = ("bash", "zsh", "tcsh")
@@ -49,4 +49,4 @@ def _show_completion(facts: Facts) -> None:
     say_lines(facts["script"])
 
 
-COMMANDS = (Command("completion", _declare_completion, _completion, _show_completion),)
+COMMANDS = (CliCommand("completion", _declare_completion, _completion, _show_completion),)

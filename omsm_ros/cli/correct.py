@@ -21,7 +21,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import Command, Facts, declare_catalogue, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, declare_catalogue, progress_bar, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
@@ -41,9 +41,9 @@ from omsm_ros.io.descriptions import (
     load_surface,
 )
 from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
-from omsm_ros.pipelines.correct import Admission, ByStamps
-from omsm_ros.pipelines.history import remembered
-from omsm_ros.pipelines.measure import Registering, measure
+from omsm_ros.pipelines.correct import Admission, StampJoining
+from omsm_ros.pipelines.history import record_in_catalogue
+from omsm_ros.pipelines.measure import RegistrationOptions, measure
 from omsm_ros.pipelines.recording import path_in
 from omsm_ros.readable import percent, plain, quantity
 
@@ -168,14 +168,16 @@ def _correct(args: argparse.Namespace) -> Facts:
             options=options,
             admission=Admission(args.settings, args.override),
             lateral=args.lateral,
-            by_stamps=ByStamps(args.delay, args.exposure) if args.by_stamps else None,
+            by_stamps=StampJoining(args.delay, args.exposure) if args.by_stamps else None,
             stated=sources_of(args.sources),
             accuracy=args.accuracy,
-            register=Registering(args.fit, args.aperture, args.tolerance) if args.fit else None,
+            register=RegistrationOptions(args.fit, args.aperture, args.tolerance)
+            if args.fit
+            else None,
             report=not args.no_report,
             progress=progress,
         )
-    warnings = remembered(args.catalogue, lambda: _keep(args))
+    warnings = record_in_catalogue(args.catalogue, lambda: _keep(args))
     warnings = [*summary["warnings"], *warnings]
     return {**summary, "warnings": warnings, "out": str(args.out)}
 
@@ -258,6 +260,6 @@ def _times(factor: float) -> str:
 
 
 COMMANDS = (
-    Command("predict", _declare_predict, _predict, _show_predict),
-    Command("correct", _declare_correct, _correct, _show_correct),
+    CliCommand("predict", _declare_predict, _predict, _show_predict),
+    CliCommand("correct", _declare_correct, _correct, _show_correct),
 )

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
-from omsm_ros.cli.command import Command, Facts, table, written
-from omsm_ros.cli.fit_option import freedoms
-from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named
+from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.fit_option import dofs
+from omsm_ros.core.comparison.matching import DEGREES_OF_FREEDOM, SEATED, ordered_dofs
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import DIFFERENCE, REPORT
@@ -23,12 +23,12 @@ from omsm_ros.pipelines.compare_measurements import (
 from omsm_ros.readable import count, figure, percent, plain, quantity
 
 
-def _freedoms(text: str) -> tuple[str, ...]:
+def _dof_argument(text: str) -> tuple[str, ...]:
     """Return the argument type: freedoms of the second measurement against the first."""
     if text == "auto":
-        return tuple(name for name in FREEDOMS if name != "power")
+        return tuple(name for name in DEGREES_OF_FREEDOM if name != "power")
     try:
-        return freedoms_named(tuple(filter(None, text.split(","))))
+        return ordered_dofs(tuple(filter(None, text.split(","))))
     except ConfigurationError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
 
@@ -39,16 +39,16 @@ def _declare_difference(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument(
         "--fit",
-        type=_freedoms,
+        type=_dof_argument,
         default=SEATED,
         metavar="FREEDOMS",
-        help=f"of {','.join(FREEDOMS)}; 'auto': all but power that the surface determines; "
+        help=f"of {','.join(DEGREES_OF_FREEDOM)}; 'auto': all but power that the surface determines; "
         f"default {','.join(SEATED)}",
     )
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="taken off both first")
     sub.add_argument(
         "--register",
-        type=freedoms,
+        type=dofs,
         metavar="FREEDOMS",
         help="of each to the nominal surface first, as 'omsm form' has them: 'auto', or of "
         "piston,tip,tilt,x,y,clocking,power",
@@ -79,7 +79,7 @@ def _difference(args: argparse.Namespace) -> Facts:
     if args.register and args.nominal is None:
         raise ConfigurationError("--register needs the surface; give --nominal SURFACE.yaml")
     options = ComparisonOptions(
-        freedoms=args.fit,
+        dofs=args.fit,
         uncertainty=args.uncertainty,
         drift=args.drift,
         units=args.unit,
@@ -128,4 +128,4 @@ def _length(value: float) -> str:
     return quantity(value, "m", 4)
 
 
-COMMANDS = (Command("difference", _declare_difference, _difference, _show_difference),)
+COMMANDS = (CliCommand("difference", _declare_difference, _difference, _show_difference),)

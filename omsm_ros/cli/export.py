@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
-from omsm_ros.cli.command import Command, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.pipelines.export_points import export
 from omsm_ros.readable import count, quantity
 
@@ -44,4 +44,4 @@ def _show_export(facts: Facts) -> None:
     table([*rows, written([facts["file"]])])
 
 
-COMMANDS = (Command("export", _declare_export, _export, _show_export),)
+COMMANDS = (CliCommand("export", _declare_export, _export, _show_export),)

@@ -7,17 +7,17 @@ import argparse
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Facts
-from omsm_ros.core.registration.degrees_of_freedom import parsed_freedoms
+from omsm_ros.core.registration.degrees_of_freedom import parse_dofs
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import count, measured
-from omsm_ros.report.measurement.page import dragged, figure_rows, settled
+from omsm_ros.report.measurement.page import correlated_moves, figure_rows, settled
 
 
-def freedoms(text: str) -> tuple[str, ...]:
+def dofs(text: str) -> tuple[str, ...]:
     """Return the argument type: 'auto', or freedoms of a pose."""
     try:
-        return parsed_freedoms(text)
+        return parse_dofs(text)
     except ConfigurationError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
 
@@ -44,7 +44,7 @@ def declare_fit(sub: argparse.ArgumentParser, default: tuple[str, ...] | None) -
     """Add the arguments of a registration."""
     sub.add_argument(
         "--fit",
-        type=freedoms,
+        type=dofs,
         default=default,
         metavar="FREEDOMS",
         help="'auto', or of piston,tip,tilt,x,y,clocking,power: what is taken out",
@@ -75,7 +75,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
     rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
     rows += [(f"{n} held", why) for n, why in removed["held"].items()]
     rows += [
-        (f"{n} not fitted", f"{why}{dragged(facts, n)}")
+        (f"{n} not fitted", f"{why}{correlated_moves(facts, n)}")
         for n, why in removed["not_determined"].items()
     ]
     rows += figure_rows(facts)

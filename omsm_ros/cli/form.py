@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, add_bags, cell_of, number, refuse_cell
-from omsm_ros.cli.command import Command, Facts, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.registration.degrees_of_freedom import AUTO
@@ -169,7 +169,7 @@ def _show_surface(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("form", _declare_form, _form, _show_form),
-    Command("compensate", _declare_compensate, _compensate, _show_compensate),
-    Command("surface", _declare_surface, _surface, _show_surface),
+    CliCommand("form", _declare_form, _form, _show_form),
+    CliCommand("compensate", _declare_compensate, _compensate, _show_compensate),
+    CliCommand("surface", _declare_surface, _surface, _show_surface),
 )

@@ -7,8 +7,8 @@ from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omsm_ros.cli.command import Command, Facts, declare_catalogue, say, table, written
-from omsm_ros.core.calibration.trend import Trend
+from omsm_ros.cli.command import CliCommand, Facts, declare_catalogue, say, table, written
+from omsm_ros.core.calibration.trend import LinearTrend
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.json_and_yaml import unknown_as_null
 from omsm_ros.quantities import shown
@@ -126,11 +126,11 @@ def _counts(machine: dict[str, Any]) -> str:
 def _drift(found: dict[str, float] | None, unit: str) -> str:
     if found is None:
         return f"{NOTHING} (not evaluated: fewer than five, or no times)"
-    drift = Trend(**found)
+    drift = LinearTrend(**found)
     low, high = (
         quantity(s * DAY_S, unit) if unit else plain(s * DAY_S) for s in (drift.low, drift.high)
     )
     return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
 
 
-COMMANDS = (Command("history", _declare_history, _history, _show_history),)
+COMMANDS = (CliCommand("history", _declare_history, _history, _show_history),)

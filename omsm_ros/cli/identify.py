@@ -19,10 +19,10 @@ from omsm_ros.cli.arguments import (
     trigger_of,
 )
 from omsm_ros.cli.command import (
-    Command,
+    CliCommand,
     Facts,
     declare_catalogue,
-    kept_at,
+    output_path_for,
     progress_bar,
     rejected,
     table,
@@ -35,9 +35,9 @@ from omsm_ros.core.identification.sampled_identification import HOLDS
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import save_calibration
-from omsm_ros.io.files import whole_file
+from omsm_ros.io.files import atomic_file
 from omsm_ros.io.model_file import load_model, save_model
-from omsm_ros.pipelines.history import remembered
+from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.pipelines.identify import (
     SampledRecord,
     model_of,
@@ -127,10 +127,13 @@ def _identify(args: argparse.Namespace) -> Facts:
         recorded_ns=recorded_ns_of_bag(bag),
     )
     facts = calibration_facts(identified.calibration)
-    path = kept_at(args.out, facts["verdict"])
+    path = output_path_for(args.out, facts["verdict"])
     save_calibration(path, identified.calibration)
     facts["calibration"] = str(path)
-    facts["warnings"] = [*facts["warnings"], *_remembered(args, identified.calibration, path)]
+    facts["warnings"] = [
+        *facts["warnings"],
+        *_record_identification(args, identified.calibration, path),
+    ]
     if args.report is not None:
         # Drawing takes a second to import; most commands do without.
         from omsm_ros.pipelines.identify import write_certificate
@@ -140,13 +143,15 @@ def _identify(args: argparse.Namespace) -> Facts:
     return facts
 
 
-def _remembered(args: argparse.Namespace, calibration: Calibration, path: Path) -> list[str]:
+def _record_identification(
+    args: argparse.Namespace, calibration: Calibration, path: Path
+) -> list[str]:
     def keep() -> bool:
         from omsm_ros.pipelines.history import keep_calibration
 
         return keep_calibration(args.catalogue, calibration, path, args.recording)
 
-    return remembered(args.catalogue, keep)
+    return record_in_catalogue(args.catalogue, keep)
 
 
 def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
@@ -193,7 +198,7 @@ def _check_for_bags(args: argparse.Namespace) -> None:
 def _model_facts(record: SampledRecord, args: argparse.Namespace) -> Facts:
     longest = _MAX_DELAY if args.max_delay is None else args.max_delay
     model = model_of(record, hold=args.hold, order=args.order, max_delay=longest)
-    path = kept_at(args.out, str(model.certificate["verdict"]))
+    path = output_path_for(args.out, str(model.certificate["verdict"]))
     save_model(path, model)
     facts = {
         **model.certificate,
@@ -297,7 +302,7 @@ def _validate(args: argparse.Namespace) -> Facts:
     }
     with ExitStack() as both:  # neither stands where the other cannot be written
         if args.out is not None:
-            stream = both.enter_context(whole_file(args.out, "w"))
+            stream = both.enter_context(atomic_file(args.out, "w"))
             stream.write(text_of_run(record, run))
             facts["run"] = str(args.out)
         if args.report is not None:
@@ -316,6 +321,6 @@ def _show_validate(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("identify", _declare, _identify, _show, rejected),
-    Command("validate", _declare_validate, _validate, _show_validate),
+    CliCommand("identify", _declare, _identify, _show, rejected),
+    CliCommand("validate", _declare_validate, _validate, _show_validate),
 )

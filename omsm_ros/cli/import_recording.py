@@ -6,7 +6,7 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from omsm_ros.cli.command import Command, Facts, progress_bar, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.io.tables.table import load_column_map
 from omsm_ros.pipelines.import_recording import import_recording
 
@@ -44,4 +44,4 @@ def _show_import(facts: Facts) -> None:
     table([written([facts["bag"]]), ("next", "look at it with 'omsm inspect'")])
 
 
-COMMANDS = (Command("import", _declare_import, _import, _show_import),)
+COMMANDS = (CliCommand("import", _declare_import, _import, _show_import),)

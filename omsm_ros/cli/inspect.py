@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from omsm_ros.cli.arguments import add_bags, cell_of
-from omsm_ros.cli.command import Command, Facts, progress_bar, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.pipelines.inspect_bag import Inspection, inspect_bag
 from omsm_ros.readable import quantity
 
@@ -74,4 +74,4 @@ def _vibration(found: Facts | None) -> list[tuple[str, str]]:
     return [("vibration", f"on a height at most {said}; {raised}"), *rows]
 
 
-COMMANDS = (Command("inspect", _declare, _act, _show),)
+COMMANDS = (CliCommand("inspect", _declare, _act, _show),)

@@ -8,18 +8,26 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
-from omsm_ros.cli.command import Command, Facts, kept_at, progress_bar, rejected, table, written
+from omsm_ros.cli.command import (
+    CliCommand,
+    Facts,
+    output_path_for,
+    progress_bar,
+    rejected,
+    table,
+    written,
+)
 from omsm_ros.cli.correct import CALIBRATION
 from omsm_ros.core.adjustment.resolved_calibration import undetermined
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_CLOCKING_RAD,
     DEFAULT_HARMONICS,
-    WIDE_GAIN,
+    UNINFORMATIVE_GAIN,
 )
 from omsm_ros.core.calibration.calibration import (
     Calibration,
-    beyond_lag,
-    declared,
+    declared_latency,
+    excess_latency_text,
     latency_of,
     verdict_of,
     with_latency,
@@ -57,7 +65,7 @@ def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--gain-uncertainty",
         type=number(quantities.GAIN_UNCERTAINTY),
-        default=WIDE_GAIN,
+        default=UNINFORMATIVE_GAIN,
         help="standard, as a share of it",
     )
     sub.add_argument(
@@ -93,7 +101,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
 
 def _kept(out: Path, calibration: Calibration) -> Path:
     """Write the calibration, and return where."""
-    path = kept_at(out, verdict_of(calibration)[0])
+    path = output_path_for(out, verdict_of(calibration)[0])
     save_calibration(path, calibration)
     return path
 
@@ -197,9 +205,9 @@ def _declare_latency(sub: argparse.ArgumentParser) -> None:
 def _latency(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     lag = calibration.dynamics.low_frequency_delay
-    if (wrong := beyond_lag(calibration, args.delay, args.uncertainty)) is not None:
+    if (wrong := excess_latency_text(calibration, args.delay, args.uncertainty)) is not None:
         raise ConfigurationError(wrong)
-    latency = declared(lag, args.delay, args.uncertainty, args.reason)
+    latency = declared_latency(lag, args.delay, args.uncertainty, args.reason)
     made = with_latency(calibration, latency)
     path = _kept(args.out, made)
     return {**_resolved_facts(made), "calibration": str(path)}
@@ -216,7 +224,7 @@ def _show_latency(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("selfcal", _declare_selfcal, _selfcal, _show_selfcal, rejected),
-    Command("reversal", _declare_reversal, _reversal, _show_reversal),
-    Command("latency", _declare_latency, _latency, _show_latency, rejected),
+    CliCommand("selfcal", _declare_selfcal, _selfcal, _show_selfcal, rejected),
+    CliCommand("reversal", _declare_reversal, _reversal, _show_reversal),
+    CliCommand("latency", _declare_latency, _latency, _show_latency, rejected),
 )

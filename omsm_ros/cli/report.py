@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from omsm_ros.cli.command import Command, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
 
@@ -31,4 +31,4 @@ def _show_report(facts: Facts) -> None:
     table([written([facts["report"]])])
 
 
-COMMANDS = (Command("report", _declare_report, _report, _show_report),)
+COMMANDS = (CliCommand("report", _declare_report, _report, _show_report),)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
-from omsm_ros.cli.command import Command, Facts, progress_bar, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.pipelines.correct import Admission
@@ -79,4 +79,4 @@ def _peak_row(peak: Facts) -> tuple[str, str]:
     return f"  {where}", f"{size}, {plain(peak['significance'])} σ: {what}: {why}"
 
 
-COMMANDS = (Command("spectrum", _declare_spectrum, _spectrum, _show_spectrum),)
+COMMANDS = (CliCommand("spectrum", _declare_spectrum, _spectrum, _show_spectrum),)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
-from omsm_ros.cli.command import Command, Facts, say
+from omsm_ros.cli.command import CliCommand, Facts, say
 from omsm_ros.pipelines.examine_host import DOUBTFUL, FAULTY, FINE, examine_host
 from omsm_ros.pipelines.record_twin import record_twin
 from omsm_ros.twin.scenario import Scenario
@@ -78,6 +78,6 @@ def _show_twin(facts: Facts) -> None:
 
 
 COMMANDS = (
-    Command("twin", _declare_twin, _twin, _show_twin),
-    Command("doctor", _declare_doctor, _doctor, _show_doctor, _faulty),
+    CliCommand("twin", _declare_twin, _twin, _show_twin),
+    CliCommand("doctor", _declare_doctor, _doctor, _show_doctor, _faulty),
 )

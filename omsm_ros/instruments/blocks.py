@@ -18,7 +18,7 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.statistics import spread
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.counting import SAMPLE, Run, Samples, Turns
+from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
 from omsm_ros.instruments.six_channel.protocol import AXES, AxisScaling
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
@@ -273,7 +273,7 @@ class BlockCutter:
         return self._settings.free_running and abs(self.period_deviation) > limit
 
     def add(
-        self, runs: Sequence[Run], arrival_ns: int, *, after_silence: bool = False
+        self, runs: Sequence[CountedRun], arrival_ns: int, *, after_silence: bool = False
     ) -> Iterator[BlockPair]:
         """Yield the blocks completed by ``runs``, which arrived together at ``arrival_ns``."""
         for i, run in enumerate(runs):
@@ -284,7 +284,7 @@ class BlockCutter:
                 self._set_clock(runs[i:], arrival_ns, after_silence and i == 0)
             yield from self._append(run)
 
-    def _set_clock(self, runs: Sequence[Run], arrival_ns: int, after_silence: bool) -> None:
+    def _set_clock(self, runs: Sequence[CountedRun], arrival_ns: int, after_silence: bool) -> None:
         """Tell the clock of the last sample that arrived before the device started anew."""
         continuous = self._channels.timed or self._settings.free_running
         if runs[0].restarted or (after_silence and not continuous):
@@ -293,7 +293,7 @@ class BlockCutter:
         last = runs[next(anew, len(runs)) - 1]
         self._clock.observe(int(self._times(last)[-1]), arrival_ns)
 
-    def _append(self, run: Run) -> Iterator[BlockPair]:
+    def _append(self, run: CountedRun) -> Iterator[BlockPair]:
         samples = run.samples.copy()
         samples["time"] = self._times(run)
         if not self.pending:
@@ -307,7 +307,7 @@ class BlockCutter:
         if self.pending:
             yield from self._take(self.pending)
 
-    def _times(self, run: Run) -> IntArray:
+    def _times(self, run: CountedRun) -> IntArray:
         """Return the device time [ns] of each sample: its own, or its count times the period."""
         times: IntArray = run.samples["time"]
         if not self._channels.timed:

@@ -28,11 +28,11 @@ Samples: TypeAlias = NDArray[np.void]
 # A gap and the time that passed may differ by this much, since arrivals are not even [s].
 _SLACK_S = 0.5
 # Copies of samples that were sent before are recognised this far back.
-_REMEMBERED = 1024
+_RECENT_SAMPLES = 1024
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class CountedRun:
     """Samples (n,) with consecutive trigger counts from ``first_sample``.
 
     restarted: the device started anew just before
@@ -75,7 +75,7 @@ class SequenceTracker:
         self._raw = self._time = self._counter = 0
         self._begun = self._anew = False
         self._held = np.empty(0, SAMPLE)
-        self._recent = np.zeros(_REMEMBERED, SAMPLE)
+        self._recent = np.zeros(_RECENT_SAMPLES, SAMPLE)
         self._recent["counter"] = -1
 
     @property
@@ -83,37 +83,37 @@ class SequenceTracker:
         """Samples that wait for their successor to show whether they are spoilt."""
         return len(self._held)
 
-    def begin_anew(self) -> None:
+    def restart_count(self) -> None:
         """Count from the device's next number, for it is known to have been restarted."""
         self._anew = self._begun
 
     def split(
         self, samples: Samples, elapsed: float = 0.0, *, broken: bool = False
-    ) -> Iterator[Run]:
+    ) -> Iterator[CountedRun]:
         """Yield the runs of ``samples`` (n,), in order.
 
         elapsed: how long nothing had come before [s];  broken: that was a silence, or the line
         was down
         """
         samples, self._held = np.concatenate([self._held, samples]), np.empty(0, SAMPLE)
-        pause = _Break(elapsed, broken)
+        pause = _StreamBreak(elapsed, broken)
         while len(samples):
             count = 0 if broken or self._anew else self._in_order(samples)
             if count:
                 yield self._accept(samples[:count], self._counter + 1, False)
-            elif self._waits(samples):
+            elif self._must_wait(samples):
                 self._held = samples.copy()
                 return
             else:
                 yield from self._one(samples, pause)
-                pause, broken, count = _Break(), False, 1
+                pause, broken, count = _StreamBreak(), False, 1
             samples = samples[count:]
 
-    def settle(self) -> Iterator[Run]:
+    def settle(self) -> Iterator[CountedRun]:
         """Yield the sample held back, when nothing came after it."""
         held, self._held = self._held, np.empty(0, SAMPLE)
         if len(held):
-            yield from self._one(held, _Break())
+            yield from self._one(held, _StreamBreak())
 
     def _in_order(self, samples: Samples) -> int:
         """Return how many samples at the beginning just go on."""
@@ -125,25 +125,25 @@ class SequenceTracker:
             good &= np.diff(samples["time"], prepend=self._time) >= 0
         return len(good) if good.all() else int(np.argmin(good))
 
-    def _accept(self, samples: Samples, first: int, restarted: bool) -> Run:
+    def _accept(self, samples: Samples, first: int, restarted: bool) -> CountedRun:
         self._begun, self._anew = True, False
         self._raw, self._time = int(samples["counter"][-1]), int(samples["time"][-1])
         self._counter = first + len(samples) - 1
-        self._recent[samples["counter"] % _REMEMBERED] = samples
-        return Run(samples, first, restarted)
+        self._recent[samples["counter"] % _RECENT_SAMPLES] = samples
+        return CountedRun(samples, first, restarted)
 
-    def _waits(self, samples: Samples) -> bool:
+    def _must_wait(self, samples: Samples) -> bool:
         """Return whether the only sample left leaps, so that the next one has to decide."""
-        return len(samples) == 1 and self._leaps(samples[0])
+        return len(samples) == 1 and self._counter_jumps(samples[0])
 
-    def _leaps(self, sample: np.void) -> bool:
+    def _counter_jumps(self, sample: np.void) -> bool:
         if self._counting.checked or not self._begun or self._anew:
             return False
-        return self._step(int(sample["counter"])) > 1 and not self._sent_before(sample)
+        return self._step(int(sample["counter"])) > 1 and not self._is_repeated(sample)
 
-    def _spoilt(self, samples: Samples) -> bool:
+    def _is_corrupted_counter(self, samples: Samples) -> bool:
         """Return whether the counter leaps at the first sample and is back at the next."""
-        if len(samples) < 2 or not self._leaps(samples[0]):
+        if len(samples) < 2 or not self._counter_jumps(samples[0]):
             return False
         here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
         return after < here
@@ -151,7 +151,7 @@ class SequenceTracker:
     def _step(self, raw: int) -> int:
         return (raw - self._raw) % self._counting.modulus
 
-    def _one(self, samples: Samples, pause: _Break) -> Iterator[Run]:
+    def _one(self, samples: Samples, pause: _StreamBreak) -> Iterator[CountedRun]:
         """Yield what becomes of the first of ``samples``, which does not just go on."""
         sample, alone = samples[0], samples[:1]
         raw = int(sample["counter"])
@@ -160,11 +160,11 @@ class SequenceTracker:
             return
         step, advance = self._step(raw), int(sample["time"]) - self._time
         in_order = step == 1 and advance >= 0
-        if self._spoilt(samples):
+        if self._is_corrupted_counter(samples):
             self.spoilt += 1
-        elif not (in_order or self._anew) and self._sent_before(sample):
+        elif not (in_order or self._anew) and self._is_repeated(sample):
             self.duplicates += 1
-        elif self._anew or self._fallen(raw, step, advance, pause):
+        elif self._anew or self._counter_fell_back(raw, step, advance, pause):
             self.restarts += 1
             yield self._accept(alone, raw, True)
         elif step == 0:
@@ -175,11 +175,11 @@ class SequenceTracker:
             self.gaps += step > 1
             yield self._accept(alone, self._counter + step, False)
 
-    def _sent_before(self, sample: np.void) -> bool:
-        remembered = self._recent[int(sample["counter"]) % _REMEMBERED]
-        return bool(remembered.tobytes() == sample.tobytes())
+    def _is_repeated(self, sample: np.void) -> bool:
+        previous = self._recent[int(sample["counter"]) % _RECENT_SAMPLES]
+        return bool(previous.tobytes() == sample.tobytes())
 
-    def _fallen(self, raw: int, step: int, advance: int, pause: _Break) -> bool:
+    def _counter_fell_back(self, raw: int, step: int, advance: int, pause: _StreamBreak) -> bool:
         if step == 1:
             return advance < 0
         if pause.broken and raw == 0:
@@ -196,16 +196,16 @@ class SequenceTracker:
         whole = step + self._turns(step, pause) * self._counting.modulus
         return abs(pause.elapsed - whole * period) > _SLACK_S
 
-    def _turns(self, step: int, pause: _Break) -> int:
+    def _turns(self, step: int, pause: _StreamBreak) -> int:
         """Return the whole turns of the counter that a silence hid."""
         if not self._counting.period:
             return 0
-        hidden = pause.elapsed / self._counting.period - step
-        return max(0, round(hidden / self._counting.modulus))
+        missing_samples = pause.elapsed / self._counting.period - step
+        return max(0, round(missing_samples / self._counting.modulus))
 
 
 @dataclass(frozen=True, slots=True)
-class _Break:
+class _StreamBreak:
     """What lay before a sample."""
 
     elapsed: float = 0.0

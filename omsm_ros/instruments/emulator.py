@@ -103,7 +103,7 @@ WRITE_INTERVAL_S = 0.005
 _MAX_SAMPLES = 2000
 
 
-class Line(Protocol):
+class InstrumentLink(Protocol):
     """What carries the bytes: a ``Pty`` or a ``TcpServer``."""
 
     @property
@@ -128,7 +128,7 @@ class Line(Protocol):
 
 
 @dataclass(slots=True)
-class Faults:
+class InstrumentFaults:
     """Faults that are still to come: counts are used up, the others last until set back.
 
     lose, duplicate: samples not sent, sent twice
@@ -168,7 +168,7 @@ class Instrument:
 
     def __init__(
         self,
-        line: Line,
+        line: InstrumentLink,
         source: Source | None = None,
         *,
         triggered: bool = False,
@@ -176,7 +176,7 @@ class Instrument:
         seed: int = 1,
     ) -> None:
         """triggered: samples only while a motion plays, with the motion's own trigger."""
-        self.faults = Faults()
+        self.faults = InstrumentFaults()
         self.truth: list[tuple[int, int]] = []
         self.keep_truth = False
         self._line = line
@@ -410,7 +410,7 @@ class Instrument:
             self._line.write(self._later.pop(0)[1], stop)
 
 
-def _use(faults: Faults, name: str, most: int) -> int:
+def _use(faults: InstrumentFaults, name: str, most: int) -> int:
     """Use up to ``most`` of a counted fault."""
     used = min(getattr(faults, name), most)
     setattr(faults, name, getattr(faults, name) - used)

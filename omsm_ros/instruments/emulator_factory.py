@@ -15,7 +15,7 @@ from omsm_ros.instruments.chrocodile.emulator import (
     ChrocodilePacketEmulator,
 )
 from omsm_ros.instruments.chrocodile.telegram import ProbeReading
-from omsm_ros.instruments.emulator import Instrument, Line, RecordingSource
+from omsm_ros.instruments.emulator import Instrument, InstrumentLink, RecordingSource
 from omsm_ros.instruments.emulator_ports import Pty, TcpServer
 from omsm_ros.instruments.micro_epsilon.emulator import (
     CapaNcdtEmulator,
@@ -24,8 +24,8 @@ from omsm_ros.instruments.micro_epsilon.emulator import (
 )
 from omsm_ros.instruments.six_channel.emulator import (
     CsvStreamEmulator,
-    Faults,
     GenericStreamEmulator,
+    StreamFaults,
 )
 from omsm_ros.instruments.six_channel.protocol import AXES, StreamScaling
 from omsm_ros.quantities import TCP_PORT
@@ -79,7 +79,7 @@ class Player(Protocol):
 class StreamPlayer:
     """Our own stream: a new sender for each motion."""
 
-    def __init__(self, line: Line, faults: Faults) -> None:
+    def __init__(self, line: InstrumentLink, faults: StreamFaults) -> None:
         self._line, self._faults = line, faults
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -138,7 +138,7 @@ class InstrumentPlayer:
         self._thread.join(timeout=_END_S)
 
 
-class Together:
+class PlayerGroup:
     """Plays a motion on several devices of one trigger, on each what it measures of it."""
 
     def __init__(self, *players: tuple[Player, Callable[[Recording], Recording]]) -> None:
@@ -167,7 +167,7 @@ class Together:
 
 
 @dataclass(frozen=True, slots=True)
-class Beside:
+class CompanionDevice:
     """A second device of the same trigger.
 
     node: whose parameters ``driver`` are;  part: what it measures of a motion
@@ -175,7 +175,7 @@ class Beside:
     """
 
     node: str
-    player: Callable[[Line, Faults], Player]
+    player: Callable[[InstrumentLink, StreamFaults], Player]
     driver: dict[str, object]
     part: Callable[[Recording], Recording] = lambda recording: recording
     tcp: bool = False
@@ -184,42 +184,42 @@ class Beside:
 @dataclass(frozen=True, slots=True)
 class Emulated:
     """player: makes it on a line;  driver: parameters a driver needs to read it;
-    tcp: it needs a TCP port, where others also work on a serial one;  beside: what else there is
+    tcp: it needs a TCP port, where others also work on a serial one;  companion: what else there is
     baud_rate: its line has no more, so a demonstration is slow, and small [bit/s]; 0 = any
     """
 
-    player: Callable[[Line, Faults], Player]
+    player: Callable[[InstrumentLink, StreamFaults], Player]
     driver: dict[str, object]
     tcp: bool = False
-    beside: Beside | None = None
+    companion: CompanionDevice | None = None
     baud_rate: int = 0
 
 
-def _chrocodile(line: Line, faults: Faults) -> Player:
+def _chrocodile(line: InstrumentLink, faults: StreamFaults) -> Player:
     emulator = ChrocodileEmulator(line, triggered=True, seed=faults.seed, probe=_READING)
     return InstrumentPlayer(emulator)
 
 
-def _chrocodile_packet(line: Line, faults: Faults) -> Player:
+def _chrocodile_packet(line: InstrumentLink, faults: StreamFaults) -> Player:
     emulator = ChrocodilePacketEmulator(line, triggered=True, seed=faults.seed, probe=_READING)
     return InstrumentPlayer(emulator)
 
 
-def _confocaldt_ethernet(line: Line, faults: Faults) -> Player:
+def _confocaldt_ethernet(line: InstrumentLink, faults: StreamFaults) -> Player:
     emulator = ConfocalDtEmulator(
         line, triggered=True, seed=faults.seed, probe=_READING, axes=AXIS_SCALING
     )
     return InstrumentPlayer(emulator)
 
 
-def _confocaldt(line: Line, faults: Faults) -> Player:
+def _confocaldt(line: InstrumentLink, faults: StreamFaults) -> Player:
     emulator = ConfocalDtSerialEmulator(
         line, triggered=True, seed=faults.seed, probe=_READING, width=3
     )
     return InstrumentPlayer(emulator)
 
 
-def _capancdt(line: Line, faults: Faults) -> Player:
+def _capancdt(line: InstrumentLink, faults: StreamFaults) -> Player:
     emulator = CapaNcdtEmulator(line, triggered=True, seed=faults.seed, probe=_CAPACITIVE)
     return InstrumentPlayer(emulator)
 
@@ -231,7 +231,7 @@ def _reference(recording: Recording) -> Recording:
     return replace(recording, distance=recording.reference)
 
 
-def _csv(line: Line, faults: Faults) -> Player:
+def _csv(line: InstrumentLink, faults: StreamFaults) -> Player:
     return InstrumentPlayer(CsvStreamEmulator(line, triggered=True, seed=faults.seed))
 
 
@@ -249,8 +249,10 @@ _OWN_ENCODERS: dict[str, object] = {
 }
 
 # RS-422 carries the distance alone, so the axes come from a device of their own.
-_AXES_BESIDE = Beside("axis_driver", StreamPlayer, {"device": "six_channel"} | _STREAM_SCALES)
-_REFERENCE_BESIDE = Beside(
+_AXES_COMPANION = CompanionDevice(
+    "axis_driver", StreamPlayer, {"device": "six_channel"} | _STREAM_SCALES
+)
+_REFERENCE_COMPANION = CompanionDevice(
     "reference_driver",
     _capancdt,
     {"device": "capancdt", "triggered": True, "probe.zero": _CAPACITIVE.zero},
@@ -270,12 +272,12 @@ EMULATED = {
             "trigger": "each",
             "probe.zero": _READING.zero,
         },
-        beside=_AXES_BESIDE,
+        companion=_AXES_COMPANION,
         baud_rate=691_200,
     ),
     # The capacitive reference beside the six-channel stream.
     "capancdt": Emulated(
-        StreamPlayer, {"device": "six_channel"} | _STREAM_SCALES, beside=_REFERENCE_BESIDE
+        StreamPlayer, {"device": "six_channel"} | _STREAM_SCALES, companion=_REFERENCE_COMPANION
     ),
     # Y and B stand still in the twin's motions: three encoders are enough.
     "confocaldt_ethernet": Emulated(
@@ -291,14 +293,16 @@ def emulated(device: str) -> Emulated:
     return EMULATED[device]
 
 
-def player_for(device: str, line: Line, beside: Line | None, faults: Faults) -> Player:
-    """Return what plays motions on ``line``, and on the line ``beside`` it if there is one."""
+def player_for(
+    device: str, line: InstrumentLink, companion: InstrumentLink | None, faults: StreamFaults
+) -> Player:
+    """Return what plays motions on ``line``, and on the line ``companion`` it if there is one."""
     known = emulated(device)
     first = known.player(line, faults)
-    if known.beside is None or beside is None:
+    if known.companion is None or companion is None:
         return first
-    second = known.beside.player(beside, faults)
-    return Together((first, lambda recording: recording), (second, known.beside.part))
+    second = known.companion.player(companion, faults)
+    return PlayerGroup((first, lambda recording: recording), (second, known.companion.part))
 
 
 # The accelerometer of the emulated cell: blocks in step with the motion that is played.
@@ -309,7 +313,7 @@ class AccelerationFeed:
 
     def __init__(self, recording: Recording, start_ns: int) -> None:
         """start_ns: when the motion begins [ns]."""
-        self._whole, self._start_ns, self._given = recording.acceleration, start_ns, 0
+        self._whole, self._start_ns, self._nonempty_channels = recording.acceleration, start_ns, 0
         self._period = recording.axes.sample_period
 
     def due(self, played: int) -> AccelerationBlock | None:
@@ -318,11 +322,13 @@ class AccelerationFeed:
         if whole is None:
             return None
         until = min(int(played * self._period / whole.sample_period), len(whole))
-        if until <= self._given:
+        if until <= self._nonempty_channels:
             return None
-        part = slice(self._given, until)
-        stamp = self._start_ns + round(self._given * whole.sample_period * NANOSECONDS_PER_S)
-        first, self._given = whole.first_sample + self._given, until
+        part = slice(self._nonempty_channels, until)
+        stamp = self._start_ns + round(
+            self._nonempty_channels * whole.sample_period * NANOSECONDS_PER_S
+        )
+        first, self._nonempty_channels = whole.first_sample + self._nonempty_channels, until
         return AccelerationBlock(
             stamp_ns=stamp,
             first_sample=first,

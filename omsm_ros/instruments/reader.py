@@ -68,7 +68,7 @@ class DeviceReader:
         self.connections = 0
         self._device = device
         self._deliver = deliver
-        self._note, self._complain = note, complain
+        self._note, self._warn = note, complain
         self._back_off = back_off
         self._when_connected = connected
         self._unproven = False
@@ -125,7 +125,7 @@ class DeviceReader:
                 self._do_requests()
                 blocks = self._device.poll(_READ_S)
                 any_came |= bool(blocks)
-                self._hand_over(blocks)
+                self._deliver_blocks(blocks)
         except (DeviceError, ConfigurationError) as err:
             self._unproven = isinstance(err, NoSamplesError)
             self.state = State.LOST
@@ -133,13 +133,13 @@ class DeviceReader:
         except Exception as err:  # a defect of ours must not end the reading for good
             self.state = State.LOST
             self._tell(defect(err))
-        self._let_go()
+        self._disconnect()
         return any_came
 
-    def _let_go(self) -> None:
+    def _disconnect(self) -> None:
         """Disconnect and hand over the partial block, whatever state the device is in."""
         try:
-            self._hand_over(self._device.close())
+            self._deliver_blocks(self._device.close())
         except (DeviceError, ConfigurationError) as err:
             self._tell(str(err))
         except Exception as err:  # a defect of ours must not end the reading for good
@@ -152,7 +152,7 @@ class DeviceReader:
             self._tell("")
         self._when_connected()
 
-    def _hand_over(self, blocks: Sequence[BlockPair]) -> None:
+    def _deliver_blocks(self, blocks: Sequence[BlockPair]) -> None:
         if blocks:
             self._deliver(blocks)
         if self.state is State.READING:
@@ -166,6 +166,6 @@ class DeviceReader:
             if not trouble:
                 self._note("connected and set up")
             elif self.state is State.READING:
-                self._complain(trouble)
+                self._warn(trouble)
             else:
-                self._complain(f"{trouble}; trying again")
+                self._warn(f"{trouble}; trying again")

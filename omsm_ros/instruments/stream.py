@@ -16,7 +16,7 @@ from omsm_ros.errors import DeviceError, NoSamplesError
 from omsm_ros.instruments.blocks import BlockCutter, BlockPair, BlockSettings, Channels
 from omsm_ros.instruments.command_port import CommandPort
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples, SequenceTracker
-from omsm_ros.instruments.micro_epsilon.protocol import HEADERS, Block, BlockDecoder
+from omsm_ros.instruments.micro_epsilon.protocol import HEADERS, BlockDecoder, MeasurementBlock
 from omsm_ros.instruments.transport import Transport
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -326,7 +326,7 @@ class BlockStreamDevice(StreamDevice):
     def _rest(self) -> Samples:
         return self._converted(self._decoder.settle())
 
-    def _converted(self, blocks: list[Block]) -> Samples:
+    def _converted(self, blocks: list[MeasurementBlock]) -> Samples:
         parts = []
         for block in blocks:
             self._identity = {

@@ -28,7 +28,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from omsm_ros.errors import BagError
-from omsm_ros.io.files import open_regular, said
+from omsm_ros.io.files import exception_text, open_regular
 from omsm_ros.quantities import shown
 
 # rosbag2 writes chunks of less than a megabyte, Foxglove of four.
@@ -39,7 +39,7 @@ _RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
 _MAX_METADATA_BYTES = 4 * 1024**2
 # What ROS 2 brings along are 100 lines a topic on the average; a second takes 25 000.
 _MOST_DEFINITION_LINES, _LONGEST_DEFINITION = 50_000, 50_000
-_OF_AN_ADDRESS = frozenset("%?#")
+_ADDRESS_ERRORS = frozenset("%?#")
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 # No recording is packed a hundred times; one that is, and is large, was made to fill a disk.
 _MOST_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 16 * 1024**2
@@ -49,7 +49,7 @@ DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or re
 
 
 @contextmanager
-def translated(path: Path, remedy: str) -> Iterator[None]:
+def bag_errors(path: Path, remedy: str) -> Iterator[None]:
     """Raise BagError for whatever the libraries say of a bag's bytes.
 
     They raise what their parts raise: struct.error, ZstdError, RuntimeError, AssertionError, …
@@ -60,7 +60,7 @@ def translated(path: Path, remedy: str) -> Iterator[None]:
         raise
     except Exception as err:
         raise BagError(
-            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {said(err)}; {remedy}"
+            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {exception_text(err)}; {remedy}"
         ) from err
 
 
@@ -85,7 +85,7 @@ def check_files(path: Path) -> None:
     for part in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not part.is_dir():
             open_regular(part, BagError, "bag").close()
-        if part.suffix == ".db3" and set(str(part)) & _OF_AN_ADDRESS:
+        if part.suffix == ".db3" and set(str(part)) & _ADDRESS_ERRORS:
             # rosbags makes an address of the path, and would read what lies elsewhere.
             raise BagError(f"bag {str(part)!r} has one of '%?#' in its path; rename it")
     metadata = path / "metadata.yaml"

@@ -25,7 +25,7 @@ from omsm_ros.errors import BagError
 from omsm_ros.io.bag_checks import MAX_CHUNK_BYTES, check_unpacked, unpacked_chunk, unpacked_message
 from omsm_ros.io.bag_writer import finish, new_bag_file, new_writer
 from omsm_ros.io.bags import check_message
-from omsm_ros.io.files import open_regular, said
+from omsm_ros.io.files import exception_text, open_regular
 from omsm_ros.io.message_mapping import typestore
 from omsm_ros.io.topics import TOPIC_TYPES
 
@@ -65,7 +65,7 @@ def repair(path: Path) -> Repair:
             f"{str(path)!r} holds no .mcap file; only MCAP is repaired here, "
             "for sqlite3 use 'ros2 bag reindex'"
         )
-    made = Repair(_beside(path))
+    made = Repair(_sibling(path))
     with open_regular(parts[0], BagError, "bag") as stream:
         _check_magic(stream, parts[0])
     file = new_bag_file(made.path)
@@ -86,13 +86,15 @@ def _copy(parts: list[Path], file: IO[bytes], made: Repair) -> None:
             _Copy(part, writer, made).run(file.flush)
         finish(writer, file)
     except OSError as err:
-        raise BagError(f"cannot write {str(made.path)!r}: {said(err)}; make room") from err
+        raise BagError(
+            f"cannot write {str(made.path)!r}: {exception_text(err)}; make room"
+        ) from err
     if not made.messages:
         why = made.lost[0] if made.lost else "nothing was recorded"
         raise BagError(f"{str(parts[0])!r} has no whole message to save ({why}); record it again")
 
 
-def _beside(path: Path) -> Path:
+def _sibling(path: Path) -> Path:
     whole = Path(os.path.abspath(path))
     return whole.with_name(f"{whole.stem}.repaired.mcap")
 
@@ -125,7 +127,7 @@ class _Copy:
                     for record in self._within(kind, body):
                         self._add(record)
                 except Exception as err:  # the libraries raise what their parts raise
-                    self._lose(f"{len(body)} bytes at {place}: {said(err)}")
+                    self._record_lost(f"{len(body)} bytes at {place}: {exception_text(err)}")
                 written()
 
     def _records(self, stream: IO[bytes]) -> Iterator[tuple[int, int, bytes]]:
@@ -138,7 +140,9 @@ class _Copy:
             body = stream.read(min(length, _MOST_BYTES))
             if not kind or len(body) < length:
                 rest = len(head) + len(body)
-                self._lose(f"the last {rest} bytes, at {place}: the file was cut short there")
+                self._record_lost(
+                    f"the last {rest} bytes, at {place}: the file was cut short there"
+                )
                 return
             yield place, kind, body
 
@@ -190,14 +194,16 @@ class _Copy:
                 data = unpacked_message(data)
             check_message(topic, kind, data)
         except Exception as err:  # the libraries raise what their parts raise
-            self._lose(f"a message of {topic!r} at {record.log_time} ns: {said(err)}")
+            self._record_lost(
+                f"a message of {topic!r} at {record.log_time} ns: {exception_text(err)}"
+            )
             return
         self._writer.add_message(
             number, record.log_time, data, record.publish_time, record.sequence
         )
         self._made.messages[topic] += 1
 
-    def _lose(self, what: str) -> None:
+    def _record_lost(self, what: str) -> None:
         if len(self._made.lost) < _MOST_NAMED:
             self._made.lost.append(f"{self._path.name}: {what}")
         else:

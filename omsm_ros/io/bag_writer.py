@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, DistanceBlock
 from omsm_ros.errors import BagError
 from omsm_ros.io import message_mapping
-from omsm_ros.io.files import beside, make_folder, said
+from omsm_ros.io.files import exception_text, make_folder, temporary_sibling
 from omsm_ros.io.message_mapping import bag_messages, typestore
 from omsm_ros.io.topics import (
     ACCELERATION_TOPIC,
@@ -210,7 +210,7 @@ class BagWriter:
         except OSError as err:
             self._failed = True
             raise BagError(
-                f"recording ended, {str(self.path)!r} takes no more: {said(err)}; it is readable "
+                f"recording ended, {str(self.path)!r} takes no more: {exception_text(err)}; it is readable "
                 f"and holds the first {self._kept} messages, the last {self._taken - self._kept} "
                 "are lost; make room and record anew"
             ) from err
@@ -251,14 +251,14 @@ class BagWriter:
 
 
 @contextmanager
-def whole_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
+def atomic_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
     """Yield the writer of a bag that appears when all went well, and not at all otherwise.
 
     BagError if there is such a file, or no room for it.
     """
     if os.path.lexists(path):
         raise _exists(path)
-    part = beside(path)
+    part = temporary_sibling(path)
     try:
         with BagWriter(part, topics) as bag:
             yield bag
@@ -300,7 +300,7 @@ def _exists(path: Path) -> BagError:
 
 def _not_writable(path: Path, err: Exception) -> BagError:
     return BagError(
-        f"cannot write {str(path)!r}: {said(err)}; check the folder, its rights and its room"
+        f"cannot write {str(path)!r}: {exception_text(err)}; check the folder, its rights and its room"
     )
 
 

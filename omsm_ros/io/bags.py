@@ -26,12 +26,12 @@ from omsm_ros.io import message_mapping
 from omsm_ros.io.bag_checks import (
     DAMAGED,
     MessageReader,
+    bag_errors,
     check_checksums,
     check_definition,
     check_files,
     check_index,
     check_kind,
-    translated,
     unpacked_message,
 )
 from omsm_ros.io.message_mapping import typestore, vibration_levels
@@ -223,7 +223,7 @@ class BagReader:
             "expected a rosbag2 folder or an .mcap file; if its recording was cut short, save what "
             "is whole with 'omsm inspect --repair'"
         )
-        with translated(self.path, whole), ExitStack() as opening:
+        with bag_errors(self.path, whole), ExitStack() as opening:
             if not self.path.exists():
                 raise BagError(f"no bag at {str(self.path)!r}; check the path")
             check_files(self.path)
@@ -323,7 +323,7 @@ class BagReader:
         """Return each state of the levels that the vibration monitor reported, in their order."""
         if not self.count([VIBRATION_TOPIC]):
             return []
-        return [told for _, told in self.records(VIBRATION_TOPIC)]
+        return [stated_messages for _, stated_messages in self.records(VIBRATION_TOPIC)]
 
     def temperatures(self) -> FloatArray:
         """Return the readings of the temperature (n,) [°C], in their order; NaN: cannot be."""
@@ -362,7 +362,7 @@ class BagReader:
                 yield from ((topic, self._record(topic, raw)) for raw in batch)
 
     def _record(self, topic: str, raw: bytes) -> Any:
-        with translated(self.path, DAMAGED):
+        with bag_errors(self.path, DAMAGED):
             message = typestore().deserialize_cdr(raw, TOPIC_TYPES[topic])
         with self._malformed_named():
             return _TO_RECORD[topic](message)
@@ -385,7 +385,7 @@ class BagReader:
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield the serialised messages; all of them must be as many as the bag promises."""
         promised = sum(connection.msgcount for connection in connections)
-        with translated(self.path, DAMAGED):
+        with bag_errors(self.path, DAMAGED):
             if connections:
                 for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
                     promised -= 1
@@ -421,6 +421,6 @@ class BagReader:
                     f"{name!r} in {str(self.path)!r} is of type {connection.msgtype!r}, expected "
                     f"{TOPIC_TYPES[topic]!r}; record the topics of the cell"
                 )
-            with translated(self.path, DAMAGED):
+            with bag_errors(self.path, DAMAGED):
                 check_definition(self.path, connection, typestore())
         return found

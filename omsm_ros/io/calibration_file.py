@@ -18,7 +18,7 @@ from omsm_ros.core.calibration.calibration_set import (
 )
 from omsm_ros.errors import CalibrationError, FileError
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import beside, read_text, said, save_json
+from omsm_ros.io.files import exception_text, read_text, save_json, temporary_sibling
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -141,13 +141,13 @@ class CalibrationFolder:
 
         A file that holds it already is linked again. Raises FileError.
         """
-        self._keep_what_is_no_link()
+        self._rename_non_link()
         short = calibration.id[:_ID_CHARACTERS]
         kept = sorted(self.link.parent.glob(f"{self.link.stem}.*.{short}{self.link.suffix}"))
         target = kept[-1] if kept else self._named(since_ns, short)
         if not kept:
             save_calibration(target, calibration)
-        self._point_at(target, since_ns)
+        self._link_to(target, since_ns)
         return target
 
     def in_force(self) -> tuple[Calibration, int] | None:
@@ -164,15 +164,15 @@ class CalibrationFolder:
         name = f"{self.link.stem}.{when:%Y%m%dT%H%M%SZ}.{short}{self.link.suffix}"
         return self.link.with_name(name)
 
-    def _keep_what_is_no_link(self) -> None:
+    def _rename_non_link(self) -> None:
         """Rename a calibration that stands where the link belongs, as it was made before."""
         if self.link.is_symlink() or not self.link.is_file():
             return
         old, since_ns = load_calibration(self.link), self.link.stat().st_mtime_ns
         os.replace(self.link, self._named(since_ns, old.id[:_ID_CHARACTERS]))
 
-    def _point_at(self, target: Path, since_ns: int) -> None:
-        part = beside(self.link)
+    def _link_to(self, target: Path, since_ns: int) -> None:
+        part = temporary_sibling(self.link)
         try:
             part.symlink_to(target.name)
             os.utime(part, ns=(since_ns, since_ns), follow_symlinks=False)
@@ -180,7 +180,7 @@ class CalibrationFolder:
         except OSError as err:
             part.unlink(missing_ok=True)
             raise FileError(
-                f"cannot link {str(self.link)!r} to {target.name!r}: {said(err)}; check the folder"
+                f"cannot link {str(self.link)!r} to {target.name!r}: {exception_text(err)}; check the folder"
             ) from err
 
 
@@ -192,10 +192,12 @@ def since(path: Path) -> int:
     try:
         return os.lstat(path).st_mtime_ns
     except (OSError, ValueError) as err:
-        raise CalibrationError(f"no calibration at {str(path)[:200]!r}: {said(err)}") from err
+        raise CalibrationError(
+            f"no calibration at {str(path)[:200]!r}: {exception_text(err)}"
+        ) from err
 
 
-def confined(path: Path, folders: str) -> Path:
+def resolved_within(path: Path, folders: str) -> Path:
     """Return ``path`` resolved; CalibrationError unless it lies below one of ``folders``.
 
     folders: separated by ":", as in PATH; "~" is the home folder, "." the working directory;

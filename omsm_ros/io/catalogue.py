@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io.files import said
+from omsm_ros.io.files import exception_text
 from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -135,7 +135,7 @@ class Catalogue:
             yield
         except (ImportError, self._sql.exc.NoSuchModuleError) as err:
             raise ConfigurationError(
-                f"catalogue: {said(err)}; pip install psycopg[binary]"
+                f"catalogue: {exception_text(err)}; pip install psycopg[binary]"
             ) from err
         except Exception as err:  # whatever a library says of a damaged file, or of an address
             raise FileError(

@@ -24,7 +24,7 @@ _LONGEST_NAME = 120
 
 
 # What libraries raise of files that they take for whole; the words are those of their own code.
-_OF_A_LIBRARY = (LookupError, TypeError, AttributeError, RecursionError, AssertionError)
+_LIBRARY_ERRORS = (LookupError, TypeError, AttributeError, RecursionError, AssertionError)
 
 
 def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -> str:
@@ -41,7 +41,7 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
             return raw.decode("utf-8")
     except (OSError, UnicodeDecodeError) as err:
         raise error(
-            f"{what} {str(path)!r} cannot be read as text: {said(err)}; give a text in UTF-8"
+            f"{what} {str(path)!r} cannot be read as text: {exception_text(err)}; give a text in UTF-8"
         ) from err
     raise error(
         f"{what} {str(path)!r} has more than {limit} bytes, the most that is accepted; "
@@ -57,7 +57,9 @@ def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[byte
     except FileNotFoundError as err:
         raise error(f"no {what} at {str(path)!r}; check the path") from err
     except (OSError, ValueError) as err:
-        raise error(f"{what} {str(path)!r} cannot be read: {said(err)}; check the path") from err
+        raise error(
+            f"{what} {str(path)!r} cannot be read: {exception_text(err)}; check the path"
+        ) from err
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise error(
@@ -67,18 +69,18 @@ def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[byte
     return os.fdopen(descriptor, "rb")
 
 
-def said(err: Exception) -> str:
+def exception_text(err: Exception) -> str:
     """Return what an exception says, on one line, without the path that a message names."""
     if isinstance(err, MemoryError):
         return "it asks for more memory than there is"
-    if isinstance(err, _OF_A_LIBRARY):
+    if isinstance(err, _LIBRARY_ERRORS):
         return "what it holds does not fit together"
     text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
     return " ".join(text.split())[:200] or type(err).__name__
 
 
 @contextmanager
-def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
+def atomic_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
     """Open ``path`` for writing under a temporary name; rename it when all went well.
 
     The temporary name cannot be foreseen, and nothing that exists is opened: neither a second
@@ -90,7 +92,7 @@ def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
         make_folder(target.parent)
         if target.exists() and not target.is_file():  # replacing /dev/null would break the machine
             raise FileExistsError(None, "it is a folder, a device or a pipe")
-        part = beside(target)
+        part = temporary_sibling(target)
         with open(part, mode, opener=_new_file) as stream:
             yield stream
         os.replace(part, target)
@@ -98,7 +100,7 @@ def whole_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
         if isinstance(err, ValueError) and part is not None:
             raise
         raise FileError(
-            f"cannot write {str(target)!r}: {said(err)}; check the folder, its rights and its room"
+            f"cannot write {str(target)!r}: {exception_text(err)}; check the folder, its rights and its room"
         ) from err
     finally:
         if part is not None:
@@ -117,7 +119,7 @@ def make_folder(path: Path) -> None:
         raise
 
 
-def beside(target: Path) -> Path:
+def temporary_sibling(target: Path) -> Path:
     """Return a name that nobody can foresee, in the folder of ``target``."""
     # Not made from the target's name, which may have all the characters that a name can have.
     return target.with_name(f".{secrets.token_hex(8)}.part")
@@ -129,7 +131,7 @@ def _new_file(path: str, flags: int) -> int:
 
 def save_bytes(path: Path | str, content: bytes) -> None:
     """Write a file."""
-    with whole_file(path) as stream:
+    with atomic_file(path) as stream:
         stream.write(content)
 
 

@@ -24,10 +24,10 @@ from omsm_ros.io.files import (
     SPECTRUM,
     SUMMARY,
     SYSTEMATIC,
-    beside,
+    exception_text,
     make_folder,
     read_text,
-    said,
+    temporary_sibling,
 )
 
 FORM_FILES = (DEVIATION, CURVES, REPORT, FORM)
@@ -66,13 +66,13 @@ def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
             if target.exists() and not target.is_dir():
                 raise NotADirectoryError(None, "it is a file; give a folder")
             _refuse_foreign(target, names)
-            staged = beside(target)
+            staged = temporary_sibling(target)
             staged.mkdir()
         except (OSError, ValueError) as err:
             raise _refusal(path, err) from err
         yield staged
         try:
-            _put_in_place(staged, target, names)
+            _move_into_place(staged, target, names)
         except (OSError, ValueError) as err:
             raise _refusal(path, err) from err
     finally:
@@ -84,12 +84,12 @@ def _refusal(path: Path | str, err: Exception) -> FileError:
     if isinstance(err, FileError):
         return err
     return FileError(
-        f"cannot write results into {str(path)!r}: {said(err)}; check the folder, its rights and "
+        f"cannot write results into {str(path)!r}: {exception_text(err)}; check the folder, its rights and "
         "its room"
     )
 
 
-def _put_in_place(staged: Path, target: Path, names: Sequence[str]) -> None:
+def _move_into_place(staged: Path, target: Path, names: Sequence[str]) -> None:
     if not target.exists():
         try:
             staged.rename(target)
@@ -168,7 +168,7 @@ def _make_own(folder: Path) -> None:
         found = os.lstat(folder)
     except OSError as err:
         raise FileError(
-            f"cannot make folder {str(folder)!r}: {said(err)}; check its rights"
+            f"cannot make folder {str(folder)!r}: {exception_text(err)}; check its rights"
         ) from err
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
         raise FileError(
@@ -181,7 +181,7 @@ def _make_own(folder: Path) -> None:
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[None]:
+def exclusive_lock(path: Path) -> Iterator[None]:
     """Hold ``path``, which need not exist, for this process alone.
 
     The system lets go of it however the process ends. Raises ConfigurationError if another one
@@ -197,7 +197,9 @@ def claimed(path: Path) -> Iterator[None]:
             f"{str(path)!r} is in use by another process; end it, or give another name"
         ) from err
     except OSError as err:
-        raise FileError(f"cannot hold {str(path)!r}: {said(err)}; check its folder") from err
+        raise FileError(
+            f"cannot hold {str(path)!r}: {exception_text(err)}; check its folder"
+        ) from err
     try:
         yield
     finally:

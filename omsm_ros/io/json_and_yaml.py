@@ -34,9 +34,9 @@ def value_of(text: str, error: type[OmsmError], what: str) -> Any:
             parse_constant=_no_constant,
             parse_float=finite_float,
             parse_int=bounded_integer,
-            object_pairs_hook=_names_once,
+            object_pairs_hook=_unique_names,
         )
-        _check_nest(value, MAX_DEPTH)
+        _check_depth(value, MAX_DEPTH)
     except RecursionError as err:
         raise error(f"{what} is nested deeper than {MAX_DEPTH} levels; flatten it") from err
     except ValueError as err:
@@ -84,7 +84,7 @@ def bounded_integer(text: str) -> int:
     return value
 
 
-def _names_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]
@@ -93,14 +93,14 @@ def _names_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def _check_nest(value: object, left: int) -> None:
+def _check_depth(value: object, left: int) -> None:
     if left < 0:
         raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels")
     if isinstance(value, str):
         value.encode()  # half a character cannot be written again
     elif isinstance(value, dict | list):
         for part in (*value, *value.values()) if isinstance(value, dict) else value:
-            _check_nest(part, left - 1)
+            _check_depth(part, left - 1)
 
 
 # YAML of plain values only: null, bool, int, float, str, list and map.
@@ -257,8 +257,8 @@ def or_none(schema: Mapping[str, Any]) -> dict[str, Any]:
 
 
 # What nobody could know is written as null.
-KNOWN_OR_NOT = or_none(ranged(SIGNAL))
-FIGURE = group({"value": KNOWN_OR_NOT, "uncertainty": KNOWN_OR_NOT})
+NUMBER_OR_NULL = or_none(ranged(SIGNAL))
+FIGURE = group({"value": NUMBER_OR_NULL, "uncertainty": NUMBER_OR_NULL})
 """A figure with its standard uncertainty."""
 CONFORMITY: Mapping[str, Any] = {
     "verdict": {"enum": ["holds", "fails", "cannot tell"]},

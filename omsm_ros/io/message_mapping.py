@@ -149,7 +149,7 @@ def probe_settings(message: Any) -> dict[str, object]:
 
 def temperature(message: Any) -> float:
     """Return a reading of a ``sensor_msgs/Temperature`` [°C], NaN for one that cannot be."""
-    return float(TEMPERATURE.or_lost(np.array([message.temperature]))[0])
+    return float(TEMPERATURE.nan_if_implausible(np.array([message.temperature]))[0])
 
 
 def _json_object(name: str, text: str) -> dict[str, object]:

@@ -22,10 +22,10 @@ from omsm_ros.quantities import MAP_POINTS, shown
 # Of a processor: to load the library, and to unpack slowly. A loop takes that much on an idle
 # computer as on a busy one; what only waits, for a disk, has ten times as long.
 LIMIT_S, SLOWEST_BYTES_S, _WAITING = 2.0, 50e6, 10.0
-_ELSEWHERE = 3
+_LINK_TYPES = 3
 
 
-def walked(path: Path, what: str) -> None:
+def walk_in_subprocess(path: Path, what: str) -> None:
     """Raise FileError if reading all of ``path`` does not end, ends its process, or leaves it."""
     limit = math.ceil(LIMIT_S + path.stat().st_size / SLOWEST_BYTES_S)
     command = [sys.executable, "-m", __name__, str(path.absolute()), str(limit)]
@@ -38,7 +38,7 @@ def walked(path: Path, what: str) -> None:
         raise FileError(endless) from err
     if done.returncode == -signal.SIGXCPU:
         raise FileError(endless)
-    if done.returncode == _ELSEWHERE:
+    if done.returncode == _LINK_TYPES:
         raise FileError(
             f"{what} takes {done.stdout.strip()} from another file; save it with all its data"
         )
@@ -78,7 +78,7 @@ def _keep_within(h5py: Any, name: str, item: Any) -> None:
         elsewhere = []
     if elsewhere:
         print(shown(elsewhere[0]))
-        sys.exit(_ELSEWHERE)
+        sys.exit(_LINK_TYPES)
 
 
 if __name__ == "__main__":
@@ -88,7 +88,7 @@ if __name__ == "__main__":
 # Libraries for some formats only: loaded when such a file comes, named when they are missing.
 
 
-def library(name: str, what: str) -> ModuleType:
+def import_optional(name: str, what: str) -> ModuleType:
     """Return the module ``name``; raise FileError, which calls the file ``what``, without it."""
     try:
         return importlib.import_module(name)

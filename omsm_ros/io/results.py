@@ -15,12 +15,12 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints,
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, said, save_bytes, whole_file
+from omsm_ros.io.files import atomic_file, exception_text, open_regular, save_bytes
 from omsm_ros.io.folders import read_result
 from omsm_ros.io.json_and_yaml import (
     CONFORMITY,
     FIGURE,
-    KNOWN_OR_NOT,
+    NUMBER_OR_NULL,
     TEXT,
     TEXTS,
     check_form,
@@ -45,7 +45,7 @@ class PlyWriter:
     """
 
     def __init__(self, path: Path | str, comment: str = "") -> None:
-        self._file = whole_file(path)
+        self._file = atomic_file(path)
         # A line break in a comment would end it and forge header lines.
         self._comment = " ".join(comment.split())[:200]
         self.points = 0
@@ -133,7 +133,7 @@ class CloudFile:
         return np.concatenate([np.empty(0, _PLY_DTYPE), *parts])
 
 
-def widened(
+def with_added_variance(
     path: Path, variance: Callable[[int, int], FloatArray], size: int = 500_000
 ) -> Iterator[NDArray[np.void]]:
     """Add a variance to the uncertainty of each point of our cloud; yield the points as they are.
@@ -156,8 +156,8 @@ def widened(
 
 _ANY = {"type": "object"}
 _COUNT, _NUMBER = ranged(COUNTER), ranged(SIGNAL)
-_ERROR = group({"rms": KNOWN_OR_NOT, "peak_to_valley": KNOWN_OR_NOT})
-_DEVIATION = group({"peak_to_valley": KNOWN_OR_NOT, "rms_area_weighted": KNOWN_OR_NOT})
+_ERROR = group({"rms": NUMBER_OR_NULL, "peak_to_valley": NUMBER_OR_NULL})
+_DEVIATION = group({"peak_to_valley": NUMBER_OR_NULL, "rms_area_weighted": NUMBER_OR_NULL})
 _STREAM = group(
     {
         "received": _COUNT,
@@ -168,10 +168,10 @@ _STREAM = group(
 )
 _SOURCE = {
     "source": TEXT, "says": TEXT, "kind": TEXT, "status": TEXT, "unit": TEXT,
-    "reason": TEXT, "standard_uncertainty": KNOWN_OR_NOT, "height": KNOWN_OR_NOT,
+    "reason": TEXT, "standard_uncertainty": NUMBER_OR_NULL, "height": NUMBER_OR_NULL,
 }  # fmt: skip
 _LIMIT = {
-    "name": TEXT, "unit": TEXT, "value": KNOWN_OR_NOT, "allowed": KNOWN_OR_NOT,
+    "name": TEXT, "unit": TEXT, "value": NUMBER_OR_NULL, "allowed": NUMBER_OR_NULL,
     "speed_factor": _NUMBER,
 }  # fmt: skip
 _LIGHT = {
@@ -193,7 +193,7 @@ _FORM = group(
     conditions=group(
         {},
         recorded_ns=or_none(ranged(STAMP)),
-        calibration_age=KNOWN_OR_NOT,
+        calibration_age=NUMBER_OR_NULL,
         temperature=or_none(_ANY),
     ),
     prediction=or_none(
@@ -201,13 +201,13 @@ _FORM = group(
             {},
             limits=rows(_LIMIT),
             not_evaluated=TEXTS,
-            speed_factor=KNOWN_OR_NOT,
+            speed_factor=NUMBER_OR_NULL,
         )
     ),
     dynamic_error_before=or_none(_ERROR),
     dynamic_error_after=or_none(_ERROR),
     deviation=or_none(group({}, raw=or_none(_DEVIATION), corrected=or_none(_DEVIATION))),
-    uncertainty=group({}, median=KNOWN_OR_NOT, largest=KNOWN_OR_NOT),
+    uncertainty=group({}, median=NUMBER_OR_NULL, largest=NUMBER_OR_NULL),
     budget=or_none(group({}, sources=rows(_SOURCE))),
     light=or_none(group(_LIGHT)),
     form=or_none(
@@ -236,7 +236,7 @@ def read_summary(path: Path) -> dict[str, Any]:
 _NUMBER_FORM_FILE = ranged(SIGNAL)
 _SQUARE = {"type": "number", "minimum": 0, "maximum": SIGNAL.high}
 _ARRAY = {"type": "array"}
-_AGAIN = "register the part again"
+_REPEATED = "register the part again"
 
 _REMOVED = group(
     {},
@@ -283,7 +283,7 @@ def read_form(path: Path) -> dict[str, Any]:
         for name in removed.get("fitted", ()):
             if name not in shares:
                 raise FileError(
-                    f"{what}: pose_uncertainty.{source} lacks {name}, which was fitted; {_AGAIN}"
+                    f"{what}: pose_uncertainty.{source} lacks {name}, which was fitted; {_REPEATED}"
                 )
     return form
 
@@ -300,14 +300,14 @@ def read_curves(path: Path) -> dict[str, Any]:
     for name, curve in (curves.get("profiles", {}) | parts).items():
         lengths = {len(_numbers(curve[column], f"{what}: {name}", 1)) for column in _COLUMNS}
         if len(lengths) > 1:
-            raise FileError(f"{what}: {name} has columns of {sorted(lengths)} values; {_AGAIN}")
+            raise FileError(f"{what}: {name} has columns of {sorted(lengths)} values; {_REPEATED}")
     if areal := density.get("areal"):
         x, y = (_numbers(areal[axis], f"{what}: areal.{axis}", 1) for axis in "xy")
         shape = _numbers(areal["value"], f"{what}: areal.value", 2).shape
         if shape != (len(y), len(x)):
             raise FileError(
                 f"{what}: areal.value has {shape[0]} × {shape[1]} values at {len(y)} × {len(x)} "
-                f"frequencies; {_AGAIN}"
+                f"frequencies; {_REPEATED}"
             )
     return curves
 
@@ -316,9 +316,9 @@ def _numbers(values: object, what: str, axes: int) -> FloatArray:
     try:
         found = np.array(values, np.float64)
     except (TypeError, ValueError) as err:
-        raise FileError(f"{what} is no row of numbers: {said(err)}; {_AGAIN}") from err
+        raise FileError(f"{what} is no row of numbers: {exception_text(err)}; {_REPEATED}") from err
     if found.ndim != axes or not found.size or not np.all(np.isfinite(found)):
-        raise FileError(f"{what} has shape {found.shape!r} or what is no number; {_AGAIN}")
+        raise FileError(f"{what} has shape {found.shape!r} or what is no number; {_REPEATED}")
     return found
 
 
@@ -368,7 +368,9 @@ def load_fields(path: Path | str) -> ScanFields:
             tuple(map(str, aligned)),
         )
     except Exception as err:  # whatever numpy says of a damaged archive
-        raise FileError(f"{what} are damaged: {said(err)}; correct the scan again") from err
+        raise FileError(
+            f"{what} are damaged: {exception_text(err)}; correct the scan again"
+        ) from err
     shape = found.fields.shape
     if len(shape) != 2 or shape[0] != len(names) or found.every < 1:
         raise FileError(f"{what} have shape {shape!r} for {len(names)} names; correct it again")

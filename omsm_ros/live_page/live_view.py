@@ -38,7 +38,7 @@ _MARGIN = 1.05
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class MapGrid:
     """Where the cells lie: ``cells`` by ``cells`` of ``pitch`` [m] from ``left``, ``bottom`` [m].
 
     generation: another one whenever the cells before mean nothing any more
@@ -61,7 +61,7 @@ class RunningMap:
     def __init__(self, values: int, cells: int = 400) -> None:
         """values: of each point;  cells: along a side, even."""
         self._values, self._cells = values, cells
-        self._grid: Grid | None = None
+        self._grid: MapGrid | None = None
         self._version = self._next_generation = 0
         self._early: list[tuple[FloatArray, FloatArray, FloatArray]] | None = []
         self._clear()
@@ -73,7 +73,7 @@ class RunningMap:
         self._changed = np.zeros((cells, cells), np.int64)
 
     @property
-    def grid(self) -> Grid | None:
+    def grid(self) -> MapGrid | None:
         """Where the cells lie now; None before the first point."""
         return self._grid
 
@@ -104,17 +104,17 @@ class RunningMap:
         x, y, values = x[good], y[good], values[good]
         if not len(x):
             return 0
-        self._remember(x, y, values)
-        if self._grid is None or not self._holds(x, y):
+        self._keep_recent(x, y, values)
+        if self._grid is None or not self._in_range(x, y):
             if self._early is not None:
                 self._lay_out()
                 return len(x)
-            while not self._holds(x, y):
+            while not self._in_range(x, y):
                 self._double(x, y)
         self._enter(x, y, values)
         return len(x)
 
-    def _remember(self, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
+    def _keep_recent(self, x: FloatArray, y: FloatArray, values: FloatArray) -> None:
         if self._early is None:
             return
         if self._grid is not None and sum(len(part) for part, *_ in self._early) > _EARLY_POINTS:
@@ -140,11 +140,11 @@ class RunningMap:
         bottom = (float(y.min()) + float(y.max()) - span) / 2
         if self._grid is not None:
             self._next_generation = self._grid.generation + 1
-        self._grid = Grid(left, bottom, span / self._cells, self._cells, self._next_generation)
+        self._grid = MapGrid(left, bottom, span / self._cells, self._cells, self._next_generation)
         self._clear()
         self._enter(x, y, values)
 
-    def _holds(self, x: FloatArray, y: FloatArray) -> bool:
+    def _in_range(self, x: FloatArray, y: FloatArray) -> bool:
         assert self._grid is not None
         size = self._grid.pitch * self._cells
         right, top = self._grid.left + size, self._grid.bottom + size
@@ -170,7 +170,7 @@ class RunningMap:
         self._count[rows, columns], self._sum[rows, columns] = count, total
         self._version += 1
         self._changed[rows, columns] = np.where(count > 0, self._version, 0)
-        self._grid = Grid(
+        self._grid = MapGrid(
             old.left - size * to_left,
             old.bottom - size * below,
             2 * old.pitch,
@@ -199,7 +199,7 @@ _SPECTRUM_SAMPLES = 4096
 _SPECTRUM_LINES = 512
 _SEVERITY = ("OK", "WARN", "STALE", "ERROR")
 # A node that says nothing for so long is gone.
-_FORGOTTEN_S = 10.0
+_STALE_S = 10.0
 # What one cell has, and others may say of it; a stranger on /diagnostics can have any number.
 _MOST_NODES = 64
 _MOST_NAME, _MOST_MESSAGE, _MOST_VALUE = 200, 500, 5000
@@ -233,11 +233,11 @@ class LiveView:
         x, y = (np.asarray(cloud[name], np.float64) for name in "xy")
         height = np.asarray(cloud["height"], np.float64)
         # What lies on no machine would stretch the map until the part is one cell of it.
-        x, y, height = (LENGTH.or_lost(column) for column in (x, y, height))
+        x, y, height = (LENGTH.nan_if_implausible(column) for column in (x, y, height))
         if self._nominal is not None:
             height = height - self._nominal.height(x, y)
         error, spread = (
-            LENGTH.or_lost(np.asarray(cloud[name], np.float64))
+            LENGTH.nan_if_implausible(np.asarray(cloud[name], np.float64))
             for name in ("dynamic_error", "uncertainty")
         )
         known = np.isfinite(error) & np.isfinite(spread)
@@ -335,8 +335,7 @@ class LiveView:
         with self._lock:
             now = self._monotonic()
             nodes = [
-                {**state, "silent": now - when > _FORGOTTEN_S}
-                for when, state in self._nodes.values()
+                {**state, "silent": now - when > _STALE_S} for when, state in self._nodes.values()
             ]
             grid = self._map.grid
             return {
@@ -344,7 +343,7 @@ class LiveView:
                 "left_out": self._left_out,
                 "compared": self._nominal is not None,
                 "grid": None if grid is None else _grid_entry(grid),
-                "light": _light(nodes, self._calibration),
+                "light": _traffic_light_entry(nodes, self._calibration),
                 "nodes": nodes,
                 "calibration": self._calibration,
                 "series": [(when - now, *rest) for when, *rest in self._series],
@@ -366,7 +365,7 @@ class LiveView:
         return {"frequency": found[0].frequency[cuts].tolist(), "amplitude": peaks.tolist()}
 
 
-def _grid_entry(grid: Grid) -> dict[str, float]:
+def _grid_entry(grid: MapGrid) -> dict[str, float]:
     return {
         "left": grid.left,
         "bottom": grid.bottom,
@@ -376,7 +375,9 @@ def _grid_entry(grid: Grid) -> dict[str, float]:
     }
 
 
-def _light(nodes: list[dict[str, Any]], calibration: Mapping[str, Any]) -> dict[str, Any]:
+def _traffic_light_entry(
+    nodes: list[dict[str, Any]], calibration: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return the worst of: states of nodes, calibration, and what the corrector measures.
 
     Green only if every node is well, the calibration was accepted without reservation, and the

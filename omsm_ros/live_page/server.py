@@ -38,7 +38,7 @@ _REFUSAL = (
 ).encode()
 
 
-class FewConnections(socket.socket):
+class ConnectionLimit(socket.socket):
     """A listening socket whose ``accept`` keeps to ``most`` connections, and refuses the others.
 
     A server that stops at the first error of ``accept`` ends only when this is closed: not where a
@@ -70,7 +70,7 @@ class FewConnections(socket.socket):
                     return connection, peer
                 _refuse(connection)
 
-    def leaving_after(
+    def releasing_slot(
         self, handler: Callable[[socket.socket, Any], None]
     ) -> Callable[[socket.socket, Any], None]:
         """Return ``handler`` of a connection and its peer, after which their place is free."""
@@ -144,7 +144,7 @@ class LiveServer:
     def start(self) -> None:
         """Listen; ConfigurationError if the port is taken."""
         try:
-            listening = FewConnections(self._host, self._wanted, _MOST_CONNECTIONS)
+            listening = ConnectionLimit(self._host, self._wanted, _MOST_CONNECTIONS)
         except (OSError, UnicodeError) as err:
             raise ConfigurationError(
                 f"viewer cannot listen on {self._host}:{self._wanted}: {err}; choose another port"
@@ -157,7 +157,7 @@ class LiveServer:
             compression=None,
             close_timeout=1,
         )
-        self._server.handler = listening.leaving_after(self._server.handler)
+        self._server.handler = listening.releasing_slot(self._server.handler)
         threading.Thread(target=_serve, args=(self._server,), daemon=True).start()
 
     def stop(self) -> None:

@@ -12,9 +12,9 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from omsm_ros.errors import OmsmError
-from omsm_ros.nodes.diagnostics import survive
-from omsm_ros.nodes.memory import give_back
-from omsm_ros.nodes.running import Paced, refuse
+from omsm_ros.nodes.diagnostics import log_internal_error
+from omsm_ros.nodes.memory import return_free_memory
+from omsm_ros.nodes.running import PacedService, refuse
 from omsm_ros.nodes.topics import REQUESTS_QOS
 
 T = TypeVar("T")
@@ -25,7 +25,7 @@ _MOST_WAITING = 8
 _IDLE_S = 1.0
 
 
-class Aside:
+class BackgroundWorker:
     """One thread that works for a node, and services that wait for it without stopping the node."""
 
     def __init__(self, node: Node, undo: ExitStack) -> None:
@@ -65,10 +65,10 @@ class Aside:
             except OmsmError as err:
                 refuse(response, str(err))
             except Exception as err:
-                refuse(response, survive(self._node, err))
+                refuse(response, log_internal_error(self._node, err))
             return response
 
-        group = Paced(self._node, undo)
+        group = PacedService(self._node, undo)
         made = self._node.create_service(
             kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group
         )
@@ -82,7 +82,7 @@ class Aside:
             except queue.Empty:
                 # Or a node has for good the memory of its largest request; the traceback of one
                 # that failed holds all of it.
-                give_back()
+                return_free_memory()
                 patience = None
                 continue
             if task is None:

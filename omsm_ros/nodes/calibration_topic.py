@@ -79,11 +79,11 @@ class CalibrationTopic:
             self._node.get_logger().error(
                 f"calibration refused: {self.refused}", throttle_duration_sec=_COMPLAINT_PERIOD_S
             )
-            self._insist()
+            self._republish()
             return
         self.announce(heard, since_ns)
 
-    def _insist(self) -> None:
+    def _republish(self) -> None:
         """Say again, as the newest, what stays in force."""
         now = self.decided()
         if self.calibration is not None and now - self._repeated_ns > _REPEAT_NS:

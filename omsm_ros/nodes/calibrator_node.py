@@ -19,15 +19,15 @@ from omsm_ros.core.streams.stamps import RecentIncrease, check_period
 from omsm_ros.errors import ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder
-from omsm_ros.io.folders import claimed
-from omsm_ros.nodes.background_worker import Aside
+from omsm_ros.io.folders import exclusive_lock
+from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
-from omsm_ros.pipelines.history import remembered
+from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.quantities import Parameter
 
 # What identifies takes seconds to load on a small computer, and samples are kept without it: each
@@ -70,11 +70,11 @@ class CalibratorNode(ManagedNode):
         self._last, self._trouble = "nothing identified yet", ""
         self._claim(undo)
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
-        self._aside = Aside(self, undo)
+        self._aside = BackgroundWorker(self, undo)
         self._aside.serve(undo, Identify, "~/identify", self._on_identify)
         self._probe: dict[str, object] = {}
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
-        self._take_up()
+        self._publish_stored()
 
     def activate(self, undo: ExitStack) -> None:
         """Begin to keep the motion."""
@@ -106,12 +106,12 @@ class CalibratorNode(ManagedNode):
     def _claim(self, undo: ExitStack) -> None:
         """Keep a second cell from taking this one's calibrations for its own."""
         try:
-            undo.enter_context(claimed(self._folder.link))
+            undo.enter_context(exclusive_lock(self._folder.link))
         except FileError as err:  # what cannot be kept is published all the same
             self._trouble = str(err)
             self.get_logger().error(self._trouble)
 
-    def _take_up(self) -> None:
+    def _publish_stored(self) -> None:
         """Publish what was in force before this start."""
         try:
             known = self._folder.in_force()
@@ -177,7 +177,7 @@ class CalibratorNode(ManagedNode):
         from omsm_ros.pipelines.history import keep_calibration
 
         source = Path(bag) if bag else None
-        warnings = remembered(
+        warnings = record_in_catalogue(
             self.values["catalogue"],
             lambda: keep_calibration(self.values["catalogue"], calibration, self._file, source),
         )
@@ -207,11 +207,11 @@ class CalibratorNode(ManagedNode):
             )
         stated, source = self._settings, request.input or "encoder"
         if request.bag:
-            told = partial(_told_by_bag, Path(request.bag), stated)
+            settings_reader = partial(_reported_settings_of_bag, Path(request.bag), stated)
         else:
             now_ns = int(self.get_clock().now().nanoseconds)
-            told = partial(_told_live, stated, self._probe, now_ns)
-        return lambda: _identified(motion(), order=order, input=source, **told())
+            settings_reader = partial(_reported_settings_live, stated, self._probe, now_ns)
+        return lambda: _identified(motion(), order=order, input=source, **settings_reader())
 
     def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
         from omsm_ros.pipelines.identify import motion_of_bag
@@ -256,13 +256,15 @@ def _identified(*motion: Any, **options: Any) -> Identification:
     return identify(*motion, **options)
 
 
-def _told_by_bag(bag: Path, stated: dict[str, object]) -> dict[str, Any]:
+def _reported_settings_of_bag(bag: Path, stated: dict[str, object]) -> dict[str, Any]:
     from omsm_ros.pipelines.identify import recorded_ns_of_bag, settings_of_bag
 
     return {"settings": settings_of_bag(bag, stated), "recorded_ns": recorded_ns_of_bag(bag)}
 
 
-def _told_live(stated: dict[str, object], probe: dict[str, object], now_ns: int) -> dict[str, Any]:
+def _reported_settings_live(
+    stated: dict[str, object], probe: dict[str, object], now_ns: int
+) -> dict[str, Any]:
     return {"settings": settings_with(stated, [probe]), "recorded_ns": now_ns}
 
 

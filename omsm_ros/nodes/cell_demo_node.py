@@ -37,8 +37,8 @@ from omsm_ros.errors import (
     too_many_open_files,
 )
 from omsm_ros.instruments.emulator_factory import EMULATED
-from omsm_ros.pipelines.demonstrate import Demonstration, conclude, table_of
-from omsm_ros.pipelines.progress import beside, tick
+from omsm_ros.pipelines.demonstrate import Demonstration, finish_demonstration, table_of
+from omsm_ros.pipelines.progress import refresh_in_thread, tick
 
 # Nodes as processes of their own: started together, ended together, their output kept.
 
@@ -194,32 +194,34 @@ class DemoNode(Node):
         return answer
 
 
-class Stage:
+class DemoStage:
     """One line of progress a stage: a bar on a terminal, a plain line elsewhere."""
 
     def __init__(self, quiet: bool) -> None:
-        self._quiet = quiet
+        self._skip_unremarkable = quiet
 
     @contextmanager
     def __call__(self, title: str, total: int = 0) -> Iterator[Callable[[int], None]]:
         plain = not sys.stderr.isatty()
-        if plain and not self._quiet:
+        if plain and not self._skip_unremarkable:
             print(f"· {title}", file=sys.stderr, flush=True)
         layout = (
             "{desc:<44} {percentage:3.0f}% |{bar:24}| {remaining} left"
             if total
             else "{desc} {elapsed}"
         )
-        silent = self._quiet or plain
+        silent = self._skip_unremarkable or plain
         with (
             tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
-            beside(partial(tick, bar)),
+            refresh_in_thread(partial(tick, bar)),
         ):
             yield lambda done: bar.update(done - bar.n)
             bar.update((total or bar.n) - bar.n)
 
 
-def perform(node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage: Stage) -> None:
+def perform(
+    node: DemoNode, processes: NodeProcesses, plan: Demonstration, stage: DemoStage
+) -> None:
     """Run the cell: step test, identification, scan, recording."""
     with stage("starting the cell and its nodes"):
         _start(node, processes, plan)
@@ -264,8 +266,8 @@ def _until_seen() -> None:
 def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:
     processes.start("cell_emulator", link=plan.link, **plan.emulator_parameters())
     processes.start("confocal_driver", **plan.driver_parameters())
-    if (beside := plan.beside_parameters()) is not None:
-        processes.start(beside[0], **beside[1])
+    if (companion := plan.companion_parameters()) is not None:
+        processes.start(companion[0], **companion[1])
     processes.start(
         "calibrator", output=str(plan.calibration_file), settings=json.dumps(plan.settings())
     )
@@ -276,7 +278,7 @@ def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> Non
         "the driver, calibrator and corrector to find each other",
         lambda: (
             node.value("confocal_driver", "connections") >= 1
-            and (beside is None or node.value(beside[0], "connections") >= 1)
+            and (companion is None or node.value(companion[0], "connections") >= 1)
             and node.value(_axes_of(plan), "axes_subscribers") >= 2
             and node.value("confocal_driver", "confocal_subscribers") >= 2
         ),
@@ -285,8 +287,8 @@ def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> Non
 
 def _axes_of(plan: Demonstration) -> str:
     """Return the node that publishes the axes."""
-    beside = plan.beside_parameters()
-    return "axis_driver" if beside and beside[0] == "axis_driver" else "confocal_driver"
+    companion = plan.companion_parameters()
+    return "axis_driver" if companion and companion[0] == "axis_driver" else "confocal_driver"
 
 
 def _scan(node: DemoNode, plan: Demonstration, progress: Callable[[int], None]) -> None:
@@ -350,14 +352,14 @@ def main() -> None:
         disturbance_file=args.disturbances,
         view=args.view,
     )
-    stage = Stage(quiet=args.json)
+    stage = DemoStage(quiet=args.json)
     try:
         rclpy.init()
         plan.prepare()
         with NodeProcesses(plan.out / "log") as processes:
             perform(DemoNode(processes), processes, plan, stage)
         with stage("correcting the bag offline, comparing with the truth"):
-            summary = conclude(plan)
+            summary = finish_demonstration(plan)
     except OmsmError as err:
         print(f"omsm demo: {one_line(err)}", file=sys.stderr)
         sys.exit(2)

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.emulator import Line
+from omsm_ros.instruments.emulator import InstrumentLink
 from omsm_ros.instruments.emulator_factory import (
     EMULATED,
     AccelerationFeed,
@@ -22,10 +22,10 @@ from omsm_ros.instruments.emulator_factory import (
     line_for,
     player_for,
 )
-from omsm_ros.instruments.six_channel.emulator import Faults
+from omsm_ros.instruments.six_channel.emulator import StreamFaults
 from omsm_ros.io import message_mapping
 from omsm_ros.io.disturbance_file import load_disturbances
-from omsm_ros.io.folders import claimed, runtime_folder
+from omsm_ros.io.folders import exclusive_lock, runtime_folder
 from omsm_ros.nodes.diagnostics import Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
@@ -42,7 +42,7 @@ _SCENARIO = (
     Parameter("step_rise", 20e-3, "edge of the step test [s]; 0 = sharp", quantities.RISE, unset=0),
     Parameter("sample_period", 1e-3, "of the trigger [s]", quantities.SAMPLE_PERIOD),
 )
-_FELT_PERIOD_S = 0.05
+_ACCELERATION_PERIOD_S = 0.05
 _FAULTS = (
     Parameter("fault_noise", 0.0, "noise burst before a frame", quantities.PROBABILITY),
     Parameter("fault_flip", 0.0, "flipped bit in a frame", quantities.PROBABILITY),
@@ -86,51 +86,53 @@ class CellEmulatorNode(ManagedNode):
         self._scenario = Scenario(**{p.name: values[p.name] for p in _SCENARIO})
         file = values["disturbances"]
         self._disturbances = load_disturbances(file) if file else NOTHING
-        beside = emulated(values["device"]).beside
-        if beside and beside.node == "reference_driver" and not self._disturbances.reference:
+        companion = emulated(values["device"]).companion
+        if companion and companion.node == "reference_driver" and not self._disturbances.reference:
             self._disturbances = replace(self._disturbances, reference=ReferenceSensor())
-        faults = Faults(
+        faults = StreamFaults(
             seed=values["seed"],
             **{p.name.removeprefix("fault_"): values[p.name] for p in _FAULTS},
         )
         self._link = values["link"] or str(runtime_folder(self.get_namespace()) / "cell")
         if not self._link.startswith("tcp://"):
-            undo.enter_context(claimed(Path(self._link)))
+            undo.enter_context(exclusive_lock(Path(self._link)))
         line = undo.enter_context(line_for(self._link))
-        self._player = player_for(values["device"], line, self._beside(undo), faults)
+        self._player = player_for(values["device"], line, self._serve_companion(undo), faults)
         undo.callback(self._player.close)
         for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
         self._messages = message_mapping.ros_messages()
-        self._felt = self.publish_on(undo, AccelerationBlock, "acceleration")
+        self._acceleration_lines = self.publish_on(undo, AccelerationBlock, "acceleration")
         self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
 
-    def _beside(self, undo: ExitStack) -> Line | None:
+    def _serve_companion(self, undo: ExitStack) -> InstrumentLink | None:
         """Return the port of the second device, None where the cell has one device."""
         device = self.values["device"]
-        if (beside := emulated(device).beside) is None:
+        if (companion := emulated(device).companion) is None:
             return None
         link = self.values["link_beside"]
-        if beside.tcp and not link:
+        if companion.tcp and not link:
             raise ConfigurationError(f"device {device!r} needs a link_beside: tcp://127.0.0.1:PORT")
         link = link or f"{self._link}_beside"
         if not link.startswith("tcp://"):
-            undo.enter_context(claimed(Path(link)))
+            undo.enter_context(exclusive_lock(Path(link)))
         return undo.enter_context(line_for(link))
 
     def activate(self, undo: ExitStack) -> None:
         """Let motions be played."""
         undo.callback(self._player.halt)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(_FELT_PERIOD_S, self._publish_felt, clock=steady)
+        timer = self.create_timer(_ACCELERATION_PERIOD_S, self._publish_acceleration, clock=steady)
         undo.callback(self.destroy_timer, timer)
 
-    def _publish_felt(self) -> None:
+    def _publish_acceleration(self) -> None:
         block = self._feed.due(self._player.played) if self._feed else None
         if block is not None:
-            self._felt.publish(message_mapping.acceleration_message(self._messages, block))
+            self._acceleration_lines.publish(
+                message_mapping.acceleration_message(self._messages, block)
+            )
 
     def _on_start(self, motion_of: Any, request: Any, response: Any) -> None:
         if not self.active:

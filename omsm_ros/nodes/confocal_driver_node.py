@@ -9,7 +9,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.factory import PARAMETERS, make_device
-from omsm_ros.nodes.background_worker import Aside
+from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.driver import DriverNode
 from omsm_ros.nodes.running import run
 
@@ -33,7 +33,7 @@ class ConfocalDriverNode(DriverNode):
     def configure(self, undo: ExitStack) -> None:
         """Make the device, which nobody touches yet, and answer requests."""
         super().configure(undo)
-        self._aside = Aside(self, undo)
+        self._aside = BackgroundWorker(self, undo)
         self._aside.serve(undo, Trigger, "~/dark_reference", self._on_dark_reference)
 
     async def _on_dark_reference(

@@ -19,9 +19,9 @@ from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.io.descriptions import load_sources
 from omsm_ros.quantities import Parameter, Quantity
 
-_AS_CALIBRATED = _NOT_ASKED = -1.0
-_GEOMETRY_OF = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}
-_SOURCE_OF: dict[str, Quantity] = {
+_FROM_CALIBRATION = _NOT_REQUESTED = -1.0
+_GEOMETRY_FIELDS = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}
+_SOURCE_FIELDS: dict[str, Quantity] = {
     "static_gain": quantities.GAIN_UNCERTAINTY,
     "lateral_lag": quantities.TIME_UNCERTAINTY,
     "pitch": quantities.ANGLE_UNCERTAINTY,
@@ -55,10 +55,10 @@ PARAMETERS = (
     Parameter("polarity", 1, "+1: distance falls as z rises; -1: reversed", choices=(1, -1)),
     Parameter(
         "lateral_lag",
-        _AS_CALIBRATED,
+        _FROM_CALIBRATION,
         "of the probe against X and C [s]; -1 = as calibrated",
         quantities.LAG,
-        unset=_AS_CALIBRATED,
+        unset=_FROM_CALIBRATION,
     ),
     *TRIGGER,
     Parameter("workpiece_frame", "workpiece", "frame of the points"),
@@ -69,16 +69,16 @@ PARAMETERS = (
             f"geometry.{field.name}",
             0.0,
             "of the probe, see `omsm align`",
-            _GEOMETRY_OF.get(field.name, quantities.LENGTH),
+            _GEOMETRY_FIELDS.get(field.name, quantities.LENGTH),
         )
         for field in fields(Geometry)
     ),
     Parameter(
         "accuracy",
-        _NOT_ASKED,
+        _NOT_REQUESTED,
         "asked for, k = 2 [m]: what the light is held against; -1 = the stated uncertainty",
         quantities.BUDGET,
-        unset=_NOT_ASKED,
+        unset=_NOT_REQUESTED,
     ),
     Parameter(
         "nominal", "", "SURFACE.yaml, for what lateral errors cost; '' = slopes are not known"
@@ -89,7 +89,7 @@ PARAMETERS = (
             f"sources.{field.name}",
             0.0,
             "standard uncertainty, k = 1; 0 = what the certificate states",
-            _SOURCE_OF.get(field.name, quantities.UNCERTAINTY),
+            _SOURCE_FIELDS.get(field.name, quantities.UNCERTAINTY),
         )
         for field in fields(ErrorSources)
     ),
@@ -102,7 +102,7 @@ def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
     return CorrectionOptions(
         polarity=values["polarity"],
         accept_other_rate=values["override"],
-        lateral_lag=None if lag == _AS_CALIBRATED else lag,
+        lateral_lag=None if lag == _FROM_CALIBRATION else lag,
         trigger=trigger_of(values),
         geometry=Geometry(**{f.name: values[f"geometry.{f.name}"] for f in fields(Geometry)}),
     )
@@ -128,4 +128,4 @@ def sources_of(values: Mapping[str, Any]) -> MachineSources:
 def accuracy_of(values: Mapping[str, Any]) -> float | None:
     """Return the accuracy asked for, k = 2 [m], None where nobody asked."""
     asked: float = values["accuracy"]
-    return None if asked == _NOT_ASKED else asked
+    return None if asked == _NOT_REQUESTED else asked

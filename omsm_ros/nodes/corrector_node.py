@@ -19,7 +19,7 @@ from std_msgs.msg import Header, String
 
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.budget import Light
+from omsm_ros.core.correction.budget import TrafficLight
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.counter_offset import LiveOffset
 from omsm_ros.core.correction.predict import Prediction
@@ -27,21 +27,21 @@ from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.core.streams.blocks import consecutive
 from omsm_ros.core.streams.continuity import LoadMeter
-from omsm_ros.core.streams.stamps import Flow, RecentIncrease
-from omsm_ros.core.streams.trigger_slips import Slip
+from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.errors import OmsmError
 from omsm_ros.io import message_mapping
-from omsm_ros.io.calibration_file import confined, load_calibration, load_for_others, since
+from omsm_ros.io.calibration_file import load_calibration, load_for_others, resolved_within, since
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.background_worker import Aside
+from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
-from omsm_ros.pipelines.measure import live_light, with_sources
+from omsm_ros.pipelines.measure import live_traffic_light, with_sources
 
 # What the corrector says of itself: starved, refusing, losing, behind, or correcting.
 
@@ -51,12 +51,12 @@ _STREAMS_CORRECTION_STATE = ("axes", "distance")
 # Longer than the pauses within a step test; five samples of a slow device.
 _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
 # Of the two seconds of small blocks that wait at most, half.
-_BEHIND_MS = 1000.0
+_DELAYED_MS = 1000.0
 # Reasons that are a sign of something lost on the way, unlike a probe that looks past its target.
 _LOSSES = ("unmatched", "late", "overdue")
 
 
-def light_values(light: Light) -> dict[str, object]:
+def light_values(light: TrafficLight) -> dict[str, object]:
     """Return the light as values of a report: no fault of the node's, so no level of it."""
     return {
         "light": light.level,
@@ -77,7 +77,7 @@ class CorrectionState:
         self.begins_at: dict[str, int] = {}
         self._heard = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
         self._period = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0.0)
-        self._flows = {stream: Flow() for stream in _STREAMS_CORRECTION_STATE}
+        self._flows = {stream: SampleFlow() for stream in _STREAMS_CORRECTION_STATE}
         self._recent = RecentIncrease()
         self._oldest_ns = 0
         self._resumes = 0.0
@@ -89,7 +89,7 @@ class CorrectionState:
         self._heard[stream] += samples
         self._period[stream] = period
 
-    def pauses(self, now: float) -> bool:
+    def has_paused(self, now: float) -> bool:
         """Return whether no block came for as long as none does only where the motion ended [s]."""
         return now > self._resumes
 
@@ -136,7 +136,7 @@ class CorrectionState:
         report.values |= {f"rms_{name}_m": value for name, value in corrector.budget.items()}
         self._add_losses(report, self._account(report, corrector), now)
         waited = self.load.worst_ms()
-        if waited > _BEHIND_MS:
+        if waited > _DELAYED_MS:
             report.add(WARN, f"falls behind: samples waited {waited / 1000:.1f} s")
         return report
 
@@ -181,18 +181,18 @@ class CorrectionState:
                 report.add(STALE, f"no sample of {stream} for {silent:.0f} s")
 
 
-def _add_motion(report: Report, slip: Slip, motion: LiveOffset) -> None:
+def _add_motion(report: Report, slip: TriggerSlip, motion: LiveOffset) -> None:
     """Enter what a motion before a fixed target said of the counts, and hold the stamps to it."""
-    told = motion.established
-    report.values["motion_offset_samples"] = None if told is None else told.samples
-    if told is None:
+    offset = motion.established
+    report.values["motion_offset_samples"] = None if offset is None else offset.samples
+    if offset is None:
         return
-    if told.samples:
+    if offset.samples:
         report.add(
             ERROR,
-            f"the motion says that the counts are {told.samples} samples apart (± "
-            f"{told.uncertainty:.2g}), so heights are wrong by what Z moves meanwhile: state "
-            f"counter_offset {motion.in_use + told.samples}, or identify anew if the lag changed",
+            f"the motion says that the counts are {offset.samples} samples apart (± "
+            f"{offset.uncertainty:.2g}), so heights are wrong by what Z moves meanwhile: state "
+            f"counter_offset {motion.in_use + offset.samples}, or identify anew if the lag changed",
         )
     elif slip.samples:
         report.add(ERROR, "but the motion says that equal counts are one trigger: a link is late")
@@ -204,7 +204,9 @@ def _add_motion(report: Report, slip: Slip, motion: LiveOffset) -> None:
 # stands there and looks along its beam; the workpiece's origin lies on the spindle's axis.
 
 
-def tell_frames(node: Node, undo: ExitStack, geometry: Geometry, names: Mapping[str, Any]) -> None:
+def broadcast_frames(
+    node: Node, undo: ExitStack, geometry: Geometry, names: Mapping[str, Any]
+) -> None:
     """Publish machine → probe and machine → workpiece, latched.
 
     names: of the frames, machine_frame, probe_frame, workpiece_frame
@@ -261,8 +263,8 @@ class CorrectorNode(ManagedNode):
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
         )
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
-        tell_frames(self, undo, self._options.geometry, self.values)
-        self._aside = Aside(self, undo)
+        broadcast_frames(self, undo, self._options.geometry, self.values)
+        self._aside = BackgroundWorker(self, undo)
         self._aside.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
         self._aside.serve(undo, PredictError, "~/predict_error", self._on_predict)
         if path := self.values["calibration"]:
@@ -315,7 +317,7 @@ class CorrectorNode(ManagedNode):
         try:
             reported = message_mapping.probe_settings(message)
         except OmsmError as err:
-            self._complain(f"probe settings refused: {err}")
+            self._warn(f"probe settings refused: {err}")
             return
         if reported == self._probe:
             return
@@ -339,7 +341,7 @@ class CorrectorNode(ManagedNode):
         self, request: LoadCalibration.Request, response: LoadCalibration.Response
     ) -> None:
         response.id = self._in_force_id()
-        path = confined(Path(request.path), self.values["calibration_folders"])
+        path = resolved_within(Path(request.path), self.values["calibration_folders"])
         calibration = await self._aside.do(partial(load_for_others, path))
         self._put_in_force(calibration, self._topic.decided())
         response.success, response.message = True, "in use"
@@ -378,7 +380,7 @@ class CorrectorNode(ManagedNode):
         self._state.arrived(info["received_timestamp"])
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples
-            self._complain(
+            self._warn(
                 self._foreign
                 or "samples come, but there is no calibration: call identify or load one"
             )
@@ -409,14 +411,14 @@ class CorrectorNode(ManagedNode):
 
     def _settle(self) -> None:
         """Publish what waits for stamps, where none come: the motion has ended."""
-        if self._corrector and self._corrector.held and self._state.pauses(time.monotonic()):
+        if self._corrector and self._corrector.held and self._state.has_paused(time.monotonic()):
             self._corrector.settle()
             self._publish(self._corrector.take())
 
     def _refuse(self, stream: str, samples: int, err: OmsmError) -> None:
         self._state.refused[stream] += samples
         self._state.refusal = str(err)
-        self._complain(f"{stream} block refused: {err}")
+        self._warn(f"{stream} block refused: {err}")
 
     def _publish(self, points: SurfacePoints | None) -> None:
         if points is None:
@@ -427,19 +429,19 @@ class CorrectorNode(ManagedNode):
         self._points.publish(cloud)
         self._state.published += 1
 
-    def _complain(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=_COMPLAINT_PERIOD_S)
 
     def report(self) -> Report:
         """Return the account, and what is wrong with it now."""
-        if self._motion and self._corrector and not self._corrector.slips.one_driver:
+        if self._motion and self._corrector and not self._corrector.slips.same_stamps:
             self._motion.judge()
         now, cpu = time.monotonic(), time.process_time()
         report = self._state.report(self._corrector, now, cpu, self._motion)
         report.values["calibration"] = self._in_force_id()
         # Before there is a point, all that is uncertain would make nothing.
         if self._state.published and self._corrector and self._topic.calibration is not None:
-            light = live_light(
+            light = live_traffic_light(
                 self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
             )
             report.values |= light_values(light)

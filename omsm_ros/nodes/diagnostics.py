@@ -89,7 +89,7 @@ def _add_clock(node: Node, report: Report) -> None:
         report.add(WARN, "use_sim_time is set, but nobody publishes /clock: stamps are 0")
 
 
-def survive(node: Node, err: Exception) -> str:
+def log_internal_error(node: Node, err: Exception) -> str:
     """Count and log a defect of ours; return the line that says what to report."""
     if os.environ.get(DEBUG):
         raise err

@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import String
 
 from omsm_ros.core.calibration.calibration import PROBE
-from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.reader import DeviceReader, State
 from omsm_ros.instruments.stream import StreamDevice
@@ -71,9 +71,9 @@ class DriverNode(ManagedNode):
             self._publish,
             self.get_logger().info,
             self.get_logger().warning,
-            connected=self._tell_settings,
+            connected=self._publish_settings,
         )
-        self._recent, self._flow = RecentIncrease(), Flow()
+        self._recent, self._flow = RecentIncrease(), SampleFlow()
         self._reported: dict[str, object] = {}
         if self._settings_topic:
             self._settings = publish_on(
@@ -93,7 +93,7 @@ class DriverNode(ManagedNode):
         thread.start()
 
     def _publish(self, blocks: Sequence[BlockPair]) -> None:
-        self._tell_settings()
+        self._publish_settings()
         for axes, distance in blocks:
             if axes is not None and self._axes is not None:
                 frame = self.values["machine_frame"]
@@ -104,7 +104,7 @@ class DriverNode(ManagedNode):
                     message_mapping.distance_message(self._messages, distance, frame)
                 )
 
-    def _tell_settings(self) -> None:
+    def _publish_settings(self) -> None:
         """Tell them before the first samples that were taken with them, and who comes later."""
         if self._settings is None:
             return

@@ -39,8 +39,8 @@ from std_srvs.srv import Trigger
 
 from omsm_ros.errors import ConfigurationError, OmsmError, one_line, shortened
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, survive
-from omsm_ros.nodes.memory import RETURN_PERIOD_S, give_back
+from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, log_internal_error
+from omsm_ros.nodes.memory import RETURN_PERIOD_S, return_free_memory
 from omsm_ros.quantities import Parameter
 
 # A node's parameters as ROS sees them: declared once, checked at each door, no others.
@@ -51,7 +51,7 @@ _MOST_CHARACTERS = 80
 _TYPES = range(ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_STRING_ARRAY + 1)
 
 
-class Declared:
+class DeclaredParameters:
     """Declares ``parameters`` on ``node``; one that is wrong keeps the node from being configured.
 
     refusal: why no parameter may be set now; empty if they may
@@ -64,19 +64,19 @@ class Declared:
         self._parameters = {parameter.name: parameter for parameter in parameters}
         self._wrong: dict[str, ConfigurationError] = {}
         # rclpy ignores what is given but never declared; here it is an error.
-        self._given = dict(node._parameter_overrides)
+        self._nonempty_channels = dict(node._parameter_overrides)
         for parameter in parameters:
             self._declare(parameter)
         node.add_on_set_parameters_callback(self._on_set)
         for service in node.services:
             if service.srv_type in (SetParameters, SetParametersAtomically):
-                service.callback = _of_types_that_are(service.callback)
+                service.callback = _rejecting_untyped(service.callback)
 
     def _declare(self, parameter: Parameter) -> None:
         value: Any = parameter.default
-        if parameter.name in self._given:
+        if parameter.name in self._nonempty_channels:
             try:
-                value = parameter.checked(self._given[parameter.name].value)
+                value = parameter.checked(self._nonempty_channels[parameter.name].value)
             except ConfigurationError as err:
                 self._wrong[parameter.name] = err
         self._node.declare_parameter(
@@ -91,7 +91,9 @@ class Declared:
         try:
             for err in self._wrong.values():
                 raise err
-            self.check_known([name for name in self._given if not name.startswith(_QOS_PREFIX)])
+            self.check_known(
+                [name for name in self._nonempty_channels if not name.startswith(_QOS_PREFIX)]
+            )
             return {
                 name: parameter.checked(self._node.get_parameter(name).value)
                 for name, parameter in self._parameters.items()
@@ -101,7 +103,7 @@ class Declared:
 
     def check_overrides(self) -> None:
         """Raise ConfigurationError for a qos_overrides.* of a topic that the node does not have."""
-        self.check_known([name for name in self._given if name.startswith(_QOS_PREFIX)])
+        self.check_known([name for name in self._nonempty_channels if name.startswith(_QOS_PREFIX)])
 
     def check_known(self, names: Sequence[str]) -> None:
         """Raise ConfigurationError for one that the node does not have, with the nearest one."""
@@ -128,7 +130,7 @@ class Declared:
         return SetParametersResult(successful=True)
 
 
-def _of_types_that_are(
+def _rejecting_untyped(
     set_them: Callable[[Any, Any], Any],
 ) -> Callable[[Any, Any], Any]:
     """Return a callback that refuses a value of no type, which rclpy would leave unanswered."""
@@ -171,7 +173,7 @@ _STEPS, _STEP_S = 20, 0.01
 AUTOSTART = Parameter("autostart", True, "configure and activate at the start", fixed=True)
 
 
-class Stage(Enum):
+class LifecycleStage(Enum):
     """How far a node has been brought."""
 
     UNCONFIGURED = "unconfigured"
@@ -197,17 +199,19 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
                 raise
             what = str(err).split(", at ")[0]
             raise ConfigurationError(f"{name}: {what}; give another __node or __ns") from err
-        self.stage = Stage.UNCONFIGURED
+        self.stage = LifecycleStage.UNCONFIGURED
         self.values: dict[str, Any] = {}
         self.fatal: OmsmError | None = None
         self._failure: Exception | None = None
         self._configured, self._activated = ExitStack(), ExitStack()
         self._outputs: list[Publisher] = []
-        self._declared = Declared(self, (*parameters, AUTOSTART), self._keeps_parameters)
+        self._declared = DeclaredParameters(self, (*parameters, AUTOSTART), self._keeps_parameters)
         self._answer_impossible_transitions()
         self.diagnostics = Diagnostics(self, self._report, self.hardware_id)
-        self.create_service(Trigger, f"~/{topics.TAKEN}", topics.tell_taken)
-        self.create_timer(RETURN_PERIOD_S, give_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_service(Trigger, f"~/{topics.PROCESSED}", topics.answer_processed_counts)
+        self.create_timer(
+            RETURN_PERIOD_S, return_free_memory, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     # What a node fills in.
 
@@ -230,7 +234,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     @property
     def active(self) -> bool:
         """Whether it works."""
-        return self.stage is Stage.ACTIVE
+        return self.stage is LifecycleStage.ACTIVE
 
     def start(self) -> None:
         """Configure and activate, unless it is to be left alone; raises what kept it from it."""
@@ -243,7 +247,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def close(self) -> None:
         """Undo everything, in the order in which it is undone by hand."""
-        if self.stage is not Stage.FINALIZED:
+        if self.stage is not LifecycleStage.FINALIZED:
             self.trigger_shutdown()
 
     def publish_on(
@@ -269,23 +273,23 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure; called by ``ros2 lifecycle``, as those below."""
-        return self._attempt(self._configure, self._configured, Stage.INACTIVE)
+        return self._attempt(self._configure, self._configured, LifecycleStage.INACTIVE)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Activate."""
-        return self._attempt(self._activate, self._activated, Stage.ACTIVE)
+        return self._attempt(self._activate, self._activated, LifecycleStage.ACTIVE)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Undo the activation."""
-        return self._end(Stage.INACTIVE)
+        return self._end(LifecycleStage.INACTIVE)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Undo the configuration."""
-        return self._end(Stage.UNCONFIGURED)
+        return self._end(LifecycleStage.UNCONFIGURED)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Undo everything, for good."""
-        return self._end(Stage.FINALIZED)
+        return self._end(LifecycleStage.FINALIZED)
 
     def _configure(self) -> None:
         self.values = self._declared.values()
@@ -296,7 +300,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._declared.check_overrides()
 
     def _attempt(
-        self, step: Callable[[], None], undo: ExitStack, reached: Stage
+        self, step: Callable[[], None], undo: ExitStack, reached: LifecycleStage
     ) -> TransitionCallbackReturn:
         self._failure = None
         try:
@@ -306,16 +310,16 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             if isinstance(err, OmsmError):
                 self.get_logger().error(f"{type(err).__name__}: {one_line(err)}")
             else:
-                survive(self, err)
+                log_internal_error(self, err)
             undo.close()
             return TransitionCallbackReturn.FAILURE
         self.stage = reached
         return TransitionCallbackReturn.SUCCESS
 
-    def _end(self, reached: Stage) -> TransitionCallbackReturn:
+    def _end(self, reached: LifecycleStage) -> TransitionCallbackReturn:
         self._undo(self._activated)
-        if reached is not Stage.INACTIVE:
-            self._let_the_last_arrive()
+        if reached is not LifecycleStage.INACTIVE:
+            self._wait_for_last_messages()
             self._undo(self._configured)
         self.stage = reached
         self._failure = None
@@ -325,9 +329,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         try:
             stack.close()
         except Exception as err:  # the rest has been undone all the same
-            survive(self, err)
+            log_internal_error(self, err)
 
-    def _let_the_last_arrive(self) -> None:
+    def _wait_for_last_messages(self) -> None:
         if any(publisher.get_subscription_count() for publisher in self._outputs):
             for _ in range(_STEPS):
                 time.sleep(_STEP_S)
@@ -351,7 +355,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         service.callback = answer
 
     def _keeps_parameters(self) -> str:
-        if self.stage is Stage.UNCONFIGURED:
+        if self.stage is LifecycleStage.UNCONFIGURED:
             return ""
         return (
             f"takes effect when {self.get_name()} is configured, and it is {self.stage.value}: "
@@ -361,11 +365,11 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     # State.
 
     def _report(self) -> Report:
-        if self.stage is Stage.UNCONFIGURED:
+        if self.stage is LifecycleStage.UNCONFIGURED:
             report = Report("")
         else:
             report = self.report()
-        if self.stage is not Stage.ACTIVE:
+        if self.stage is not LifecycleStage.ACTIVE:
             report.add(WARN, f"{self.stage.value}: it does nothing until it is activated")
         if self._failure is not None:
             report.add(ERROR, one_line(self._failure))

@@ -21,7 +21,7 @@ _LIBC = ctypes.CDLL(None)
 _SETTINGS, _KEPT_BY_THREADS = "GLIBC_TUNABLES", "glibc.malloc.tcache_count"
 
 
-def share_one_pool(held_back: Collection[signal.Signals] = ()) -> None:
+def use_single_malloc_arena(held_back: Collection[signal.Signals] = ()) -> None:
     """Let all threads share one pool of memory; each of the middleware's would keep its own.
 
     A thread would also keep small pieces that were freed, seven of each size: what it needed once,
@@ -42,17 +42,17 @@ def share_one_pool(held_back: Collection[signal.Signals] = ()) -> None:
     signal.pthread_sigmask(signal.SIG_UNBLOCK, held_back)
 
 
-def keep_for_good() -> None:
+def freeze_garbage_collector() -> None:
     """Let Python look no more through what there is by now: a node needs it to its end.
 
     Its modules are more than 80 000 objects. Without them a look at all that came since takes less
-    than a millisecond, so that ``give_back`` can ask for one while samples come in.
+    than a millisecond, so that ``return_free_memory`` can ask for one while samples come in.
     """
     gc.collect()
     gc.freeze()
 
 
-def give_back() -> None:
+def return_free_memory() -> None:
     """Return to the system what was freed in between, not at the end alone.
 
     What a listener has not taken is kept for it. When it is sent and freed, small pieces lie

@@ -31,7 +31,7 @@ from omsm_ros.io.topics import CellBag, relative
 from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
-from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, TAKEN, publish_on
+from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, publish_on
 from omsm_ros.quantities import Parameter
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -47,12 +47,12 @@ from omsm_ros.units import NANOSECONDS_PER_S
 # beyond which it drops them, and sends them again three seconds later.
 _MOST_OPEN, _MOST_OPEN_BYTES = 200, 256 * 1024
 # A service that has just been found may drop a request; a node may be computing.
-_ASK_AGAIN_S = 2.0
+_RETRY_S = 2.0
 # Who has not been asked with success for so long is not waited for; nor is what has not been
 # taken for so long: the middleware sends again after three.
 _PATIENCE_S = 10.0
 _DISCOVERY_S = 3.0  # of the service of a node whose subscription is known
-_LOOK_AROUND_S = 0.2
+_PRESENCE_PERIOD_S = 0.2
 
 
 @dataclass
@@ -79,7 +79,7 @@ class Listeners:
         self._published: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()
         self._listeners: dict[str, _Listener] = {}
-        self._looked = -_LOOK_AROUND_S
+        self._looked = -_PRESENCE_PERIOD_S
         self._seen: Counter[str] = Counter()
         self._present: dict[str, set[str]] = {}
         self._changed = time.monotonic()
@@ -104,7 +104,7 @@ class Listeners:
         return not unseen and all(each.taken for each in self._listeners.values())
 
     @property
-    def unchanged_s(self) -> float:
+    def seconds_since_change(self) -> float:
         """For how many seconds nobody has come or gone."""
         return time.monotonic() - self._changed
 
@@ -114,7 +114,7 @@ class Listeners:
         return all(self._has_room(each) for each in self._listeners.values())
 
     @property
-    def waited_for(self) -> list[str]:
+    def pending_listeners(self) -> list[str]:
         """Names of those who have not taken everything."""
         return sorted(n for n, each in self._listeners.items() if any(self._open(each).values()))
 
@@ -138,9 +138,9 @@ class Listeners:
     def look(self) -> None:
         """Hear what they have answered, and ask again who had not taken everything."""
         now = time.monotonic()
-        if now - self._looked >= _LOOK_AROUND_S:
+        if now - self._looked >= _PRESENCE_PERIOD_S:
             self._looked = now
-            self._look_around(now)
+            self._update_present(now)
         for name, each in list(self._listeners.items()):
             self._hear(name, each, now)
             waiting = any(self._open(each).values())
@@ -154,20 +154,20 @@ class Listeners:
             elif each.taken and now - each.last_progress > _PATIENCE_S:
                 self._count_lost(name, each, now)
 
-    def _look_around(self, now: float) -> None:
+    def _update_present(self, now: float) -> None:
         before, seen = self._present, self._seen.copy()
-        present = self._present = self._look_who_is_there()
+        present = self._present = self._present_listeners()
         if present != before or self._seen != seen:
             self._changed = now
         for name in self._listeners.keys() - present.keys():
             self._node.destroy_client(self._listeners.pop(name).client)
         for name in present.keys() - self._listeners.keys() - self.deaf:
-            client = self._node.create_client(Trigger, f"{name}/{TAKEN}")
+            client = self._node.create_client(Trigger, f"{name}/{PROCESSED}")
             self._listeners[name] = _Listener(client, present[name], met=now)
         for name, each in self._listeners.items():
             each.topics = present[name]
 
-    def _look_who_is_there(self) -> dict[str, set[str]]:
+    def _present_listeners(self) -> dict[str, set[str]]:
         found: dict[str, set[str]] = {}
         for publisher in self._publishers:
             topic = publisher.topic_name
@@ -187,7 +187,7 @@ class Listeners:
             with suppress(DataError):
                 self._enter(listener, _counts(future.result().message), now)
                 self._find_again(name, listener)
-        elif now - since > _ASK_AGAIN_S:
+        elif now - since > _RETRY_S:
             listener.client.remove_pending_request(future)
             listener.asked = None
 
@@ -213,7 +213,7 @@ class Listeners:
         self._node.destroy_client(self._listeners.pop(name).client)
         self.deaf.add(name)
         self._node.get_logger().warning(
-            f"{name} listens but does not say what it has taken (service {TAKEN}): it is not "
+            f"{name} listens but does not say what it has taken (service {PROCESSED}): it is not "
             "waited for, and loses what its queue does not hold"
         )
 
@@ -358,7 +358,7 @@ class PlayerNode(ManagedNode):
     def _play(self, now: float) -> None:
         self._listeners.look()
         if not self._begun:
-            self._obstacle = self._in_the_way()
+            self._obstacle = self._reason_not_to_play()
             if self._obstacle:
                 return
             self._begun = True
@@ -372,10 +372,10 @@ class PlayerNode(ManagedNode):
             self._publish_next()
         self._tell_time(now)
         answered = now - self._asked_at >= _ANSWER_S
-        if self._next is None and not self._listeners.waited_for and answered:
-            self._at_the_end()
+        if self._next is None and not self._listeners.pending_listeners and answered:
+            self._on_end()
 
-    def _in_the_way(self) -> str:
+    def _reason_not_to_play(self) -> str:
         """Return why playing cannot begin yet; empty if it can."""
         for topic, publisher in self._offers.items():
             name = publisher.topic_name
@@ -390,7 +390,7 @@ class PlayerNode(ManagedNode):
                 return f"{' and '.join(missing)} must listen to {name} first (parameter wait_for)"
         if not self._listeners.known:
             return "who listens has not answered yet"
-        if self._listeners.unchanged_s < (delay := self.values["delay"]):
+        if self._listeners.seconds_since_change < (delay := self.values["delay"]):
             return f"it begins {delay:g} s after the last listener came (parameter delay)"
         return ""
 
@@ -416,7 +416,7 @@ class PlayerNode(ManagedNode):
         sec, nanosec = divmod(max(min(due, ahead), self._position_ns), NANOSECONDS_PER_S)
         self._time.publish(ClockMessage(clock=Time(sec=sec, nanosec=nanosec)))
 
-    def _at_the_end(self) -> None:
+    def _on_end(self) -> None:
         if self.values["loop"]:
             self._begin()
             return
@@ -459,7 +459,7 @@ class PlayerNode(ManagedNode):
         if not self.active:
             return report
         report.values["paused"] = not self._wanted
-        report.values["waited_for"] = " ".join(self._listeners.waited_for)
+        report.values["waited_for"] = " ".join(self._listeners.pending_listeners)
         if self._obstacle:
             report.add(ERROR, self._obstacle)
         for name, count in (+self._listeners.lost).items():

@@ -34,10 +34,10 @@ from omsm_ros.errors import (
     too_many_open_files,
 )
 from omsm_ros.io import json_and_yaml
-from omsm_ros.loading import nothing_to_undo
-from omsm_ros.nodes.diagnostics import survive
-from omsm_ros.nodes.managed import ManagedNode, Stage
-from omsm_ros.nodes.memory import keep_for_good
+from omsm_ros.loading import exit_on_signal_while_loading
+from omsm_ros.nodes.diagnostics import log_internal_error
+from omsm_ros.nodes.managed import LifecycleStage, ManagedNode
+from omsm_ros.nodes.memory import freeze_garbage_collector
 from omsm_ros.nodes.start import ENDING
 from omsm_ros.nodes.topics import REQUESTS_QOS
 
@@ -45,7 +45,7 @@ _BAD_INPUT, _DEFECT = 2, 70  # as of the commands
 # A node that has not ended so long after it was asked to ends at the next signal, as it stands.
 _PATIENCE_S = 5.0
 # For a log message of a node that cannot start to reach who listens on /rosout.
-_LAST_WORDS_S = 1.0
+_SHUTDOWN_LOG_S = 1.0
 # Between two requests of one service: a client that is held up for ten of them loses nothing.
 _PACE_S = 0.01
 
@@ -58,12 +58,12 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
     """
     node = None
     try:
-        with nothing_to_undo(ENDING):
+        with exit_on_signal_while_loading(ENDING):
             _init()
-        ending = _Ending()  # after rclpy, which puts back the handlers of the system
+        ending = _SignalEnd()  # after rclpy, which puts back the handlers of the system
         node = make_node()
         node.start()
-        keep_for_good()
+        freeze_garbage_collector()
     except Exception as err:
         _give_up(node, err)
     try:
@@ -112,13 +112,13 @@ def _give_up(node: ManagedNode | None, err: Exception) -> None:
         text = short or text
         print(text, file=sys.stderr)
     else:  # the line is in the log already
-        time.sleep(_LAST_WORDS_S if node.count_subscribers("/rosout") else 0.0)
+        time.sleep(_SHUTDOWN_LOG_S if node.count_subscribers("/rosout") else 0.0)
     rclpy.try_shutdown()
     _ignore_signals()
     sys.exit(_BAD_INPUT if known else _DEFECT)
 
 
-class _Ending:
+class _SignalEnd:
     """Hears signals to end, at any time and in any thread, and interrupts nothing.
 
     A launch sends SIGINT twice; a handler that raises in the middle of an orderly end would leave
@@ -164,15 +164,15 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _spin(node: ManagedNode, ending: _Ending) -> None:
+def _spin(node: ManagedNode, ending: _SignalEnd) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     ending.wakes(lambda: executor.create_task(lambda: None))
-    while not (ending.asked.is_set() or node.fatal or node.stage is Stage.FINALIZED):
+    while not (ending.asked.is_set() or node.fatal or node.stage is LifecycleStage.FINALIZED):
         try:
             executor.spin_once()
         except Exception as err:
-            survive(node, err)
+            log_internal_error(node, err)
 
 
 def settings_of(text: str) -> dict[str, object]:
@@ -180,7 +180,7 @@ def settings_of(text: str) -> dict[str, object]:
     return json_and_yaml.object_of(text or "{}", ConfigurationError, "parameter 'settings'")
 
 
-class Paced(ReentrantCallbackGroup):  # type: ignore[misc]
+class PacedService(ReentrantCallbackGroup):  # type: ignore[misc]
     """Lets a service take one request after the other, a moment apart.
 
     Requests wait in the node's own queue, which is deep. A client's holds ten answers by default:
@@ -226,10 +226,10 @@ def serve(
         except OmsmError as err:
             refuse(response, str(err))
         except Exception as err:
-            refuse(response, survive(node, err))
+            refuse(response, log_internal_error(node, err))
         return response
 
-    group = Paced(node, undo)
+    group = PacedService(node, undo)
     made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group)
     undo.callback(node.destroy_service, made)
 

@@ -16,8 +16,8 @@ import sys
 from pathlib import Path
 
 from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
-from omsm_ros.loading import nothing_to_undo, one_thread_of_blas
-from omsm_ros.nodes.memory import share_one_pool
+from omsm_ros.loading import exit_on_signal_while_loading, one_thread_of_blas
+from omsm_ros.nodes.memory import use_single_malloc_arena
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a node to end."""
@@ -48,8 +48,8 @@ def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
     _check_open_files(name)
-    with nothing_to_undo(ENDING):
-        share_one_pool(ENDING)  # first, for the process may begin again
+    with exit_on_signal_while_loading(ENDING):
+        use_single_malloc_arena(ENDING)  # first, for the process may begin again
         one_thread_of_blas()
         end_with_launch()
         set_up_fast_dds()
@@ -111,10 +111,10 @@ def set_up_fast_dds() -> None:
         os.environ[_PROFILES] = str(Path(__file__).with_name("fast_dds.xml"))
         if not os.environ.get(_PUBLICATION_MODE):
             os.environ.setdefault(_MORE_FROM_PROFILE, "1")
-    _send_aside()
+    _send_from_own_thread()
 
 
-def _send_aside() -> None:
+def _send_from_own_thread() -> None:
     """Let Fast DDS send from a thread of its own: a listener that stands still stops nobody.
 
     Whoever publishes would wait for it, a second and more; after 0.1 s Fast DDS forgets to send the

@@ -46,10 +46,10 @@ LATCHED_BY_MANY_QOS = QoSProfile(
 # Requests wait for their turn while a node computes; ten, the usual depth, are soon lost.
 REQUESTS_QOS = QoSProfile(depth=1000)
 
-TAKEN = "taken"
+PROCESSED = "taken"
 """Service of every node, below its name: how many messages it has taken of each topic, as JSON."""
 
-_taken: Counter[str] = Counter()
+_processed: Counter[str] = Counter()
 
 # At most so many messages are taken in a row, so that timers and services have their turn.
 _BULK = 500
@@ -88,7 +88,7 @@ def listen(
 
     def take(message: Any, info: MessageInfo) -> None:
         callback(message, info)
-        _taken[made.topic_name] += 1
+        _processed[made.topic_name] += 1
 
     def take_all(message: Any, info: MessageInfo) -> None:
         take(message, info)
@@ -123,9 +123,11 @@ def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInf
     return _BULK
 
 
-def tell_taken(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+def answer_processed_counts(
+    request: Trigger.Request, response: Trigger.Response
+) -> Trigger.Response:
     """Answer how many messages of each topic this process has dealt with."""
-    response.success, response.message = True, json_and_yaml.text_of(dict(_taken))
+    response.success, response.message = True, json_and_yaml.text_of(dict(_processed))
     return response
 
 

@@ -13,13 +13,13 @@ from omsm_ros import quantities
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.ripple.accelerometer import (
     AXES,
-    CARRIAGE,
     PROBE,
+    SLIDE,
     Alarm,
     MonitorOptions,
     RunningSpectrum,
 )
-from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.io import json_and_yaml, message_mapping
 from omsm_ros.io.calibration_file import load_calibration
@@ -37,7 +37,7 @@ PARAMETERS = (
     Parameter("bands", "5 50 150 500 2000", "edges of the bands, rising [Hz]"),
     Parameter("window", 1.0, "length of a spectrum [s]", quantities.WAIT),
     Parameter("averages", 4, "spectra over which levels are averaged", quantities.COUNT),
-    Parameter("mount", PROBE, "where the accelerometer sits", choices=(PROBE, CARRIAGE)),
+    Parameter("mount", PROBE, "where the accelerometer sits", choices=(PROBE, SLIDE)),
     Parameter("axis", "z", "along which a height is measured", choices=AXES),
     Parameter("alarm", 20e-9, "effect on a height at which to warn, rms [m]", quantities.STEP),
     Parameter("release", 0.7, "share of it below which the alarm ends", quantities.PROBABILITY),
@@ -69,7 +69,7 @@ class VibrationMonitorNode(ManagedNode):
         self._alarm = Alarm(values["alarm"], values["release"])
         self._refused, self._blocks_refused = "", 0
         self._lately = RecentIncrease()
-        self._flow, self._block = Flow(), 0.0
+        self._flow, self._block = SampleFlow(), 0.0
         self._calibration: Calibration | None = None
         self._topic = CalibrationTopic(self, undo, self._use, listens=True)
         if path := values["calibration"]:
@@ -77,7 +77,7 @@ class VibrationMonitorNode(ManagedNode):
 
     def activate(self, undo: ExitStack) -> None:
         """Begin to listen, and to tell."""
-        self._told = 0
+        self._task_result = 0
         self._publisher = publish_on(self, undo, String, "vibration")
         listen(self, undo, AccelerationBlock, "acceleration", self._take)
 
@@ -99,10 +99,10 @@ class VibrationMonitorNode(ManagedNode):
             text = "raised" if self._alarm.raised else "ended"
             self.get_logger().warning(f"vibration alarm {text}: {self._line(levels)}")
         # Once for each spectrum, however short the blocks are.
-        if levels is not None and levels.windows != self._told:
-            self._told = levels.windows
-            told = {**levels.entry(), "alarm": self._alarm.raised, "limit": self._alarm.limit}
-            self._publisher.publish(String(data=json_and_yaml.text_of(told)))
+        if levels is not None and levels.windows != self._task_result:
+            self._task_result = levels.windows
+            content = {**levels.entry(), "alarm": self._alarm.raised, "limit": self._alarm.limit}
+            self._publisher.publish(String(data=json_and_yaml.text_of(content)))
 
     def _levels(self) -> Any:
         known = self._calibration
@@ -131,7 +131,7 @@ class VibrationMonitorNode(ManagedNode):
         else:
             report.message = self._line(levels)
             report.values.update(_figures(levels))
-            if self.values["mount"] == CARRIAGE and self._calibration is not None:
+            if self.values["mount"] == SLIDE and self._calibration is not None:
                 report.values["response_valid_up_to"] = self._calibration.valid_up_to
             if self._alarm.raised:
                 report.add(WARN, f"vibration beyond {quantity(self._alarm.limit, 'm')}: "

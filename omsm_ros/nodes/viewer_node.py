@@ -75,21 +75,21 @@ class ViewerNode(ManagedNode):
         try:
             self._view.add_points(message_mapping.cloud_array(message))
         except OmsmError as err:
-            self._complain(str(err))
+            self._warn(str(err))
 
     def _on_acceleration(self, message: Any, info: MessageInfo) -> None:
         try:
             self._view.add_acceleration(message_mapping.acceleration_block(message))
         except OmsmError as err:
-            self._complain(str(err))
+            self._warn(str(err))
 
     def _on_calibration(self, message: Any, info: MessageInfo) -> None:
         try:
             self._view.set_calibration(message_mapping.calibration(message))
         except OmsmError as err:
-            self._complain(str(err))
+            self._warn(str(err))
 
-    def _complain(self, text: str) -> None:
+    def _warn(self, text: str) -> None:
         self._refused += 1
         self.get_logger().warning(text, throttle_duration_sec=5.0)
 
@@ -102,7 +102,7 @@ class ViewerNode(ManagedNode):
                 try:
                     self._view.add_state(status.name, level, status.message, values)
                 except OmsmError as err:
-                    self._complain(str(err))
+                    self._warn(str(err))
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ from omsm_ros import __version__
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.io.files import SUMMARY, make_folder, read_text, said, save_json
+from omsm_ros.io.files import SUMMARY, exception_text, make_folder, read_text, save_json
 from omsm_ros.io.json_and_yaml import check_form, ranged
 from omsm_ros.io.results import read_summary
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -108,7 +108,7 @@ def run_campaign(
             "other recordings become bags by 'omsm import'"
         )
     sign = [load_calibration(calibration).id, *options, __version__]
-    with _alone(out):
+    with _name_from_single_scan(out):
         earlier = {entry.bag: entry for entry in load_campaign(out)}
         tasks = [_task(bag, folder, calibration, out, options, sign) for bag in found]
         entries = {t.bag: earlier[t.bag] for t in tasks if _is_done(earlier.get(t.bag), t, out)}
@@ -117,7 +117,7 @@ def run_campaign(
         with _executor(jobs or os.cpu_count() or 1, scheduler) as executor:
             asked = {executor.submit(correct_one, task): task for task in waiting}
             for future in as_completed(asked):
-                entry = _told(future, asked[future])
+                entry = _task_result(future, asked[future])
                 entries[entry.bag] = entry
                 _save(out, entries)
                 progress(len(entries), len(tasks))
@@ -184,7 +184,7 @@ def correct_one(task: Task) -> Entry:
                 stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
             )  # fmt: skip
         except OSError as err:
-            found = CRASHED, said(err)
+            found = CRASHED, exception_text(err)
             continue
         if done.returncode == 0:
             return Entry(task.bag, task.folder, task.fingerprint, DONE, "", _recorded(task.path))
@@ -196,7 +196,7 @@ def correct_one(task: Task) -> Entry:
     return Entry(task.bag, task.folder, task.fingerprint, *found)
 
 
-def _told(future: Future[Entry], task: Task) -> Entry:
+def _task_result(future: Future[Entry], task: Task) -> Entry:
     """Return what became of a bag, also where every worker died that tried it."""
     try:
         return future.result()
@@ -260,14 +260,14 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 
 
 @contextmanager
-def _alone(out: Path) -> Iterator[None]:
+def _name_from_single_scan(out: Path) -> Iterator[None]:
     """Hold the folder, so that two campaigns never write into it."""
     try:
         make_folder(out)
         lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as err:
         raise FileError(
-            f"cannot write into {str(out)!r}: {said(err)}; give another folder"
+            f"cannot write into {str(out)!r}: {exception_text(err)}; give another folder"
         ) from err
     try:
         try:
@@ -293,7 +293,7 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         address = urlsplit(scheduler)
     except ValueError as err:
         raise ConfigurationError(
-            f"scheduler {scheduler!r} is no address: {said(err)}; write tcp://host:port"
+            f"scheduler {scheduler!r} is no address: {exception_text(err)}; write tcp://host:port"
         ) from err
     local = address.scheme == "tcp" and address.hostname in _LOCAL_HOSTS
     if not (local or address.scheme == "tls"):
@@ -309,7 +309,7 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TypeError) as err:
         raise ConfigurationError(
-            f"no scheduler answers at {scheduler!r}: {said(err)}; start 'dask scheduler' there"
+            f"no scheduler answers at {scheduler!r}: {exception_text(err)}; start 'dask scheduler' there"
         ) from err
     with client:
         # A worker that dies takes its bag along; another one does it.

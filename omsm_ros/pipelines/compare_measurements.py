@@ -13,14 +13,14 @@ import numpy as np
 from omsm_ros.core.comparison.agreement import (
     COVERAGE_FACTOR,
     FIGURES,
-    Agreement,
-    Number,
+    ComparedFigure,
+    ComparisonAgreement,
     figures_of,
 )
-from omsm_ros.core.comparison.compare import Comparison, Side, compare
+from omsm_ros.core.comparison.compare import Comparison, SideSummary, compare_measurements_of_part
 from omsm_ros.core.comparison.matching import SEATED
 from omsm_ros.core.comparison.resampling import RADIUS_CELLS, TREND_DEGREE
-from omsm_ros.core.comparison.stated_errors import Measurement
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.surface.deviation import deviation
@@ -32,7 +32,7 @@ from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import load_fields
 from omsm_ros.pipelines.form import registered
-from omsm_ros.readable import moment
+from omsm_ros.readable import date_text
 from omsm_ros.units import LengthUnits
 
 MAP = "difference.csv"
@@ -47,7 +47,7 @@ _METHOD = (
 class ComparisonOptions:
     """How two measurements are compared.
 
-    freedoms: in which the second is moved onto the first
+    dofs: in which the second is moved onto the first
     uncertainty: standard uncertainty of the heights of a file that carries none [m]
     drift: standard deviation at the end of a scan whose fields hold none [m]
     units: of files that do not carry them;  spacing: of the places compared [m]
@@ -55,7 +55,7 @@ class ComparisonOptions:
     register: freedoms in which each is registered to the nominal surface first; None: it is not
     """
 
-    freedoms: Sequence[str] = SEATED
+    dofs: Sequence[str] = SEATED
     uncertainty: float | None = None
     drift: float | None = None
     units: LengthUnits | None = None
@@ -64,7 +64,9 @@ class ComparisonOptions:
     register: Sequence[str] | None = None
 
 
-def measurement_at(path: Path, options: ComparisonOptions, nominal: Surface | None) -> Measurement:
+def measurement_at(
+    path: Path, options: ComparisonOptions, nominal: Surface | None
+) -> ComparedMeasurement:
     """Read a result folder, a cloud or a map, less the ``nominal`` heights if there are any.
 
     Raises FileError for what cannot be read, DataError for points beyond the nominal surface.
@@ -74,10 +76,10 @@ def measurement_at(path: Path, options: ComparisonOptions, nominal: Surface | No
     if nominal is not None and options.register is None:
         height = deviation(points.x, points.y, points.height, nominal)
         points = replace(points, height=height)
-    measured = Measurement(
+    measured = ComparedMeasurement(
         name=str(path),
         points=points,
-        fields=_fields_beside(path, points),
+        fields=_fields_file_of(path, points),
         common=options.uncertainty if points.uncertainty is None else None,
         drift=options.drift,
         calibration=_calibration_of(path),
@@ -114,7 +116,7 @@ def _calibration_of(path: Path) -> str:
     return str(read_result(summary, "summary").get("calibration", ""))
 
 
-def _fields_beside(path: Path, points: MeasuredPoints) -> ScanFields | None:
+def _fields_file_of(path: Path, points: MeasuredPoints) -> ScanFields | None:
     """Return what the systematic errors of a scan of ours do to its points, if they are stored."""
     folder = path if path.is_dir() else path.parent
     if path.is_file() and path.name != "cloud.ply":
@@ -130,7 +132,7 @@ def compare_measurements(
 ) -> tuple[Comparison, dict[str, Any]]:
     """Compare two measurements, and return what was found with the content of its JSON."""
     measured = [measurement_at(path, options, nominal) for path in (a, b)]
-    found = compare(*measured, options.freedoms, options.spacing, options.length)
+    found = compare_measurements_of_part(*measured, options.dofs, options.spacing, options.length)
     facts = facts_of(found)
     for key, m in zip(("a", "b"), measured, strict=True):
         facts[key]["notes"] = list(m.points.notes)
@@ -148,7 +150,7 @@ def write_difference(out: Path, found: Comparison, facts: dict[str, Any]) -> Non
     # Here, because drawing takes longer to load than most of the rest.
     from omsm_ros.report.difference import render
 
-    date = moment(datetime.now(timezone.utc))
+    date = date_text(datetime.now(timezone.utc))
     names = [Path(facts[key]["file"]).name for key in ("a", "b")]
     save_text(out / REPORT, render(" and ".join(names), date, facts, found))
     save_json(out / DIFFERENCE, facts)
@@ -171,7 +173,7 @@ def facts_of(found: Comparison) -> dict[str, Any]:
             "shared_area": found.shared,
         },
         "registration": {
-            "fitted": list(matched.freedoms),
+            "fitted": list(matched.dofs),
             "moved": matched.moved,
             "not_determined": matched.refused,
         },
@@ -186,16 +188,16 @@ def facts_of(found: Comparison) -> dict[str, Any]:
     }
 
 
-def _side(side: Side) -> dict[str, Any]:
+def _side(side: SideSummary) -> dict[str, Any]:
     entry = asdict(side)
     return {"file": entry.pop("name"), **entry}
 
 
-def _numbers(figures: dict[str, Number]) -> dict[str, Any]:
+def _numbers(figures: dict[str, ComparedFigure]) -> dict[str, Any]:
     return {name: asdict(number) for name, number in figures.items()}
 
 
-def _terms(agreement: Agreement | None) -> dict[str, Any] | None:
+def _terms(agreement: ComparisonAgreement | None) -> dict[str, Any] | None:
     if agreement is None:
         return None
     radius, x, y = agreement.aperture

@@ -23,22 +23,28 @@ from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import (
     ScanFields,
     ScanTrace,
-    resolves_turns,
+    resolves_per_turn_waves,
     scan_fields,
     standard_fields,
 )
-from omsm_ros.core.correction.uncertainty import with_lateral
+from omsm_ros.core.correction.uncertainty import with_lateral_uncertainty
 from omsm_ros.core.kinematics.kinematics import PitchCurve, Surface
-from omsm_ros.core.kinematics.scan_path import PathStart, ScanPath
-from omsm_ros.core.streams.blocks import Account, AxisBlock, DistanceBlock, FloatArray, Reason
+from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
+from omsm_ros.core.streams.blocks import (
+    Account,
+    AxisBlock,
+    DistanceBlock,
+    FloatArray,
+    RejectionReason,
+)
 from omsm_ros.core.streams.stamps import axes_at_probe
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.core.streams.trigger_slips import CommonTrigger, Slip
+from omsm_ros.core.streams.trigger_slips import CommonTrigger, TriggerSlip
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io import bags
-from omsm_ros.io.results import PlyWriter, widened
+from omsm_ros.io.results import PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import MOST_JUDGED
@@ -49,7 +55,7 @@ from omsm_ros.readable import quantity
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 # A quarter of a gigabyte: one stream may be recorded that far ahead of the other.
-MOST_WAITING = 4_000_000
+MAX_PENDING_BLOCKS = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,7 @@ class Admission:
 
 
 @dataclass(frozen=True)
-class ByStamps:
+class StampJoining:
     """Probe and axes joined by their stamps, not by a common trigger counter.
 
     delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
@@ -97,7 +103,7 @@ class CorrectedScan:
         options: CorrectionOptions,
         *,
         admission: Admission = Admission(),
-        by_stamps: ByStamps | None = None,
+        by_stamps: StampJoining | None = None,
         progress: Progress = no_progress,
     ) -> None:
         self.path = path
@@ -124,7 +130,7 @@ class CorrectedScan:
                 polarity=self._options.polarity,
             )
             self.admitted = admit(self._calibration, self.reasons, self._admission.override)
-            self._corrector = Corrector(self._calibration, self._options, MOST_WAITING)
+            self._corrector = Corrector(self._calibration, self._options, MAX_PENDING_BLOCKS)
             self._stack = opening.pop_all()
         return self
 
@@ -171,7 +177,7 @@ class CorrectedScan:
         return self._corrector.stamp_skew
 
     @property
-    def slip(self) -> Slip | None:
+    def slip(self) -> TriggerSlip | None:
         """The last slip of the two counters so far, None without one."""
         return self._corrector.slips.found
 
@@ -201,13 +207,13 @@ class CorrectedScan:
             self._progress(done, total)
 
     def _check_complete(self) -> None:
-        name = Reason.OVERDUE.name.lower()
+        name = RejectionReason.OVERDUE.name.lower()
         account = self.account
         lost = min(s.counted.get(name, 0) for s in (account.axes, account.distance))
         if lost:
             raise BagError(
                 f"{str(self.path)!r}: {lost} samples waited for their partners in vain, for one "
-                f"stream was recorded more than {MOST_WAITING} samples ahead of the other; "
+                f"stream was recorded more than {MAX_PENDING_BLOCKS} samples ahead of the other; "
                 "record both at the same time"
             )
         received = (account.axes.received, account.distance.received)
@@ -216,7 +222,9 @@ class CorrectedScan:
                 raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
 
 
-def _joined_by_stamps(bag: bags.BagReader, how: ByStamps) -> Iterator[AxisBlock | DistanceBlock]:
+def _joined_by_stamps(
+    bag: bags.BagReader, how: StampJoining
+) -> Iterator[AxisBlock | DistanceBlock]:
     """Yield the axes at the probe's samples, and the probe's blocks, as if one trigger had both.
 
     A message that repeats samples or comes late has no axes; it is counted as what it is.
@@ -239,7 +247,7 @@ def _joined_by_stamps(bag: bags.BagReader, how: ByStamps) -> Iterator[AxisBlock 
 # have
 # passed, it is that of a polynomial through them, and the cloud is gone through once more.
 
-NOT_IN_POINTS = (
+LATERAL_SOURCES = (
     "{names}: not in the uncertainty of the points, because the surface's slopes are not known; "
     "give --nominal SURFACE.yaml"
 )
@@ -270,13 +278,13 @@ def add_lateral_errors(
     if not sources or options.surface is not None or not trace.seen:
         return None
     points = trace.points()
-    if not resolves_turns(points):
+    if not resolves_per_turn_waves(points):
         names = ", ".join(dict.fromkeys(source.name for source in sources))
-        return LateralErrors({}, 0.0, np.empty(0), (NOT_IN_POINTS.format(names=names),))
+        return LateralErrors({}, 0.0, np.empty(0), (LATERAL_SOURCES.format(names=names),))
     by_source = standard_fields(sources, points.with_slopes(None))
     fields = scan_fields(by_source, trace.every)
     kept, largest = EvenSelection(most), 0.0
-    for rows in widened(cloud, lambda first, count: _variance(fields, first, count)):
+    for rows in with_added_variance(cloud, lambda first, count: _variance(fields, first, count)):
         kept.add(rows)
         largest = max(largest, float(rows["uncertainty"].max()))
     heights = {name: float(np.sqrt(np.mean(np.sum(f**2, axis=0)))) for name, f in by_source.items()}
@@ -333,7 +341,7 @@ def correct_bag(
     admission: Admission | None = None,
     nominal: Surface | None = None,
     lateral: float = 0.0,
-    by_stamps: ByStamps | None = None,
+    by_stamps: StampJoining | None = None,
     progress: Progress = no_progress,
 ) -> Correction:
     """Correct a bag into ``cloud`` (PLY).
@@ -362,7 +370,7 @@ def correct_bag(
                 found.see(block)
                 if points is not None:
                     if nominal is not None and lateral:
-                        points = with_lateral(points, nominal, lateral)
+                        points = with_lateral_uncertainty(points, nominal, lateral)
                     found.add(points, ply.write(points))
         shifted = add_lateral_errors(cloud, scan.options, scan.trace, MOST_DRAWN)
         done = _correction(scan, found)
@@ -380,7 +388,7 @@ class _Findings:
         self._running = {name: RunningStatistics() for name in names}
         self.largest = 0.0
         self.drawn = EvenSelection(MOST_DRAWN)
-        self.path = PathStart(MOST_JUDGED)
+        self.path = ScanPathReader(MOST_JUDGED)
 
     def see(self, block: AxisBlock | DistanceBlock | None) -> None:
         if block is None:

@@ -48,7 +48,7 @@ from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
 from omsm_ros.twin.true_response import TrueResponse
-from omsm_ros.twin.truth import TruthComparison, departure_from_truth
+from omsm_ros.twin.truth import TruthComparison, compare_with_truth
 from omsm_ros.units import PPM
 
 # The demonstration: where its results go, how the twin is set, what each node is told.
@@ -124,11 +124,11 @@ class Demonstration:
         return str((self.out / "cell").absolute())
 
     @property
-    def link_beside(self) -> str:
+    def companion_link(self) -> str:
         """The emulated port of the second device; empty without one."""
-        if (beside := emulated(self.device).beside) is None:
+        if (companion := emulated(self.device).companion) is None:
             return ""
-        return _tcp_link() if beside.tcp else f"{self.link}_beside"
+        return _tcp_link() if companion.tcp else f"{self.link}_beside"
 
     @property
     def step_test_samples(self) -> int:
@@ -144,7 +144,7 @@ class Demonstration:
         """Return ROS parameters of the emulator."""
         return {
             "device": self.device,
-            "link_beside": self.link_beside,
+            "link_beside": self.companion_link,
             "time_lapse": self.lapse,
             "seed": self.seed,
             "start_radius": self.radius,
@@ -157,12 +157,12 @@ class Demonstration:
         fixed = {"device": self.device, "port": self.link, "sample_period": self.sample_period}
         return fixed | emulated(self.device).driver
 
-    def beside_parameters(self) -> tuple[str, dict[str, object]] | None:
+    def companion_parameters(self) -> tuple[str, dict[str, object]] | None:
         """Return the node that reads the second device, and its ROS parameters; None without."""
-        if (beside := emulated(self.device).beside) is None:
+        if (companion := emulated(self.device).companion) is None:
             return None
-        fixed = {"port": self.link_beside, "sample_period": self.sample_period}
-        return beside.node, fixed | beside.driver
+        fixed = {"port": self.companion_link, "sample_period": self.sample_period}
+        return companion.node, fixed | companion.driver
 
     def settings(self) -> dict[str, object]:
         """Return what the calibration will belong to."""
@@ -211,10 +211,10 @@ def _tcp_link() -> str:
 _REST_SAMPLES = 100
 RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
 TITLE = "Paraboloid mirror measured on the emulated cell"
-_REGISTERING = measurement.Registering(("piston", "tip", "tilt"))
+_REGISTERING = measurement.RegistrationOptions(("piston", "tip", "tilt"))
 
 
-def conclude(plan: Demonstration) -> dict[str, Any]:
+def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     """Correct the recorded bag offline, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
     options = with_sources(CorrectionOptions(), calibration, NOTHING_STATED, PAPER_MIRROR)
@@ -227,7 +227,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = planned_test_of(plan.scenario, plan.disturbances)
-    judgement = Judgement(options, out=plan.out, fitted=_REGISTERING.freedoms)
+    judgement = Judgement(options, out=plan.out, fitted=_REGISTERING.dofs)
     summary = measurement.summarise(plan.bag, done, calibration, judgement)
     measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
     summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
@@ -254,7 +254,7 @@ def conclude(plan: Demonstration) -> dict[str, Any]:
 
 def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
     """Return the entries of the summary that only the twin's truth can give; lengths in metres."""
-    truth: TruthComparison = departure_from_truth(
+    truth: TruthComparison = compare_with_truth(
         recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
     )
     probe = Probe()

@@ -36,7 +36,7 @@ _DISCOVERY_TIMEOUT_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class HostCheck:
     """One thing that was looked at.
 
     state: "fine", "doubtful" (works, but may not for long) or "faulty"
@@ -49,7 +49,7 @@ class Check:
     remedy: str = ""
 
 
-def examine_host(folder: Path, port: str = "") -> list[Check]:
+def examine_host(folder: Path, port: str = "") -> list[HostCheck]:
     """Look at everything that a cell on this computer depends on.
 
     folder: where recordings will lie;  port: a serial device that must be there, such as
@@ -66,15 +66,15 @@ def examine_host(folder: Path, port: str = "") -> list[Check]:
     ]
 
 
-def _python() -> Check:
+def _python() -> HostCheck:
     name = f"{sys.version_info[0]}.{sys.version_info[1]}"
     low, high = (".".join(map(str, limit)) for limit in _PYTHONS)
     if _PYTHONS[0] <= sys.version_info[:2] <= _PYTHONS[1]:
-        return Check("Python", FINE, name)
-    return Check("Python", FAULTY, name, f"use Python {low} to {high}: make PYTHON=… setup")
+        return HostCheck("Python", FINE, name)
+    return HostCheck("Python", FAULTY, name, f"use Python {low} to {high}: make PYTHON=… setup")
 
 
-def _packages() -> Iterator[Check]:
+def _packages() -> Iterator[HostCheck]:
     missing, found = [], []
     for package in _PACKAGES:
         try:
@@ -83,53 +83,55 @@ def _packages() -> Iterator[Check]:
             missing.append(package)
     if missing:
         remedy = f"pip install {' '.join(missing)}"
-        yield Check("packages", FAULTY, f"missing: {', '.join(missing)}", remedy)
+        yield HostCheck("packages", FAULTY, f"missing: {', '.join(missing)}", remedy)
     else:
-        yield Check("packages", FINE, ", ".join(found))
+        yield HostCheck("packages", FINE, ", ".join(found))
     absent = {p: use for p, use in _EXTRAS.items() if importlib.util.find_spec(p) is None}
     if absent:
         use = ", ".join(f"{package} ({use})" for package, use in absent.items())
-        yield Check("optional packages", FINE, f"not installed: {use}")
+        yield HostCheck("optional packages", FINE, f"not installed: {use}")
 
 
-def _open_files() -> Check:
+def _open_files() -> HostCheck:
     """Return whether a process may hold as many files as nodes and commands do."""
     most = open_files()
     if most >= FEWEST_OPEN_FILES:
-        return Check("open files", FINE, f"{most} at most" if most < math.inf else "any number")
+        return HostCheck("open files", FINE, f"{most} at most" if most < math.inf else "any number")
     found = f"a process may hold {most} open, and may need {FEWEST_OPEN_FILES}"
-    return Check("open files", FAULTY, found, MORE_FILES)
+    return HostCheck("open files", FAULTY, found, MORE_FILES)
 
 
-def _ros(environment: os._Environ[str]) -> Iterator[Check]:
+def _ros(environment: os._Environ[str]) -> Iterator[HostCheck]:
     """Yield whether nodes can start, and whether they find each other."""
     if importlib.util.find_spec("rclpy") is None:
-        yield Check(
+        yield HostCheck(
             "ROS 2", DOUBTFUL, "not found: the offline commands work, nodes do not",
             "'make setup' and '. ./env.sh', or source /opt/ros/jazzy/setup.bash",
         )  # fmt: skip
         return
     if importlib.util.find_spec("omsm_msgs") is None:
-        yield Check("ROS 2", FAULTY, "rclpy, but no omsm_msgs", "build it: make setup; . ./env.sh")
+        yield HostCheck(
+            "ROS 2", FAULTY, "rclpy, but no omsm_msgs", "build it: make setup; . ./env.sh"
+        )
         return
-    yield Check("ROS 2", FINE, environment.get("ROS_DISTRO", "jazzy, from PyPI"))
+    yield HostCheck("ROS 2", FINE, environment.get("ROS_DISTRO", "jazzy, from PyPI"))
     reach = environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     domain = environment.get("ROS_DOMAIN_ID", "0")
     found = f"domain {domain}, range {reach}"
     if reach == "LOCALHOST":
-        yield Check("DDS settings", FINE, found)
+        yield HostCheck("DDS settings", FINE, found)
     else:
-        yield Check(
+        yield HostCheck(
             "DDS settings", DOUBTFUL, f"{found}: other computers may command these nodes",
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or a ROS_DOMAIN_ID of your own",
         )  # fmt: skip
     yield _discovery()
 
 
-def _discovery() -> Check:
+def _discovery() -> HostCheck:
     """Return whether two processes' worth of ROS find each other and pass a message."""
     if open_files() < FEWEST_OPEN_FILES:
-        return Check("DDS discovery", FAULTY, "not evaluated: too few open files", MORE_FILES)
+        return HostCheck("DDS discovery", FAULTY, "not evaluated: too few open files", MORE_FILES)
     command = [sys.executable, "-m", "omsm_ros.nodes.discovery_check"]
     try:
         done = subprocess.run(
@@ -139,35 +141,37 @@ def _discovery() -> Check:
         found = f"no message within {_DISCOVERY_TIMEOUT_S:g} s"
     else:
         if done.returncode == 0:
-            return Check("DDS discovery", FINE, done.stdout.strip())
+            return HostCheck("DDS discovery", FINE, done.stdout.strip())
         found = (done.stderr.strip().splitlines() or ["no message"])[-1]
     remedy = "allow UDP multicast on the loopback interface, or set ROS_STATIC_PEERS=127.0.0.1"
-    return Check("DDS discovery", FAULTY, found, remedy)
+    return HostCheck("DDS discovery", FAULTY, found, remedy)
 
 
-def _serial(port: str) -> Check:
+def _serial(port: str) -> HostCheck:
     ports = serial_ports()
     if port and port not in ports and not Path(port).exists():
         there = f"; there are: {', '.join(ports)}" if ports else "; there is none"
-        return Check(
+        return HostCheck(
             "serial port", FAULTY, f"no {port}{there}", "plug the device in; name its port"
         )
     wanted = [port] if port else ports
     closed = [p for p in wanted if not os.access(p, os.R_OK | os.W_OK)]
     if closed:
         remedy = "sudo usermod -aG dialout $USER, then log in again"
-        return Check("serial port", FAULTY, f"no permission to open {', '.join(closed)}", remedy)
-    return Check("serial port", FINE, ", ".join(wanted) or "none on this computer")
+        return HostCheck(
+            "serial port", FAULTY, f"no permission to open {', '.join(closed)}", remedy
+        )
+    return HostCheck("serial port", FINE, ", ".join(wanted) or "none on this computer")
 
 
-def _clock(synchronised: Callable[[], bool | None]) -> Check:
+def _clock(synchronised: Callable[[], bool | None]) -> HostCheck:
     """Return whether stamps of this computer can be compared with those of another."""
     remedy = "sudo timedatectl set-ntp true, where stamps of several computers are compared"
     by_hand = "see that chrony or another NTP client runs, where several computers are compared"
     states = {
-        True: Check("clock", FINE, "synchronised"),
-        False: Check("clock", DOUBTFUL, "not synchronised", remedy),
-        None: Check("clock", DOUBTFUL, "not evaluated: timedatectl says nothing here", by_hand),
+        True: HostCheck("clock", FINE, "synchronised"),
+        False: HostCheck("clock", DOUBTFUL, "not synchronised", remedy),
+        None: HostCheck("clock", DOUBTFUL, "not evaluated: timedatectl says nothing here", by_hand),
     }
     return states[synchronised()]
 
@@ -184,14 +188,16 @@ def _kernel_clock_synchronised() -> bool | None:
     return {"yes": True, "no": False}.get(done.stdout.strip())
 
 
-def _disk(folder: Path) -> Check:
+def _disk(folder: Path) -> HostCheck:
     there = folder.absolute()
     while not there.exists():
         there = there.parent
     if not os.access(there, os.W_OK):
-        return Check("disk", FAULTY, f"no permission to write in {there}", "choose another folder")
+        return HostCheck(
+            "disk", FAULTY, f"no permission to write in {there}", "choose another folder"
+        )
     hours = shutil.disk_usage(there).free / _BYTES_PER_HOUR
     found = f"room for {hours:.0f} hours of recording at 1 kHz in {there}"
     if hours < _ENOUGH_HOURS:
-        return Check("disk", DOUBTFUL, found, "free some space, or record elsewhere")
-    return Check("disk", FINE, found)
+        return HostCheck("disk", DOUBTFUL, found, "free some space, or record elsewhere")
+    return HostCheck("disk", FINE, found)

@@ -9,25 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.comparison.stated_errors import Fields, Measurement
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement, ErrorFields
 from omsm_ros.core.correction.systematic import ScanFields
-from omsm_ros.core.form.analyse import Form, analyse_form
+from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import conformity
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.degrees_of_freedom import MOVES, Registration
 from omsm_ros.core.registration.placement import (
-    FREEDOMS,
+    DEGREES_OF_FREEDOM,
     Aperture,
     Placed,
-    Portion,
-    Portions,
+    PointBatch,
+    PointBatches,
     placed,
 )
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.core.surface.deviation import unlike
+from omsm_ros.core.surface.deviation import mismatch_text
 from omsm_ros.core.surface.height_grid import as_grid
-from omsm_ros.core.surface.measured_points import MeasuredPoints, each_once
+from omsm_ros.core.surface.measured_points import MeasuredPoints, without_duplicates
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.maps.read_map import read_points
@@ -51,7 +51,7 @@ class MeasurementMeasuredPortions:
     missing: how many points of a map, beside these, have no height
     """
 
-    portions: Portions
+    portions: PointBatches
     sources: tuple[str, ...]
     systematic: bool
     notes: tuple[str, ...] = ()
@@ -65,7 +65,7 @@ class MeasurementMeasuredPortions:
         asked: Sequence[str],
         aperture: Aperture | None = None,
         filters: tuple[float | None, float | None] = (None, None),
-    ) -> Form:
+    ) -> FormResult:
         """Return the form against ``surface``, with all that is known of the points."""
         return analyse_form(
             surface,
@@ -93,14 +93,14 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     try:
         cloud = CloudFile(file)
     except FileError:
-        points = each_once(read_points(file, units))
+        points = without_duplicates(read_points(file, units))
         gridded = as_grid(points) is not None
         return MeasurementMeasuredPortions(
             lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
         )
     notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
-    beside = file.with_name(SYSTEMATIC)
-    fields = load_fields(beside) if beside.is_file() else None
+    fields_path = file.with_name(SYSTEMATIC)
+    fields = load_fields(fields_path) if fields_path.is_file() else None
     if fields is None:
         return MeasurementMeasuredPortions(lambda: _portions(cloud, None), (), False, notes)
     return MeasurementMeasuredPortions(
@@ -108,19 +108,19 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     )
 
 
-def _slices(points: MeasuredPoints) -> Iterator[Portion]:
+def _slices(points: MeasuredPoints) -> Iterator[PointBatch]:
     for first in range(0, len(points), _PORTION):
         part = slice(first, first + _PORTION)
         x, y, height = points.x[part], points.y[part], points.height[part]
-        yield Portion(x, y, height, np.empty((0, len(x))))
+        yield PointBatch(x, y, height, np.empty((0, len(x))))
 
 
-def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[Portion]:
+def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatch]:
     first = 0
     for rows in cloud.portions(_PORTION):
         x, y, height = (rows[name].astype(np.float64) for name in ("x", "y", "height"))
         effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
-        yield Portion(x, y, height, effects)
+        yield PointBatch(x, y, height, effects)
         first += len(x)
 
 
@@ -169,19 +169,19 @@ def draw_form(measured: Path, out: Path) -> None:
     from omsm_ros.pipelines.publish import publish_form
 
     folder = measured if measured.is_dir() else measured.parent
-    beside = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
-    summary = read_summary(beside) if beside and beside.is_file() else None
+    fields_path = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
+    summary = read_summary(fields_path) if fields_path and fields_path.is_file() else None
     publish_form(out, f"Form of {measured.resolve().name}", summary)
 
 
-def _deviations(form: Form) -> np.ndarray[Any, np.dtype[np.void]]:
+def _deviations(form: FormResult) -> np.ndarray[Any, np.dtype[np.void]]:
     table = np.empty(len(form.map), [(name, "<f8") for name in "xyz"])
     table["x"], table["y"], table["z"] = form.map.x, form.map.y, form.map.deviation
     return table
 
 
 def form_facts(
-    form: Form, measured: MeasurementMeasuredPortions, nominal: Surface
+    form: FormResult, measured: MeasurementMeasuredPortions, nominal: Surface
 ) -> dict[str, Any]:
     """Return the content of ``form.json``; lengths in metres, angles in radians."""
     found = form.registration
@@ -189,22 +189,22 @@ def form_facts(
     return {
         "pose": {
             name: {"value": placement.value(name), "uncertainty": found.uncertainty(name)}
-            for name in FREEDOMS
+            for name in DEGREES_OF_FREEDOM
         },
         "deviation": {name: figure.entry() for name, figure in form.deviation.items()},
         "zernike": _terms(form),
         "removed": {
-            "fitted": list(found.freedoms.fitted),
-            "not_determined": dict(found.freedoms.refused),
-            "held": dict(found.freedoms.held),
+            "fitted": list(found.dofs.fitted),
+            "not_determined": dict(found.dofs.refused),
+            "held": dict(found.dofs.held),
             "pose_uncertainty": {
-                source: dict(zip(found.freedoms.fitted, map(float, shares), strict=True))
+                source: dict(zip(found.dofs.fitted, map(float, shares), strict=True))
                 for source, shares in found.from_source.items()
             },
             "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
             "notes": [
                 *measured.notes,
-                *_unlike(form, nominal),
+                *_mismatch_text(form, nominal),
                 *_advice(form),
             ],
         },
@@ -221,21 +221,21 @@ def form_facts(
     }
 
 
-def _unlike(form: Form, nominal: Surface) -> list[str]:
+def _mismatch_text(form: FormResult, nominal: Surface) -> list[str]:
     x, y = form.map.x, form.map.y
-    return unlike(x, y, nominal.height(x, y) + form.map.deviation, nominal)
+    return mismatch_text(x, y, nominal.height(x, y) + form.map.deviation, nominal)
 
 
-def _counts(form: Form, missing: int) -> dict[str, int]:
+def _counts(form: FormResult, missing: int) -> dict[str, int]:
     """Return every point by what became of it, and those that never had a height."""
     added = {name: form.counts[name] + missing for name in ("read", "not_finite")}
     return form.counts | added
 
 
-def _advice(form: Form) -> list[str]:
+def _advice(form: FormResult) -> list[str]:
     """Return what would say more, where a move leaves less of the form than it is sure of."""
-    freedoms, rms = form.registration.freedoms, form.deviation["rms"]
-    fitted = [n for n in freedoms.fitted if n in MOVES]
+    dofs, rms = form.registration.dofs, form.deviation["rms"]
+    fitted = [n for n in dofs.fitted if n in MOVES]
     if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:
         fitted = []
     advice = [
@@ -243,10 +243,10 @@ def _advice(form: Form) -> list[str]:
         "is known of form that looks so; the figures of the best fit hold all the same; if the "
         "part was not moved since it was cut, hold it: --fit piston,tip,tilt"
     ] * bool(fitted)
-    if freedoms.held:
-        others = ",".join(n for n in freedoms.fitted if n not in freedoms.held)
+    if dofs.held:
+        others = ",".join(n for n in dofs.fitted if n not in dofs.held)
         advice.append(
-            f"{' and '.join(freedoms.held)} held as in the nominal pose, for form looks like a "
+            f"{' and '.join(dofs.held)} held as in the nominal pose, for form looks like a "
             "move there; how far the part may be off all the same is in every uncertainty but "
             "those of the best fit, which no move changes; if it "
             f"is known to sit within a micrometre, name what to fit: --fit {others}"
@@ -254,7 +254,7 @@ def _advice(form: Form) -> list[str]:
     return advice
 
 
-def _curves(form: Form) -> dict[str, Any]:
+def _curves(form: FormResult) -> dict[str, Any]:
     density = form.density
     x, y, areal = density.coarse(_MOST_BLOCKS)
     return {
@@ -273,7 +273,7 @@ def _curves(form: Form) -> dict[str, Any]:
     }
 
 
-def _terms(form: Form) -> list[dict[str, Any]]:
+def _terms(form: FormResult) -> list[dict[str, Any]]:
     fit = form.zernike
     known = [
         {"n": t.n, "m": t.m, "value": float(value), "uncertainty": float(spread)}
@@ -288,7 +288,9 @@ _PORTION_REGISTERED_POINTS = 65_536
 POSE = "pose of the part"
 
 
-def registered(m: Measurement, nominal: Surface, freedoms: Sequence[str]) -> Measurement:
+def registered(
+    m: ComparedMeasurement, nominal: Surface, dofs: Sequence[str]
+) -> ComparedMeasurement:
     """Return the measurement's deviations along the normal, in the frame of its part.
 
     Its errors are what they are once the pose has followed them, and the pose's own are one more
@@ -299,14 +301,14 @@ def registered(m: Measurement, nominal: Surface, freedoms: Sequence[str]) -> Mea
     points, fields = m.points, m.fields
     names = fields.names if fields is not None else ()
 
-    def portions() -> Iterator[Portion]:
+    def portions() -> Iterator[PointBatch]:
         for first in range(0, len(points), _PORTION_REGISTERED_POINTS):
             part = slice(first, first + _PORTION_REGISTERED_POINTS)
             x, y, height = points.x[part], points.y[part], points.height[part]
             effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
-            yield Portion(x, y, height, effects)
+            yield PointBatch(x, y, height, effects)
 
-    found = register(nominal, portions, freedoms, sources=names, even=as_grid(points) is not None)
+    found = register(nominal, portions, dofs, sources=names, even=as_grid(points) is not None)
     where = [placed(nominal, found.placement, portion) for portion in portions()]
     whole = Placed(*(np.concatenate(parts, axis=-1) for parts in zip(*where, strict=True)))
     kept = np.flatnonzero(np.isfinite(whole.deviation))
@@ -315,8 +317,8 @@ def registered(m: Measurement, nominal: Surface, freedoms: Sequence[str]) -> Mea
     return replace(
         m,
         points=_points(points, placed_points, kept, found),
-        fields=None if fields is None else _Followed(found, placed_points, kept, fields),
-        pose=_OfPose(found, placed_points),
+        fields=None if fields is None else _RegisteredFields(found, placed_points, kept, fields),
+        pose=_PoseFields(found, placed_points),
     )
 
 
@@ -324,7 +326,7 @@ def _points(
     points: MeasuredPoints, at: Placed, kept: IntArray, found: Registration
 ) -> MeasuredPoints:
     note = "registered by " + ", ".join(
-        f"{name} {found.placement.value(name):.4g}" for name in found.freedoms.fitted
+        f"{name} {found.placement.value(name):.4g}" for name in found.dofs.fitted
     )
     left_out = len(points) - len(kept)
     return replace(
@@ -337,13 +339,13 @@ def _points(
 
 
 @dataclass(frozen=True, eq=False)
-class _Followed:
+class _RegisteredFields:
     """Fields of a scan once the pose has followed each error, as ``omsm form`` has them."""
 
     found: Registration
     at_: Placed
     kept: IntArray
-    fields: Fields
+    fields: ErrorFields
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -359,7 +361,7 @@ class _Followed:
 
 
 @dataclass(frozen=True, eq=False)
-class _OfPose:
+class _PoseFields:
     """What the pose may be wrong by, one row an independent part of it."""
 
     found: Registration

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration, verdict_of
-from omsm_ros.core.calibration.trend import Trend, trend
+from omsm_ros.core.calibration.trend import LinearTrend, trend
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration
@@ -99,13 +99,13 @@ class MachineHistory:
     machine: str
     calibrations: list[dict[str, Any]]
     measurements: list[dict[str, Any]]
-    delay: Trend | None
-    static_gain: Trend | None
-    deviation: Trend | None
+    delay: LinearTrend | None
+    static_gain: LinearTrend | None
+    deviation: LinearTrend | None
 
 
 @dataclass(frozen=True, slots=True)
-class History:
+class CatalogueHistory:
     """What a catalogue holds, machine by machine.
 
     older: how many calibrations and measurements are older than those listed; zero unless a
@@ -116,7 +116,7 @@ class History:
     older: int
 
 
-def history(address: str, machine: str = "") -> History:
+def history(address: str, machine: str = "") -> CatalogueHistory:
     """Return what the catalogue holds; of one machine, or of all."""
     older = 0
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
@@ -128,7 +128,7 @@ def history(address: str, machine: str = "") -> History:
             for row in found:
                 name = row["machine"] or ""
                 rows.setdefault(name, {table: [] for table in _TABLES})[table].append(row)
-    return History([_of(name, **rows[name]) for name in sorted(rows)], older)
+    return CatalogueHistory([_of(name, **rows[name]) for name in sorted(rows)], older)
 
 
 def _of(
@@ -142,7 +142,7 @@ def _of(
     )  # fmt: skip
 
 
-def _trend(rows: list[dict[str, Any]], name: str) -> Trend | None:
+def _trend(rows: list[dict[str, Any]], name: str) -> LinearTrend | None:
     values = np.array([np.nan if row[name] is None else row[name] for row in rows], np.float64)
     times = np.array([_seconds(row["recorded_at"]) for row in rows], np.float64)
     return trend(times, values)
@@ -189,7 +189,7 @@ def _recorded(bag: Path | None) -> int | None:
 # Writing something into the catalogue must never cost a measurement.
 
 
-def remembered(address: str, keep: Callable[[], bool]) -> list[str]:
+def record_in_catalogue(address: str, keep: Callable[[], bool]) -> list[str]:
     """Write something down if there is a catalogue; return a warning where that failed.
 
     A measurement is never lost because of a database: it lies in its folder already.

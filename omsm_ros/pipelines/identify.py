@@ -28,7 +28,7 @@ from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import read_blocks
 from omsm_ros.quantities import TIME_LAPSE
-from omsm_ros.readable import moment, quantity
+from omsm_ros.readable import date_text, quantity
 from omsm_ros.report.certificate.markdown import picture_name, render_markdown
 from omsm_ros.report.certificate.model_page import ModelPage, model_figures_of, render_model
 from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
@@ -233,4 +233,4 @@ def write_model_page(
 
 
 def _today() -> str:
-    return moment(datetime.now(timezone.utc))
+    return date_text(datetime.now(timezone.utc))

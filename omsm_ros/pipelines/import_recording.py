@@ -17,18 +17,18 @@ from omsm_ros.core.streams.imported_columns import (
     MOST_PERIOD_ERROR,
     PROBE,
     ColumnMap,
-    Rows,
+    TableRows,
     axis_blocks,
     check_epoch,
     counter_of_times,
     counter_of_triggers,
     distance_blocks,
-    in_step,
     period_of,
+    share_trigger,
 )
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.io import bags
-from omsm_ros.io.bag_writer import whole_bag
+from omsm_ros.io.bag_writer import atomic_bag
 from omsm_ros.io.tables.open_tables import open_tables
 from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -72,7 +72,7 @@ class RowCounter:
         number = self._triggers(first)[0] if self._triggered else 0
         return float(times[0]) - number * self._period, self._period
 
-    def count(self, piece: Mapping[str, FloatArray]) -> Rows:
+    def count(self, piece: Mapping[str, FloatArray]) -> TableRows:
         """Return the numbers and times of the next rows (column name → (n,))."""
         times, origin = self._times(piece), self.origin
         number = -1 if self._last is None else self._last[1]
@@ -85,7 +85,7 @@ class RowCounter:
             counter = np.arange(number + 1, number + 1 + len(next(iter(piece.values()))))
         elapsed = counter * self._period if times is None else times - origin.epoch
         self._last = (0.0 if times is None else float(times[-1]), int(counter[-1]))
-        return Rows(counter, elapsed, self._period, origin.start)
+        return TableRows(counter, elapsed, self._period, origin.start)
 
     def _times(self, piece: Mapping[str, FloatArray]) -> FloatArray | None:
         if not self._timed:
@@ -153,7 +153,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
     topics = [bags.AXES_TOPIC] * any(source.found.axes for source in sources)
     topics += [bags.DISTANCE_TOPIC] * any(source.found.distance for source in sources)
     done = 0
-    with whole_bag(out, topics) as bag:
+    with atomic_bag(out, topics) as bag:
         # By time, as they would have been recorded, so that no reader has to keep one back.
         merged = heapq.merge(*(s.blocks() for s in streams), key=lambda block: block.stamp_ns)
         for block in merged:
@@ -196,7 +196,7 @@ def _check_counted(streams: Sequence[_Stream]) -> None:
 
 
 @contextmanager
-def _told_of(file: str) -> Iterator[None]:
+def _import_remarks(file: str) -> Iterator[None]:
     """Name the file where its rows cannot be counted."""
     try:
         yield
@@ -214,7 +214,7 @@ class _Stream:
         self.counted = bool({*COUNTING} & {*channels})
         self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
         first = sources[0].first()
-        with _told_of(sources[0].found.file):
+        with _import_remarks(sources[0].found.file):
             self.begins, self.period = self.counter.begin(first)
 
     def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:
@@ -231,7 +231,7 @@ def _align(streams: Sequence[_Stream], mapped: ColumnMap) -> None:
     epoch = min(begun)
     start = epoch if mapped.dated else mapped.start
     counted = len(begun) < len(streams) or any(s.triggered for s in streams)
-    together = counted or in_step(begun, [s.period for s in streams])
+    together = counted or share_trigger(begun, [s.period for s in streams])
     for stream in streams:
         own = stream.begins is not None and not together
         stream.counter.origin = Origin(start, epoch, stream.begins if own else epoch)
@@ -302,7 +302,7 @@ class _Source:
         """Yield the file's blocks; ``counter`` goes on from the file before."""
         found = self.found
         for piece in self._pieces():
-            with _told_of(found.file):
+            with _import_remarks(found.file):
                 rows = counter.count(piece)
             skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
             self._last = int(rows.counter[-1])
@@ -313,12 +313,12 @@ class _Source:
         found.repeated_names = self._table.repeated_names
         found.passed_over = self._table.passed_over
 
-    def _number(self, rows: Rows) -> int:
+    def _number(self, rows: TableRows) -> int:
         """Return the trigger number before those of ``rows``."""
         return int(rows.counter[0]) - 1 if self._last is None else self._last
 
     def _made(
-        self, piece: Mapping[str, FloatArray], rows: Rows
+        self, piece: Mapping[str, FloatArray], rows: TableRows
     ) -> Iterator[AxisBlock | DistanceBlock]:
         found = self.found
         if found.axes:

@@ -80,20 +80,20 @@ def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspecti
     return Inspection(streams, [*faults, *_faults(watches)], vibration)
 
 
-def _vibration(told: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
+def _vibration(levels: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
     """Return the largest levels of all spectra that the monitor told; None of none.
 
     rms: of each axis by band [m/s²];  height, height_total: effect on a height, rms [m], None
     where no calibration told it;  alarms: spectra during which the alarm was raised
     """
     # Bands follow the sampling rate, so they are those of the last.
-    alike = [one for one in told if one["bands"] == told[-1]["bands"]]
+    alike = [one for one in levels if one["bands"] == levels[-1]["bands"]]
     if not alike:
         return None
     heights = [one for one in alike if one["height"] is not None]
     return {
-        "spectra": len(told),
-        "alarms": sum(one["alarm"] for one in told),
+        "spectra": len(levels),
+        "alarms": sum(one["alarm"] for one in levels),
         "bands": alike[-1]["bands"],
         "rms": {axis: _largest(one["rms"][axis] for one in alike) for axis in alike[-1]["rms"]},
         "height": _largest(one["height"] for one in heights) if heights else None,

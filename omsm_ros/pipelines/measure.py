@@ -12,31 +12,36 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from omsm_ros import __version__
-from omsm_ros.core.calibration.calibration import Calibration, age_at, beyond_lag, latency_of
+from omsm_ros.core.calibration.calibration import (
+    Calibration,
+    age_at,
+    excess_latency_text,
+    latency_of,
+)
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.budget import (
-    Light,
-    Reason,
     ScanBudget,
-    light_of,
-    noisier,
+    TrafficLight,
+    TrafficLightReason,
+    excess_noise_reasons,
     scan_budget,
+    traffic_light_of,
 )
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, RANDOM, MachineSources
 from omsm_ros.core.correction.predict import predict_error
-from omsm_ros.core.correction.systematic import resolves_turns, scan_fields
+from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fields
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.deviation import unlike
+from omsm_ros.core.surface.deviation import mismatch_text
 from omsm_ros.errors import DataError
 from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.results import save_fields
 from omsm_ros.io.topics import AnyBag
-from omsm_ros.pipelines.correct import Admission, ByStamps, Correction, correct_bag
+from omsm_ros.pipelines.correct import Admission, Correction, StampJoining, correct_bag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
 
@@ -48,7 +53,7 @@ if TYPE_CHECKING:
 
 # What a fit takes out of the deviations is no error of theirs any more; how well it does is in
 # the uncertainty of the form.
-_POSE_FREEDOMS: Mapping[str, tuple[str, ...]] = {
+_POSE_DOFS: Mapping[str, tuple[str, ...]] = {
     "tilt": ("tip", "tilt"),
     "decentre": ("x", "y"),
     "clocking": ("clocking",),
@@ -67,8 +72,8 @@ def with_sources(
     known = options.sources or ErrorSources.of(calibration)
     return replace(
         options,
-        sources=replace(known, **stated.of_points()),
-        systematic=stated.of_the_scan(),
+        sources=replace(known, **stated.point_uncertainties()),
+        systematic=stated.scan_sources(),
         surface=nominal,
     )
 
@@ -107,19 +112,21 @@ class Judgement:
             trace.with_slopes(options.surface) if len(trace) else trace,
             done.trace.seen,
         )
-        if self.out is not None and len(trace) and resolves_turns(trace):
+        if self.out is not None and len(trace) and resolves_per_turn_waves(trace):
             kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
             save_fields(self.out / SYSTEMATIC, kept)
         return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
 
-    def _light(self, budget: ScanBudget, done: Correction, calibration: Calibration) -> Light:
-        counts = _POSE_FREEDOMS if self.options.surface is not None else {}
+    def _light(
+        self, budget: ScanBudget, done: Correction, calibration: Calibration
+    ) -> TrafficLight:
+        counts = _POSE_DOFS if self.options.surface is not None else {}
         fitted = [
             name
-            for name, freedoms in _POSE_FREEDOMS.items()
-            if "auto" in self.fitted or set(freedoms) <= set(self.fitted)
+            for name, dofs in _POSE_DOFS.items()
+            if "auto" in self.fitted or set(dofs) <= set(self.fitted)
         ]
-        return light_of(
+        return traffic_light_of(
             calibration,
             {name: size for name, size in budget.heights.items() if name not in fitted},
             self.stated,
@@ -130,44 +137,44 @@ class Judgement:
         )
 
 
-def live_light(
+def live_traffic_light(
     corrector: Corrector,
     calibration: Calibration,
     stated: MachineSources,
     accuracy: float | None,
-) -> Light:
+) -> TrafficLight:
     """Return the light of what has been corrected so far, by the uncertainty of its points."""
     shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
-    return light_of(
+    return traffic_light_of(
         calibration,
         shared,
         stated,
         accuracy=accuracy,
         pose_open=(),
-        doubts=(*noisier(corrector.budget), *_without_slopes(corrector, stated)),
+        doubts=(*excess_noise_reasons(corrector.budget), *_without_slopes(corrector, stated)),
     )
 
 
-def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[Reason]:
-    lateral = {s.name for s in stated.of_the_scan() if s.needs_slope and s.standard_uncertainty}
+def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[TrafficLightReason]:
+    lateral = {s.name for s in stated.scan_sources() if s.needs_slope and s.standard_uncertainty}
     missing = sorted(lateral - set(corrector.budget))
     if missing and corrector.trace.seen:
-        yield Reason(
+        yield TrafficLightReason(
             f"{', '.join(missing)} not in the uncertainty of the points: no slopes are known",
             "give the corrector the part's surface (parameter nominal)",
         )
 
 
-def _losses(done: Correction) -> Iterator[Reason]:
-    yield from map(Reason, done.faults)
-    yield from noisier(done.budget)
+def _losses(done: Correction) -> Iterator[TrafficLightReason]:
+    yield from map(TrafficLightReason, done.faults)
+    yield from excess_noise_reasons(done.budget)
     for text in done.reasons:
-        yield Reason(
+        yield TrafficLightReason(
             f"the calibration was used although {text}",
             "identify as the scan is made, and correct with that calibration",
         )
     if beyond := done.account["axes"]["counted"].get("beyond"):
-        yield Reason(
+        yield TrafficLightReason(
             f"{beyond} samples lie beyond the range of the calibration set",
             "calibrate there too, and make the set anew with 'omsm calset'",
         )
@@ -175,21 +182,21 @@ def _losses(done: Correction) -> Iterator[Reason]:
         lost = stream["received"] - stream["corrected"]
         if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
             share = 100 * lost / stream["received"]
-            yield Reason(
+            yield TrafficLightReason(
                 f"{name}: {lost} samples ({share:.1f} %) gave no point",
                 "see the reasons of the account; run slower where the probe lost its target",
             )
 
 
 @dataclass(frozen=True)
-class Registering:
+class RegistrationOptions:
     """How a part is registered to its nominal surface, and judged.
 
-    freedoms: of the fit, or "auto";  aperture: of the part, None for all points
+    dofs: of the fit, or "auto";  aperture: of the part, None for all points
     tolerance: of the peak to valley of 99.5 % [m], if there is one
     """
 
-    freedoms: Sequence[str]
+    dofs: Sequence[str]
     aperture: Aperture | None = None
     tolerance: float | None = None
 
@@ -203,10 +210,10 @@ def measure(
     options: CorrectionOptions | None = None,
     admission: Admission | None = None,
     lateral: float = 0.0,
-    by_stamps: ByStamps | None = None,
+    by_stamps: StampJoining | None = None,
     stated: MachineSources = NOTHING_STATED,
     accuracy: float | None = None,
-    register: Registering | None = None,
+    register: RegistrationOptions | None = None,
     report: bool = True,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
@@ -234,7 +241,7 @@ def measure(
         by_stamps=by_stamps,
         progress=progress,
     )
-    fitted = register.freedoms if register is not None else ()
+    fitted = register.dofs if register is not None else ()
     summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out, fitted))
     if register is not None and nominal is not None and done.statistics:
         add_form(out, summary, nominal, register)
@@ -246,11 +253,11 @@ def measure(
     return summary
 
 
-def _unlike(done: Correction, nominal: Surface | None) -> list[str]:
+def _mismatch_text(done: Correction, nominal: Surface | None) -> list[str]:
     if nominal is None:
         return []
     x, y = (done.points[name].astype(np.float64) for name in "xy")
-    return unlike(x, y, done.points["height"], nominal)
+    return mismatch_text(x, y, done.points["height"], nominal)
 
 
 def _publish(
@@ -270,7 +277,9 @@ def _publish(
     publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
 
 
-def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Registering) -> None:
+def add_form(
+    out: Path, summary: dict[str, Any], nominal: Surface, register: RegistrationOptions
+) -> None:
     """Register the cloud in ``out``, and say in the ``summary`` what came of it."""
     # Here, because most corrections do without.
     from omsm_ros.pipelines.form import judge_form, open_measurement
@@ -279,7 +288,7 @@ def add_form(out: Path, summary: dict[str, Any], nominal: Surface, register: Reg
         open_measurement(out),
         nominal,
         out,
-        register.freedoms,
+        register.dofs,
         register.aperture,
         tolerance=register.tolerance,
     )
@@ -322,8 +331,8 @@ def summarise(
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
-    summary["warnings"] += _unlike(done, judgement.options.surface)
-    if (late := beyond_lag(calibration, judgement.options.lateral_lag or 0.0)) is not None:
+    summary["warnings"] += _mismatch_text(done, judgement.options.surface)
+    if (late := excess_latency_text(calibration, judgement.options.lateral_lag or 0.0)) is not None:
         summary["warnings"].append(late)
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
@@ -334,17 +343,17 @@ def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:
 
     Each is None where nobody recorded it.
     """
-    told = done.temperatures[np.isfinite(done.temperatures)]
+    valid_temperatures = done.temperatures[np.isfinite(done.temperatures)]
     return {
         "recorded_ns": done.recorded_ns,
         "calibration_age": age_at(calibration, done.recorded_ns),
         "temperature": None
-        if not len(told)
+        if not len(valid_temperatures)
         else {
-            "mean": float(np.mean(told)),
-            "lowest": float(np.min(told)),
-            "highest": float(np.max(told)),
-            "change": float(told[-1] - told[0]),
+            "mean": float(np.mean(valid_temperatures)),
+            "lowest": float(np.min(valid_temperatures)),
+            "highest": float(np.max(valid_temperatures)),
+            "change": float(valid_temperatures[-1] - valid_temperatures[0]),
         },
     }
 

@@ -32,7 +32,7 @@ from omsm_ros.report.spectrum import CAPTIONS, drawn
 from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.part import Spokes
+from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.plant import PAPER_DYNAMICS
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, on_a_flat, planned_test_of, scan_of
@@ -127,7 +127,7 @@ def circle_scan(name: str, seed: int) -> Recording:
     )
     cell = Cell(seed=seed, probe=_TEXTURE_PROBE, disturbances=errors)
     motion = Circle(Flat(), CIRCLE_RADIUS_M, rpm, turns=_CIRCLE_SECONDS * rpm * RPM_HZ)
-    return record(cell, motion, Spokes(Flat(), CIRCLE_RADIUS_M))
+    return record(cell, motion, AzimuthalRipple(Flat(), CIRCLE_RADIUS_M))
 
 
 def _scanned(out: Path, names: tuple[str, ...], seed: int) -> list[SpectrumOfScan]:
@@ -161,9 +161,9 @@ def _circles(out: Path, seed: int) -> _Done:
 def _vibration(out: Path, seed: int) -> _Done:
     scans = _scanned(out, ("F2", "F3"), seed)
     quiet, shaken = scans
-    folded = [row for row in shaken.named if row.kind == FOLDED]
-    seen = folded[0].line.possible["time"] if folded else float("nan")
-    true = folded[0].frequency if folded else float("nan")
+    aliased = [row for row in shaken.named if row.kind == FOLDED]
+    seen = aliased[0].line.possible["time"] if aliased else float("nan")
+    true = aliased[0].frequency if aliased else float("nan")
     still = sum(row.kind != PART for row in quiet.named)
     rows = [
         Compared("vibration that F3 feels", "680 Hz", quantity(true, "Hz", 5)),
@@ -171,7 +171,7 @@ def _vibration(out: Path, seed: int) -> _Done:
                  "the paper's own formula gives 320 Hz"),
         Compared("lines of F2 that are not on the part", "minimal vibration", str(still)),
         Compared("false wavelength in F3", "20 µm",
-                 quantity(1 / folded[0].line.possible["path"] if folded else None, "m"),
+                 quantity(1 / aliased[0].line.possible["path"] if aliased else None, "m"),
                  "33.93 µm a sample at 320 Hz; 20 µm would take a radius of 4.1 mm"),
     ]  # fmt: skip
     return _spectrum_page(scans, rows, "A vibration that folds (Fig. 11)",

@@ -20,7 +20,7 @@ def no_progress(done: int, total: int) -> None:
 _TICK_S = 0.5
 
 
-class Line(Protocol):
+class ProgressLine(Protocol):
     """What shows a time, as a bar of ``tqdm`` does."""
 
     def refresh(self) -> object:
@@ -28,7 +28,7 @@ class Line(Protocol):
 
 
 @contextmanager
-def beside(show: Callable[[Event], object]) -> Iterator[None]:
+def refresh_in_thread(show: Callable[[Event], object]) -> Iterator[None]:
     """Let ``show`` run in a thread of its own; its event is set at the end, which waits for it."""
     done = Event()
     shown = Thread(target=show, args=(done,), daemon=True)
@@ -40,7 +40,7 @@ def beside(show: Callable[[Event], object]) -> Iterator[None]:
         shown.join()
 
 
-def tick(line: Line, done: Event) -> None:
+def tick(line: ProgressLine, done: Event) -> None:
     """Refresh ``line`` twice a second until ``done``."""
     while not done.wait(_TICK_S):
         line.refresh()

@@ -38,7 +38,7 @@ from omsm_ros.pipelines.spectrum import (
     summary_of,
     without_bands,
 )
-from omsm_ros.readable import moment, quantity
+from omsm_ros.readable import date_text, quantity
 from omsm_ros.report import style
 from omsm_ros.report.measurement.figures import levelled, surface_figures
 from omsm_ros.report.measurement.form_figures import form_figures
@@ -114,7 +114,7 @@ def publish(
     curves = read_curves(out / CURVES) if (out / CURVES).is_file() else {}
     if form:
         figures = {**figures, **form_figures(form, curves)}
-    date = moment(datetime.now(timezone.utc))
+    date = date_text(datetime.now(timezone.utc))
     page = render(Report(title, date, summary, calibration, figures, form, curves, surface))
     save_text(out / REPORT, page)
 

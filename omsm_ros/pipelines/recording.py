@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from omsm_ros.core.kinematics.scan_path import PathStart, ScanPath
+from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
 from omsm_ros.core.streams.blocks import Block
 from omsm_ros.errors import BagError
 from omsm_ros.io import bags
@@ -38,7 +38,7 @@ def sample_period_in(path: AnyBag) -> float:
 
 def path_in(path: AnyBag, progress: Progress = no_progress) -> ScanPath:
     """Return the start of the path that a bag holds, with its readings where it has some."""
-    start = PathStart(MOST_JUDGED)
+    start = ScanPathReader(MOST_JUDGED)
     with bags.BagReader(path) as bag:
         wanted = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
         present = [t.role for t in bag.topics() if t.messages and t.role in wanted]

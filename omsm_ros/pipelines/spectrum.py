@@ -15,9 +15,13 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.ripple.accelerometer import Felt, accelerations_of, felt
+from omsm_ros.core.ripple.accelerometer import (
+    AccelerationLines,
+    acceleration_lines,
+    accelerations_of,
+)
 from omsm_ros.core.ripple.density import BandStopped, Density, band_stop, density
-from omsm_ros.core.ripple.ripple_guard import Named, name_lines, study_all
+from omsm_ros.core.ripple.ripple_guard import NamedLine, analyse_scans, name_lines
 from omsm_ros.core.ripple.scan_signal import (
     PATH,
     RADIUS,
@@ -70,7 +74,7 @@ class SpectrumOfScan:
     """
 
     studied: StudiedScan
-    named: list[Named]
+    named: list[NamedLine]
     motion: Density
     points: SurfacePoints
     account: dict[str, Any]
@@ -81,7 +85,7 @@ class SpectrumOfScan:
 @dataclass(frozen=True, eq=False)
 class _Read:
     signal: ScanSignal
-    felt: Felt | None
+    acceleration_lines: AccelerationLines | None
     points: SurfacePoints
     motion: Density
     account: dict[str, Any]
@@ -98,7 +102,7 @@ def spectra_of(
     """
     names = _names(paths)
     read = [_read(path, name, options, progress) for path, name in zip(paths, names, strict=True)]
-    studied = study_all([(one.signal, one.felt) for one in read])
+    studied = analyse_scans([(one.signal, one.acceleration_lines) for one in read])
     named = name_lines(studied)
     return [
         SpectrumOfScan(
@@ -144,7 +148,7 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     signal = scan_signal(name, period, (points.sample, height), (count, x, y, c))
     return _Read(
         signal=signal,
-        felt=_felt(path),
+        acceleration_lines=_acceleration_lines(path),
         points=points,
         motion=_motion_density(z, period),
         account=account,
@@ -152,12 +156,14 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     )
 
 
-def _felt(path: AnyBag) -> Felt | None:
+def _acceleration_lines(path: AnyBag) -> AccelerationLines | None:
     with bags.BagReader(path) as bag:
         if not any(t.role == bags.ACCELERATION_TOPIC and t.messages for t in bag.topics()):
             return None
         blocks = [block for _, block in bag.records(bags.ACCELERATION_TOPIC)]
-    return felt(*accelerations_of([b for b in blocks if isinstance(b, AccelerationBlock)]))
+    return acceleration_lines(
+        *accelerations_of([b for b in blocks if isinstance(b, AccelerationBlock)])
+    )
 
 
 def _motion_density(z: FloatArray, period: float) -> Density:
@@ -220,7 +226,7 @@ def _scan_facts(scan: SpectrumOfScan, options: SpectrumOptions) -> dict[str, Any
             "amplitude": float(np.median(studied.spectrum.amplitude_floor)),
         },
         "motion": _motion_facts(scan.motion, options.calibration),
-        "accelerometer": _felt_facts(studied.felt),
+        "accelerometer": _acceleration_facts(studied.acceleration_lines),
         "peaks": [_peak_facts(studied, row) for row in scan.named],
         "band_stop": _stop_facts(scan, options.stop),
     }
@@ -240,14 +246,14 @@ def _motion_facts(motion: Density, calibration: Calibration | None) -> dict[str,
     }
 
 
-def _felt_facts(found: Felt | None) -> dict[str, Any] | None:
+def _acceleration_facts(found: AccelerationLines | None) -> dict[str, Any] | None:
     if found is None:
         return None
     lines = [asdict(line) | {"displacement": line.displacement} for line in found.lines]
     return {"highest": found.highest, "duration": found.duration, "lines": lines}
 
 
-def _peak_facts(studied: StudiedScan, row: Named) -> dict[str, Any]:
+def _peak_facts(studied: StudiedScan, row: NamedLine) -> dict[str, Any]:
     line = row.line
     possible = line.possible
     place = studied.coordinates[line.coordinate]

@@ -18,7 +18,7 @@ from omsm_ros.core.adjustment.scan_reader import ScanColumns, ScanReader
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_CLOCKING_RAD,
     DEFAULT_HARMONICS,
-    WIDE_GAIN,
+    UNINFORMATIVE_GAIN,
     SelfCalibration,
     self_calibrate,
 )
@@ -32,7 +32,7 @@ from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import sample_period_in
-from omsm_ros.readable import counted
+from omsm_ros.readable import counts_text
 
 # What is to be found must not be in the points already.
 _PLAIN = CorrectionOptions(lateral_lag=0.0)
@@ -63,7 +63,7 @@ class SelfCalibrationOptions:
     clocking: float = DEFAULT_CLOCKING_RAD
     polarity: int = 1
     static_gain: float = 1.0
-    gain_uncertainty: float = WIDE_GAIN
+    gain_uncertainty: float = UNINFORMATIVE_GAIN
     settings: Mapping[str, object] = field(default_factory=dict)
 
 
@@ -137,7 +137,7 @@ def _check_points(scan: CorrectedScan) -> None:
     if not scan.account.axes.corrected:
         raise BagError(
             f"{str(scan.path)!r} gives no surface point: of {scan.account.distance.received} "
-            f"readings {counted(scan.account.distance.counted)}, of "
-            f"{scan.account.axes.received} axis samples {counted(scan.account.axes.counted)}; "
+            f"readings {counts_text(scan.account.distance.counted)}, of "
+            f"{scan.account.axes.received} axis samples {counts_text(scan.account.axes.counted)}; "
             "look at it with 'omsm inspect'"
         )

@@ -19,7 +19,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import DataError
 from omsm_ros.io.files import save_bytes, save_text
-from omsm_ros.pipelines.form import MeasurementMeasuredPortions as Measurement
+from omsm_ros.pipelines.form import MeasurementMeasuredPortions as OpenedMeasurement
 from omsm_ros.quantities import SAMPLE_PERIOD
 from omsm_ros.readable import percent, quantity
 from omsm_ros.units import RPM_HZ
@@ -116,14 +116,14 @@ COMPENSATION, PATH = "compensation.csv", "compensation.nc"
 # Of its standard uncertainty: an offset beyond it is there at 95 %.
 _SURE = 2.0
 # Of the area; with less of it sure, the cut follows the noise of the measurement.
-_LEAST_SURE = 0.5
+_LEAST_SIGNIFICANT_SHARE = 0.5
 # Of the rms before; a cut that leaves more is hardly worth it.
 _MOST_LEFT = 0.9
 _HEAD = "x_m,y_m,offset_m,uncertainty_m\n"
 
 
 def compensate_form(
-    measured: Measurement,
+    measured: OpenedMeasurement,
     surface: Surface,
     out: Path,
     low_pass: float,
@@ -152,7 +152,7 @@ def compensate_form(
         **path,
         "places": int(np.sum(known)),
         "low_pass": low_pass,
-        "removed": list(form.registration.freedoms.fitted),
+        "removed": list(form.registration.dofs.fitted),
         "rms_before": found.before,
         "rms_after": found.after,
         "largest_offset": float(np.max(np.abs(found.offset[known]))),
@@ -173,7 +173,7 @@ def _along(path: ToolPath, out: Path) -> dict[str, Any]:
 def _warnings(sure: float, before: float, after: float) -> list[str]:
     """Return what speaks against the cut."""
     found = []
-    if sure < _LEAST_SURE:
+    if sure < _LEAST_SIGNIFICANT_SHARE:
         found.append(
             f"on {percent(1 - sure)} of the area the offset is less than twice its uncertainty: a "
             "cut would put errors of the measurement onto the part; measure with less, hold "

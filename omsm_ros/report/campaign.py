@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.trend import FEWEST, Trend, outliers, trend
+from omsm_ros.core.calibration.trend import FEWEST, LinearTrend, outliers, trend
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.readable import NOTHING, count, days, moment_of, percent, quantity
+from omsm_ros.readable import NOTHING, count, date_text_of_stamp, days, percent, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import fill, picture
 from omsm_ros.report.tables import part
@@ -40,7 +40,7 @@ class Series:
         """What one unit on the picture is in the unit of the summary, and its name."""
         return {"m": (NANOMETRE_M, "nm"), "s": (DAY_S, "d")}.get(self.unit, (1.0, self.unit))
 
-    def told(self, value: float) -> str:
+    def formatted(self, value: float) -> str:
         """Return a value as text."""
         return days(value) if self.unit == "s" else quantity(value, self.unit)
 
@@ -59,7 +59,7 @@ SERIES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Measurement:
+class CampaignEntry:
     """One bag of a campaign: its name, state, time [ns], link, and what its summary says.
 
     said: why there is no summary, if there is none
@@ -73,7 +73,7 @@ class Measurement:
     summary: Mapping[str, Any]
 
 
-def render(title: str, measurements: Sequence[Measurement], calibration: Calibration) -> str:
+def render(title: str, measurements: Sequence[CampaignEntry], calibration: Calibration) -> str:
     """Return the page as HTML; all text from outside is escaped."""
     judged = judge(measurements)
     return fill(
@@ -89,16 +89,16 @@ def render(title: str, measurements: Sequence[Measurement], calibration: Calibra
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class JudgedSeries:
     """A series over all measurements: values (n,), which stand out (n,), how it drifts."""
 
     series: Series
     values: FloatArray
     outlying: Any
-    drift: Trend | None
+    drift: LinearTrend | None
 
 
-def judge(measurements: Sequence[Measurement]) -> list[Judged]:
+def judge(measurements: Sequence[CampaignEntry]) -> list[JudgedSeries]:
     """Look for outliers and drift in each series that any measurement has."""
     times = _times(measurements)
     found = []
@@ -107,7 +107,7 @@ def judge(measurements: Sequence[Measurement]) -> list[Judged]:
         if np.any(np.isfinite(values)):
             drift = trend(times, values) if series.judged else None
             outlying = outliers(values) & _differs(values, np.nanmedian(values)) & series.judged
-            found.append(Judged(series, values, outlying, _seen(drift, times, values)))
+            found.append(JudgedSeries(series, values, outlying, _seen(drift, times, values)))
     return found
 
 
@@ -116,7 +116,7 @@ def _differs(values: FloatArray, usual: float) -> BoolArray:
     return np.asarray(np.abs(values - usual) > _ALIKE * abs(usual))
 
 
-def _seen(slope: Trend | None, over: FloatArray, values: FloatArray) -> Trend | None:
+def _seen(slope: LinearTrend | None, over: FloatArray, values: FloatArray) -> LinearTrend | None:
     """Return a trend whose change over all measurements could be read, None for any other."""
     if slope is None:
         return None
@@ -124,13 +124,13 @@ def _seen(slope: Trend | None, over: FloatArray, values: FloatArray) -> Trend | 
     return slope if abs(change) > _ALIKE * abs(np.nanmedian(values)) else None
 
 
-def remarks(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> list[str]:
+def remarks(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries]) -> list[str]:
     """Say what failed, what stands out and what drifts, each in a sentence."""
     found = [f"{m.name}: {m.state}, {m.said}" for m in measurements if m.state != "done"]
     for one in judged:
         for i in np.flatnonzero(one.outlying):
-            usual = one.series.told(float(np.nanmedian(one.values)))
-            value = one.series.told(float(one.values[i]))
+            usual = one.series.formatted(float(np.nanmedian(one.values)))
+            value = one.series.formatted(float(one.values[i]))
             found.append(
                 f"{measurements[i].name} stands out: {_low(one.series.name)} is {value}, where "
                 f"{usual} is usual"
@@ -139,13 +139,13 @@ def remarks(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> li
             unit = "K" if one.series is TEMPERATURE else one.series.unit
             low, high = (quantity(s * DAY_S, unit) for s in (one.drift.low, one.drift.high))
             found.append(f"{one.series.name} drifts by {low} to {high} a day (95 %)")
-    found += _with_temperature(judged)
+    found += _temperature_correlation(judged)
     if sum(m.state == "done" for m in measurements) < FEWEST:
         found.append(f"outliers and drift: not evaluated, of fewer than {FEWEST} measurements")
     return found
 
 
-def _with_temperature(judged: Sequence[Judged]) -> list[str]:
+def _temperature_correlation(judged: Sequence[JudgedSeries]) -> list[str]:
     """Say which figures go with the temperature, each in a sentence."""
     warm = [one.values for one in judged if one.series is TEMPERATURE]
     found = []
@@ -165,12 +165,12 @@ def _low(name: str) -> str:
     return name[0].lower() + name[1:]
 
 
-def _value(measurement: Measurement, series: Series) -> float:
+def _value(measurement: CampaignEntry, series: Series) -> float:
     value = part(measurement.summary, *series.place)
     return float(value) if isinstance(value, int | float) else np.nan
 
 
-def _times(measurements: Sequence[Measurement]) -> FloatArray:
+def _times(measurements: Sequence[CampaignEntry]) -> FloatArray:
     """Return the time of each recording [s], NaN where it has none."""
     unknown = np.nan
     return np.array(
@@ -181,19 +181,19 @@ def _times(measurements: Sequence[Measurement]) -> FloatArray:
     )
 
 
-def _headlines(measurements: Sequence[Measurement]) -> list[tuple[str, str]]:
+def _headlines(measurements: Sequence[CampaignEntry]) -> list[tuple[str, str]]:
     states = [m.state for m in measurements]
     return [(state, count(states.count(state))) for state in ("done", "refused", "crashed")]
 
 
 def _row(
-    place: int, measurement: Measurement, judged: Sequence[Judged], calibration: Calibration
+    place: int, measurement: CampaignEntry, judged: Sequence[JudgedSeries], calibration: Calibration
 ) -> dict[str, Any]:
     known = {one.series: one for one in judged}
     cells = []
     for series in SERIES:
         one = known.get(series)
-        text = NOTHING if one is None else series.told(float(one.values[place]))
+        text = NOTHING if one is None else series.formatted(float(one.values[place]))
         cells.append((text, one is not None and bool(one.outlying[place])))
     verdict = None
     if measurement.state == "done":
@@ -203,7 +203,7 @@ def _row(
     return {
         "name": measurement.name,
         "link": measurement.link,
-        "when": moment_of(measurement.recorded_ns),
+        "when": date_text_of_stamp(measurement.recorded_ns),
         "verdict": verdict,
         "said": measurement.said,
         "state": measurement.state,
@@ -213,7 +213,7 @@ def _row(
     }
 
 
-def _figure(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> bytes:
+def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries]) -> bytes:
     """Return each series over time, or over the order of names where no time is known."""
     times = _times(measurements)
     timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
@@ -242,7 +242,7 @@ def _figure(measurements: Sequence[Measurement], judged: Sequence[Judged]) -> by
 _COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-class History(Protocol):
+class HistoryLike(Protocol):
     """A machine and its rows of the catalogue."""
 
     machine: str
@@ -250,7 +250,7 @@ class History(Protocol):
     measurements: list[dict[str, Any]]
 
 
-def draw(machines: Sequence[History]) -> bytes:
+def draw(machines: Sequence[HistoryLike]) -> bytes:
     """Return a figure (PNG) with one colour a machine; rejected calibrations as crosses."""
     made, axes = style.figure(10.0, 7.0, rows=3)
     lag, gain, form = axes[:, 0]

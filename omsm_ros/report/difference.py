@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR, TermNumber
+from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR, ComparedTerm
 from omsm_ros.core.comparison.compare import Comparison
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
@@ -18,7 +18,7 @@ from omsm_ros.report import style
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, Layer, embedded, policy_of, script
 from omsm_ros.report.page_parts import Headline, fill, picture
 from omsm_ros.report.tables import Table
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 # Figures of a comparison: profiles of both and of their difference, E_n of the terms.
@@ -89,7 +89,7 @@ def _line(axes: Axes, drawn: Profile, unit: float, **look: str) -> None:
     axes.plot(drawn.position / MILLIMETRE_M, drawn.value / unit, linewidth=1.1, **look)
 
 
-def terms(numbers: Sequence[TermNumber]) -> Figure:
+def terms(numbers: Sequence[ComparedTerm]) -> Figure:
     """Draw E_n of the Zernike terms of the difference, the bounds at ±1."""
     made, axes = style.figure(6.1, 3.6)
     ax = axes[0, 0]
@@ -136,7 +136,7 @@ def render(title: str, date: str, facts: Mapping[str, Any], found: Comparison) -
         "difference.html",
         title=title,
         date=date,
-        verdict=Verdict(level, word, tuple(facts["reasons"])),
+        verdict=PageVerdict(level, word, tuple(facts["reasons"])),
         reservations=facts["reservations"],
         headlines=headlines(facts),
         map=map_of(found),

@@ -13,7 +13,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study
 from omsm_ros.report.tables import Table
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import DEGREE_RAD, NANOMETRE_M
 
 
@@ -43,14 +43,14 @@ class ExperimentPage:
 def render(page: ExperimentPage) -> str:
     """Return the page as HTML."""
     rows = [(row.name, row.paper, row.ours, row.remark) for row in page.rows]
-    beside = Table("", ("the paper", "the twin", "remark"), rows, prose="remark")
+    comparison_table = Table("", ("the paper", "the twin", "remark"), rows, prose="remark")
     return fill_study(
         StudyPage(
             title=page.title,
             subtitle="on the digital twin",
-            verdict=Verdict("unknown", "Side by side", (page.summary,)),
+            verdict=PageVerdict("unknown", "Side by side", (page.summary,)),
             sections=(
-                Section("The paper's figures beside ours", tables=(beside,)),
+                Section("The paper's figures beside ours", tables=(comparison_table,)),
                 Section("Measured", tuple(page.figures), page.tables),
             ),
             captions=page.captions,

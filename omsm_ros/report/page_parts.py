@@ -12,7 +12,7 @@ import jinja2
 
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.tables import Table
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 
 # A page from its template: text from outside escaped, numbers set as in print.
 
@@ -128,7 +128,7 @@ class StudyPage:
 
     title: str
     subtitle: str
-    verdict: Verdict
+    verdict: PageVerdict
     sections: tuple[Section, ...]
     captions: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, bytes] = field(default_factory=dict)

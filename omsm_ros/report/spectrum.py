@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from omsm_ros.core.ripple.density import Density, density, evenly, smoothed
-from omsm_ros.core.ripple.ripple_guard import Named
+from omsm_ros.core.ripple.ripple_guard import NamedLine
 from omsm_ros.core.ripple.scan_signal import PATH, TIME
 from omsm_ros.core.ripple.source_hypotheses import (
     ARTEFACT,
@@ -27,7 +27,7 @@ from omsm_ros.readable import count, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study
 from omsm_ros.report.tables import Table
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 # Spectra of scans, their lines in the colour of their kind.
@@ -45,7 +45,7 @@ _WIDTH_IN, _ROW_IN = 9.2, 2.5
 _MOST_NAMED = 8
 
 
-def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
+def over_time(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure:
     """Draw the amplitude spectral density of each scan over time, its lines named."""
     made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
     for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
@@ -59,7 +59,7 @@ def over_time(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure:
     return made
 
 
-def over_path(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
+def over_path(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure | None:
     """Draw the density along the path over wavelength; None where no scan moves over the part."""
     moving = [(s, n) for s, n in scans if PATH in s.coordinates]
     if not moving:
@@ -86,7 +86,9 @@ def _curve(axes: Axes, spectrum: Density, unit: float, *, over: bool = False) ->
     axes.plot(place, height, color=style.MUTED, linewidth=0.8)
 
 
-def _marks(axes: Axes, named: Sequence[Named], coordinate: str, unit: float, extent: float) -> None:
+def _marks(
+    axes: Axes, named: Sequence[NamedLine], coordinate: str, unit: float, extent: float
+) -> None:
     """Mark the lines: amplitude a stands a²/2 high in one resolution."""
     for row in named:
         if coordinate not in row.line.possible:
@@ -98,7 +100,7 @@ def _marks(axes: Axes, named: Sequence[Named], coordinate: str, unit: float, ext
         axes.plot([place], [height], "o", color=COLOURS[row.kind], markersize=5, zorder=5)
 
 
-def _kinds(axes: Axes, named: Sequence[Named]) -> None:
+def _kinds(axes: Axes, named: Sequence[NamedLine]) -> None:
     for kind in KINDS:
         if any(row.kind == kind for row in named):
             axes.plot([], [], "o", color=COLOURS[kind], markersize=5, label=kind)
@@ -129,7 +131,7 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
     return made
 
 
-def evidence(scans: Sequence[tuple[StudiedScan, Sequence[Named]]]) -> Figure | None:
+def evidence(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure | None:
     """Draw every line of every scan at its frequency in time: what stays is no texture.
 
     None where there is no such line.
@@ -172,7 +174,7 @@ class SpectrumPage:
 
 
 def drawn(
-    scans: Sequence[tuple[StudiedScan, Sequence[Named], Density]], valid_up_to: float | None
+    scans: Sequence[tuple[StudiedScan, Sequence[NamedLine], Density]], valid_up_to: float | None
 ) -> dict[str, bytes]:
     """Return PNG files of all figures."""
     pairs = [(studied, named) for studied, named, _ in scans]
@@ -197,7 +199,7 @@ def render(page: SpectrumPage) -> str:
             verdict=_verdict(summary),
             sections=(
                 Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
-                Section("Evidence", ("evidence", "path"), (_felt_table(scans),)),
+                Section("Evidence", ("evidence", "path"), (_acceleration_table(scans),)),
                 Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
                 Section("Band stop", tables=(_stop_table(scans),)),
             ),
@@ -208,15 +210,15 @@ def render(page: SpectrumPage) -> str:
     )
 
 
-def _verdict(summary: Mapping[str, Any]) -> Verdict:
+def _verdict(summary: Mapping[str, Any]) -> PageVerdict:
     counts = summary["counts"]
     found = tuple(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
     if not found:
-        return Verdict("good", "No line beyond 3 σ", ("nothing but noise",))
+        return PageVerdict("good", "No line beyond 3 σ", ("nothing but noise",))
     if counts[UNDECIDED]:
         wanted = sorted({p["needs"] for s in summary["scans"] for p in s["peaks"] if p["needs"]})
-        return Verdict("unknown", "Not all decided", (*found, *wanted))
-    return Verdict("good", "All lines named", found)
+        return PageVerdict("unknown", "Not all decided", (*found, *wanted))
+    return PageVerdict("good", "All lines named", found)
 
 
 def _peak_table(scan: Mapping[str, Any]) -> Table:
@@ -244,7 +246,7 @@ def _true(peak: Mapping[str, Any]) -> str:
     return f"{peak['order']} a turn" if peak["order"] else ""
 
 
-def _felt_table(scans: Sequence[Mapping[str, Any]]) -> Table:
+def _acceleration_table(scans: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         (
             f"{scan['name']}, {line['axis']}",

@@ -57,19 +57,19 @@ def figure(
     made = empty(width, height)
     between = _BETWEEN_SHARED_ROWS_IN if options.get("sharex") else _BETWEEN_ROWS_IN
     high = (height - _BOTTOM_IN - _TOP_IN - (rows - 1) * between) / rows
-    wide = (width - _LEFT_IN - _RIGHT_IN - (columns - 1) * _BETWEEN_COLUMNS_IN) / columns
+    axes_width = (width - _LEFT_IN - _RIGHT_IN - (columns - 1) * _BETWEEN_COLUMNS_IN) / columns
     places = {
         "left": _LEFT_IN / width,
         "right": 1 - _RIGHT_IN / width,
         "bottom": _BOTTOM_IN / height,
         "top": 1 - _TOP_IN / height,
         "hspace": between / high,
-        "wspace": _BETWEEN_COLUMNS_IN / wide,
+        "wspace": _BETWEEN_COLUMNS_IN / axes_width,
     }
     axes = made.subplots(rows, columns, squeeze=False, gridspec_kw=places, **options)
     for one in axes.flat:
         quiet(one)
-        one.yaxis.set_label_coords(-_NAME_LEFT_OF_AXES_IN / wide, 0.5)
+        one.yaxis.set_label_coords(-_NAME_LEFT_OF_AXES_IN / axes_width, 0.5)
     return made, axes
 
 

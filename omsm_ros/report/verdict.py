@@ -15,7 +15,7 @@ _LEAST_SHARE_CORRECTED = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class PageVerdict:
     """level: "good", "care", "bad" or "unknown";  word: for the reader;  reasons: all of them."""
 
     level: str
@@ -25,7 +25,7 @@ class Verdict:
 
 def verdict_on_measurement(
     summary: Mapping[str, object], calibration: Calibration | None
-) -> Verdict:
+) -> PageVerdict:
     """Weigh the calibration's certificate, the account of samples, and the warnings.
 
     Warnings are those of the measurement (``summary["warnings"]``); the certificate's own
@@ -37,20 +37,20 @@ def verdict_on_measurement(
     if stated == "rejected":
         against += ["the calibration was rejected", *map(str, certificate.get("reasons") or ())]
     if against:
-        return Verdict("bad", "Not to be trusted", tuple(against))
+        return PageVerdict("bad", "Not to be trusted", tuple(against))
     warnings = [*map(str, part(summary, "warnings") or ())]
     if light := part(summary, "light"):
         return _of_light(light, warnings)
     doubts = [*warnings, *_losses(summary), *_latency(calibration)]
     if not stated:
         missing = "the calibration has no certificate" if calibration else "no calibration is given"
-        return Verdict("unknown", "Not judged", (missing, *doubts))
+        return PageVerdict("unknown", "Not judged", (missing, *doubts))
     if doubts:
-        return Verdict("care", "Trusted with reservations", tuple(doubts))
-    return Verdict("good", "Trusted", (f"calibration {stated}", "every sample accounted for"))
+        return PageVerdict("care", "Trusted with reservations", tuple(doubts))
+    return PageVerdict("good", "Trusted", (f"calibration {stated}", "every sample accounted for"))
 
 
-def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> Verdict:
+def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> PageVerdict:
     """Return the light of the measurement, amber at best where there are warnings."""
     level = {"green": "good", "amber": "care", "red": "bad"}[light["level"]]
     if warnings and level == "good":
@@ -59,7 +59,7 @@ def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> Verdict:
     reasons = [
         f"{r['what']}: {r['remedy']}" if r["remedy"] else r["what"] for r in light["reasons"]
     ]
-    return Verdict(level, word, (*warnings, *reasons) or ("every source was looked at",))
+    return PageVerdict(level, word, (*warnings, *reasons) or ("every source was looked at",))
 
 
 def _streams(summary: Mapping[str, object]) -> Mapping[str, Any]:

@@ -19,8 +19,8 @@ from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.machine_errors import Shift, random_walk
-from omsm_ros.twin.part import posed
-from omsm_ros.twin.plant import Grid, Plant, move
+from omsm_ros.twin.part import mounted_surface
+from omsm_ros.twin.plant import Plant, TimeGrid, move
 from omsm_ros.twin.probe import LEVEL, Probe, ProbeRandom, read, slope_of
 from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
@@ -42,7 +42,7 @@ _MOST_BEAM_ITERATIONS = 12
 _BEAM_SETTLED_M = 1e-12
 
 
-class Look(NamedTuple):
+class ProbeTarget(NamedTuple):
     """What the probe looks at, each (n,) [m].
 
     probe: its own true Z;  surface: height of the part under it;  x, y: where, on the chuck
@@ -56,7 +56,7 @@ class Look(NamedTuple):
     distance: FloatArray
 
 
-Shifting = Callable[[FloatArray, AxisPositions], Shift]
+ShiftFunction = Callable[[FloatArray, AxisPositions], Shift]
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Timing:
 class Scene:
     """Everything as signals in time.
 
-    carriage, probe: true Z [m];  surface: as it sits on the chuck
+    slide, probe: true Z [m];  surface: as it sits on the chuck
     stand_off: height of the probe's zero above the axis zero [m]
     shifting: what moves the workpiece against the probe, at a time and a position of the slides
     vibration: lines between workpiece and probe, which an accelerometer feels too
@@ -87,9 +87,9 @@ class Scene:
     motion: Motion
     surface: Surface
     stand_off: float
-    carriage: Trajectory
+    slide: Trajectory
     probe: Trajectory
-    shifting: tuple[Shifting, ...]
+    shifting: tuple[ShiftFunction, ...]
     vibration: Vibration
 
     def positions(self, time: FloatArray) -> AxisPositions:
@@ -99,7 +99,7 @@ class Scene:
             return slides
         return slides._replace(b=slides.b + self.disturbances.machine.b_wobble(time))
 
-    def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> Look:
+    def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> ProbeTarget:
         """Return what is before the probe at ``time`` (n,) [s], ``about`` so far away [m]."""
         slides = self.positions(time)
         x, y, raised = self._shift(time, slides)
@@ -109,7 +109,7 @@ class Scene:
             on_x, on_y = workpiece_xy(shifted.x, shifted.y, slides.c)
             height = self.surface.height(on_x, on_y)
             distance = height + raised - probe - self.stand_off
-            return Look(probe, height, on_x, on_y, distance)
+            return ProbeTarget(probe, height, on_x, on_y, distance)
         return self._along_the_beam(mount, shifted, probe, raised, about)
 
     def _shift(self, time: FloatArray, slides: AxisPositions) -> Shift:
@@ -127,7 +127,7 @@ class Scene:
         probe: FloatArray,
         raised: FloatArray,
         about: FloatArray | float,
-    ) -> Look:
+    ) -> ProbeTarget:
         """Return what ``look`` does, for a beam that slants or a probe that B carries about."""
         zero = probe + self.stand_off - raised
         distance = np.zeros_like(probe) + about
@@ -138,16 +138,16 @@ class Scene:
             distance = distance + change
             if np.all(abs(change) < _BEAM_SETTLED_M):
                 break
-        return Look(probe, height, at.x, at.y, distance)
+        return ProbeTarget(probe, height, at.x, at.y, distance)
 
-    def over_an_exposure(self, time: FloatArray) -> Look:
+    def over_an_exposure(self, time: FloatArray) -> ProbeTarget:
         """Return the mean of what is before the probe during the exposures at ``time``."""
         probe = self.disturbances.probe
-        before, weights = probe.looks()
+        before, weights = probe.exposure_instants()
         look = self.look(time - before[0])
         if len(before) > 1:
             looks = (look, *(self.look(time - ago, look.distance) for ago in before[1:]))
-            look = Look(*(weights @ np.array(parts) for parts in zip(*looks, strict=True)))
+            look = ProbeTarget(*(weights @ np.array(parts) for parts in zip(*looks, strict=True)))
         if not self.vibration.lines:
             return look
         # Lines may be faster than the looks: their mean is known in closed form.
@@ -187,19 +187,19 @@ def scene_of(
     return Scene(
         disturbances=disturbances,
         motion=motion,
-        surface=posed(surface, disturbances.machine.pose),
+        surface=mounted_surface(surface, disturbances.machine.pose),
         stand_off=stand_off,
-        carriage=moved.carriage,
+        slide=moved.slide,
         probe=moved.probe,
         shifting=tuple(_shifting(disturbances, times, random)),
         vibration=vibration,
     )
 
 
-def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> list[Shifting]:
+def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> list[ShiftFunction]:
     """Return what is switched on of all that moves the workpiece; ``times`` span the simulation."""
     machine, zero = disturbances.machine, np.zeros(1)
-    result: list[Shifting] = []
+    result: list[ShiftFunction] = []
     if not is_default(machine.drift):
         walk = Trajectory(times[0], times[1] - times[0], random_walk(times, random["drift"]))
         result.append(lambda time, slides: Shift(zero, zero, machine.drift.height(time, walk)))
@@ -214,15 +214,15 @@ def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> 
     return result
 
 
-def _grid(plant: Plant, disturbances: Disturbances, timing: Timing) -> Grid:
+def _grid(plant: Plant, disturbances: Disturbances, timing: Timing) -> TimeGrid:
     forgotten = int(np.ceil(plant.lead_in() / timing.period))
     if is_default(disturbances):
-        return Grid(forgotten, timing.samples, timing.period, timing.substeps, timing.substeps)
+        return TimeGrid(forgotten, timing.samples, timing.period, timing.substeps, timing.substeps)
     probe, clocks = disturbances.probe, disturbances.clocks.reach_s(timing.duration)
     reference = disturbances.reference.latency_s if disturbances.reference else 0.0
     late = max(probe.latency_s + probe.window_s, reference)
     lead = late + clocks + disturbances.structure.lead_s
-    return Grid(
+    return TimeGrid(
         lead=forgotten + int(np.ceil(lead / timing.period)) + _SPARE_SAMPLES,
         samples=timing.samples + int(np.ceil(clocks / timing.period)) + _SPARE_SAMPLES,
         sample_period=timing.period,
@@ -263,7 +263,7 @@ class Cell:
 class Truth:
     """What only the twin knows beside the motion of the probe; arrays of shape (n,).
 
-    time: when the trigger came [s];  carriage: true Z of the carriage then [m]
+    time: when the trigger came [s];  slide: true Z of the carriage then [m]
     x, y: where on the chuck the probe looked [m]
     distance: true distance along the beam, before the probe's own errors [m]
     surface: the part as it sits on the chuck
@@ -271,7 +271,7 @@ class Truth:
     """
 
     time: FloatArray
-    carriage: FloatArray
+    slide: FloatArray
     x: FloatArray
     y: FloatArray
     distance: FloatArray
@@ -288,7 +288,7 @@ class Recording:
     surface_height: true height of the surface then under the probe [m]
     truth: what else is true, None where nobody knows
 
-    ``probe_motion - truth.carriage`` is the true dynamic error.
+    ``probe_motion - truth.slide`` is the true dynamic error.
     """
 
     axes: AxisBlock
@@ -335,7 +335,7 @@ def record(
         **_further_channels(scene, instants, timing, random),
         truth=Truth(
             time=instants.trigger,
-            carriage=scene.carriage.at(instants.trigger),
+            slide=scene.slide.at(instants.trigger),
             x=seen.x,
             y=seen.y,
             distance=seen.distance,
@@ -364,7 +364,7 @@ def _random_streams(seed: int) -> dict[str, np.random.Generator]:
 
 def _axes(cell: Cell, scene: Scene, when: Instants, random: np.random.Generator) -> AxisBlock:
     encoder, slides = scene.disturbances.encoder, scene.positions(when.trigger)
-    z = encoder.seen(scene.carriage).at(when.z)
+    z = encoder.seen(scene.slide).at(when.z)
     late = scene.positions(when.c).c if when.c is not when.trigger else slides.c
     return AxisBlock(
         stamp_ns=0,
@@ -382,11 +382,11 @@ def _distance(
     cell: Cell,
     scene: Scene,
     when: Instants,
-    seen: Look,
+    seen: ProbeTarget,
     random: Mapping[str, np.random.Generator],
 ) -> DistanceBlock:
     errors, slope = scene.disturbances.probe, LEVEL
-    if errors.sees_slope:
+    if errors.is_slope_sensitive:
         c = scene.positions(when.probe - errors.lag_s).c
         slope = slope_of(scene.surface, seen.x, seen.y, c)
     streams = ProbeRandom(random["probe"], random["dropout"])
@@ -400,7 +400,7 @@ def _further_channels(
     channels: dict[str, Any] = {}
     if reference := scene.disturbances.reference:
         channels["reference"] = reference.read(
-            scene.carriage, when.trigger, timing.period, random["reference"]
+            scene.slide, when.trigger, timing.period, random["reference"]
         )
     if accelerometer := scene.disturbances.accelerometer:
         period = accelerometer.sample_period_s or timing.period

@@ -50,7 +50,7 @@ class PartPose:
 
 
 @dataclass(frozen=True, slots=True)
-class PosedSurface:
+class MountedSurface:
     """``surface`` in the pose that it has on the chuck; heights are along the spindle."""
 
     surface: Surface
@@ -73,9 +73,9 @@ class PosedSurface:
         return np.asarray(z + pose.z_m, np.float64)
 
 
-def posed(surface: Surface, pose: PartPose) -> Surface:
+def mounted_surface(surface: Surface, pose: PartPose) -> Surface:
     """Return ``surface`` on the chuck; itself where it sits as it should."""
-    return surface if is_default(pose) else PosedSurface(surface, pose)
+    return surface if is_default(pose) else MountedSurface(surface, pose)
 
 
 # What a turned mirror really looks like: its nominal shape and a figure error on top.
@@ -142,7 +142,7 @@ class FigureError:
 
 
 @dataclass(frozen=True, slots=True)
-class Spokes:
+class AzimuthalRipple:
     """A surface: ``nominal`` plus waves across every circle about the spindle axis.
 
     wavelength: along the circle of ``radius`` [m], rounded to a whole number a turn

@@ -61,7 +61,7 @@ class Plant:
 class Response:
     """True motion at the sample instants [m], each (n,): of the carriage and of the probe."""
 
-    carriage: FloatArray
+    slide: FloatArray
     probe: FloatArray
 
 
@@ -69,12 +69,12 @@ class Response:
 class Movement:
     """True motion as signals in time [m]: of the carriage and of the probe."""
 
-    carriage: Trajectory
+    slide: Trajectory
     probe: Trajectory
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class TimeGrid:
     """When the simulation steps, and which of its steps are kept.
 
     lead, samples: sample periods before and after time 0
@@ -98,12 +98,12 @@ def respond(
 ) -> Response:
     """Move the plant through ``motion`` and look at it every ``sample_period`` [s]."""
     lead = int(np.ceil(plant.lead_in() / sample_period))
-    moved = move(plant, motion, Grid(lead, samples, sample_period, substeps, substeps))
+    moved = move(plant, motion, TimeGrid(lead, samples, sample_period, substeps, substeps))
     at_samples = slice(lead - 1, lead - 1 + samples)
-    return Response(moved.carriage.values[at_samples], moved.probe.values[at_samples])
+    return Response(moved.slide.values[at_samples], moved.probe.values[at_samples])
 
 
-def move(plant: Plant, motion: Motion, grid: Grid) -> Movement:
+def move(plant: Plant, motion: Motion, grid: TimeGrid) -> Movement:
     """Move the plant through ``motion`` from ``grid.lead`` periods before time 0.
 
     Each sample period is cut into ``substeps``; the command is held at its value in the
@@ -113,12 +113,14 @@ def move(plant: Plant, motion: Motion, grid: Grid) -> Movement:
     """
     servo, both = plant.servo, _series(plant.servo, plant.dynamics)
     return Movement(
-        _seen_through(servo, 0.0, motion, grid),
-        _seen_through(both, plant.dynamics.delay, motion, grid),
+        _through_system(servo, 0.0, motion, grid),
+        _through_system(both, plant.dynamics.delay, motion, grid),
     )
 
 
-def _seen_through(system: TransferFunction, delay: float, motion: Motion, grid: Grid) -> Trajectory:
+def _through_system(
+    system: TransferFunction, delay: float, motion: Motion, grid: TimeGrid
+) -> Trajectory:
     step, period, substeps, every = grid.step, grid.sample_period, grid.substeps, grid.every
     sections = _zero_order_hold_sections(system, step)
     state = np.zeros((len(sections), 2))

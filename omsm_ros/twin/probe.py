@@ -19,8 +19,8 @@ from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 _EXPOSURE_NODES = 4
 # Of the difference that takes the slope: small against any figure, large against rounding.
 _SLOPE_STEP_M = 1e-6
-_FULL_LIGHT = 0.5
-_LEAST_LIGHT = 1e-4
+_FULL_INTENSITY = 0.5
+_LEAST_INTENSITY = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +95,13 @@ class ProbeErrors:
         return self.latency_s + self.window_s / 2
 
     @property
-    def sees_slope(self) -> bool:
+    def is_slope_sensitive(self) -> bool:
         """True if what it reports depends on the slope of the surface."""
         sizes = (self.slope_error_m_per_rad, self.slope_error_m_per_rad2)
         limits = (self.intensity_slope_rad, self.dropout_slope_rad)
         return any(sizes) or any(limit is not None for limit in limits)
 
-    def looks(self) -> tuple[FloatArray, FloatArray]:
+    def exposure_instants(self) -> tuple[FloatArray, FloatArray]:
         """Return instants before the trigger [s] and weights, (k,), that stand for the exposure."""
         if not self.window_s:
             return np.array([self.latency_s]), np.ones(1)
@@ -153,7 +153,7 @@ def read(
 ) -> DistanceBlock:
     """Return what the probe reports of ``true_distance`` (n,) [m] to a surface of ``slope``."""
     samples = len(true_distance)
-    light = _light(errors, slope)
+    light = _intensity(errors, slope)
     noise = probe.noise if not errors.noise_m else float(np.hypot(probe.noise, errors.noise_m))
     seen = probe.scale * (true_distance + _error(probe, errors, true_distance, slope))
     noisy = seen + random.noise.normal(0.0, noise, samples) / np.sqrt(light)
@@ -169,7 +169,7 @@ def read(
         first_sample=0,
         sample_period=period,
         distance=np.where(there, reading, np.nan),
-        intensity=np.where(there, _FULL_LIGHT * light, 0.0).astype(np.float32),
+        intensity=np.where(there, _FULL_INTENSITY * light, 0.0).astype(np.float32),
         status=np.where(there, Status.OK, Status.NO_TARGET).astype(np.uint8),
     )
 
@@ -190,10 +190,10 @@ def _error(
     return error
 
 
-def _light(errors: ProbeErrors, slope: Slope) -> FloatArray:
+def _intensity(errors: ProbeErrors, slope: Slope) -> FloatArray:
     """Return the light that comes back, per that of a flat, (n,) or (1,)."""
     if errors.intensity_slope_rad is None:
         return np.ones(1)
     # Never quite dark: a noise without bound would be no noise any more.
     steep = slope.steepness / errors.intensity_slope_rad
-    return np.asarray(np.maximum(np.exp(-(steep**2)), _LEAST_LIGHT), np.float64)
+    return np.asarray(np.maximum(np.exp(-(steep**2)), _LEAST_INTENSITY), np.float64)

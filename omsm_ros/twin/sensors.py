@@ -46,10 +46,10 @@ class ReferenceSensor:
         )
 
     def read(
-        self, carriage: Trajectory, time: FloatArray, period: float, random: np.random.Generator
+        self, slide: Trajectory, time: FloatArray, period: float, random: np.random.Generator
     ) -> DistanceBlock:
         """Return what it reports of the carriage for the triggers at ``time`` (n,) [s]."""
-        z = carriage.at(time - self.latency_s)
+        z = slide.at(time - self.latency_s)
         said = z * (1 + self.scale_ppm * PPM) + self.cubic_m * (z / self.half_range_m) ** 3
         in_range = abs(z) <= self.half_range_m
         noisy = said + random.normal(0.0, self.noise_m, len(z))
@@ -213,13 +213,13 @@ class Pitch:
         ratio = [1.0, 2 * self.damping_ratio * omega, omega**2]
         return [self.rad_per_m_s2 * omega**2, 0.0, 0.0], ratio
 
-    def angle(self, carriage: Trajectory) -> FloatArray:
+    def angle(self, slide: Trajectory) -> FloatArray:
         """Return the pitch α [rad] along the carriage's motion, (n,)."""
-        z = carriage.values
+        z = slide.values
         steady = self.rad_per_m * z + self.periodic_rad * np.sin(2 * np.pi * z / self.period_m)
         if not self.rad_per_m_s2:
             return np.asarray(steady, np.float64)
-        numerator, denominator, _ = signal.cont2discrete(self._mode, carriage.step, method="foh")
+        numerator, denominator, _ = signal.cont2discrete(self._mode, slide.step, method="foh")
         return np.asarray(steady + signal.lfilter(numerator.ravel(), denominator, z - z[0]))
 
     def response(self, s: ComplexArray) -> ComplexArray:
@@ -248,12 +248,12 @@ class EncoderErrors:
     def __post_init__(self) -> None:
         check_numbers(self, positive=("signal_period_m",), not_negative=("resolution_m",))
 
-    def seen(self, carriage: Trajectory) -> Trajectory:
+    def seen(self, slide: Trajectory) -> Trajectory:
         """Return the position under the encoder [m], before its own errors."""
         if self.pitch is None:
-            return carriage
-        values = carriage.values + self.pitch.arm_m * self.pitch.angle(carriage)
-        return Trajectory(carriage.start, carriage.step, values)
+            return slide
+        values = slide.values + self.pitch.arm_m * self.pitch.angle(slide)
+        return Trajectory(slide.start, slide.step, values)
 
     def read(self, position: FloatArray, noise: FloatArray) -> FloatArray:
         """Return what it says at ``position`` (n,) [m], with ``noise`` (n,) [m]."""

@@ -1,6 +1,6 @@
 """What a real structure does beside G(s): it creeps, rocks, has backlash, drags and stiffens.
 
-``carriage → G(s) → creep, soft modes → stiffness → friction → backlash → probe``
+``slide → G(s) → creep, soft modes → stiffness → friction → backlash → probe``
 
 All but creep and soft modes act at once, on the deflection or on the position, so they are as
 fine in time as G's own output is. Not imitated: backlash and friction within the servo loop,
@@ -33,7 +33,7 @@ _STILL_M = 1e-16
 
 
 @dataclass(frozen=True, eq=False)
-class Driven(Trajectory):
+class BacklashOutput(Trajectory):
     """A motion behind backlash, as exact between its values as that of what drives it.
 
     driver: what drives it;  held: where it stays until it is driven on, (n,) [m]
@@ -53,7 +53,7 @@ class Driven(Trajectory):
         return np.asarray(np.clip(held, low, high), np.float64)
 
 
-def backlash(driver: Trajectory, width: float) -> Driven:
+def backlash(driver: Trajectory, width: float) -> BacklashOutput:
     """Return what follows ``driver`` through a gap of ``width`` [m], at first in its middle."""
     position, half = driver.values, width / 2
     runs, state, states = list(_monotone_runs(position)), position[0], []
@@ -63,7 +63,7 @@ def backlash(driver: Trajectory, width: float) -> Driven:
         state = max(state, end - half) if up else min(state, end + half)
     held = np.repeat(states, [last - first for first, last, _ in runs])
     values = np.clip(held, position - half, position + half)
-    return Driven(driver.start, driver.step, values, driver, held, half)
+    return BacklashOutput(driver.start, driver.step, values, driver, held, half)
 
 
 def friction(position: FloatArray, presliding: float) -> FloatArray:
@@ -187,7 +187,7 @@ class StructureErrors:
     """Between carriage and probe; nothing by default.
 
     creep, log_creep, soft_modes: linear, slow
-    compliance_per_m_of_z, compliance_per_m_of_x: the deflection ``carriage - probe`` grows by
+    compliance_per_m_of_z, compliance_per_m_of_x: the deflection ``slide - probe`` grows by
         this part per metre of Z or X
     hardening_deflection_m: deflection at which a hardening spring has twice its stiffness
     backlash_m: lost motion at a reversal, the full width of the loop
@@ -234,20 +234,20 @@ def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Mov
     """
     if is_default(errors):
         return moved
-    carriage, probe = moved.carriage.values, moved.probe.values
+    slide, probe = moved.slide.values, moved.probe.values
     probe = probe + _slow_parts(errors, moved.probe)
     if errors.compliance_per_m_of_z or errors.compliance_per_m_of_x:
         x = np.interp(moved.probe.times, slide_x.times, slide_x.values)
-        along = errors.compliance_per_m_of_z * carriage + errors.compliance_per_m_of_x * x
-        probe = carriage - (carriage - probe) * (1 + along)
+        along = errors.compliance_per_m_of_z * slide + errors.compliance_per_m_of_x * x
+        probe = slide - (slide - probe) * (1 + along)
     if errors.hardening_deflection_m is not None:
-        probe = carriage - hardened(carriage - probe, errors.hardening_deflection_m)
+        probe = slide - hardened(slide - probe, errors.hardening_deflection_m)
     if errors.friction:
         probe = probe - errors.friction.drag_m * friction(probe, errors.friction.presliding_m)
     result = Trajectory(moved.probe.start, moved.probe.step, probe)
     if errors.backlash_m:
         result = backlash(result, errors.backlash_m)
-    return Movement(moved.carriage, result)
+    return Movement(moved.slide, result)
 
 
 def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
@@ -256,7 +256,7 @@ def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
         return np.zeros(1)
     every = max(int(_slow_step(errors) / probe.step), 1)
     coarse = Trajectory(probe.start, probe.step * every, probe.values[::every])
-    moving = _spun_up(coarse)
+    moving = _with_spin_up(coarse)
     added = np.zeros_like(moving)
     for creep in errors.relaxations:
         filtered = _through(([1.0], [creep.time_constant_s, 1.0]), moving, coarse.step)
@@ -277,7 +277,7 @@ def _slow_step(errors: StructureErrors) -> float:
     return min(_LONGEST_SLOW_STEP_S, min(times) / _SLOW_STEPS)
 
 
-def _spun_up(probe: Trajectory) -> FloatArray:
+def _with_spin_up(probe: Trajectory) -> FloatArray:
     """Return the motion about its mean, coming up smoothly from rest there before time 0."""
     before = max(round(-probe.start / probe.step), 1)
     mean = probe.values[:before].mean()

@@ -13,18 +13,18 @@ from omsm_ros.twin.cell import Recording
 
 
 @dataclass(frozen=True, slots=True)
-class Departure:
+class ErrorFigures:
     """Peak to valley and root mean square about zero of an error [m]."""
 
     peak_to_valley: float
     rms: float
 
 
-def spread(error: FloatArray, weight: FloatArray | None = None) -> Departure:
+def spread(error: FloatArray, weight: FloatArray | None = None) -> ErrorFigures:
     """Return the departure of ``error`` (n,) [m]; rms weighted by ``weight`` (n,) if given."""
     if not len(error):
         raise DataError("no points to compare with the truth")
-    return Departure(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))
+    return ErrorFigures(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,12 +36,12 @@ class TruthComparison:
     surface_deviation: corrected height minus the true surface
     """
 
-    dynamic_error_before: Departure
-    dynamic_error_after: Departure
-    surface_deviation: Departure
+    dynamic_error_before: ErrorFigures
+    dynamic_error_after: ErrorFigures
+    surface_deviation: ErrorFigures
 
 
-def departure_from_truth(
+def compare_with_truth(
     recording: Recording, sample: ArrayLike, height: FloatArray, dynamic_error: FloatArray
 ) -> TruthComparison:
     """Compare corrected points, each array (n,), with the truth of the recording they came from.

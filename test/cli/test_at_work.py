@@ -7,7 +7,7 @@ import time
 import pytest
 
 from omsm_ros.cli import command_line as module
-from omsm_ros.cli.command_line import at_work
+from omsm_ros.cli.command_line import progress_in_background
 from omsm_ros.pipelines import progress
 
 LINE = "omsm form: 00:00 so far"
@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
     def isatty(self):
         return self.tty
 
-    def waited_for(self, text, seconds=20.0):
+    def pending_listeners(self, text, seconds=20.0):
         end = time.monotonic() + seconds
         while text not in self.getvalue() and time.monotonic() < end:
             time.sleep(0.01)
@@ -41,8 +41,8 @@ def terminal(monkeypatch):
 
 def test_long_work_counts_its_seconds_and_leaves_nothing_behind(terminal):
     stderr = terminal()
-    with at_work("omsm form", quiet=False):
-        assert stderr.waited_for(LINE)
+    with progress_in_background("omsm form", quiet=False):
+        assert stderr.pending_listeners(LINE)
     assert stderr.getvalue().endswith("\r")
     assert stderr.getvalue().split("\r")[-2].strip() == ""
 
@@ -51,8 +51,8 @@ def test_a_fault_finds_the_line_gone(terminal):
     stderr = terminal()
 
     def fails():
-        with at_work("omsm form", quiet=False):
-            assert stderr.waited_for(LINE)
+        with progress_in_background("omsm form", quiet=False):
+            assert stderr.pending_listeners(LINE)
             raise ValueError("wrong")
 
     with pytest.raises(ValueError, match="wrong"):
@@ -62,12 +62,12 @@ def test_a_fault_finds_the_line_gone(terminal):
 
 def test_short_work_programs_and_pipes_see_nothing(terminal):
     stderr = terminal(patience=1000.0)
-    with at_work("omsm form", quiet=False):
+    with progress_in_background("omsm form", quiet=False):
         pass
     assert stderr.getvalue() == ""
     stderr = terminal()
-    with at_work("omsm form", quiet=True):
-        assert not stderr.waited_for(LINE, 0.1)
+    with progress_in_background("omsm form", quiet=True):
+        assert not stderr.pending_listeners(LINE, 0.1)
     stderr.tty = False
-    with at_work("omsm form", quiet=False):
-        assert not stderr.waited_for(LINE, 0.1)
+    with progress_in_background("omsm form", quiet=False):
+        assert not stderr.pending_listeners(LINE, 0.1)

@@ -29,7 +29,7 @@ def test_plan_writes_what_the_machine_can_run(capsys, tmp_path):
     assert "G21" in (tmp_path / "steps.nc").read_text()
 
 
-def test_plan_writes_equal_steps_when_told(capsys, tmp_path):
+def test_plan_writes_equal_steps_when_requested(capsys, tmp_path):
     sizes = ("--step", 9.8e-6, "--second-step", 9.8e-6)
     found = facts(capsys, "plan", "steps", "--out", tmp_path, "--count", 5, *sizes)
     table = np.loadtxt(tmp_path / "steps.csv", delimiter=",", skiprows=1)

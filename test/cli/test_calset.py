@@ -101,18 +101,20 @@ def test_sources_in_a_file_reach_points_budget_and_light(capsys, tmp_path, scan,
         "--out", tmp_path / "result", "--no-report", "--settings", '{"machine": "twin"}',
     ]  # fmt: skip
     silent = facts(capsys, *arguments)
-    told = facts(capsys, *arguments, "--sources", tmp_path / "machine.yaml", "--accuracy", "1e-9")
-    rows = {row["source"]: row for row in told["budget"]["sources"]}
+    reported = facts(
+        capsys, *arguments, "--sources", tmp_path / "machine.yaml", "--accuracy", "1e-9"
+    )
+    rows = {row["source"]: row for row in reported["budget"]["sources"]}
     assert rows["tilt"]["reason"] == "dial gauge"
     # 10 µrad over a ring of 2 mm: 20 nm at the rim, 14 nm rms.
     assert rows["tilt"]["height"] == pytest.approx(1e-5 * 2e-3, rel=0.2)
     assert (rows["clocking"]["status"], rows["clocking"]["height"]) == ("declared", 0.0)
     assert rows["drift"]["status"] == "not evaluated"
     assert rows["discretisation"]["status"] == "evaluated"
-    before, after = (s["uncertainty"]["median"] for s in (silent, told))
+    before, after = (s["uncertainty"]["median"] for s in (silent, reported))
     assert after == pytest.approx(np.hypot(before, 1e-5 * 1.75e-3), rel=0.03)
-    assert told["light"]["level"] == "red"
+    assert reported["light"]["level"] == "red"
     assert silent["light"]["level"] == "amber"
-    said = [reason["what"] for reason in told["light"]["reasons"]]
+    said = [reason["what"] for reason in reported["light"]["reasons"]]
     assert any("(decentre)" in what for what in said)
     assert (tmp_path / "result" / "systematic.npz").is_file()

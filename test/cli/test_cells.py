@@ -40,9 +40,9 @@ def test_a_second_cell_is_inspected_and_corrected(
     capsys, tmp_path, second, true_calibration, options
 ):
     assert cli.main(["inspect", str(second), "--json", *options]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert [t["samples"] for t in told["topics"]] == [1000, 1000]
-    assert told["faults"] == []
+    reported = json.loads(capsys.readouterr().out)
+    assert [t["samples"] for t in reported["topics"]] == [1000, 1000]
+    assert reported["faults"] == []
     save_calibration(tmp_path / "cal.json", true_calibration)
     given = ["--calibration", str(tmp_path / "cal.json"), "--out", str(tmp_path / "out")]
     assert cli.main(["correct", str(second), *given, "--no-report", "--json", *options]) == 0
@@ -79,13 +79,13 @@ def test_every_command_of_a_bag_looks_for_the_cell_that_is_asked_for(
     save_calibration(tmp_path / "cal.json", true_calibration)
     asked = of_a_bag(command, second, tmp_path)
     status = cli.main([*asked, "--namespace", "/cell3"])
-    told = capsys.readouterr()
+    reported = capsys.readouterr()
     if command == "inspect":  # shows what there is of the cell: nothing
         assert status == 0
-        assert "nothing on '/cell3/axes'" in told.out
+        assert "nothing on '/cell3/axes'" in reported.out
     else:
         assert status == 2
-        assert "/cell3/" in told.err
+        assert "/cell3/" in reported.err
 
 
 def test_no_command_of_a_bag_is_forgotten():

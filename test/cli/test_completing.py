@@ -49,7 +49,7 @@ def test_what_bash_offers(script, tmp_path, line, expected):
     assert len(expected) > 5 or set(done.stdout.split()) == expected
 
 
-def test_where_shtab_is_not_installed_the_remedy_is_told(capsys, monkeypatch):
+def test_where_shtab_is_not_installed_the_remedy_is_reported(capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "shtab", None)
     assert cli.main(["completion", "zsh"]) == 2
     assert "pip install shtab" in capsys.readouterr().err

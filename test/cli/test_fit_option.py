@@ -37,21 +37,21 @@ def facts():
     }
 
 
-def test_what_goes_with_a_freedom_that_is_not_determined_is_told_apart(facts):
+def test_effects_of_an_undetermined_degree_of_freedom_are_reported_separately(facts):
     """3 and 4 µrad make 5 µrad; the 17 mrad of a turned part are told where the turn is."""
     rows = dict(form_rows(facts))
     assert rows["tip"] == "1.0 µrad ± 5.0 µrad (k = 1)"
     assert rows["y"] == "22.0 µm ± 4.0 µm (k = 1)"
-    told = rows["clocking not fitted"]
-    assert told.startswith("it does what tip and y do; clocking ± 17 mrad would go with")
-    assert told.endswith("tip ± 17 mrad, y ± 900 µm, at the same form")
+    reported = rows["clocking not fitted"]
+    assert reported.startswith("it does what tip and y do; clocking ± 17 mrad would go with")
+    assert reported.endswith("tip ± 17 mrad, y ± 900 µm, at the same form")
 
 
-def test_a_freedom_that_was_held_is_told_with_the_reason(facts):
+def test_a_fixed_degree_of_freedom_is_reported_with_the_reason(facts):
     assert dict(form_rows(facts))["x held"] == "form looks like it here"
 
 
-def test_a_figure_that_may_be_nothing_is_told_as_a_bound(facts):
+def test_an_unresolved_figure_is_reported_as_an_upper_bound(facts):
     rows = dict(form_rows(facts))
     assert rows["PV"] == "at most 17.0 nm (k = 2)"
     assert rows["Ssk"] == "-0.40 ± 0.60 (k = 2)"

@@ -73,7 +73,7 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     }
 
 
-def test_a_scan_of_which_nothing_can_be_corrected_is_told(
+def test_a_scan_of_which_nothing_can_be_corrected_is_reported(
     capsys, folder, tmp_path, small_scan_blocks
 ):
     with BagWriter(tmp_path / "dark.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
@@ -127,7 +127,7 @@ def test_inspect_counts_what_is_there(capsys, folder):
     assert text.splitlines()[-1].split() == ["faults", "none", "found"]
 
 
-def test_a_cut_bag_is_repaired_beside_itself(capsys, folder, tmp_path):
+def test_a_truncated_bag_is_repaired_into_a_new_file_next_to_it(capsys, folder, tmp_path):
     cut = tmp_path / "cut.mcap"
     whole = (folder / "scan.mcap").read_bytes()
     cut.write_bytes(whole[: len(whole) // 2])
@@ -331,8 +331,8 @@ def test_a_defect_of_ours_is_one_line_that_says_what_to_report(capsys, monkeypat
 def test_what_nobody_knows_is_null(capsys, monkeypatch, folder):
     from omsm_ros.cli import inspect
 
-    told = {"topics": [{"a": float("nan"), "b": [float("inf")]}], "faults": []}
-    monkeypatch.setattr(inspect.Inspection, "entry", lambda _: told)
+    reported = {"topics": [{"a": float("nan"), "b": [float("inf")]}], "faults": []}
+    monkeypatch.setattr(inspect.Inspection, "entry", lambda _: reported)
     status, out, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert status == 0
     assert json.loads(out)["topics"] == [{"a": None, "b": [None]}]

@@ -96,8 +96,8 @@ def test_a_measured_pitch_is_taken_off_over_the_arm(corrected, tmp_path):
 
 def test_a_lateral_uncertainty_costs_by_the_slope_of_the_surface(corrected, folder):
     nominal = ("--nominal", folder / "mirror.yaml")
-    plain, wide = corrected(*nominal)[1], corrected(*nominal, "--lateral", 1e-6)[1]
-    added = np.sqrt(np.maximum(wide["uncertainty"] ** 2.0 - plain["uncertainty"] ** 2.0, 0.0))
+    plain, broad = corrected(*nominal)[1], corrected(*nominal, "--lateral", 1e-6)[1]
+    added = np.sqrt(np.maximum(broad["uncertainty"] ** 2.0 - plain["uncertainty"] ** 2.0, 0.0))
     # z = r² / 2R about its axis, with slope r / R; 2 f (1 + (d / 2f)²)^1.5 across and along.
     slopes = added / 1e-6 / np.hypot(plain["x"], plain["y"])
     focal, off = 25.4e-3, 50.8e-3
@@ -138,8 +138,8 @@ def test_stamps_that_are_apart_are_one_trigger_within_the_tolerance(
         of_distance=lambda block: replace(block, stamp_ns=block.stamp_ns + 10**9),
     )  # fmt: skip
     usual = corrected()[1]
-    told = corrected("--stamp-tolerance", 1.2 * LATE_S, bag="late.mcap")
-    np.testing.assert_array_equal(told[1]["height"], usual["height"])
+    reported = corrected("--stamp-tolerance", 1.2 * LATE_S, bag="late.mcap")
+    np.testing.assert_array_equal(reported[1]["height"], usual["height"])
     slipped(corrected(bag="late.mcap")[0], 3)
 
 

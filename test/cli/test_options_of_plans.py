@@ -119,13 +119,13 @@ def test_limits_of_the_machine_are_held_against_the_motion(capsys, sine, calibra
 
 
 def test_a_budget_that_is_smaller_lets_it_run_less_fast(capsys, sine, calibration):
-    wide, narrow = (
+    broad, narrow = (
         predicted(capsys, sine, calibration, "", "--budget", budget) for budget in (1e-6, 1e-12)
     )
-    assert wide["safe"]
-    assert wide["speed_factor"] >= narrow["speed_factor"]
-    assert wide["peak_to_valley"] == narrow["peak_to_valley"]
-    assert narrow["residual"] == wide["residual"]
+    assert broad["safe"]
+    assert broad["speed_factor"] >= narrow["speed_factor"]
+    assert broad["peak_to_valley"] == narrow["peak_to_valley"]
+    assert narrow["residual"] == broad["residual"]
     assert narrow["safe"] is (2 * narrow["residual"] <= 1e-12)
 
 
@@ -215,7 +215,7 @@ def test_the_twin_is_made_as_its_options_say(capsys, monkeypatch, tmp_path):
         (["--view", "--json"], ["--view", "--json"]),
     ],
 )
-def test_the_demonstration_is_told_what_was_asked_for(monkeypatch, tmp_path, given, passed_on):
+def test_the_demonstration_gets_the_requested_options(monkeypatch, tmp_path, given, passed_on):
     called = []
     monkeypatch.setattr(command_line.subprocess, "call", lambda words: called.append(words) or 7)
     assert cli.main(["demo", "--out", str(tmp_path), *given]) == 7

@@ -55,7 +55,9 @@ def refused(capsys, *arguments):
     ],
     ids=lambda words: " ".join(word[:12] for word in words),
 )  # fmt: skip
-def test_a_long_name_is_told_by_its_beginning_and_its_end(capsys, tmp_path, monkeypatch, arguments):
+def test_a_long_name_is_reported_by_its_beginning_and_its_end(
+    capsys, tmp_path, monkeypatch, arguments
+):
     monkeypatch.chdir(tmp_path)
     said = refused(capsys, *arguments)
     assert len(said) < 600

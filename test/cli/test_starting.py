@@ -6,19 +6,24 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.cli import start
-from omsm_ros.pipelines.examine_host import Check
+from omsm_ros.pipelines.examine_host import HostCheck
 
 
 def test_omsm_alone_tells_what_to_do_next(capsys):
     assert cli.main([]) == 0
-    told = capsys.readouterr().out
-    words = [line.split("omsm ")[1].split()[0] for line in told.splitlines() if "  omsm " in line]
+    reported = capsys.readouterr().out
+    words = [
+        line.split("omsm ")[1].split()[0] for line in reported.splitlines() if "  omsm " in line
+    ]
     before = ["doctor", "demo", "twin", "plan", "import", "inspect"]
     assert words == [*before, "identify", "predict", "correct", "form", "batch"]
 
 
 def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):
-    checks = [Check("disk", "fine", "room"), Check("ROS 2", "faulty", "no omsm_msgs", "build it")]
+    checks = [
+        HostCheck("disk", "fine", "room"),
+        HostCheck("ROS 2", "faulty", "no omsm_msgs", "build it"),
+    ]
     monkeypatch.setattr(start, "examine_host", lambda folder, port: checks)
     assert cli.main(["doctor", "--folder", str(tmp_path)]) == 2
     out, err = capsys.readouterr()
@@ -26,8 +31,8 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
     assert "→ build it" in out
     assert err.strip() == "omsm: not ready: ROS 2; each has its remedy above"
     assert cli.main(["doctor", "--json"]) == 2
-    told = json.loads(capsys.readouterr().out)
-    assert [check["state"] for check in told["checks"]] == ["fine", "faulty"]
+    reported = json.loads(capsys.readouterr().out)
+    assert [check["state"] for check in reported["checks"]] == ["fine", "faulty"]
 
 
 @pytest.mark.parametrize(
@@ -74,7 +79,7 @@ def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
 
 
 @pytest.mark.parametrize("redirected", ["2>&-", "2>/dev/full", ">&- 2>&-"])
-def test_the_exit_status_is_right_where_nobody_can_be_told(redirected, tmp_path):
+def test_the_exit_status_is_right_without_a_readable_stderr(redirected, tmp_path):
     command = f"{sys.executable} -m omsm_ros.cli compare none.json none.json {redirected}"
     done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")

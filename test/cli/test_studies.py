@@ -155,18 +155,18 @@ def test_align_warns_programs_too_of_a_form_that_is_no_noise(capsys, tmp_path, c
     assert "no sphere of that radius, or its form" in warning
 
 
-def test_a_pitch_that_was_measured_elsewhere_is_told(capsys, tmp_path, scan_bag, calibration):
+def test_a_pitch_that_was_measured_elsewhere_is_reported(capsys, tmp_path, scan_bag, calibration):
     (tmp_path / "g.yaml").write_text("abbe_arm: 0.05\n")
     words = ["correct", scan_bag, "--calibration", calibration, "--geometry", tmp_path / "g.yaml"]
-    told = {}
+    reported = {}
     for name, low, high in (("here", -0.1, 0.1), ("elsewhere", 5.0, 6.0)):
         table = tmp_path / f"{name}.csv"
         table.write_text(f"z_m,pitch_rad\n{low},1e-6\n{high},2e-6\n")
         out = ["--out", tmp_path / name, "--no-report", "--pitch", table]
         reasons = facts(capsys, *words, *out)["light"]["reasons"]
-        told[name] = [r["what"] for r in reasons if "pitch was measured" in r["what"]]
-    assert told["here"] == []
-    assert "from 5.00 m to 6.00 m" in told["elsewhere"][0]
+        reported[name] = [r["what"] for r in reasons if "pitch was measured" in r["what"]]
+    assert reported["here"] == []
+    assert "from 5.00 m to 6.00 m" in reported["elsewhere"][0]
 
 
 @pytest.mark.parametrize(
@@ -179,7 +179,9 @@ def test_a_wrong_geometry_file_is_refused(tmp_path, text):
         descriptions.load_geometry(path)
 
 
-def test_correct_refuses_a_foreign_calibration_unless_told(capsys, tmp_path, scan_bag, calibration):
+def test_correct_refuses_a_foreign_calibration_unless_requested(
+    capsys, tmp_path, scan_bag, calibration
+):
     arguments = ["correct", str(scan_bag), "--calibration", str(calibration), "--out"]
     foreign = ["--settings", '{"machine": "another"}', "--no-report"]
     assert cli.main([*arguments, str(tmp_path / "a"), *foreign]) == 2

@@ -36,6 +36,6 @@ def test_the_manual_is_made_without_a_warning(tmp_path):
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    told = (tmp_path / "reference" / "commands.html").read_text(encoding="utf-8")
-    assert "omsm identify" in told
+    reported = (tmp_path / "reference" / "commands.html").read_text(encoding="utf-8")
+    assert "omsm identify" in reported
     assert "sample period" in (tmp_path / "reference" / "quantities.html").read_text("utf-8")

@@ -97,7 +97,7 @@ _XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "told"),
+    ("name", "text", "reported"),
     [
         *(("a.ply", _ASCII.format(n, _XYZ), f"number of points is '{n[:5]}")
           for n in ("-5", "1e9", "many", "9" * 400, "7" * 13)),
@@ -116,8 +116,8 @@ _XYZ = "property float x\nproperty float y\nproperty float z\n"
         ("a.dat", "5 5 1e300 1 0\n" + "1 0 0 0\n" * 25, "spacing dx of the map is 1e+297 m"),
     ],
 )  # fmt: skip
-def test_counts_and_coordinates_that_cannot_be_are_named(place, name, text, told):
-    assert told in refused(place, EXPORT, name, text.encode())
+def test_counts_and_coordinates_that_cannot_be_are_named(place, name, text, reported):
+    assert reported in refused(place, EXPORT, name, text.encode())
 
 
 def test_a_micrometre_as_windows_writes_it_is_understood(place):
@@ -252,7 +252,7 @@ def nested(times: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("surface", "told"),
+    ("surface", "reported"),
     [
         (nested(4), "4 turned frames within one another"),
         ({"shape": "sum", "parts": [{"shape": "flat"}] * 1000}, "1001 shapes"),
@@ -262,8 +262,8 @@ def nested(times: int) -> dict[str, Any]:
         ({"shape": "grid", "file": "/dev/zero"}, "no regular file"),
     ],
 )
-def test_a_surface_that_would_take_hours_is_refused(place, surface, told):
-    assert told in refused(place, SHOW, "a.yaml", json.dumps(surface).encode())
+def test_a_surface_that_would_take_hours_is_refused(place, surface, reported):
+    assert reported in refused(place, SHOW, "a.yaml", json.dumps(surface).encode())
 
 
 def test_a_surface_of_many_terms_is_quick(place):
@@ -280,8 +280,8 @@ def test_a_surface_of_many_terms_is_quick(place):
 @pytest.mark.parametrize("speed", ["0", "-0.0", "1e-300"])
 def test_a_spindle_that_stands_makes_no_scan(place, speed):
     words = ("surface", "show", "{}", "--radius", "0.002", "--rpm", speed)
-    told = refused(place, words, "a.yaml", b"shape: flat\n")
-    assert "spindle speed is" in told
+    reported = refused(place, words, "a.yaml", b"shape: flat\n")
+    assert "spindle speed is" in reported
 
 
 # No files at all.

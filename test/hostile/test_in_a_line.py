@@ -51,16 +51,16 @@ def test_axes_without_z_are_no_axes(place):
 
 
 @pytest.mark.parametrize(
-    ("more", "told"),
+    ("more", "reported"),
     [
         ({"delimiter": ""}, "has 0 characters, expected at least 1"),
         ({"delimiter": ";;"}, "has 2 characters, expected at most 1"),
         ({"zone": "noon"}, "'noon', expected pattern '^(Z|"),
     ],
 )
-def test_a_text_of_another_form_is_told_with_what_is_wanted(place, more, told):
+def test_a_text_of_another_form_is_told_with_what_is_wanted(place, more, reported):
     words = ("import", "log.csv", "--map", "bad.yaml", "--out", "new.mcap")
-    assert told in refused(place, *words, bad_yaml=json.dumps(trees.COLUMNS | more))
+    assert reported in refused(place, *words, bad_yaml=json.dumps(trees.COLUMNS | more))
 
 
 def test_a_start_beyond_all_time_is_refused(place):

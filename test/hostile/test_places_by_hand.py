@@ -42,15 +42,15 @@ def test_places_that_are_one_but_for_their_last_bits_are_no_area(place, size, re
     assert not list(recwarn)
 
 
-@pytest.mark.parametrize(("entry", "told"), [(2, "dx"), (3, "dy")])
+@pytest.mark.parametrize(("entry", "reported"), [(2, "dx"), (3, "dy")])
 @pytest.mark.parametrize("value", ["1e308", "1e-320"])
-def test_a_map_of_impossible_spacing_is_refused(place, entry, told, value, recwarn):
+def test_a_map_of_impossible_spacing_is_refused(place, entry, reported, value, recwarn):
     first, *rest = (place / "good.dat").read_text().split("\n")
     numbers = first.split()
     numbers[entry] = value
     raw = "\n".join([" ".join(numbers), *rest]).encode()
     words = ("export", "{}", "--out", "e.x3p")
-    assert f"spacing {told} of the map" in refused(place, words, "bad.dat", raw)
+    assert f"spacing {reported} of the map" in refused(place, words, "bad.dat", raw)
     assert not list(recwarn)
 
 

@@ -102,18 +102,20 @@ class Bench:
         if block.axes is not None:
             return np.rint(block.axes.x / NANOMETRE).astype(np.int64)
         count, counter = len(block.distance), block.distance.first_sample % self.modulus
-        told = block.distance.distance
+        reported = block.distance.distance
         for k, sent in truth.items():
             if k <= self._after or sent % self.modulus != counter:
                 continue
             last = truth.get(k + count - 1, -1)  # a restart may lie between
             if (last - sent - count + 1) % self.modulus:
                 continue
-            off = told - (10 + (k + np.arange(count)) % 80) * 1e-6
+            off = reported - (10 + (k + np.arange(count)) % 80) * 1e-6
             if np.nanmax(abs(off), initial=0.0) <= self.resolution:
                 self._after = k + count - 1
                 return np.arange(k, k + count)
-        raise AssertionError(f"invented: {counter} with {told[:3]} m after number {self._after}")
+        raise AssertionError(
+            f"invented: {counter} with {reported[:3]} m after number {self._after}"
+        )
 
     def check(self) -> None:
         """Every sample once, with its true counter and values, or counted under a reason."""

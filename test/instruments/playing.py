@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 
-from omsm_ros.instruments.six_channel.emulator import GenericStreamEmulator, Played
+from omsm_ros.instruments.six_channel.emulator import GenericStreamEmulator, PlayedCounts
 from omsm_ros.twin.cell import Recording
 
 SOON = 10.0
@@ -35,7 +35,7 @@ class Playing:
     ) -> None:
         self.stop = threading.Event()
         self.progress = 0
-        self.played = Played()
+        self.played = PlayedCounts()
         self._arguments = (emulator, recording, time_lapse)
         self._thread = threading.Thread(target=self._run)
 

@@ -127,14 +127,14 @@ def test_a_plc_that_counts_anew_goes_on(plc, device):
     assert device.statistics.restarts == 1
 
 
-def test_a_ring_of_another_size_is_told(plc):
+def test_a_ring_of_another_size_is_reported(plc):
     ring = AdsRing("ads://127.0.0.1?samples=60")
     with pytest.raises(DeviceError, match="packed to one byte"):
         ring.open()
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # its server's
-def test_a_symbol_that_is_not_there_is_told(plc):
+def test_a_symbol_that_is_not_there_is_reported(plc):
     ring = AdsRing(f"{ADDRESS}&symbol=GVL.other")
     with pytest.raises(DeviceError, match=r"GVL\.other"):
         ring.open()

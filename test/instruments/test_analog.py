@@ -255,7 +255,7 @@ def test_samples_that_were_overwritten_are_a_loss(daq):
         source.read(0.0)
 
 
-def test_without_the_driver_the_remedy_is_told():
+def test_without_the_driver_the_remedy_is_reported():
     pytest.importorskip("nidaqmx", reason="nidaqmx is an optional package")
     with pytest.raises(DeviceError, match="NI-DAQmx"):
         NidaqInput("daq://Dev1/ai0", 1).open(1000.0)

@@ -20,9 +20,9 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
 from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder, LineDecoder
 from omsm_ros.instruments.chrocodile.telegram import MAX_TELEGRAM_BYTES, Layout
 from omsm_ros.instruments.micro_epsilon.protocol import (
-    Believed,
-    Block,
     BlockDecoder,
+    MeasurementBlock,
+    PlausibleValueFilter,
     SerialDecoder,
     channel_dtype,
     confocal_dtype,
@@ -78,7 +78,7 @@ def of_packets(found: Any) -> Found:
 
 def blocks(form: str, kind: tuple[int, int], width: int) -> list[bytes]:
     return [
-        encode_block(form, Block(1, 2, kind, 3 * i, np.full((3, width), i, np.uint8)))
+        encode_block(form, MeasurementBlock(1, 2, kind, 3 * i, np.full((3, width), i, np.uint8)))
         for i in range(6)
     ]
 
@@ -91,7 +91,7 @@ class Three:
     """What is believed of three bytes a value, with its places of damage."""
 
     def __init__(self) -> None:
-        self._decoder, self._believed = SerialDecoder(2), Believed(2)
+        self._decoder, self._believed = SerialDecoder(2), PlausibleValueFilter(2)
 
     def feed(self, data: bytes) -> Found:
         values, spoilt = self._believed.feed(*self._decoder.feed(data))

@@ -112,12 +112,12 @@ def test_another_service_on_the_port_is_named(cell: Any) -> None:
 
 def test_a_device_that_tells_nothing_by_itself_is_asked_for_its_configuration(cell: Any) -> None:
     run = cell()
-    told, usual = run.instrument.greet, run.instrument.receive
+    reported, usual = run.instrument.greet, run.instrument.receive
     run.instrument.greet = lambda: None
 
     def receive(data: bytes) -> None:
         if b"CONF" in data:
-            told()
+            reported()
         else:
             usual(data)
 

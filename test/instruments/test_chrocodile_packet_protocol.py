@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.chrocodile.packet_protocol import (
-    Command,
     Data,
     DataFormat,
     Message,
+    PacketCommand,
     PacketDecoder,
     encode_command,
     encode_data,
@@ -56,7 +56,7 @@ def counters(found: list[Message]) -> list[int]:
 
 
 def test_a_command_by_hand() -> None:
-    wire = encode_command(Command("SHZ", (1000.0, "ab"), 1, 7))
+    wire = encode_command(PacketCommand("SHZ", (1000.0, "ab"), 1, 7))
     body = struct.pack("<IIIHHHH", 0x5A4853, 0, 0, 1, 0, 7, 2)
     body += struct.pack("<If", 1, 1000.0) + struct.pack("<II", 2, 2) + b"ab\0\0"
     assert wire == struct.pack("<IiQI", 0xAA55AA55, 20 + len(body), 0, 0x00444D43) + body
@@ -111,7 +111,7 @@ def test_more_than_a_packet_holds_is_refused() -> None:
 def test_any_split_gives_the_same_messages(
     given_values: list[object], ticket: int, draw: st.DataObject
 ) -> None:
-    asked = Command("SODX", tuple(given_values), 0, ticket)  # type: ignore[arg-type]
+    asked = PacketCommand("SODX", tuple(given_values), 0, ticket)  # type: ignore[arg-type]
     wire = encode_command(asked) + encode_format(FORMAT) + data(0, 3) + data(3, 4)
     cuts = sorted(draw.draw(st.lists(st.integers(0, len(wire)))))
     decoder = PacketDecoder()
@@ -125,7 +125,9 @@ def test_any_split_gives_the_same_messages(
 
 
 def test_byte_by_byte() -> None:
-    wire = encode_format(FORMAT) + data(0, 50) + encode_command(Command("CONF")) + data(50, 50)
+    wire = (
+        encode_format(FORMAT) + data(0, 50) + encode_command(PacketCommand("CONF")) + data(50, 50)
+    )
     decoder = PacketDecoder()
     found = [m for i in range(len(wire)) for m in decoder.feed(wire[i : i + 1])]
     assert counters(found) == list(range(50))  # what follows the others has not come
@@ -177,7 +179,7 @@ def test_a_packet_cut_off_does_not_swallow_the_next(place: int, lost: int) -> No
 def test_noise_and_mutations_raise_nothing(portions: list[bytes], place: int, value: int) -> None:
     decoder = PacketDecoder()
     mutated = bytearray(
-        encode_format(FORMAT) + data(0, 5) + encode_command(Command("SHZ", (1, "x")))
+        encode_format(FORMAT) + data(0, 5) + encode_command(PacketCommand("SHZ", (1, "x")))
     )
     mutated[place % len(mutated)] = value
     for portion in [bytes(mutated), *portions]:

@@ -116,7 +116,7 @@ def test_a_telegram_before_the_echo_is_whole_although_nothing_follows_it() -> No
     assert counters(made.feed(telegrams(0, 1) + command("STO"))) == [0]
 
 
-def test_without_a_decoder_everything_else_is_discarded_and_remembered() -> None:
+def test_without_a_decoder_other_bytes_are_discarded_and_counted() -> None:
     made = DollarStream()
     made.expect(command("STO"))
     assert made.feed(b"SSH-2.0-OpenSSH\r\n") == []

@@ -133,7 +133,7 @@ def test_what_is_no_number_is_no_target():
     assert np.isnan(found).tolist() == [True, True, True, False]
 
 
-def test_beyond_the_range_is_told_and_still_has_its_distance():
+def test_beyond_the_range_is_reported_and_still_has_its_distance():
     nm = np.int32([-1, 1, 299_999, 300_001])
     found, _, status = read(s33024=nm)
     outside = Status.OUT_OF_RANGE

@@ -76,7 +76,7 @@ def test_a_drift_that_changes_is_followed() -> None:
     assert abs(stamps - host)[4000:].max() < 0.1 * MS
 
 
-def test_the_drift_is_told() -> None:
+def test_the_drift_is_reported() -> None:
     device, _, arrival = link(4000, drift=50e-6)
     clock = DeviceClock()
     stamps_of(clock, device[:100], arrival[:100])
@@ -86,7 +86,7 @@ def test_the_drift_is_told() -> None:
 
 
 @pytest.mark.parametrize("rate", [0.9, 1.1, 1 / 20])
-def test_a_device_at_another_rate_is_followed_and_told(rate: float) -> None:
+def test_a_device_at_another_rate_is_followed_and_reported(rate: float) -> None:
     device, host, arrival = link(4000, drift=rate - 1)
     clock = DeviceClock()
     stamps = stamps_of(clock, device, arrival)

@@ -110,7 +110,7 @@ def test_a_triggered_counter_at_zero_after_a_silence_is_a_restart() -> None:
 def test_a_device_known_to_have_been_restarted_counts_from_its_number() -> None:
     tracker = SequenceTracker(FREE)
     numbers(tracker, samples([100, 101]))
-    tracker.begin_anew()
+    tracker.restart_count()
     assert numbers(tracker, samples([102, 103])) == [102, 103]
     assert (tracker.restarts, tracker.lost) == (1, 0)
 

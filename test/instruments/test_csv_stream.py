@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.instruments.emulator import Instrument
-from omsm_ros.instruments.loopback import Clock
+from omsm_ros.instruments.loopback import SimulatedClock
 from omsm_ros.instruments.six_channel.device import (
     CsvSettings,
     CsvStreamDevice,
@@ -86,7 +86,7 @@ class Banner(Instrument):
         (GenericStreamDevice, "the baud rate and what is connected"),
     ],
 )
-def test_bytes_that_are_no_samples_are_told(bench: Any, device: Any, check: str) -> None:
+def test_bytes_that_are_no_samples_are_reported(bench: Any, device: Any, check: str) -> None:
     run = bench(Banner, device, None)
     run.run(4.0)
     assert run.delivered == 0
@@ -121,7 +121,9 @@ def test_a_number_that_no_counter_has_costs_its_line(number: bytes) -> None:
         b"%s,%d,%d,0,%d,0,0,0,0\n" % (number if k % 2 else b"%d" % k, k * 10**6, k, k)
         for k in range(40)
     ]
-    device = CsvStreamDevice(Script(*lines), CsvSettings(block_size=1), Clock().nanoseconds)
+    device = CsvStreamDevice(
+        Script(*lines), CsvSettings(block_size=1), SimulatedClock().nanoseconds
+    )
     device.open()
     blocks = [pair for _ in lines for pair in device.poll(0.05)] + device.close()
     found = {pair.distance.first_sample: pair.distance.distance[0] for pair in blocks}

@@ -17,8 +17,8 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
 from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder, LineDecoder
 from omsm_ros.instruments.chrocodile.telegram import Layout
 from omsm_ros.instruments.micro_epsilon.protocol import (
-    Block,
     BlockDecoder,
+    MeasurementBlock,
     SerialDecoder,
     confocal_dtype,
     encode_block,
@@ -53,7 +53,9 @@ def packets() -> bytes:
 
 def blocks() -> bytes:
     frames = np.zeros((20, confocal_dtype(FLAGS).itemsize), np.uint8)
-    return b"".join(encode_block("confocal", Block(1, 2, FLAGS, i * 20, frames)) for i in range(20))
+    return b"".join(
+        encode_block("confocal", MeasurementBlock(1, 2, FLAGS, i * 20, frames)) for i in range(20)
+    )
 
 
 CASES: dict[str, tuple[Callable[[], Any], Callable[[], bytes], int]] = {

@@ -36,9 +36,9 @@ def test_every_emulated_device_has_its_driver() -> None:
     assert set(EMULATED) == {*DEVICES, "capancdt"}
     names = {parameter.name for parameter in PARAMETERS}
     # A probe without encoders is no whole cell.
-    beside = EMULATED["confocaldt"].beside
-    assert beside is not None
-    assert beside.node == "axis_driver"
+    companion = EMULATED["confocaldt"].companion
+    assert companion is not None
+    assert companion.node == "axis_driver"
     for each in EMULATED.values():
         assert set(each.driver) <= names
 

@@ -14,7 +14,11 @@ from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.emulator_ports import Pty
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
-from omsm_ros.instruments.six_channel.emulator import Faults, GenericStreamEmulator, Played
+from omsm_ros.instruments.six_channel.emulator import (
+    GenericStreamEmulator,
+    PlayedCounts,
+    StreamFaults,
+)
 from omsm_ros.instruments.six_channel.protocol import FRAME, encode_frames
 from omsm_ros.instruments.transport import SerialTransport
 from omsm_ros.twin.cell import Recording
@@ -78,7 +82,7 @@ def test_every_sample_arrives_as_the_twin_made_it(
         blocks = drain(driver, playing)
     blocks += driver.close()
     count = len(recording.axes)
-    assert playing.played == Played(samples=count, intact=count)
+    assert playing.played == PlayedCounts(samples=count, intact=count)
     assert playing.progress == count
     assert sum(len(axes) for axes, _ in blocks) == count
     assert [axes.first_sample for axes, _ in blocks] == list(range(0, count, 100))
@@ -92,7 +96,7 @@ def test_every_sample_arrives_as_the_twin_made_it(
 def test_every_sample_is_accounted_for_with_every_fault(
     pty: Pty, driver: GenericStreamDevice, recording: Recording, seed: int
 ) -> None:
-    faults = Faults(**EVERY_FAULT, jump_at=500, jump_by=1000, seed=seed)
+    faults = StreamFaults(**EVERY_FAULT, jump_at=500, jump_by=1000, seed=seed)
     with Playing(GenericStreamEmulator(pty, faults=faults), recording) as playing:
         blocks = drain(driver, playing)
     blocks += driver.close()
@@ -176,7 +180,7 @@ def test_a_driver_that_comes_back_sees_a_gap_for_what_it_missed(
     blocks += driver.close()
     unheard = emulator.play(recording, math.inf)
     count = len(recording.axes)
-    assert unheard == Played(samples=count, unread=count)
+    assert unheard == PlayedCounts(samples=count, unread=count)
     driver.open()
     with Playing(emulator, recording) as playing:
         blocks += drain(driver, playing)

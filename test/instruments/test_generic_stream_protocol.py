@@ -149,7 +149,7 @@ def test_every_byte_is_accounted_for(portions: list[bytes]) -> None:
     assert found.frames + bad == sum(map(bool, segments))
 
 
-def test_reasons_are_told_apart() -> None:
+def test_reasons_are_distinguished() -> None:
     good = encode_frames(some_frames(1))
     decoder = FrameDecoder()
     decoder.feed(good[1:])
@@ -209,7 +209,9 @@ def test_a_frame_of_another_size_with_a_good_crc_is_refused() -> None:
     st.sampled_from([1, -1]),
     st.floats(-0.5, 0.5),
 )
-def test_axis_survives_to_half_a_count(values: list[float], sign: int, offset: float) -> None:
+def test_axis_positions_round_trip_to_half_a_count(
+    values: list[float], sign: int, offset: float
+) -> None:
     axis = AxisScaling(1e10, sign=sign, offset=offset)
     positions = np.array(values)
     error = axis.values(axis.counts(positions)) - positions

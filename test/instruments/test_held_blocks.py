@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omsm_ros.instruments.micro_epsilon.device import CapaNcdtDevice, CapaNcdtSettings
-from omsm_ros.instruments.micro_epsilon.protocol import Block, encode_block
+from omsm_ros.instruments.micro_epsilon.protocol import MeasurementBlock, encode_block
 
 from .scripted_stream import Script
 
@@ -14,7 +14,7 @@ MS = 1_000_000
 
 def block(first: int, count: int) -> bytes:
     frames = np.zeros((count, 4), np.uint8)
-    return encode_block("capacitive", Block(1, 2, (0b01, 0), first, frames))
+    return encode_block("capacitive", MeasurementBlock(1, 2, (0b01, 0), first, frames))
 
 
 def stamps(portions: list[bytes], arrivals_ms: list[float], period: float) -> dict[int, float]:

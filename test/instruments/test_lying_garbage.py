@@ -21,8 +21,8 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
 from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder
 from omsm_ros.instruments.chrocodile.telegram import Layout
 from omsm_ros.instruments.micro_epsilon.protocol import (
-    Block,
     BlockDecoder,
+    MeasurementBlock,
     channel_dtype,
     encode_block,
 )
@@ -52,7 +52,7 @@ def packets(first: int, count: int) -> list[bytes]:
 def blocks(first: int, count: int) -> list[bytes]:
     frames = np.full((3, 8), 7, np.uint8)
     return [
-        encode_block("capacitive", Block(1, 2, CHANNELS, k, frames))
+        encode_block("capacitive", MeasurementBlock(1, 2, CHANNELS, k, frames))
         for k in range(first, first + count)
     ]
 

@@ -168,7 +168,7 @@ def test_without_a_counter_a_silence_begins_anew(bench: Any) -> None:
     assert run.device.statistics.restarts == 1
 
 
-def test_a_wrong_baud_rate_is_no_sample_and_is_told(bench: Any) -> None:
+def test_a_wrong_baud_rate_is_no_sample_and_is_reported(bench: Any) -> None:
     class Garbled(ConfocalDtSerialEmulator):
         def pack(self, measured: Any, counters: Any, times_ns: Any) -> list[bytes]:
             return [b"\xff\x80\x3f"] * len(measured)
@@ -252,7 +252,7 @@ def test_senseless_settings_are_refused(make: Callable[[], object]) -> None:
         (CapaNcdtDevice, CapaNcdtSettings(triggered=True)),
     ],
 )
-def test_another_service_on_the_port_is_told_though_a_trigger_may_be_waited_for(
+def test_another_service_on_the_port_is_reported_even_while_waiting_for_a_trigger(
     bench: Any, device: Any, wanted: Any
 ) -> None:
     class Banner(Instrument):

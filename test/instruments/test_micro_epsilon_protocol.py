@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ProtocolError
 from omsm_ros.instruments.micro_epsilon.protocol import (
-    Block,
     BlockDecoder,
+    MeasurementBlock,
     SerialDecoder,
     channel_dtype,
     confocal_dtype,
@@ -29,12 +29,12 @@ FLAGS = (1 << 8 | 1 << 11 | 1 << 15 | 1 << 19, 0)
 DTYPE = confocal_dtype(FLAGS)
 
 
-def block(first: int, count: int) -> Block:
+def block(first: int, count: int) -> MeasurementBlock:
     frames = np.zeros(count, DTYPE)
     frames["counter"] = np.arange(first, first + count)
     frames["encoder 1"] = -frames["counter"].astype(int)
     raw = frames.view(np.uint8).reshape(count, DTYPE.itemsize)
-    return Block(2418004, 11020009, FLAGS, first, raw)
+    return MeasurementBlock(2418004, 11020009, FLAGS, first, raw)
 
 
 def wire(first: int, count: int) -> bytes:
@@ -45,14 +45,14 @@ def decoder() -> BlockDecoder:
     return BlockDecoder("confocal", confocal_dtype)
 
 
-def counters(found: list[Block]) -> list[int]:
+def counters(found: list[MeasurementBlock]) -> list[int]:
     return [int(c) for b in found for c in b.frames.reshape(-1).view(DTYPE)["counter"]]
 
 
 # Blocks, by hand.
 
 
-def decoded(sent: bytes, made: BlockDecoder | None = None) -> list[Block]:
+def decoded(sent: bytes, made: BlockDecoder | None = None) -> list[MeasurementBlock]:
     """What is in ``sent``, which nothing follows."""
     made = made or decoder()
     return made.feed(sent) + made.settle()

@@ -8,7 +8,7 @@ import pytest
 from omsm_ros.errors import DeviceError, NoSamplesError
 from omsm_ros.instruments.chrocodile.device import Chrocodile, ChrocodileDevice, ChrocodileSettings
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.chrocodile.packet_protocol import Command, encode_command
+from omsm_ros.instruments.chrocodile.packet_protocol import PacketCommand, encode_command
 from omsm_ros.instruments.micro_epsilon.device import ConfocalDtDevice, ConfocalDtSettings
 from omsm_ros.instruments.micro_epsilon.protocol import encode_frames
 
@@ -31,20 +31,20 @@ CLOSED = DeviceError("connection was lost: closed by the device")
 
 
 @pytest.mark.parametrize("kind", [ChrocodileDevice, ChrocodilePacketDevice])
-def test_a_web_server_that_hangs_up_is_told(kind: type[Chrocodile]) -> None:
+def test_a_web_server_that_hangs_up_is_reported(kind: type[Chrocodile]) -> None:
     device = kind(Service(b"HTTP/1.1 400 Bad Request\r\n", CLOSED), ChrocodileSettings())
     with pytest.raises(DeviceError, match=r"HTTP/1\.1 400.*no CHRocodile is there"):
         device.open()
 
 
 def test_a_service_that_repeats_what_it_hears_is_no_device() -> None:
-    service = Service(encode_command(Command("CONF")), echo=True)
+    service = Service(encode_command(PacketCommand("CONF")), echo=True)
     device = ChrocodilePacketDevice(service, ChrocodileSettings())
     with pytest.raises(DeviceError, match="no CHRocodile is there"):
         device.open()
 
 
-def test_a_counter_that_stands_still_is_told() -> None:
+def test_a_counter_that_stands_still_is_reported() -> None:
     """The frame has intensity and counter the other way round than the settings say."""
     now = [0.0]
     frames = [np.array([[98_232, 512, 100 * k + i] for i in range(100)]) for k in range(40)]

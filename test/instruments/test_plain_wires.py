@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from omsm_ros.instruments.chrocodile.packet_protocol import (
-    Command,
     Data,
     DataFormat,
+    PacketCommand,
     PacketDecoder,
     decode_command,
 )
@@ -265,7 +265,7 @@ def test_commands_of_packets_carry_every_kind_of_argument() -> None:
     )
     sent = wires.packet_command("CONF", 0x2000, 9, *arguments)
     (found,) = PacketDecoder().feed(sent)
-    assert found == Command("CONF", (-5, 12.5, "ready", "q", b"\x00\x01"), 0x2000, 9)
+    assert found == PacketCommand("CONF", (-5, 12.5, "ready", "q", b"\x00\x01"), 0x2000, 9)
     assert decode_command(sent[20:]) == found
 
 

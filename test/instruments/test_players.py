@@ -23,7 +23,7 @@ from omsm_ros.instruments.factory import (
     make_reference,
 )
 from omsm_ros.instruments.reader import DeviceReader
-from omsm_ros.instruments.six_channel.emulator import Faults
+from omsm_ros.instruments.six_channel.emulator import StreamFaults
 from omsm_ros.twin.cell import Recording
 
 SOON = 20.0
@@ -36,7 +36,7 @@ def play(name: str, link: str, recording: Recording, lapse: float = 20.0) -> lis
     got: list[BlockPair] = []
     stop = threading.Event()
     with line_for(link) as line:
-        player = emulated(name).player(line, Faults())
+        player = emulated(name).player(line, StreamFaults())
         values = defaults() | {"device": name, "port": line.path} | emulated(name).driver
         device = make_device(values)
         reader = DeviceReader(device, got.extend)
@@ -93,23 +93,23 @@ def test_the_twins_motion_comes_out(
             np.testing.assert_allclose(found, expected, rtol=0, atol=half_count * 1.001)
 
 
-@pytest.mark.parametrize("name", [name for name in EMULATED if EMULATED[name].beside])
-def test_the_device_beside_it_measures_the_same_motion(
+@pytest.mark.parametrize("name", [name for name in EMULATED if EMULATED[name].companion])
+def test_the_companion_device_measures_the_same_motion(
     name: str, tmp_path: Path, step_test: Recording
 ) -> None:
-    beside = emulated(name).beside
-    assert beside is not None
+    companion = emulated(name).companion
+    assert companion is not None
     far = replace(step_test.distance, distance=0.5 * step_test.axes.z)
     recording = replace(step_test, reference=far)
-    axes_wanted = beside.node == "axis_driver"
+    axes_wanted = companion.node == "axis_driver"
     make = make_axes if axes_wanted else make_reference
     parameters = AXIS_PARAMETERS if axes_wanted else REFERENCE_PARAMETERS
-    second = "tcp://127.0.0.1:0" if beside.tcp else str(tmp_path / "second")
+    second = "tcp://127.0.0.1:0" if companion.tcp else str(tmp_path / "second")
     got: list[BlockPair] = []
     stop = threading.Event()
     with line_for(str(tmp_path / "first")) as line, line_for(second) as other:
-        player = player_for(name, line, other, Faults())
-        values = {p.name: p.default for p in parameters} | {"port": other.path} | beside.driver
+        player = player_for(name, line, other, StreamFaults())
+        values = {p.name: p.default for p in parameters} | {"port": other.path} | companion.driver
         device = make(values)
         reader = DeviceReader(device, got.extend)
         thread = threading.Thread(target=reader.run, args=(stop,))

@@ -106,7 +106,7 @@ def test_waiting_for_a_driver_can_be_stopped(pty: Pty) -> None:
     assert not pty.wait_for_reader(1e6, stop)
 
 
-def test_bytes_without_a_reader_are_lost_and_told(pty: Pty, driver: SerialTransport) -> None:
+def test_bytes_without_a_reader_are_counted_as_lost(pty: Pty, driver: SerialTransport) -> None:
     assert pty.write(b"nobody") == 0
     driver.open()
     assert pty.write(b"heard") == 5

@@ -86,7 +86,7 @@ def test_that_nothing_can_be_read_stays_until_samples_come() -> None:
     assert reader.trouble == "mute"
 
 
-def test_a_defect_is_told_and_survived() -> None:
+def test_an_internal_error_is_reported_and_the_node_continues() -> None:
     reader, notes, got = run([[], []], [ZeroDivisionError("of ours"), [BLOCK]])
     assert len(got) == 1
     assert reader.connections == 2

@@ -105,7 +105,7 @@ def test_a_second_client_waits_for_the_first_to_leave() -> None:
             checked(got)
 
 
-def test_a_reference_is_read_beside_its_command_port() -> None:
+def test_a_reference_is_read_in_addition_to_its_command_port() -> None:
     with TcpServer() as data, TcpServer() as commands:
         emulator = CapaNcdtEmulator(data, commands=commands)
         port = int(commands.path.rpartition(":")[2])

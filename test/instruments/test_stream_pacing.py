@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.six_channel import emulator as generic_stream
 from omsm_ros.instruments.six_channel.emulator import (
-    Faults,
     FaultyLine,
     GenericStreamEmulator,
-    Played,
+    PlayedCounts,
+    StreamFaults,
 )
 from omsm_ros.instruments.six_channel.protocol import FRAME, FrameDecoder
 from omsm_ros.twin.cell import Recording
@@ -81,7 +81,7 @@ def test_sequence_and_clock_run_on_from_play_to_play(recording: Recording) -> No
 
 def test_silence_is_a_pause_of_the_trigger(recording: Recording) -> None:
     sink = Sink()
-    faults = Faults(silence_at=50, silence=3.0)
+    faults = StreamFaults(silence_at=50, silence=3.0)
     GenericStreamEmulator(sink, faults=faults).play(recording, math.inf)
     frames = decoded(sink)
     np.testing.assert_array_equal(frames["sequence"], np.arange(len(recording.axes)))
@@ -112,11 +112,13 @@ def test_a_frame_cut_off_spoils_the_next_only_if_somebody_listens(
     st.integers(0, 1000),
     st.lists(st.integers(1, 20), min_size=1, max_size=5),
 )
-def test_the_line_knows_what_survives_it(rates: list[float], seed: int, sizes: list[int]) -> None:
+def test_the_faulty_link_counts_intact_frames(
+    rates: list[float], seed: int, sizes: list[int]
+) -> None:
     """Against the decoder: intact frames come out, in order, and nothing else does."""
-    line = FaultyLine(Faults(**dict(zip(EVERY_FAULT, rates, strict=True)), seed=seed))
+    line = FaultyLine(StreamFaults(**dict(zip(EVERY_FAULT, rates, strict=True)), seed=seed))
     decoder = FrameDecoder()
-    total, survived = Played(), 0
+    total, survived = PlayedCounts(), 0
     frames = np.zeros(sum(sizes), FRAME)
     frames["sequence"] = np.arange(len(frames))
     found = []
@@ -135,7 +137,7 @@ def test_faults_repeat_with_their_seed(recording: Recording) -> None:
     wires = []
     for seed in (1, 1, 2):
         sink = Sink()
-        faults = Faults(**EVERY_FAULT, seed=seed)
+        faults = StreamFaults(**EVERY_FAULT, seed=seed)
         GenericStreamEmulator(sink, faults=faults).play(recording, math.inf)
         wires.append(sink.data)
     assert wires[0] == wires[1] != wires[2]
@@ -144,7 +146,9 @@ def test_faults_repeat_with_their_seed(recording: Recording) -> None:
 @pytest.mark.parametrize("name", list(EVERY_FAULT))
 def test_each_fault_strikes_as_often_as_asked(recording: Recording, name: str) -> None:
     sink = Sink()
-    played = GenericStreamEmulator(sink, faults=Faults(**{name: 0.1})).play(recording, math.inf)
+    played = GenericStreamEmulator(sink, faults=StreamFaults(**{name: 0.1})).play(
+        recording, math.inf
+    )
     struck = {"drop": played.dropped, "duplicate": played.duplicated}.get(name, played.spoilt)
     expected = 0.1 * played.samples * (2 if name == "truncate" else 1)
     # Four standard deviations of a binomial count; a cut frame spoils two unless they meet.
@@ -157,7 +161,7 @@ def test_each_fault_strikes_as_often_as_asked(recording: Recording, name: str) -
 )
 def test_senseless_faults_are_refused(arguments: dict[str, float], named: str) -> None:
     with pytest.raises(ConfigurationError, match=named):
-        Faults(**arguments)
+        StreamFaults(**arguments)
 
 
 @pytest.mark.parametrize("time_lapse", [0.0, -1.0, math.nan])

@@ -37,7 +37,7 @@ def test_every_byte_value_passes_both_ways() -> None:
         driver.close()
 
 
-def test_without_a_client_bytes_are_lost_and_told() -> None:
+def test_bytes_without_a_client_are_counted_as_lost() -> None:
     with TcpServer() as server:
         assert not server.has_reader
         assert server.read() == b""

@@ -56,7 +56,7 @@ def test_a_replayed_trace_gives_the_same_blocks(device: Any, emulator: Any, tmp_
         np.testing.assert_array_equal(a.axes.z, b.axes.z)
 
 
-def test_a_driver_that_says_something_else_is_told() -> None:
+def test_a_driver_that_says_something_else_is_reported() -> None:
     replay = ReplayTransport([Event(0.0, "open", b""), Event(0.1, ">", b"$STO\r")])
     replay.open()
     with pytest.raises(DeviceError, match=r"sends b'\$VER\\r', the trace goes on with"):
@@ -90,7 +90,7 @@ def test_every_connection_is_in_the_trace(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/nonexistent/wire.trace", "/", "wire\0trace"])
-def test_a_trace_that_cannot_be_written_is_told_with_the_remedy_and_the_line_is_let_go(
+def test_an_unwritable_trace_is_reported_with_the_remedy_and_the_port_is_closed(
     place: str,
 ) -> None:
     loop = Loopback()

@@ -21,7 +21,7 @@ from rosbags.rosbag2 import Reader
 from omsm_ros.errors import BagError
 from omsm_ros.io import bag_writer, bags
 from omsm_ros.io.bag_repair import repair
-from omsm_ros.io.bag_writer import BagWriter, whole_bag
+from omsm_ros.io.bag_writer import BagWriter, atomic_bag
 from omsm_ros.io.topics import LATCHED_TOPICS, TOPIC_TYPES
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
@@ -138,7 +138,7 @@ def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
         """
         import sys
         from omsm_ros.core.streams.blocks import AxisBlock
-        from omsm_ros.io.bag_writer import BagWriter, whole_bag
+        from omsm_ros.io.bag_writer import BagWriter, atomic_bag
         import numpy as np
         zeros = {name: np.zeros(100) for name in "xyzbc"}
         bag = BagWriter(sys.argv[1], ("/omsm/axes",)).__enter__()
@@ -155,13 +155,13 @@ def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
         with subprocess.Popen(
             [sys.executable, "-c", program, str(path)], stdout=subprocess.PIPE, text=True
         ) as process:
-            told = 0
+            reported = 0
             for line in itertools.islice(process.stdout, 200):
-                told = int(line)
+                reported = int(line)
             process.send_signal(signal.SIGKILL)
             rest = [int(line) for line in process.stdout if line.endswith("\n")]
         assert process.returncode == -signal.SIGKILL
-        flushed = max([told, *rest]) + 1
+        flushed = max([reported, *rest]) + 1
         try:
             found = first_samples(path)
         except BagError:  # within a write
@@ -176,19 +176,19 @@ def test_a_whole_bag_appears_when_all_went_well_or_not_at_all(tmp_path, axes):
     path = tmp_path / "made.mcap"
 
     def interrupted():
-        with whole_bag(path, TOPICS) as bag:
+        with atomic_bag(path, TOPICS) as bag:
             bag.write_axes(axes[0])
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
         interrupted()
     assert list(tmp_path.iterdir()) == []
-    with whole_bag(path, TOPICS) as bag:
+    with atomic_bag(path, TOPICS) as bag:
         bag.write_axes(axes[0])
         assert not path.exists()
     assert first_samples(path) == [axes[0].first_sample]
     with pytest.raises(BagError, match=r"made\.mcap' exists"):
-        whole_bag(path, TOPICS).__enter__()
+        atomic_bag(path, TOPICS).__enter__()
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -272,11 +272,11 @@ def test_a_full_tmpfs(tmp_path, small_scan_blocks):
         pytest.skip("no right to mount a tmpfs")
     try:
         path = place / "scan.mcap"
-        with pytest.raises(BagError, match="No space left on device") as told:
+        with pytest.raises(BagError, match="No space left on device") as reported:
             record(path, [axes for axes, _ in small_scan_blocks[:40]])
         found = first_samples(path)
         assert 5 < len(found) < 20
-        assert f"holds the first {len(found)} messages, the last 1 are lost" in str(told.value)
+        assert f"holds the first {len(found)} messages, the last 1 are lost" in str(reported.value)
     finally:
         subprocess.run(["umount", str(place)], check=True)
 

@@ -112,7 +112,7 @@ def test_a_block_that_contradicts_itself_is_refused(tmp_path, small_scan_blocks)
         _open(path, bags.AXES_TOPIC)
 
 
-def test_a_set_of_calibrations_survives_the_message(true_calibration):
+def test_a_set_of_calibrations_is_unchanged_by_the_message(true_calibration):
     made = calibration_set("x", [(0.0, true_calibration), (0.01, true_calibration)])
     message = message_mapping.calibration_message(message_mapping.bag_messages(), made, 7)
     heard = message_mapping.calibration(message)
@@ -128,7 +128,7 @@ def test_a_set_of_calibrations_survives_the_message(true_calibration):
         message_mapping.calibration(message)
 
 
-def test_calibration_survives_the_message(true_calibration):
+def test_a_calibration_is_unchanged_by_the_message(true_calibration):
     message = message_mapping.calibration_message(
         message_mapping.bag_messages(), true_calibration, 7
     )

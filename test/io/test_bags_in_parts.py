@@ -53,15 +53,15 @@ def part(folder, pairs, plugin, mode):
 def in_parts(folder, pairs, plugin, mode):
     """One folder with the files of several bags, and metadata that speak of all."""
     folder.mkdir()
-    told = []
+    reported = []
     for k in range(PARTS):
         alone = folder.parent / f"part{k}"
         some = pairs[k * BLOCKS_A_PART : (k + 1) * BLOCKS_A_PART]
-        told.append(part(alone, some, plugin, mode)["rosbag2_bagfile_information"])
-        (name,) = told[k]["relative_file_paths"]
+        reported.append(part(alone, some, plugin, mode)["rosbag2_bagfile_information"])
+        (name,) = reported[k]["relative_file_paths"]
         shutil.move(alone / name, folder / name)
-    whole = told[0]
-    for each in told[1:]:
+    whole = reported[0]
+    for each in reported[1:]:
         whole["relative_file_paths"] += each["relative_file_paths"]
         whole["files"] += each["files"]
         whole["message_count"] += each["message_count"]

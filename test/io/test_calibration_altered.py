@@ -94,9 +94,9 @@ def gone(place, key):
 
 
 def refused(content):
-    with pytest.raises(CalibrationError, match=r"^the file: ") as told:
+    with pytest.raises(CalibrationError, match=r"^the file: ") as reported:
         calibration_of(copy.deepcopy(content), "the file")
-    return str(told.value)
+    return str(reported.value)
 
 
 def test_the_id_is_the_hash_of_the_content(content):
@@ -112,9 +112,9 @@ def test_every_leaf_counts(content, change):
     ways = list(leaves(content))
     assert len(ways) > 30
     for way in ways:
-        told = refused(changed(content, way, change))
-        assert "\n" not in told
-        assert len(told) < 600
+        reported = refused(changed(content, way, change))
+        assert "\n" not in reported
+        assert len(reported) < 600
 
 
 def test_what_is_added_counts_too(content):

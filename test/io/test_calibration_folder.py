@@ -13,9 +13,9 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import CalibrationError, FileError
 from omsm_ros.io.calibration_file import (
     CalibrationFolder,
-    confined,
     load_calibration,
     load_for_others,
+    resolved_within,
     save_calibration,
     since,
 )
@@ -99,15 +99,15 @@ def test_ways_out_of_the_folder_are_refused(tmp_path: Path, way: str) -> None:
     inside.mkdir()
     (inside / "link").symlink_to("/etc/passwd")
     with pytest.raises(CalibrationError) as refused:
-        confined(Path(way.format(inside)), f"/nowhere:{inside}")
+        resolved_within(Path(way.format(inside)), f"/nowhere:{inside}")
     assert "root:" not in str(refused.value)
     assert len(str(refused.value)) < 1000
 
 
 def test_what_lies_below_is_let_in(tmp_path: Path) -> None:
     file = tmp_path / "a" / "cal.json"
-    assert confined(file, str(tmp_path)) == file
-    assert confined(file, "") == file
+    assert resolved_within(file, str(tmp_path)) == file
+    assert resolved_within(file, "") == file
 
 
 def test_by_default_it_is_the_home_folder_and_the_working_directory(
@@ -117,10 +117,10 @@ def test_by_default_it_is_the_home_folder_and_the_working_directory(
         (tmp_path / name).mkdir()
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path / "here")
-    assert confined(Path("~/cal.json"), "~:.") == tmp_path / "home" / "cal.json"
-    assert confined(Path("cal.json"), "~:.") == tmp_path / "here" / "cal.json"
+    assert resolved_within(Path("~/cal.json"), "~:.") == tmp_path / "home" / "cal.json"
+    assert resolved_within(Path("cal.json"), "~:.") == tmp_path / "here" / "cal.json"
     with pytest.raises(CalibrationError, match="outside the folders"):
-        confined(tmp_path / "other" / "cal.json", "~:.")
+        resolved_within(tmp_path / "other" / "cal.json", "~:.")
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_by_default_it_is_the_home_folder_and_the_working_directory(
         '{"schema": "omsm-calibration/1", "id": "s3cret"}',
     ],
 )
-def test_of_what_is_no_calibration_nothing_is_told_to_others(tmp_path: Path, content: str) -> None:
+def test_an_invalid_calibration_is_not_published(tmp_path: Path, content: str) -> None:
     file = tmp_path / "cal.json"
     file.write_text(content)
     with pytest.raises(CalibrationError, match="no calibration that can be used") as refused:

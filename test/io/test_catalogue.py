@@ -21,7 +21,7 @@ def address(tmp_path, true_calibration):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ("recorded_at = 'yesterday'", "yesterday"),
         ("added_at = '2026-13-45'", "month must be in 1..12"),
@@ -31,12 +31,12 @@ def address(tmp_path, true_calibration):
         ("machine = x'ff'", r"machine of one of the calibrations is b'\xff', expected str"),
     ],
 )
-def test_a_row_that_cannot_be_is_named(address, change, told):
+def test_a_row_that_cannot_be_is_named(address, change, reported):
     with closing(sqlite3.connect(address)) as base, base:
         base.execute(f"UPDATE calibrations SET {change}")
     with pytest.raises(FileError, match=r"catalogue .*catalogue.sqlite") as refusal:
         history(address)
-    assert told in str(refusal.value)
+    assert reported in str(refusal.value)
 
 
 def test_a_view_without_end_is_given_up(address, monkeypatch):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io.folders import claimed
+from omsm_ros.io.folders import exclusive_lock
 
 HOLDER = (
     "import sys, time; from pathlib import Path; from omsm_ros.io.folders import claimed\n"
@@ -21,16 +21,20 @@ HOLDER = (
 
 def test_a_second_one_is_refused_and_a_later_one_is_not(tmp_path: Path) -> None:
     path = tmp_path / "port"
-    with claimed(path), pytest.raises(ConfigurationError, match="in use"), claimed(path):
+    with (
+        exclusive_lock(path),
+        pytest.raises(ConfigurationError, match="in use"),
+        exclusive_lock(path),
+    ):
         pass
-    with claimed(path):
+    with exclusive_lock(path):
         pass
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("path", ["", ".", "..", "/", "a/.."])
 def test_what_names_no_file_is_refused(path: str) -> None:
-    with pytest.raises(ConfigurationError, match="names no file"), claimed(Path(path)):
+    with pytest.raises(ConfigurationError, match="names no file"), exclusive_lock(Path(path)):
         pass
 
 
@@ -41,23 +45,23 @@ def test_who_was_killed_holds_nothing(tmp_path: Path) -> None:
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
-    with pytest.raises(ConfigurationError), claimed(path):
+    with pytest.raises(ConfigurationError), exclusive_lock(path):
         pass
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stdout.close()
-    with claimed(path):
+    with exclusive_lock(path):
         pass
 
 
 def test_a_link_laid_in_its_place_is_not_followed(tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     (tmp_path / ".port.lock").symlink_to(victim)
-    with pytest.raises(FileError), claimed(tmp_path / "port"):
+    with pytest.raises(FileError), exclusive_lock(tmp_path / "port"):
         pass
     assert not victim.exists()
 
 
 def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="none"), claimed(tmp_path / "none" / "port"):
+    with pytest.raises(FileError, match="none"), exclusive_lock(tmp_path / "none" / "port"):
         pass

@@ -8,7 +8,7 @@ import pytest
 
 from omsm_ros.errors import FileError
 from omsm_ros.io.results import read_curves, read_form
-from omsm_ros.report.measurement.page import Report, dragged, render
+from omsm_ros.report.measurement.page import Report, correlated_moves, render
 
 FIGURE = {"value": 2e-9, "uncertainty": 1e-10}
 FORM = {
@@ -62,7 +62,7 @@ def test_what_a_registration_writes_is_read_as_it_is(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("way", "value", "told"),
+    ("way", "value", "reported"),
     [
         (["deviation"], 3, "deviation is 3, expected names and values"),
         (["deviation", "rms"], 1e-9, "deviation.rms is 1e-09, expected names and values"),
@@ -87,15 +87,15 @@ def test_what_a_registration_writes_is_read_as_it_is(tmp_path):
         (["conformity"], {}, "verdict is required and missing"),
     ],
 )
-def test_a_form_that_was_altered_is_told_by_its_place(tmp_path, way, value, told):
+def test_a_form_that_was_altered_is_reported_by_its_place(tmp_path, way, value, reported):
     path = written(tmp_path, "form.json", changed(FORM, way, value))
-    with pytest.raises(FileError, match=rf"^form '.*form.json': .*{told}") as refused:
+    with pytest.raises(FileError, match=rf"^form '.*form.json': .*{reported}") as refused:
         read_form(path)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("way", "value", "told"),
+    ("way", "value", "reported"),
     [
         (["psd"], 3, "psd is 3, expected names and values or null"),
         (["psd", "band"], [1.0], "psd.band has 1 values, expected at least 2"),
@@ -111,16 +111,16 @@ def test_a_form_that_was_altered_is_told_by_its_place(tmp_path, way, value, told
         (["psd", "areal", "value"], [[1, 2, 3], [4]], "areal.value is no row of numbers"),
     ],
 )
-def test_curves_that_were_altered_are_told_by_their_place(tmp_path, way, value, told):
+def test_curves_that_were_altered_are_reported_by_their_place(tmp_path, way, value, reported):
     path = written(tmp_path, "curves.json", changed(CURVES, way, value))
-    with pytest.raises(FileError, match=rf"^curves '.*curves.json': .*{told}") as refused:
+    with pytest.raises(FileError, match=rf"^curves '.*curves.json': .*{reported}") as refused:
         read_curves(path)
     assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("read", [read_form, read_curves])
 @pytest.mark.parametrize("text", ["", "[1]", '{"a": NaN}', '{"a": 1, "a": 2}'])
-def test_what_is_no_strict_json_is_told(tmp_path, read, text):
+def test_invalid_json_is_reported(tmp_path, read, text):
     (tmp_path / "f.json").write_text(text)
     with pytest.raises(FileError, match=r"f.json' is "):
         read(tmp_path / "f.json")
@@ -130,10 +130,10 @@ def test_what_is_no_strict_json_is_told(tmp_path, read, text):
 
 @pytest.mark.parametrize("own", [None, 0.0, 2e-6])
 @pytest.mark.parametrize("share", [0.0, 1e-6])
-def test_what_moves_with_a_freedom_is_told_only_where_both_are_known(own, share):
+def test_correlated_moves_are_reported_only_where_both_are_known(own, share):
     form = changed(FORM, ["pose", "clocking"], {"value": 0.0, "uncertainty": own})
     form["removed"]["pose_uncertainty"]["clocking"] = {"piston": 0.0, "tip": share}
-    told = dragged(form, "clocking")
-    assert bool(told) is bool(own and share)
-    if told:
-        assert told.startswith("; clocking ± 2.0 µrad would go with tip ± 1.0 µrad")
+    reported = correlated_moves(form, "clocking")
+    assert bool(reported) is bool(own and share)
+    if reported:
+        assert reported.startswith("; clocking ± 2.0 µrad would go with tip ± 1.0 µrad")

@@ -56,7 +56,7 @@ def test_each_limit_is_read_under_its_own_name_and_no_other_changes(file, name):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("servo: 50\n", r"'servo' is unknown, expected one of \['exposure', 'motion_frequency'"),
         ("z_jerk: fast\n", "z_jerk is 'fast', expected a number; write digits with a decimal"),
@@ -66,8 +66,8 @@ def test_each_limit_is_read_under_its_own_name_and_no_other_changes(file, name):
         ("- 3\n", "expected 'name: value' lines"),
     ],
 )
-def test_a_limit_that_cannot_be_is_named(file, text, told):
-    with pytest.raises(FileError, match=rf"^limits .*a.yaml'.*{told}"):
+def test_a_limit_that_cannot_be_is_named(file, text, reported):
+    with pytest.raises(FileError, match=rf"^limits .*a.yaml'.*{reported}"):
         load_limits(file(text))
 
 
@@ -78,7 +78,7 @@ def test_a_pitch_is_read_by_its_names_in_si(file):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("z_mm,pitch_rad\n0,0\n1,0\n", "has 0 columns 'z_m'"),
         ("z_m,pitch_rad\n0,0\n0,1e-6\n", "do not increase; sort them"),
@@ -86,8 +86,8 @@ def test_a_pitch_is_read_by_its_names_in_si(file):
         ("z_m,pitch_rad\n0,0\n1,90\n", r"pitch_rad\[1\] is 90.0 rad, expected"),
     ],
 )
-def test_a_pitch_that_cannot_be_is_named(file, text, told):
-    with pytest.raises(FileError, match=rf"p.csv'.*{told}"):
+def test_a_pitch_that_cannot_be_is_named(file, text, reported):
+    with pytest.raises(FileError, match=rf"p.csv'.*{reported}"):
         load_pitch(file(text, "p.csv"))
 
 
@@ -106,7 +106,7 @@ def test_a_motion_is_its_places_and_the_step_of_its_times(tmp_path_factory, z, p
 
 
 @pytest.mark.parametrize(
-    ("times", "told"),
+    ("times", "reported"),
     [
         ("0 1 2 2", "step|steps of 0 to 1 s, expected even steps; sample the motion evenly"),
         ("0 1 2 3.1", "steps of 1 to 1.1 s, expected even steps"),
@@ -114,9 +114,9 @@ def test_a_motion_is_its_places_and_the_step_of_its_times(tmp_path_factory, z, p
         ("0 100 200 300", "step of time_s is 100.0 s, expected .* to 10 s"),
     ],
 )
-def test_a_motion_of_uneven_times_is_refused(file, times, told):
+def test_a_motion_of_uneven_times_is_refused(file, times, reported):
     text = "time_s,z_m\n" + "".join(f"{t},0\n" for t in times.split())
-    with pytest.raises(FileError, match=rf"motion .*m.csv'.*({told})"):
+    with pytest.raises(FileError, match=rf"motion .*m.csv'.*({reported})"):
         load_motion(file(text, "m.csv"))
 
 
@@ -174,7 +174,7 @@ def test_how_a_text_is_written_is_taken_over(file):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         (mapping(z="{name: Z, unit: rad}"), "z has the unit 'rad'; write one of"),
         (mapping(z="{name: Z, unit: count, count: 0}"), "z: one count is 0 in SI, expected"),
@@ -189,8 +189,8 @@ def test_how_a_text_is_written_is_taken_over(file):
         ("sample_period: 0.001\n", "columns is required and missing"),
     ],
 )
-def test_what_no_map_may_say_is_told_by_its_place(file, text, told):
-    with pytest.raises(FileError, match=rf"^map .*a.yaml'.*{told}") as refused:
+def test_invalid_map_entries_are_reported_with_their_place(file, text, reported):
+    with pytest.raises(FileError, match=rf"^map .*a.yaml'.*{reported}") as refused:
         load_column_map(file(text))
     assert "\n" not in str(refused.value)
 

@@ -175,7 +175,7 @@ def test_a_calibration_is_the_bytes_of_the_standard(true_calibration):
 
 @pytest.mark.parametrize("name", ["settings", "certificate"])
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("[1]", "expected a JSON object"),
         ('{"a": NaN}', "NaN is not a JSON number"),
@@ -183,10 +183,10 @@ def test_a_calibration_is_the_bytes_of_the_standard(true_calibration):
         (" " * 2_000_001, "of 2000001 characters, at most 2000000 are accepted; shorten it"),
     ],
 )
-def test_a_calibration_whose_json_is_none_names_its_part(true_calibration, name, text, told):
+def test_a_calibration_whose_json_is_none_names_its_part(true_calibration, name, text, reported):
     message = message_mapping.calibration_message(bag_messages(), true_calibration, 0)
     setattr(message, name, text)
-    with pytest.raises(CalibrationError, match=rf"^{name} .*{told}"):
+    with pytest.raises(CalibrationError, match=rf"^{name} .*{reported}"):
         message_mapping.calibration(message)
 
 
@@ -229,12 +229,12 @@ def test_a_cloud_with_what_nobody_measured_is_not_dense():
 
 
 @pytest.mark.parametrize("change", [{"point_step": 32}, {"is_bigendian": True}])
-def test_a_cloud_of_others_is_told(change):
+def test_a_foreign_cloud_is_reported(change):
     message = message_mapping.cloud_message(bag_messages(), pack_points(cloud(2)), 0)
     for name, value in change.items():
         setattr(message, name, value)
-    told = rf"expected {POINT_DTYPE.itemsize}; give one that the corrector published"
-    with pytest.raises(DataError, match=told):
+    reported = rf"expected {POINT_DTYPE.itemsize}; give one that the corrector published"
+    with pytest.raises(DataError, match=reported):
         message_mapping.cloud_array(message)
 
 
@@ -298,7 +298,7 @@ def test_a_bag_of_ours_holds_the_bytes_of_the_standard(tmp_path, small_scan_bloc
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"sample_period": 0.0}, "sample_period is 0.0 s"),
         ({"sample_period": math.nan}, "sample_period is nan s"),
@@ -308,7 +308,7 @@ def test_a_bag_of_ours_holds_the_bytes_of_the_standard(tmp_path, small_scan_bloc
     ],
 )
 def test_a_block_that_cannot_be_is_a_malformed_message_of_its_bag(
-    tmp_path, small_scan_blocks, change, told
+    tmp_path, small_scan_blocks, change, reported
 ):
     path = tmp_path / "a.mcap"
     message = message_mapping.axis_message(bag_messages(), small_scan_blocks[0][0])
@@ -322,6 +322,6 @@ def test_a_block_that_cannot_be_is_a_malformed_message_of_its_bag(
     ):
         with (
             bags.BagReader(path) as reader,
-            pytest.raises(BagError, match=rf"a.mcap' holds a malformed message: .*{told}"),
+            pytest.raises(BagError, match=rf"a.mcap' holds a malformed message: .*{reported}"),
         ):
             read_all(reader)

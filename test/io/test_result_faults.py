@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, read_text, said, save_text, whole_file
+from omsm_ros.io.files import atomic_file, exception_text, open_regular, read_text, save_text
 from omsm_ros.io.folders import read_result, result_folder
 
 NAMES = ("cloud", "form", "report", "summary")
@@ -80,7 +80,7 @@ def test_a_folder_in_the_place_of_a_file_is_named_before_anything_goes(tmp_path)
     assert (tmp_path / "out" / "summary").read_text() == "1"
 
 
-def test_a_file_of_the_user_is_not_replaced_by_one_beside_the_result(tmp_path):
+def test_a_user_file_next_to_the_result_is_not_replaced(tmp_path):
     """Only an earlier run's may be: whose else it is, nobody knows."""
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "notes").write_text("mine")
@@ -109,16 +109,16 @@ def test_a_name_in_the_working_directory_is_where_it_is_when_the_run_begins(tmp_
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("[1]", "expected a JSON object"),
         ('{"a": Infinity}', "Infinity is not a JSON number"),
         ("", "is not JSON"),
     ],
 )
-def test_a_result_that_is_none_is_told_by_what_it_should_be(tmp_path, text, told):
+def test_an_invalid_result_is_reported_with_the_expected_kind(tmp_path, text, reported):
     (tmp_path / "x.json").write_text(text)
-    with pytest.raises(FileError, match=rf"^the figures .*x.json'.*{told}"):
+    with pytest.raises(FileError, match=rf"^the figures .*x.json'.*{reported}"):
         read_result(tmp_path / "x.json", "the figures")
 
 
@@ -175,7 +175,7 @@ def test_what_is_no_file_is_neither_replaced_nor_read(tmp_path, kind):
 
 @contextmanager
 def of_another(path):
-    with whole_file(path, "w") as stream:
+    with atomic_file(path, "w") as stream:
         stream.write("half")
         yield
 
@@ -211,4 +211,4 @@ def test_a_text_is_read_up_to_its_bound(tmp_path, size):
     ],
 )
 def test_what_an_exception_says_is_one_short_line_without_its_path(error, text):
-    assert said(error) == text
+    assert exception_text(error) == text

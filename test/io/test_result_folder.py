@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import save_text, whole_file
+from omsm_ros.io.files import atomic_file, save_text
 from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
 
 NAMES = ("cloud", "report", "summary")
@@ -91,13 +91,13 @@ def test_a_link_laid_for_the_temporary_name_is_not_followed(tmp_path, monkeypatc
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / ".foreseen.part").symlink_to(victim)
-    with pytest.raises(FileError, match="File exists"), whole_file(tmp_path / "a"):
+    with pytest.raises(FileError, match="File exists"), atomic_file(tmp_path / "a"):
         pass
     assert victim.read_text() == "precious"
 
 
 def test_temporary_names_differ(tmp_path):
-    with whole_file(tmp_path / "a") as one, whole_file(tmp_path / "a") as other:
+    with atomic_file(tmp_path / "a") as one, atomic_file(tmp_path / "a") as other:
         assert one.name != other.name
     assert os.listdir(tmp_path) == ["a"]
 

@@ -26,8 +26,8 @@ def load(folder: Path, *items: str, head: str = HEAD):
 
 def test_what_is_stated_arrives(tmp_path):
     found = load(tmp_path, TILT, WAVE, NOISE)
-    assert found.of_points() == {"probe_noise": 1e-8}
-    tilt, wave = found.of_the_scan()
+    assert found.point_uncertainties() == {"probe_noise": 1e-8}
+    tilt, wave = found.scan_sources()
     assert (tilt.name, tilt.standard_uncertainty, tilt.origin) == ("tilt", 5e-6, "declared")
     assert wave.standard_uncertainty == pytest.approx(8e-9 / 2**0.5)
     assert wave.reason == "ball"

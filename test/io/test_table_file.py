@@ -76,6 +76,6 @@ def test_what_windows_and_spreadsheets_add_is_read_past(tmp_path, text):
         ("u,y\n1,2\n3,nan\n5,6\n", "y has no reading in 1 of 3 rows, first in row 2"),
     ],
 )
-def test_a_table_of_another_form_is_told_where_and_what_to_do(tmp_path, text, says):
+def test_a_table_of_another_form_is_reported_where_and_what_to_do(tmp_path, text, says):
     with pytest.raises(FileError, match=says):
         load_columns(written(tmp_path, text), ("u", "y"))

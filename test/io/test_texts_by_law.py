@@ -129,7 +129,7 @@ def test_the_first_line_that_is_no_row_is_named_by_its_number(tmp_path_factory, 
 
 
 @pytest.mark.parametrize(
-    ("rows", "told"),
+    ("rows", "reported"),
     [
         (["1,2", "nan,2", "3,nan"], "a has no reading in 1 of 3 rows, first in row 2; cut the"),
         (["1,nan", "2,nan", "3,4"], "b has no reading in 2 of 3 rows, first in row 1; cut the"),
@@ -139,9 +139,9 @@ def test_the_first_line_that_is_no_row_is_named_by_its_number(tmp_path_factory, 
         (["1,2", "inf,2"], r"a\[1\] is inf, expected"),
     ],
 )
-def test_a_column_that_is_not_whole_is_told_with_its_row(tmp_path, rows, told):
+def test_a_column_that_is_not_whole_is_reported_with_its_row(tmp_path, rows, reported):
     (tmp_path / "t.csv").write_text("\n".join(["a,b", *rows]) + "\n")
-    with pytest.raises(FileError, match=rf"table .*t.csv'.*{told}"):
+    with pytest.raises(FileError, match=rf"table .*t.csv'.*{reported}"):
         load_columns(tmp_path / "t.csv", ("a", "b"))
 
 
@@ -189,7 +189,7 @@ def test_how_far_a_zone_is_ahead(zone, seconds):
 
 
 @pytest.mark.parametrize(
-    ("text", "zone", "told"),
+    ("text", "zone", "reported"),
     [
         ("2026-11-21T14:03:05", "", "no time zone; write it into the map, as zone: '.01:00'"),
         ("2026-11-21T14:03:05Z", "+01:00", "states its time zone; leave zone out of the map"),
@@ -200,8 +200,8 @@ def test_how_far_a_zone_is_ahead(zone, seconds):
         ("2026-11-21T25:03:05Z", "", "out of range"),
     ],
 )
-def test_a_date_that_is_none_is_refused(text, zone, told):
-    with pytest.raises(ValueError, match=told):
+def test_a_date_that_is_none_is_refused(text, zone, reported):
+    with pytest.raises(ValueError, match=reported):
         seconds_since_1970([text], zone)
 
 

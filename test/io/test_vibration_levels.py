@@ -29,7 +29,7 @@ def levels():
     return running.levels()
 
 
-def told(found=None, **changes):
+def reported(found=None, **changes):
     return {**(found or levels()).entry(), "alarm": True, "limit": 2e-8, **changes}
 
 
@@ -41,9 +41,9 @@ def record(path, *states):
     return path
 
 
-def test_levels_go_through_a_bag_and_are_told(tmp_path, capsys):
+def test_levels_go_through_a_bag_and_are_reported(tmp_path, capsys):
     quiet = replace(levels(), effect=None, total_effect=None)
-    states = [told(), told(quiet, alarm=False)]
+    states = [reported(), reported(quiet, alarm=False)]
     path = record(tmp_path / "a.mcap", *states)
     with bags.BagReader(path) as bag:
         assert bag.vibration() == states
@@ -62,7 +62,7 @@ def test_levels_go_through_a_bag_and_are_told(tmp_path, capsys):
 
 def test_an_effect_that_nobody_knows_is_said_to_be_none(tmp_path, capsys):
     quiet = replace(levels(), effect=None, total_effect=None)
-    path = record(tmp_path / "a.mcap", told(quiet))
+    path = record(tmp_path / "a.mcap", reported(quiet))
     assert inspect_bag(path).vibration["height"] is None
     main(["inspect", str(path)])
     assert "not evaluated: no calibration" in capsys.readouterr().out
@@ -79,10 +79,10 @@ def test_a_bag_without_levels_has_none(tmp_path, capsys):
     ("state", "said"),
     [
         ({}, "bands is required"),
-        (told(alarm="yes"), "alarm is 'yes'"),
-        (told(height=[1e-9]), "levels, expected one of each"),
-        (told(rms={"x": [-1.0], "y": [1.0], "z": [1.0]}), "rms"),
-        (told(extra=1), "'extra' is unknown"),
+        (reported(alarm="yes"), "alarm is 'yes'"),
+        (reported(height=[1e-9]), "levels, expected one of each"),
+        (reported(rms={"x": [-1.0], "y": [1.0], "z": [1.0]}), "rms"),
+        (reported(extra=1), "'extra' is unknown"),
     ],
 )
 def test_what_is_no_level_is_refused_in_one_line(tmp_path, capsys, state, said):

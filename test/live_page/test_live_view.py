@@ -40,7 +40,7 @@ def unpacked(news):
     return cells, generation, version, places, layers
 
 
-def test_heights_are_told_in_nanometres_and_once(clock):
+def test_heights_are_reported_in_nanometres_and_once(clock):
     view = LiveView(monotonic=clock)
     assert view.news(-1, 0) is None
     view.add_points(cloud([0.0, 1e-3], [0.0, 1e-3], [5e-9, -7e-9]))
@@ -171,8 +171,8 @@ def test_a_line_of_vibration_stands_where_it_is(clock):
             stamp_ns=0, first_sample=0, sample_period=5e-4, x=wave, y=0 * wave, z=0 * wave
         )
         view.add_acceleration(block)
-    told = view.state()["spectrum"]
-    peak = told["frequency"][int(np.argmax(told["amplitude"]))]
+    reported = view.state()["spectrum"]
+    peak = reported["frequency"][int(np.argmax(reported["amplitude"]))]
     assert peak == pytest.approx(320, abs=2.5)
 
 

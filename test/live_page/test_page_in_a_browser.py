@@ -61,7 +61,7 @@ def page():
 
 
 @pytest.mark.timeout(120)
-def test_points_are_drawn_counted_and_told_anew_after_a_restart(page):
+def test_points_are_drawn_counted_and_reported_again_after_a_restart(page):
     view = LiveView()
     first = LiveServer(view, render("Cell 1"), "127.0.0.1", 0)
     first.start()

@@ -79,7 +79,7 @@ def test_the_page_is_one_file_that_runs_no_foreign_script(serve):
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", page)
 
 
-def test_a_browser_is_told_everything_once_and_then_what_is_new(serve, view):
+def test_a_browser_gets_the_full_state_once_and_then_changes_only(serve, view):
     view.add_points(points(500))
     with socket_of(serve()) as socket:
         state = json.loads(socket.recv(timeout=5))
@@ -149,7 +149,7 @@ def test_beyond_this_computer_only_with_a_token(serve, view):
             pass
 
 
-def test_a_token_of_any_signs_opens_the_page_by_the_address_that_is_told(serve, view):
+def test_any_token_characters_work_in_the_printed_address(serve, view):
     with urllib.request.urlopen(serve(token="a b&c=d#e%f/g+h?ä" * 2).address) as answer:
         assert answer.status == 200
     with pytest.raises(ConfigurationError, match="at most 200 fit into an address"):
@@ -212,12 +212,12 @@ def answer_to(server, request):
 def test_a_foolish_request_is_refused_without_a_traceback(
     serve, caplog, request_line, more, status
 ):
-    told = answer_to(serve(), f"{request_line} HTTP/1.1\r\n{more}\r\n\r\n".encode())
-    assert told.startswith(f"HTTP/1.1 {status} ")
+    reported = answer_to(serve(), f"{request_line} HTTP/1.1\r\n{more}\r\n\r\n".encode())
+    assert reported.startswith(f"HTTP/1.1 {status} ")
     assert not caplog.records
 
 
-def test_who_only_knocks_leaves_room_for_a_browser_and_too_many_are_told(serve):
+def test_idle_connections_leave_room_for_a_browser_and_excess_ones_are_refused(serve):
     server = serve()
     with ExitStack() as idle:
         for _ in range(64):
@@ -225,13 +225,13 @@ def test_who_only_knocks_leaves_room_for_a_browser_and_too_many_are_told(serve):
         time.sleep(0.3)
         with pytest.raises(urllib.error.HTTPError, match="503"):
             urllib.request.urlopen(server.address)
-    told = ""
+    reported = ""
     for _ in range(50):
         time.sleep(0.05)
-        told = answer_to(server, GOOD)
-        if not told.startswith("HTTP/1.1 503 "):
+        reported = answer_to(server, GOOD)
+        if not reported.startswith("HTTP/1.1 503 "):
             break
-    assert told.startswith("HTTP/1.1 200 ")
+    assert reported.startswith("HTTP/1.1 200 ")
 
 
 def test_the_page_is_there_again_after_the_process_ran_out_of_files(serve):

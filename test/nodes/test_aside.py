@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
-from omsm_ros.nodes.background_worker import Aside
+from omsm_ros.nodes.background_worker import BackgroundWorker
 
 
 def outcome(awaited):
@@ -27,9 +27,9 @@ def outcome(awaited):
 
 
 @pytest.fixture
-def aside():
+def worker():
     with ExitStack() as undo:
-        yield Aside(SimpleNamespace(executor=None), undo)
+        yield BackgroundWorker(SimpleNamespace(executor=None), undo)
 
 
 def soon(true):
@@ -39,11 +39,11 @@ def soon(true):
     return true()
 
 
-def test_what_was_found_is_kept_by_nobody_but_who_asked(aside):
+def test_what_was_found_is_kept_by_nobody_but_who_asked(worker):
     class Found:
         pass
 
-    found = outcome(aside.do(Found))
+    found = outcome(worker.do(Found))
     kept = weakref.ref(found)
     del found
     assert soon(lambda: kept() is None)
@@ -54,7 +54,7 @@ def resident_bytes():
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc can be asked for it")
-def test_memory_of_the_work_goes_back_to_the_system(aside):
+def test_memory_of_the_work_goes_back_to_the_system(worker):
     parts = []
 
     def work():
@@ -62,6 +62,6 @@ def test_memory_of_the_work_goes_back_to_the_system(aside):
         del parts[:-1]  # what stays lies above all that is free
 
     before = resident_bytes()
-    outcome(aside.do(work))
+    outcome(worker.do(work))
     assert resident_bytes() > before + 100e6
     assert soon(lambda: resident_bytes() < before + 30e6)

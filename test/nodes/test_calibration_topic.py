@@ -87,7 +87,7 @@ def test_the_same_with_a_newer_stamp_is_not_taken_up_anew(cell, two):
     assert cell.said[-1] == (two[0].id, STARTED_NS)
 
 
-def test_one_that_is_refused_is_told_and_the_one_in_force_said_again_as_the_newest(cell, two):
+def test_a_refused_calibration_is_reported_and_the_active_one_republished(cell, two):
     cell.topic.announce(two[0], STARTED_NS - SECOND)
     cell.refuses.add(two[1].id)
     cell.hear(two[1], STARTED_NS + SECOND)

@@ -8,7 +8,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.errors import FileError
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, sources_of
 from omsm_ros.nodes.corrector_node import light_values
-from omsm_ros.pipelines.measure import live_light, with_sources
+from omsm_ros.pipelines.measure import live_traffic_light, with_sources
 
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 FILE = """\
@@ -27,25 +27,25 @@ def values(tmp_path, **changes):
 
 def test_a_parameter_is_stated_before_the_file(tmp_path):
     assert sources_of(DEFAULTS).stated == ()
-    assert sources_of(values(tmp_path)).of_points() == {"probe_noise": 5e-9}
+    assert sources_of(values(tmp_path)).point_uncertainties() == {"probe_noise": 5e-9}
     said = sources_of(values(tmp_path, **{"sources.probe_noise": 8e-9}))
-    assert said.of_points() == {"probe_noise": 8e-9}
-    assert [source.name for source in said.of_the_scan()] == ["drift_walk"]
+    assert said.point_uncertainties() == {"probe_noise": 8e-9}
+    assert [source.name for source in said.scan_sources()] == ["drift_walk"]
     with pytest.raises(FileError, match="no sources at"):
         sources_of(DEFAULTS | {"sources_file": str(tmp_path / "none.yaml")})
 
 
 def test_the_light_follows_what_is_corrected(tmp_path, true_calibration, small_scan):
-    told = values(tmp_path, accuracy=1e-9)
-    stated = sources_of(told)
+    reported = values(tmp_path, accuracy=1e-9)
+    stated = sources_of(reported)
     corrector = Corrector(
         true_calibration, with_sources(CorrectionOptions(), true_calibration, stated, None)
     )
-    before = live_light(corrector, true_calibration, stated, accuracy_of(DEFAULTS))
+    before = live_traffic_light(corrector, true_calibration, stated, accuracy_of(DEFAULTS))
     assert before.level == "amber"
     corrector.push_axes(small_scan.axes)
     corrector.push_distance(small_scan.distance)
-    after = live_light(corrector, true_calibration, stated, accuracy_of(told))
+    after = live_traffic_light(corrector, true_calibration, stated, accuracy_of(reported))
     # A walk of 1 nm in a second is one of 6 nm in forty, and half of that on the mean.
     assert 5e-9 < after.uncertainty / 2 < 0.1e-6
     assert after.level == "red"

@@ -90,14 +90,14 @@ def test_the_rate_is_that_of_the_samples_and_the_first_trigger_is_kept():
 
 
 @pytest.mark.parametrize(
-    ("period", "waited", "told"), [(1e-3, 1.9, False), (1e-3, 2.5, True), (1.0, 4.5, False)]
+    ("period", "waited", "reported"), [(1e-3, 1.9, False), (1e-3, 2.5, True), (1.0, 4.5, False)]
 )
-def test_silence_is_told_after_two_seconds_or_five_samples(period, waited, told):
+def test_silence_is_reported_after_two_seconds_or_five_samples(period, waited, reported):
     state = CorrectionState()
     heard(state, 0, 0.0, period=period)
     state.report(None, 0.0, 0.0)
     report = state.report(None, waited, 0.0)
-    assert ("no sample of axes for" in report.text) == told
+    assert ("no sample of axes for" in report.text) == reported
 
 
 def test_one_stream_may_be_silent_alone():
@@ -114,11 +114,11 @@ def test_one_stream_may_be_silent_alone():
 def test_a_motion_pauses_when_no_block_came_for_a_second_or_three_blocks():
     state = CorrectionState()
     state.heard("axes", 0, 100, 1e-3, now=10.0)
-    assert not state.pauses(10.9)
-    assert state.pauses(11.1)
+    assert not state.has_paused(10.9)
+    assert state.has_paused(11.1)
     state.heard("axes", 100, 100, 1e-2, now=10.0)  # blocks of a second
-    assert not state.pauses(12.9)
-    assert state.pauses(13.1)
+    assert not state.has_paused(12.9)
+    assert state.has_paused(13.1)
 
 
 def corrected(seconds=2.0):
@@ -153,7 +153,7 @@ def test_some_refused_blocks_are_a_warning_that_passes():
     assert report.values["axes_refused"] == 30
 
 
-def test_missing_samples_are_told_with_their_number():
+def test_missing_samples_are_reported_with_their_number():
     corrector, state, now = corrected()
     for first in (2500, 2600, 2700):  # 500 triggers were lost on the way
         axes, distance = blocks(first)

@@ -16,7 +16,7 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.nodes.correction_parameters import PARAMETERS as OF_CORRECTOR
 from omsm_ros.nodes.correction_parameters import accuracy_of, options_of, trigger_of
-from omsm_ros.nodes.managed import Declared
+from omsm_ros.nodes.managed import DeclaredParameters
 from omsm_ros.quantities import Parameter
 
 from .fake_node import FakeNode
@@ -34,7 +34,7 @@ PORT = {"port": "tcp://probe:7891"}
 
 def declared(given=None, refusal=""):
     node = FakeNode("driver", {**PORT, **(given or {})})
-    return node, Declared(node, PARAMETERS, lambda: refusal)
+    return node, DeclaredParameters(node, PARAMETERS, lambda: refusal)
 
 
 def test_what_is_not_given_has_its_default_and_a_whole_number_is_a_number():
@@ -59,7 +59,7 @@ def test_what_is_not_given_has_its_default_and_a_whole_number_is_a_number():
         ({"z" * 100_000: 5}, "^.{1,200}$"),
     ],
 )
-def test_what_is_wrong_is_told_with_the_node_when_it_is_configured(given, named):
+def test_configuration_errors_are_reported_with_the_node(given, named):
     _, made = declared(given)
     with pytest.raises(ConfigurationError, match=named) as refused:
         made.values()
@@ -101,7 +101,7 @@ def test_overrides_of_a_topic_that_there_is_not_are_refused_once_topics_are_made
     made.check_overrides()
 
 
-def test_ranges_are_told_to_who_asks_and_hold_what_means_not_stated():
+def test_parameter_ranges_are_described_and_include_the_value_for_not_stated():
     node, _ = declared()
     described = {name: each.descriptor for name, each in node.parameters.items()}
     (whole,) = described["block_size"].integer_range
@@ -119,7 +119,7 @@ def test_ranges_are_told_to_who_asks_and_hold_what_means_not_stated():
 def test_a_value_of_no_type_is_answered(kind):
     node = FakeNode("driver", PORT)
     node.create_service(kind, "set", lambda request, response: "rclpy's own")
-    Declared(node, PARAMETERS, str)
+    DeclaredParameters(node, PARAMETERS, str)
     (service,) = node.services
     wrong = ParameterMessage(name="window", value=ParameterValue(type=77))
     right = ParameterMessage(
@@ -145,15 +145,15 @@ def test_the_corrector_corrects_as_its_parameters_say():
     assert usual.geometry == Geometry()
     assert accuracy_of(DEFAULTS) is None
     places = {f"geometry.{f.name}": i * 1e-3 for i, f in enumerate(fields(Geometry))}
-    told = DEFAULTS | places | {
+    reported = DEFAULTS | places | {
         "polarity": -1, "override": True, "lateral_lag": 0.0, "counter_offset": -7,
         "stamp_tolerance": 5e-3, "accuracy": 1e-8,
     }  # fmt: skip
-    options = options_of(told)
+    options = options_of(reported)
     assert options.polarity == -1
     assert options.accept_other_rate
     assert options.lateral_lag == 0.0  # known to be none, which is not: not stated
     assert [getattr(options.geometry, f.name) for f in fields(Geometry)] == [*places.values()]
     assert (options.trigger.counter_offset, options.trigger.stamp_tolerance) == (-7, 5e-3)
-    assert trigger_of(told) == options.trigger
-    assert accuracy_of(told) == 1e-8
+    assert trigger_of(reported) == options.trigger
+    assert accuracy_of(reported) == 1e-8

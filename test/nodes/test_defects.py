@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock
 
-from omsm_ros.nodes.diagnostics import Diagnostics, Report, survive
+from omsm_ros.nodes.diagnostics import Diagnostics, Report, log_internal_error
 
 
 class FakeNode:
@@ -34,14 +34,14 @@ class FakeNode:
         return f"/omsm/node_{id(self)}"
 
 
-def test_the_last_defect_is_told_with_their_number():
+def test_the_last_internal_error_is_reported_with_their_number():
     node = FakeNode()
-    told = Diagnostics(node, lambda: Report("correcting", {"received": 5}))
-    told.publish()
+    reported = Diagnostics(node, lambda: Report("correcting", {"received": 5}))
+    reported.publish()
     assert node.published[-1].status[0].message == "correcting"
     for err in (ValueError("first"), KeyError("second")):
-        assert survive(node, err) == node.logged[-1]
-    told.publish()
+        assert log_internal_error(node, err) == node.logged[-1]
+    reported.publish()
     status = node.published[-1].status[0]
     assert status.level == DiagnosticStatus.ERROR
     assert status.message == f"{node.logged[-1]} (2 in all)"

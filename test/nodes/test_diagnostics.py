@@ -8,7 +8,15 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from omsm_ros.nodes.diagnostics import ERROR, OK, STALE, WARN, Diagnostics, Report, survive
+from omsm_ros.nodes.diagnostics import (
+    ERROR,
+    OK,
+    STALE,
+    WARN,
+    Diagnostics,
+    Report,
+    log_internal_error,
+)
 
 from .fake_node import FakeNode
 
@@ -65,20 +73,20 @@ def test_what_is_published_has_name_stamp_hardware_and_values():
     assert array.header.stamp.sec == node.now_ns // 10**9
 
 
-@pytest.mark.parametrize(("simulated", "now_ns", "told"), [
+@pytest.mark.parametrize(("simulated", "now_ns", "reported"), [
     (True, 0, True), (True, 5, False), (False, 0, False),
 ])  # fmt: skip
-def test_simulated_time_that_nobody_sets_is_told(simulated, now_ns, told):
+def test_simulated_time_that_nobody_sets_is_reported(simulated, now_ns, reported):
     node = FakeNode()
     node.simulated, node.now_ns = simulated, now_ns
     _, status = published(node, Report("correcting"))
-    assert ("nobody publishes /clock" in status.message) == told
-    assert status.level == (DiagnosticStatus.WARN if told else DiagnosticStatus.OK)
+    assert ("nobody publishes /clock" in status.message) == reported
+    assert status.level == (DiagnosticStatus.WARN if reported else DiagnosticStatus.OK)
 
 
 def test_defects_are_those_of_the_node_itself():
     one, other = FakeNode("one_with_defects"), FakeNode("one_without")
-    line = survive(one, ValueError("first"))
+    line = log_internal_error(one, ValueError("first"))
     assert "ValueError: first" in line
     assert one.logged == [("error", line)]
     assert published(one, Report("well"))[1].level == DiagnosticStatus.ERROR
@@ -89,5 +97,5 @@ def test_somebody_who_looks_for_a_defect_sees_it_raised(monkeypatch):
     monkeypatch.setenv("OMSM_DEBUG", "1")
     node = FakeNode("debugged")
     with pytest.raises(ValueError, match="here"):
-        survive(node, ValueError("here"))
+        log_internal_error(node, ValueError("here"))
     assert node.logged == []

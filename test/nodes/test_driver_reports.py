@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
 from omsm_ros.instruments.reader import State
 from omsm_ros.io import message_mapping
 from omsm_ros.nodes import driver as driving
@@ -32,7 +32,7 @@ class Driver(SimpleNamespace):
     """A DriverNode's own methods on what they need, without a node of ROS."""
 
     report, _publish = DriverNode.report, DriverNode._publish
-    _tell_settings, _both = DriverNode._tell_settings, DriverNode._both
+    _publish_settings, _both = DriverNode._publish_settings, DriverNode._both
     _add_faults, _add_silence = DriverNode._add_faults, DriverNode._add_silence
     hardware_id = DriverNode.hardware_id
 
@@ -49,7 +49,7 @@ def driver(monkeypatch):
         _device=SimpleNamespace(counts=lambda: dict(counts), identity={"version": "2.1"},
                                 settings={"rate_hz": 1000.0}),
         _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
-        _recent=RecentIncrease(), _flow=Flow(), _reported={},
+        _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},
         _messages=message_mapping.ros_messages(),
         _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
         _settings=Published(),
@@ -79,7 +79,7 @@ def test_a_device_that_reads_is_well_and_says_how_fast(driver):
     assert driver.hardware_id() == "tcp://a:1"
 
 
-def test_what_goes_wrong_is_told_by_name_for_as_long_as_it_is_new(driver):
+def test_new_faults_are_reported_by_name_while_recent(driver):
     driver.passes(1.0, 1000)
     report = driver.passes(1.0, 1000, malformed=3, losses_of_sync=1)
     assert report.level == WARN
@@ -144,7 +144,7 @@ def test_a_driver_of_axes_alone_passes_over_distances(driver):
     assert [topic for topic, _ in driver._both()] == ["axes"]
 
 
-def test_settings_are_told_once_before_the_first_block_and_again_when_they_change(driver):
+def test_settings_are_reported_once_before_the_first_block_and_again_when_they_change(driver):
     order = []
     driver._settings.publish = lambda message: order.append(json.loads(message.data))
     driver._axes.publish = lambda message: order.append("axes")
@@ -152,7 +152,7 @@ def test_settings_are_told_once_before_the_first_block_and_again_when_they_chang
     driver._publish([pair()])
     driver._device.settings = {"rate_hz": 2000.0}
     driver._publish([pair()])
-    told = {"probe.device": "six_channel", "probe.rate_hz": 1000.0}
-    assert order == [told, "axes", "axes", told | {"probe.rate_hz": 2000.0}, "axes"]
+    reported = {"probe.device": "six_channel", "probe.rate_hz": 1000.0}
+    assert order == [reported, "axes", "axes", reported | {"probe.rate_hz": 2000.0}, "axes"]
     driver._settings = None
-    driver._tell_settings()
+    driver._publish_settings()

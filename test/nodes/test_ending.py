@@ -23,7 +23,7 @@ def signal_at_once(which, handler):
         os.kill(os.getpid(), number)
 
 signal.signal = signal_at_once
-ending = running._Ending()
+ending = running._SignalEnd()
 sys.exit(0 if ending.asked.wait(5) else 3)
 """
 

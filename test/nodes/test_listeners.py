@@ -56,12 +56,12 @@ class Node:
     """As far as Listeners needs one; with a listener that takes what it is let take."""
 
     def __init__(self):
-        self.client, self.said, self.told = Client(), [], True
+        self.client, self.said, self.reported = Client(), [], True
         self.taken = 0
         self.there = [Endpoint()]
 
     def get_subscriptions_info_by_topic(self, _):
-        return self.there if self.told else []
+        return self.there if self.reported else []
 
     def create_client(self, *_):
         return self.client
@@ -123,44 +123,46 @@ def test_it_is_waited_for_until_it_has_taken_everything(cell):
     published(listeners, 5)
     node.taken += 4
     pass_by(3.0)
-    assert listeners.waited_for == ["/omsm/corrector"]
+    assert listeners.pending_listeners == ["/omsm/corrector"]
     node.taken += 1
     pass_by(1.0)
-    assert listeners.waited_for == []
+    assert listeners.pending_listeners == []
     assert not +listeners.lost
 
 
 def test_it_is_known_for_how_long_nobody_has_come_or_gone(cell):
     node, listeners, pass_by = cell
     pass_by(3.0)
-    assert listeners.unchanged_s == pytest.approx(2.9, abs=0.21)  # it is looked around now and then
+    assert listeners.seconds_since_change == pytest.approx(
+        2.9, abs=0.21
+    )  # it is looked around now and then
     node.there = [Endpoint(), Endpoint()]  # another of the same name
     pass_by(1.0)
-    assert listeners.unchanged_s == pytest.approx(0.9, abs=0.21)
+    assert listeners.seconds_since_change == pytest.approx(0.9, abs=0.21)
     node.there = [Endpoint(), type("Other", (Endpoint,), {"node_name": "other"})()]
     pass_by(1.0)
-    assert listeners.unchanged_s == pytest.approx(0.9, abs=0.21)
+    assert listeners.seconds_since_change == pytest.approx(0.9, abs=0.21)
     pass_by(1.0)
-    assert listeners.unchanged_s == pytest.approx(1.9, abs=0.21)
+    assert listeners.seconds_since_change == pytest.approx(1.9, abs=0.21)
 
 
 def test_one_of_whom_only_the_middleware_knows_is_not_forgotten(cell):
     """Nothing may begin before it is known who it is, and has told what it took."""
     node, listeners, pass_by = cell
-    node.told = False
+    node.reported = False
     pass_by(1.0)
     assert not listeners.known
-    node.told = True
+    node.reported = True
     pass_by(1.0)
     assert listeners.known
 
 
 def test_one_that_comes_while_it_plays_is_asked_first(cell):
     node, listeners, pass_by = cell
-    node.told = False
+    node.reported = False
     pass_by(1.0)
     assert listeners.room
-    node.told = True
+    node.reported = True
     pass_by(1.0, answering=False)
     assert not listeners.room
     pass_by(1.0)
@@ -176,7 +178,7 @@ def test_what_is_never_taken_is_lost_and_not_waited_for_for_ever(cell, answering
     node.taken = 3
     pass_by(1.0)
     pass_by(25.0, answering)
-    assert listeners.waited_for == []
+    assert listeners.pending_listeners == []
     assert listeners.lost == {"/omsm/corrector": 2}
     assert "has lost 2 messages" in node.said[0]
 
@@ -191,10 +193,10 @@ def test_what_came_late_after_all_was_not_lost(cell):
     pass_by(1.0)
     assert listeners.lost["/omsm/corrector"] == 1
     published(listeners, 2)
-    assert listeners.waited_for == ["/omsm/corrector"]
+    assert listeners.pending_listeners == ["/omsm/corrector"]
     node.taken = 6
     pass_by(1.0)
-    assert listeners.waited_for == []
+    assert listeners.pending_listeners == []
     assert listeners.lost["/omsm/corrector"] == 1
 
 

@@ -13,7 +13,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from omsm_ros.errors import DeviceError
 from omsm_ros.nodes import managed
 from omsm_ros.nodes.diagnostics import ERROR, OK, WARN, Report
-from omsm_ros.nodes.managed import ManagedNode, Stage
+from omsm_ros.nodes.managed import LifecycleStage, ManagedNode
 
 from .fake_node import FakeNode
 
@@ -29,14 +29,19 @@ class Managed(FakeNode):
     _configure, _activate, _undo = (
         ManagedNode._configure, ManagedNode._activate, ManagedNode._undo,
     )  # fmt: skip
-    _let_the_last_arrive = ManagedNode._let_the_last_arrive
+    _wait_for_last_messages = ManagedNode._wait_for_last_messages
     _keeps_parameters, _report = ManagedNode._keeps_parameters, ManagedNode._report
     publish_on, active, start = ManagedNode.publish_on, ManagedNode.active, ManagedNode.start
     _answer_impossible_transitions = ManagedNode._answer_impossible_transitions
 
     def __init__(self):
         super().__init__("driver")
-        self.stage, self.values, self.fatal, self._failure = Stage.UNCONFIGURED, {}, None, None
+        self.stage, self.values, self.fatal, self._failure = (
+            LifecycleStage.UNCONFIGURED,
+            {},
+            None,
+            None,
+        )
         self._configured, self._activated, self._outputs = ExitStack(), ExitStack(), []
         self._declared = SimpleNamespace(values=lambda: {"port": "a"}, check_overrides=lambda: None)
         self.did, self.fails, self.rivals = [], {}, 1
@@ -74,29 +79,31 @@ def node(monkeypatch):
 
 
 def test_there_and_back_undoes_each_step_in_reverse(node):
-    assert (node.on_configure(None), node.stage) == (DONE, Stage.INACTIVE)
+    assert (node.on_configure(None), node.stage) == (DONE, LifecycleStage.INACTIVE)
     assert node.values == {"port": "a"}
-    assert (node.on_activate(None), node.stage, node.active) == (DONE, Stage.ACTIVE, True)
-    assert (node.on_deactivate(None), node.stage) == (DONE, Stage.INACTIVE)
-    assert (node.on_cleanup(None), node.stage) == (DONE, Stage.UNCONFIGURED)
+    assert (node.on_activate(None), node.stage, node.active) == (DONE, LifecycleStage.ACTIVE, True)
+    assert (node.on_deactivate(None), node.stage) == (DONE, LifecycleStage.INACTIVE)
+    assert (node.on_cleanup(None), node.stage) == (DONE, LifecycleStage.UNCONFIGURED)
     assert node.did == ["configure", "activate", "undo activate", "undo configure"]
 
 
 def test_a_shutdown_from_activity_undoes_everything(node):
     node.on_configure(None)
     node.on_activate(None)
-    assert (node.on_shutdown(None), node.stage) == (DONE, Stage.FINALIZED)
+    assert (node.on_shutdown(None), node.stage) == (DONE, LifecycleStage.FINALIZED)
     assert node.did[2:] == ["undo activate", "undo configure"]
 
 
 @pytest.mark.parametrize("step", ["configure", "activate"])
-def test_a_step_that_fails_is_undone_told_and_may_be_tried_again(node, step):
+def test_a_failed_transition_is_undone_reported_and_can_be_retried(node, step):
     node.fails[step] = DeviceError("no answer from tcp://a:1;\ncheck the cable")
     node.on_configure(None)
     outcome = node.on_activate(None) if step == "activate" else None
     assert outcome in (FAILED, None)
     assert node.did[-1] == f"undo {step}"
-    assert node.stage is (Stage.INACTIVE if step == "activate" else Stage.UNCONFIGURED)
+    assert node.stage is (
+        LifecycleStage.INACTIVE if step == "activate" else LifecycleStage.UNCONFIGURED
+    )
     line = "DeviceError: no answer from tcp://a:1; check the cable"
     assert node.logged == [("error", line)]
     report = node._report()
@@ -140,7 +147,7 @@ def test_who_listens_is_given_time_to_fetch_the_last(node, listeners, waits):
 def test_it_starts_by_itself_unless_it_is_to_be_left_alone(node, auto):
     node.parameters["autostart"] = SimpleNamespace(value=auto)
     node.start()
-    assert node.stage is (Stage.ACTIVE if auto else Stage.UNCONFIGURED)
+    assert node.stage is (LifecycleStage.ACTIVE if auto else LifecycleStage.UNCONFIGURED)
 
 
 def test_what_keeps_it_from_starting_is_raised_and_it_goes_no_further(node):
@@ -164,7 +171,7 @@ def test_only_what_works_is_well(node):
     assert (report.level, report.text, report.values["lifecycle"]) == (OK, "reading", "active")
 
 
-def test_another_that_publishes_the_same_is_told(node):
+def test_another_that_publishes_the_same_is_reported(node):
     with ExitStack() as undo:
         node.publish_on(undo, object, "axes")
         node.on_configure(None)

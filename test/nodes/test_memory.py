@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from omsm_ros.nodes.memory import give_back
+from omsm_ros.nodes.memory import return_free_memory
 
 PIECE, COUNT = 4000, 4000
 
@@ -21,7 +21,7 @@ from omsm_ros.nodes import memory
 from nodes.test_memory import held_kib
 
 if sys.argv[1] == "nodes":
-    memory.share_one_pool([signal.SIGINT])
+    memory.use_single_malloc_arena([signal.SIGINT])
 libc = ctypes.CDLL(None)
 libc.malloc.restype = ctypes.c_void_p
 libc.free.argtypes = [ctypes.c_void_p]
@@ -40,7 +40,7 @@ before = held_kib()
 for _ in range(8):
     threading.Thread(target=burst).start()
 done.wait()
-memory.give_back()
+memory.return_free_memory()
 print(held_kib() - before)
 end.set()
 """
@@ -55,7 +55,7 @@ if not again:
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])
     os.kill(os.getpid(), signal.SIGUSR1)
 print(os.getpid(), sys.argv[1:], os.environ.get("GLIBC_TUNABLES"), flush=True)
-memory.share_one_pool([signal.SIGUSR1])
+memory.use_single_malloc_arena([signal.SIGUSR1])
 """
 # As a node keeps what it loaded: what refers to itself alone is gone, now and later.
 KEPT = """
@@ -65,10 +65,10 @@ from nodes.test_memory import lost_cycle
 
 gc.disable()
 early = lost_cycle()
-memory.keep_for_good()
+memory.freeze_garbage_collector()
 print(early() is None, gc.get_freeze_count() > 1000, len(gc.get_objects()) < 100)
 late = lost_cycle()
-memory.give_back()
+memory.return_free_memory()
 print(late() is None)
 """
 glibc = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_trim"), reason="not glibc")
@@ -96,7 +96,7 @@ def test_cycles_that_nothing_refers_to_are_given_back():
     try:
         cycle = lost_cycle()
         assert cycle() is not None
-        give_back()
+        return_free_memory()
         assert cycle() is None
     finally:
         gc.enable()
@@ -112,7 +112,7 @@ def test_what_was_freed_below_a_piece_in_use_is_given_back():
     libc = ctypes.CDLL(None)
     libc.malloc.restype = ctypes.c_void_p
     libc.free.argtypes = [ctypes.c_void_p]
-    give_back()
+    return_free_memory()
     before = held_kib()
     pieces = [libc.malloc(PIECE) for _ in range(COUNT)]
     for piece in pieces:
@@ -122,7 +122,7 @@ def test_what_was_freed_below_a_piece_in_use_is_given_back():
     for piece in pieces:
         libc.free(piece)
     kept = held_kib() - before
-    give_back()
+    return_free_memory()
     left = held_kib() - before
     libc.free(last)
     size = PIECE * COUNT / 1024
@@ -133,10 +133,10 @@ def test_what_was_freed_below_a_piece_in_use_is_given_back():
 
 def said(program, *arguments, **settings):
     """Its lines, run as a process whose glibc was told ``settings`` alone."""
-    told = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
-    told["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
+    reported = {name: value for name, value in os.environ.items() if name != "GLIBC_TUNABLES"}
+    reported["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])
     command = [sys.executable, "-c", program, *arguments]
-    done = subprocess.run(command, env=told | settings, check=True, stdout=subprocess.PIPE)
+    done = subprocess.run(command, env=reported | settings, check=True, stdout=subprocess.PIPE)
     return done.stdout.decode().splitlines()
 
 
@@ -159,7 +159,7 @@ def test_a_process_begins_again_once_as_it_was():
 
 
 @glibc
-def test_what_the_user_told_glibc_stays():
+def test_user_settings_of_glibc_are_kept():
     other = "glibc.malloc.perturb=0"
     _, second, _ = said(BEGUN, GLIBC_TUNABLES=other)
     assert second.endswith(f"{other}:glibc.malloc.tcache_count=0")

@@ -16,8 +16,8 @@ from std_srvs.srv import SetBool, Trigger
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.corrector_node import tell_frames
-from omsm_ros.nodes.running import Paced, refuse, serve, settings_of
+from omsm_ros.nodes.corrector_node import broadcast_frames
+from omsm_ros.nodes.running import PacedService, refuse, serve, settings_of
 
 from .fake_node import FakeNode
 
@@ -71,7 +71,7 @@ def test_requests_are_taken_one_after_the_other_a_moment_apart():
     node.create_timer = lambda period, callback, **_: SimpleNamespace(
         cancel=lambda: calls.append("cancel"), reset=lambda: calls.append("reset"), over=callback
     )
-    paced = Paced(node, ExitStack())
+    paced = PacedService(node, ExitStack())
     calls.clear()
     assert paced.can_execute(None)
     assert paced.beginning_execution(None)
@@ -119,10 +119,10 @@ class Waiting:
 @pytest.mark.parametrize(("count", "at_once"), [(0, 0), (3, 3), (100_000, None)])
 def test_what_waits_is_taken_in_bulk_but_not_without_end(count, at_once):
     queue, taken = Waiting(count), []
-    told = topics.take_waiting(queue, lambda message, info: taken.append(message))
-    assert told == len(taken) == count - queue.left
-    assert told == at_once if at_once is not None else 100 < told < 10_000
-    assert taken == list(range(count - 1, count - 1 - told, -1))
+    reported = topics.take_waiting(queue, lambda message, info: taken.append(message))
+    assert reported == len(taken) == count - queue.left
+    assert reported == at_once if at_once is not None else 100 < reported < 10_000
+    assert taken == list(range(count - 1, count - 1 - reported, -1))
 
 
 def listening(waiting):
@@ -148,7 +148,7 @@ def test_all_that_wait_are_taken_in_one_round_and_counted(monkeypatch):
     made, order = listening(2)
     made.callback("first", {})
     assert order == ["first", 1, 0, "after"]
-    answer = topics.tell_taken(Trigger.Request(), Trigger.Response())
+    answer = topics.answer_processed_counts(Trigger.Request(), Trigger.Response())
     assert answer.success
     assert json.loads(answer.message) == {"/omsm/axes": 3}
     made.more["event_callbacks"].message_lost(SimpleNamespace(total_count=4))
@@ -195,7 +195,7 @@ def test_the_probe_s_frame_looks_along_its_beam(beam_x, beam_y):
     assert z == 0.0  # the shortest turn has no part about Z itself
 
 
-def test_frames_are_told_from_the_machine_to_probe_and_workpiece(monkeypatch):
+def test_frames_are_broadcast_from_the_machine_to_probe_and_workpiece(monkeypatch):
     messages = pytest.importorskip("geometry_msgs.msg")
 
     class TFMessage(SimpleNamespace):
@@ -206,7 +206,7 @@ def test_frames_are_told_from_the_machine_to_probe_and_workpiece(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "tf2_msgs.msg", fake)
     node = FakeNode()
     names = {"machine_frame": "mill", "probe_frame": "needle", "workpiece_frame": "part"}
-    tell_frames(node, ExitStack(), Geometry(centre_x=3e-3, centre_y=-2e-3, beam_x=0.1), names)
+    broadcast_frames(node, ExitStack(), Geometry(centre_x=3e-3, centre_y=-2e-3, beam_x=0.1), names)
     (said,) = node.messages("/tf_static")
     placed = {each.child_frame_id: each for each in said.transforms}
     assert {each.header.frame_id for each in said.transforms} == {"mill"}
@@ -221,6 +221,6 @@ def test_frames_are_told_from_the_machine_to_probe_and_workpiece(monkeypatch):
 def test_without_the_messages_of_tf_that_is_said_and_nothing_else(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "tf2_msgs", None)
     node = FakeNode()
-    tell_frames(node, ExitStack(), Geometry(), {})
+    broadcast_frames(node, ExitStack(), Geometry(), {})
     assert node.published == []
     assert node.logged == [("info", "tf2_msgs is not installed: no transforms are published")]

@@ -21,7 +21,7 @@ def nothing_chosen(monkeypatch, tmp_path):
         monkeypatch.delenv(name)
 
 
-def test_fast_dds_sends_from_a_thread_of_its_own_unless_told(monkeypatch):
+def test_fast_dds_sends_from_a_thread_of_its_own_unless_requested(monkeypatch):
     start.set_up_fast_dds()
     assert os.environ[MODE] == "ASYNCHRONOUS"
     assert os.environ[MORE] == "1"
@@ -34,7 +34,7 @@ def test_fast_dds_sends_from_a_thread_of_its_own_unless_told(monkeypatch):
     assert PROFILES in os.environ
 
 
-def test_fast_dds_is_told_what_to_hear_by_and_to_free():
+def test_fast_dds_is_configured_for_its_transports_and_to_release_memory():
     start.set_up_fast_dds()
     profile = ElementTree.parse(os.environ[PROFILES])
 
@@ -73,7 +73,7 @@ def test_transports_that_the_user_has_chosen_stay(monkeypatch):
 
 def test_a_node_with_too_few_open_files_ends_in_one_line_before_ros_loads(monkeypatch, capsys):
     monkeypatch.setattr(start, "open_files", lambda: 12)
-    monkeypatch.setattr(start, "share_one_pool", None)
+    monkeypatch.setattr(start, "use_single_malloc_arena", None)
     monkeypatch.setattr(start.sys, "argv", ["/ws/install/lib/omsm_ros/corrector"])
     with pytest.raises(SystemExit) as ended:
         start.main()

@@ -10,14 +10,14 @@ import pytest
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
 from omsm_ros.core.ripple.accelerometer import (
-    CARRIAGE,
     PROBE,
+    SLIDE,
     Alarm,
     MonitorOptions,
     RunningSpectrum,
 )
 from omsm_ros.core.streams.blocks import AccelerationBlock
-from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import message_mapping
 from omsm_ros.nodes import vibration_monitor_node as module
@@ -53,14 +53,14 @@ def now(monkeypatch):
 @pytest.fixture
 def made(now):
     def make(mount=PROBE, edges=(5.0, 50.0, 500.0)):
-        told = []
+        reported = []
         options = MonitorOptions(edges=edges, mount=mount)
         return Monitor(
             _running=RunningSpectrum(options), _alarm=Alarm(LIMIT_M, 0.7), _refused="",
             _blocks_refused=0, _lately=RecentIncrease(),
-            _flow=Flow(), _block=0.0, _calibration=None, _told=0, told=told, logged=[],
+            _flow=SampleFlow(), _block=0.0, _calibration=None, _task_result=0, reported=reported, logged=[],
             values={"mount": mount}, now=now, sent=0,
-            _publisher=SimpleNamespace(publish=lambda m: told.append(json.loads(m.data))),
+            _publisher=SimpleNamespace(publish=lambda m: reported.append(json.loads(m.data))),
         )  # fmt: skip
 
     return make
@@ -88,13 +88,13 @@ def test_before_a_window_is_full_nothing_is_known(made):
     report = monitor.report()
     assert (report.level, report.text) == (STALE, "no full window of acceleration yet")
     assert report.values["samples"] == 1000
-    assert monitor.told == []
+    assert monitor.reported == []
 
 
-def test_a_line_is_told_with_its_axis_frequency_size_and_effect(made):
+def test_a_line_is_reported_with_its_axis_frequency_size_and_effect(made):
     monitor = made()
     shake(monitor, 3.0, 10e-9)
-    found = monitor.told[-1]
+    found = monitor.reported[-1]
     assert found["line"]["axis"] == "z"
     assert found["line"]["frequency"] == pytest.approx(LINE_HZ, abs=0.5)
     amplitude = 10e-9 * (2 * math.pi * LINE_HZ) ** 2
@@ -111,40 +111,40 @@ def test_a_line_is_told_with_its_axis_frequency_size_and_effect(made):
     assert "120.0 Hz" in report.text
 
 
-def test_each_spectrum_is_told_once(made):
+def test_each_spectrum_is_reported_once(made):
     monitor = made()
     shake(monitor, 4.0, 1e-9)
     # Windows of a second, half overlapping: at 1.0, 1.5, … 4.0 s.
-    assert [found["windows"] for found in monitor.told] == sorted(
-        {found["windows"] for found in monitor.told}
+    assert [found["windows"] for found in monitor.reported] == sorted(
+        {found["windows"] for found in monitor.reported}
     )
-    assert len(monitor.told) == 7
+    assert len(monitor.reported) == 7
 
 
 def test_the_alarm_rises_once_stays_and_ends_when_it_is_quiet(made):
     # The jump itself, twice integrated, is a slow motion: it is left out.
     monitor = made(edges=(60.0, 500.0))
     shake(monitor, 3.0, 2.5 * LIMIT_M)
-    assert monitor.told[-1]["alarm"] is True
+    assert monitor.reported[-1]["alarm"] is True
     report = monitor.report()
     assert report.level == WARN
     assert "vibration beyond 20.0 nm" in report.text
     assert report.values["alarms"] == 1
     shake(monitor, 6.0, 0.1 * LIMIT_M)
-    assert monitor.told[-1]["alarm"] is False
+    assert monitor.reported[-1]["alarm"] is False
     assert monitor.report().values["alarms"] == 1
     assert [text.split(":")[0] for text in monitor.logged] == [
         "vibration alarm raised", "vibration alarm ended",
     ]  # fmt: skip
 
 
-def test_on_the_carriage_the_effect_needs_a_calibration(made, true_calibration):
-    monitor = made(CARRIAGE)
+def test_on_the_slide_the_effect_needs_a_calibration(made, true_calibration):
+    monitor = made(SLIDE)
     shake(monitor, 2.0, 10e-9)
     report = monitor.report()
     assert report.level == WARN
     assert "effect on a height not evaluated: no calibration yet" in report.text
-    assert monitor.told[-1]["height"] is None
+    assert monitor.reported[-1]["height"] is None
     assert "strongest line" in report.message
     monitor._use(true_calibration, 0)
     shake(monitor, 2.0, 10e-9)
@@ -153,10 +153,10 @@ def test_on_the_carriage_the_effect_needs_a_calibration(made, true_calibration):
     # What the encoder sees and the probe follows: a height moves by |1 - G| of it.
     response = complex(true_calibration.dynamics.normalised().response(np.array([LINE_HZ]))[0])
     expected = 10e-9 / math.sqrt(2) * abs(1 - response)
-    assert monitor.told[-1]["height_total"] == pytest.approx(expected, rel=0.1)
+    assert monitor.reported[-1]["height_total"] == pytest.approx(expected, rel=0.1)
 
 
-def test_silence_is_told_and_the_levels_are_called_those_of_before(made):
+def test_silence_is_reported_and_the_levels_are_marked_as_old(made):
     monitor = made()
     shake(monitor, 2.0, 10e-9)
     monitor.report()

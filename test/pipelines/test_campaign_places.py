@@ -143,7 +143,7 @@ def test_what_was_done_is_written_down_strictly(shop, corrected, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"schema": "omsm-campaign/2"}, "schema is 'omsm-campaign/2', expected 'omsm-campaign/1'"),
         ({"entries": {}}, "entries is {}, expected a list"),
@@ -153,7 +153,7 @@ def test_what_was_done_is_written_down_strictly(shop, corrected, tmp_path):
         ({"recorded_ns": 10**30}, "more than 64 bits"),
     ],
 )
-def test_a_campaign_that_was_altered_is_told_by_its_part(tmp_path, change, told):
+def test_a_campaign_that_was_altered_is_reported_by_its_part(tmp_path, change, reported):
     entry = dict.fromkeys(("bag", "folder", "fingerprint", "said"), "a") | {"state": "done"}
     content = {"schema": "omsm-campaign/1", "entries": [entry]}
     if set(change) <= set(content):
@@ -161,13 +161,13 @@ def test_a_campaign_that_was_altered_is_told_by_its_part(tmp_path, change, told)
     else:
         entry |= change
     (tmp_path / "campaign.json").write_text(json.dumps(content))
-    with pytest.raises(FileError, match=told) as refused:
+    with pytest.raises(FileError, match=reported) as refused:
         load_campaign(tmp_path)
     assert "campaign.json" in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("scheduler", "told"),
+    ("scheduler", "reported"),
     [
         ("tcp://10.0.0.7:8786", "beyond this host it must be tls://host:port"),
         ("inproc://x", "beyond this host it must be"),
@@ -175,9 +175,11 @@ def test_a_campaign_that_was_altered_is_told_by_its_part(tmp_path, change, told)
         ("tcp://[::1", "is no address"),
     ],
 )
-def test_a_scheduler_that_runs_whatever_it_is_sent_is_on_this_host(shop, tmp_path, scheduler, told):
+def test_a_scheduler_that_runs_whatever_it_is_sent_is_on_this_host(
+    shop, tmp_path, scheduler, reported
+):
     folder = shop("a.mcap")
-    with pytest.raises(ConfigurationError, match=told) as refused:
+    with pytest.raises(ConfigurationError, match=reported) as refused:
         run_campaign(folder, tmp_path / "cal.json", tmp_path / "out", scheduler=scheduler)
     assert scheduler in str(refused.value)
 

@@ -154,7 +154,7 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["--fit", "piston,roll"], "freedom 'roll' is unknown"),
         (["--uncertainty", "-1"], "standard uncertainty"),
@@ -165,16 +165,16 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
         (["--register", "roll"], "roll"),
     ],
 )
-def test_a_wrong_wish_is_one_line(results, tmp_path, capsys, arguments, told):
+def test_a_wrong_wish_is_one_line(results, tmp_path, capsys, arguments, reported):
     pair = (results["slow"], results["fast"])
     status, said = difference(capsys, tmp_path / "d", *pair, *arguments)
     assert status == BAD_INPUT
-    assert told in said
+    assert reported in said
     assert len(said.splitlines()) == 1
     assert not (tmp_path / "d").exists()
 
 
-def test_fields_that_are_damaged_are_told(results, tmp_path, capsys):
+def test_fields_that_are_damaged_are_reported(results, tmp_path, capsys):
     folder = tmp_path / "copy"
     folder.mkdir()
     for part in results["slow"].iterdir():

@@ -39,10 +39,10 @@ def test_summary_and_page_tell_age_and_temperature(tmp_path, small_scan_blocks, 
     bag = record(tmp_path / "a.mcap", small_scan_blocks, [20.0, 20.3, 20.1])
     old = dated(true_calibration, NOON_NS - 3 * DAY_NS)
     summary = measure(bag, old, tmp_path / "out")
-    told = summary["conditions"]
-    assert told["recorded_ns"] == NOON_NS
-    assert told["calibration_age"] == 3 * 86_400
-    assert told["temperature"] == {
+    reported = summary["conditions"]
+    assert reported["recorded_ns"] == NOON_NS
+    assert reported["calibration_age"] == 3 * 86_400
+    assert reported["temperature"] == {
         "mean": pytest.approx(20.1333, abs=1e-3), "lowest": 20.0, "highest": 20.3,
         "change": pytest.approx(0.1),
     }  # fmt: skip
@@ -65,7 +65,7 @@ def test_a_certificate_without_a_date_has_no_age(true_calibration, entry):
     assert age_at(dated(true_calibration, entry), NOON_NS) is None
 
 
-def test_a_temperature_that_cannot_be_is_told(tmp_path, small_scan_blocks, true_calibration):
+def test_an_implausible_temperature_is_reported(tmp_path, small_scan_blocks, true_calibration):
     """In kelvin, one of them; the scan itself is as good as ever."""
     bag = record(tmp_path / "a.mcap", small_scan_blocks, [293.15, 20.0])
     summary = measure(bag, true_calibration, tmp_path / "out", report=False)

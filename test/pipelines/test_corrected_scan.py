@@ -84,7 +84,7 @@ def test_a_stream_recorded_long_before_the_other_loses_nothing(
 def test_samples_that_had_to_be_given_up_are_an_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
-    monkeypatch.setattr(correct, "MOST_WAITING", 5000)
+    monkeypatch.setattr(correct, "MAX_PENDING_BLOCKS", 5000)
     monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
     path = write(tmp_path / "ahead.mcap", small_scan_blocks, ahead=len(small_scan_blocks))
     with pytest.raises(BagError, match="waited for their partners in vain"):
@@ -95,7 +95,7 @@ def test_samples_that_had_to_be_given_up_are_an_error(
 def test_axes_that_go_on_without_the_probe_are_no_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
-    monkeypatch.setattr(correct, "MOST_WAITING", 5000)
+    monkeypatch.setattr(correct, "MAX_PENDING_BLOCKS", 5000)
     monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
     path = tmp_path / "stopped.mcap"
     with BagWriter(path, TOPICS) as writer:
@@ -163,7 +163,7 @@ def test_what_is_found_on_the_way_is_what_the_cloud_says(bag, true_calibration, 
 
 
 @pytest.mark.parametrize("samples", [1, 10, 100, 400])
-def test_a_probe_whose_counter_is_off_gives_no_points_and_is_told(
+def test_a_probe_whose_counter_is_off_gives_no_points_and_is_reported(
     tmp_path, small_scan_blocks, true_calibration, samples
 ):
     """The pairs are of different instants: whatever came of them would be no height."""

@@ -47,12 +47,12 @@ def test_the_emulator_is_given_the_file_by_its_whole_path(tmp_path, monkeypatch)
 def test_a_live_cloud_that_differs_says_why(live, equal, said):
     summary = {"live_equals_offline": equal, "live_points": live}
     summary["samples"] = {"distance": {"received": 1010, "corrected": 1000, "counted": {}}}
-    (told,) = [text for name, text in sample_rows(summary) if name.startswith("live cloud")]
-    assert told.startswith(said)
-    assert ("--time-lapse" in told) == (live < 1000)
+    (reported,) = [text for name, text in sample_rows(summary) if name.startswith("live cloud")]
+    assert reported.startswith(said)
+    assert ("--time-lapse" in reported) == (live < 1000)
 
 
-def test_a_file_that_cannot_be_read_is_told_before_anything_is_cleared(tmp_path):
+def test_a_file_that_cannot_be_read_is_reported_before_anything_is_cleared(tmp_path):
     kept = tmp_path / "calibration.json"
     kept.write_text("{}")
     with pytest.raises(FileError, match="nowhere"):

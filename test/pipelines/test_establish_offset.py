@@ -27,12 +27,12 @@ def streams(period: float, starts: int = 0) -> tuple[list[Block], list[Block]]:
     for first in range(0, SAMPLES, 100):
         k = 50 + first + np.arange(100)
         stamp = round(first * period * 1e9)
-        told = {"stamp_ns": stamp, "sample_period": period}
+        reported = {"stamp_ns": stamp, "sample_period": period}
         axes.append(
-            AxisBlock(first_sample=first, x=still, y=still, z=PATH[k], b=still, c=still, **told)
+            AxisBlock(first_sample=first, x=still, y=still, z=PATH[k], b=still, c=still, **reported)
         )
         seen = 50e-6 - PATH[k + SLIP]
-        distance.append(DistanceBlock(first_sample=first + starts, distance=seen, **told))
+        distance.append(DistanceBlock(first_sample=first + starts, distance=seen, **reported))
     return axes, distance
 
 
@@ -47,7 +47,7 @@ def established(
 
 @pytest.mark.parametrize("period", [1e-3, 0.1])
 @pytest.mark.parametrize("starts", [0, 7000, 12])
-def test_the_slip_beside_what_the_stamps_say_is_found(
+def test_a_slip_in_addition_to_the_stamped_one_is_found(
     monkeypatch: pytest.MonkeyPatch, period: float, starts: int
 ) -> None:
     assert established(monkeypatch, *streams(period, starts), period) == SLIP - starts

@@ -53,9 +53,9 @@ def test_without_ros_the_offline_commands_are_left(no_ros):
 
 
 @pytest.mark.parametrize(("reach", "state"), [("LOCALHOST", FINE), ("SUBNET", DOUBTFUL)])
-def test_nodes_that_other_computers_may_command_are_told(monkeypatch, reach, state):
+def test_nodes_that_other_computers_may_command_are_reported(monkeypatch, reach, state):
     pytest.importorskip("omsm_msgs")
-    monkeypatch.setattr(host, "_discovery", lambda: host.Check("DDS discovery", FINE, ""))
+    monkeypatch.setattr(host, "_discovery", lambda: host.HostCheck("DDS discovery", FINE, ""))
     checks = by_name(host._ros({"ROS_AUTOMATIC_DISCOVERY_RANGE": reach, "ROS_DOMAIN_ID": "7"}))
     assert checks["DDS settings"].state == state
     assert "domain 7" in checks["DDS settings"].found
@@ -93,7 +93,7 @@ def test_a_clock_of_which_nothing_is_known_is_not_called_synchronised(answer, st
 
 
 @pytest.mark.parametrize(("free", "state"), [(5e9, FINE), (1e9, DOUBTFUL)])
-def test_room_on_the_disk_is_told_in_hours(monkeypatch, tmp_path, free, state):
+def test_room_on_the_disk_is_reported_in_hours(monkeypatch, tmp_path, free, state):
     usage = host.shutil.disk_usage(tmp_path)._replace(free=free)
     monkeypatch.setattr(host.shutil, "disk_usage", lambda path: usage)
     check = host._disk(tmp_path / "not" / "yet")

@@ -141,7 +141,7 @@ def test_the_command_tells_what_it_did(result, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "reported"),
     [
         (["--out", "a.stl"], "'.stl' of 'a.stl' is not known; end it in one of .csv"),
         (["--out", "a.x3p", "--spacing", "1e-12"], "spacing"),
@@ -149,12 +149,12 @@ def test_the_command_tells_what_it_did(result, tmp_path, capsys):
         (["--out", "a.dat", "--spacing", "1e-8"], "widen it"),
     ],
 )
-def test_a_wrong_wish_is_one_line(result, tmp_path, monkeypatch, capsys, arguments, told):
+def test_a_wrong_wish_is_one_line(result, tmp_path, monkeypatch, capsys, arguments, reported):
     monkeypatch.chdir(tmp_path)
     assert main(["export", str(result), *arguments]) == BAD_INPUT
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
-    assert told in lines[0]
+    assert reported in lines[0]
     assert not list(tmp_path.iterdir())
 
 

@@ -177,13 +177,13 @@ def test_a_stream_without_time_needs_a_period():
 
 
 @pytest.mark.parametrize(
-    ("numbers", "told"),
+    ("numbers", "reported"),
     [
         ([-1.0, 0.0], r"trigger\[0\] is -1.0, expected"),
         ([1e16, 2e16], r"trigger\[0\] is 1e\+16, expected"),
     ],
 )
-def test_triggers_that_no_counter_has_are_told_by_their_row(numbers, told):
+def test_impossible_trigger_counts_are_reported_with_their_row(numbers, reported):
     rows = counter(triggered=True)
-    with pytest.raises(DataError, match=told):
+    with pytest.raises(DataError, match=reported):
         rows.count({"n": np.array(numbers), "d": np.zeros(len(numbers))})

@@ -146,8 +146,8 @@ def test_ten_million_rows_in_the_memory_of_few(tmp_path):
         done = subprocess.run(
             [*command, "--out", out, "--json"], capture_output=True, text=True, check=True
         )
-        told, peak = done.stdout.splitlines()
-        assert json.loads(told)["files"][0]["rows"] == rows
+        reported, peak = done.stdout.splitlines()
+        assert json.loads(reported)["files"][0]["rows"] == rows
         peaks.append(int(peak))
     assert peaks[1] < 1.2 * peaks[0]
 

@@ -78,8 +78,8 @@ def test_a_step_test_as_csv_gives_the_calibration_of_its_bag(capsys, tmp_path, s
     (tmp_path / "map.yaml").write_text(MAP)
     arguments = ["import", tmp_path / "steps.csv", "--map", tmp_path / "map.yaml"]
     assert cli.main([*map(str, arguments), "--out", str(tmp_path / "a.mcap"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["files"][0]["rows"] == len(steps["z"])
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["files"][0]["rows"] == len(steps["z"])
     with BagWriter(tmp_path / "b.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(step_test):
             bag.write_axes(axes)

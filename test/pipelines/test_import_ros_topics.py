@@ -182,7 +182,7 @@ def test_a_probe_that_begins_later_is_joined_by_its_stamps(importer):
     assert importer.blocks()[0].first_sample == 50
 
 
-def test_rates_of_their_own_keep_their_stamps_and_are_told(importer):
+def test_rates_of_their_own_keep_their_stamps_and_are_reported(importer):
     write_mcap(importer.folder / "a.mcap", [*joints(300, 2e-3), *ranges(500, late=0.0503)])
     found = importer(MAP + RANGE, "a.mcap")
     assert all(f.own_clock for f in found)

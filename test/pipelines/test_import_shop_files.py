@@ -115,7 +115,7 @@ def test_seconds_since_1970_set_the_clock(read):
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
-def test_parts_of_a_second_since_1970_set_the_clock_where_they_are_told(read, unit, scale):
+def test_parts_of_a_second_since_1970_set_the_clock_where_they_are_reported(read, unit, scale):
     rows = [f"{round((1763200000.25 + i / 100) * scale)},{i}" for i in range(3)]
     text = "\n".join(["t,d", *rows])
     # Told otherwise, the date would be lost, or another one made of it.
@@ -129,7 +129,7 @@ def test_parts_of_a_second_since_1970_set_the_clock_where_they_are_told(read, un
     assert read.importer.blocks()[0].stamp_ns == 1_000_000_000
 
 
-def test_stamps_that_jitter_are_told_from_a_wrong_period(read):
+def test_stamps_that_jitter_are_distinguished_from_a_wrong_period(read):
     random = np.random.default_rng(1)
     rows = [f"{1763200000 + i / 1000 + random.normal(0, 2e-4):.6f},{i}" for i in range(3000)]
     mapping = DATED.replace("date", "unix") + "sample_period: 0.001\n"
@@ -147,9 +147,9 @@ def test_stamps_that_jitter_are_told_from_a_wrong_period(read):
     ],
 )
 def test_a_trigger_that_does_not_count_is_named_with_its_file(read, rows, said):
-    told = refusal(read, "i,d\n" + rows, PROBE + "  trigger: {name: i}\n")
-    assert said in told
-    assert "a.csv" in told
+    reported = refusal(read, "i,d\n" + rows, PROBE + "  trigger: {name: i}\n")
+    assert said in reported
+    assert "a.csv" in reported
 
 
 # Refused in one line.
@@ -195,7 +195,7 @@ def test_what_would_be_another_number_is_refused(read, text, more, said):
         (b"d\n" + b"1" * 5_000_000, "more than 100000 characters"),
     ],
 )
-def test_what_is_no_text_is_told_what_it_is(read, data, said):
+def test_a_non_text_file_is_reported_with_its_kind(read, data, said):
     assert said in refusal(read, data)
 
 
@@ -254,9 +254,9 @@ def test_a_line_of_units_that_contradicts_the_map_is_refused(read, unit):
 )
 def test_intensities_above_all_are_in_another_unit(read, unit, said):
     mapping = PROBE + f"  intensity: {{name: p, unit: {unit}}}\n"
-    told = refusal(read, "d,p\n0,48\n1,52\n2,50\n", mapping)
-    assert "intensity is" in told
-    assert said in told
+    reported = refusal(read, "d,p\n0,48\n1,52\n2,50\n", mapping)
+    assert "intensity is" in reported
+    assert said in reported
     assert len(read("d,p\n0,48\n1,52\n2,50\n", mapping.replace(unit, "'%'"))) == 3
 
 
@@ -296,7 +296,7 @@ def test_a_spindle_that_goes_on_or_jumps_at_rest_shows_none(importer):
         importer.out.unlink()
 
 
-def test_gaps_of_triggers_beside_a_file_that_cannot_show_them_are_refused(importer):
+def test_trigger_gaps_with_a_file_that_cannot_contain_them_are_refused(importer):
     (importer.folder / "z.csv").write_text("n,Z\n" + "".join(f"{n},0\n" for n in (0, 1, 3, 4)))
     (importer.folder / "d.csv").write_text("d\n1\n2\n3\n4\n")
     mapping = PROBE + "  trigger: {name: n}\n  z: {name: Z, unit: mm}\n"
@@ -308,7 +308,7 @@ def test_gaps_of_triggers_beside_a_file_that_cannot_show_them_are_refused(import
     importer(mapping, "z.csv", "d.csv")
 
 
-def test_a_column_that_is_not_there_or_stands_twice_is_told_by_the_names_of_the_file(read):
+def test_a_column_that_is_not_there_or_stands_twice_is_reported_by_the_names_of_the_file(read):
     mapping = PROBE + "  intensity: {name: p, unit: '1'}\n"
     missing = refusal(read, "p,D\n0,1\n1,2\n", mapping)
     assert "no column 'd' of distance, but ['p', 'D']" in missing

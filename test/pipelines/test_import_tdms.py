@@ -21,14 +21,14 @@ def tdms(channels, properties=()):
     for name, values in channels.items():
         objects.append((tdms_text(f"/'log'/'{name}'"), values, dict(properties).get(name, {})))
     meta = struct.pack("<I", len(objects))
-    for path, values, told in objects:
+    for path, values, reported in objects:
         meta += path
         if values is None:
             meta += struct.pack("<I", 0xFFFFFFFF)
         else:
             meta += struct.pack("<IIIQ", 20, 10, 1, len(values))  # 10 = double, one dimension
-        meta += struct.pack("<I", len(told))
-        for key, value in told.items():
+        meta += struct.pack("<I", len(reported))
+        for key, value in reported.items():
             meta += tdms_text(key)
             if isinstance(value, str):
                 meta += struct.pack("<I", 0x20) + tdms_text(value)
@@ -51,8 +51,8 @@ def tdms_file(importer):
 
 def test_channels_of_a_tdms_file(importer, tdms_file):
     gap = np.linspace(-3, 4, 1000)
-    told = {"gap": {"unit_string": "um", "wf_increment": 1e-3}}
-    tdms_file.write_bytes(tdms({"gap": gap, "other": gap * 2}, told))
+    reported = {"gap": {"unit_string": "um", "wf_increment": 1e-3}}
+    tdms_file.write_bytes(tdms({"gap": gap, "other": gap * 2}, reported))
     (found,) = importer(TDMS_MAP, "a.tdms")
     assert found.rows == 1000
     np.testing.assert_allclose(importer.blocks()[0].distance, gap * 1e-6)
@@ -66,15 +66,15 @@ def test_segments_that_a_logger_appended_follow_each_other(importer, tdms_file):
 
 
 @pytest.mark.parametrize(
-    ("told", "said"),
+    ("reported", "said"),
     [
         ({"unit_string": "mm"}, "in mm, the map in um"),
         ({"unit_string": "V"}, "in V, the map in um"),
         ({"wf_increment": 5e-4}, "sample period of 0.0005 s, the map 0.001 s"),
     ],
 )
-def test_what_a_tdms_file_states_is_not_overruled(importer, tdms_file, told, said):
-    tdms_file.write_bytes(tdms({"gap": np.arange(9.0)}, {"gap": told}))
+def test_what_a_tdms_file_states_is_not_overruled(importer, tdms_file, reported, said):
+    tdms_file.write_bytes(tdms({"gap": np.arange(9.0)}, {"gap": reported}))
     with pytest.raises(FileError, match=said):
         importer(TDMS_MAP, "a.tdms")
 
@@ -95,8 +95,8 @@ def test_a_damaged_tdms_file_is_one_clear_error(importer, tdms_file, cut):
 @pytest.mark.parametrize("key", ["wf_increment", "wf_start_offset"])
 def test_channels_that_were_not_sampled_together_are_refused(importer, tdms_file, key):
     channels = {"gap": np.arange(9.0), "n": np.arange(9.0), "other": np.arange(9.0)}
-    told = {"gap": {key: 1e-3}, "n": {key: 2e-3}, "other": {key: 7e-3}}
-    tdms_file.write_bytes(tdms(channels, told))
+    reported = {"gap": {key: 1e-3}, "n": {key: 2e-3}, "other": {key: 7e-3}}
+    tdms_file.write_bytes(tdms(channels, reported))
     with pytest.raises(FileError, match=f"{key} 0.001 of 'log/gap' and 0.002 of 'log/n'"):
         importer(TDMS_MAP + "  trigger: {name: log/n}\n", "a.tdms")
     importer(TDMS_MAP, "a.tdms")  # what is not read may be as it is
@@ -126,7 +126,7 @@ def test_a_scale_is_applied_and_one_that_is_not_known_is_not_left_out(importer, 
         ({"NI_Number_Of_Scales": 50.0}, "does not fit together"),
     ],
 )
-def test_scales_that_are_none_are_told_at_once(importer, tdms_file, spoilt, said):
+def test_invalid_scales_are_reported_at_once(importer, tdms_file, spoilt, said):
     tdms_file.write_bytes(tdms({"gap": np.arange(9.0)}, {"gap": SLOPE | spoilt}))
     with pytest.raises(FileError, match=said):
         importer(TDMS_MAP, "a.tdms")

@@ -14,7 +14,7 @@ from omsm_ros.io.files import CLOUD, SYSTEMATIC
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import CloudFile, PlyWriter, save_fields
 from omsm_ros.readable import count
-from omsm_ros.twin.part import PartPose, posed
+from omsm_ros.twin.part import PartPose, mounted_surface
 
 RADIUS, POINTS = 12.7e-3, 40_000
 ASTIGMATISM, COMA = 50e-9, 15e-9
@@ -37,7 +37,7 @@ def folder(tmp_path_factory):
     r, angle = np.linspace(RADIUS, 0, POINTS), np.linspace(0, 160 * np.pi, POINTS)
     x, y = (np.float64(np.float32(v)) for v in (r * np.cos(angle), r * np.sin(angle)))
     pose = PartPose(z_m=1e-4, tilt_x_rad=2e-3, tilt_y_rad=-1e-3)
-    height = posed(Mirror(), pose).height(x, y) + rng.normal(0, 1e-8, POINTS)
+    height = mounted_surface(Mirror(), pose).height(x, y) + rng.normal(0, 1e-8, POINTS)
     dust = rng.random(POINTS) < 1e-3
     nothing = np.zeros(POINTS)
     points = SurfacePoints(
@@ -119,7 +119,7 @@ def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp
     small = {"x_m": 1e-6, "y_m": 1e-6, "tilt_x_rad": 1e-5, "tilt_y_rad": 1e-5, "z_m": 1e-6}
     there = PAPER_MIRROR.height(x, y)
     moves = [
-        (posed(PAPER_MIRROR, PartPose(**{name: size})).height(x, y) - there) / size
+        (mounted_surface(PAPER_MIRROR, PartPose(**{name: size})).height(x, y) - there) / size
         for name, size in small.items()
     ]
     design = np.stack(moves, axis=1) / np.linalg.norm(moves, axis=1)
@@ -198,19 +198,20 @@ def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
     )
     words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
     plain = json.loads(form(folder, tmp_path / "a", *words)[1].read_text())
-    told = json.loads(form(known, tmp_path / "b", *words)[1].read_text())
-    assert told["removed"]["not_evaluated"] == []
+    reported = json.loads(form(known, tmp_path / "b", *words)[1].read_text())
+    assert reported["removed"]["not_evaluated"] == []
     assert plain["removed"]["not_evaluated"]
     before, after = (
-        {(t["n"], t["m"]): t["uncertainty"] for t in found["zernike"]} for found in (plain, told)
+        {(t["n"], t["m"]): t["uncertainty"] for t in found["zernike"]}
+        for found in (plain, reported)
     )
     assert after[2, 2] == pytest.approx(20e-9, rel=0.02)
     assert after[3, 3] == pytest.approx(before[3, 3], rel=0.5)
     # A tilt of the instrument goes into the pose, and leaves the form.
-    spindle = told["removed"]["pose_uncertainty"]["spindle"]
+    spindle = reported["removed"]["pose_uncertainty"]["spindle"]
     assert spindle["tilt"] == pytest.approx(3e-9 / RADIUS, rel=0.02)
     for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
-        assert told["deviation"][name]["uncertainty"] > plain["deviation"][name]["uncertainty"]
+        assert reported["deviation"][name]["uncertainty"] > plain["deviation"][name]["uncertainty"]
 
 
 def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path):
@@ -257,7 +258,7 @@ def test_a_map_of_another_program_goes_the_same_way(folder, tmp_path):
     assert found["pose"]["tip"]["value"] == pytest.approx(2e-3, abs=1e-7)
 
 
-def test_a_scan_without_its_calibration_is_told_from_a_map(folder, tmp_path, capsys):
+def test_a_scan_without_its_calibration_is_distinguished_from_a_map(folder, tmp_path, capsys):
     bag = tmp_path / "scan.mcap"
     bag.write_bytes(b"\x89MCAP0\r\n" + bytes(100))
     words = ["form", bag, "--nominal", folder / "mirror.yaml", "--out", tmp_path / "out"]
@@ -265,13 +266,13 @@ def test_a_scan_without_its_calibration_is_told_from_a_map(folder, tmp_path, cap
     assert "is a bag, no map" in capsys.readouterr().err
 
 
-def test_a_move_that_hides_the_form_is_advised_against(folder, tmp_path):
+def test_a_fitted_move_that_masks_form_gives_a_warning(folder, tmp_path):
     """Over a small disc a shift and astigmatism are one; held, the same points say much more."""
     words = ("--aperture", RADIUS / 6)
     notes = {}
     for fit in ("auto", "piston,tip,tilt"):
         _, path = form(folder, tmp_path / fit, "--fit", fit, *words)
-        told = json.loads(path.read_text())
-        notes[fit] = told["removed"]["notes"]
+        reported = json.loads(path.read_text())
+        notes[fit] = reported["removed"]["notes"]
     assert any("hold it: --fit piston,tip,tilt" in note for note in notes["auto"])
     assert not any("hold it" in note for note in notes["piston,tip,tilt"])

@@ -49,7 +49,7 @@ def aged(calibration, delay):
     return dataclasses.replace(calibration, dynamics=dynamics, settings={"machine": "lathe 1"})
 
 
-def test_what_is_told_twice_stands_there_once(tmp_path, address, true_calibration):
+def test_repeated_statements_are_listed_once(tmp_path, address, true_calibration):
     path = tmp_path / "cal.json"
     calibration_file.save_calibration(path, true_calibration)
     folder = result(tmp_path / "a")
@@ -143,8 +143,8 @@ def test_a_correction_does_not_fail_with_its_catalogue(
     arguments = ["correct", bag, "--calibration", tmp_path / "cal.json", "--no-report", "--json"]
     arguments += ["--out", tmp_path / "out", "--catalogue", tmp_path / "broken.sqlite"]
     assert cli.main([str(a) for a in arguments]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert any("not written into the catalogue" in w for w in told["warnings"])
+    reported = json.loads(capsys.readouterr().out)
+    assert any("not written into the catalogue" in w for w in reported["warnings"])
     assert (tmp_path / "out" / "cloud.ply").exists()
     assert (
         cli.main(["history", "--catalogue", str(tmp_path / "b"), "--add", str(tmp_path / "out")])
@@ -195,16 +195,16 @@ def test_a_password_is_never_shown(monkeypatch):
     assert "127.0.0.1" in str(refused.value)
 
 
-def test_history_is_listed_drawn_and_told_as_json(capsys, tmp_path, address, true_calibration):
+def test_history_is_listed_drawn_and_reported_as_json(capsys, tmp_path, address, true_calibration):
     path = tmp_path / "cal.json"
     calibration_file.save_calibration(path, true_calibration)
     folder = result(tmp_path / "a")
     arguments = ["history", "--catalogue", address, "--add", str(path), str(folder)]
     assert cli.main([*arguments, "--plot", str(tmp_path / "h.png")]) == 0
-    told = capsys.readouterr().out
-    assert true_calibration.id[:8] in told
-    assert "form 17.0 nm rms" in told
-    assert "not evaluated: fewer than five" in told
+    reported = capsys.readouterr().out
+    assert true_calibration.id[:8] in reported
+    assert "form 17.0 nm rms" in reported
+    assert "not evaluated: fewer than five" in reported
     assert (tmp_path / "h.png").read_bytes().startswith(b"\x89PNG")
     assert cli.main(["history", "--catalogue", address, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)

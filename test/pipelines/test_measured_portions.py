@@ -90,13 +90,13 @@ def test_a_map_says_that_it_is_even(tmp_path):
 
 
 @pytest.mark.parametrize(("unit", "notes"), [("m", 0), ("mm", 1)])
-def test_a_unit_that_our_cloud_does_not_need_is_told(result, unit, notes):
+def test_a_unit_that_our_cloud_does_not_need_is_reported(result, unit, notes):
     measured = open_measurement(result, units_of(unit))
     assert (len(measured.notes), measured.sources) == (notes, ())
     assert all("--unit was not used" in note for note in measured.notes)
 
 
-def test_what_is_not_there_is_told_with_what_to_give(tmp_path):
+def test_missing_input_is_reported_with_the_option_to_give(tmp_path):
     with pytest.raises(FileError, match=r"no cloud at .*cloud.ply'; give a cloud, a map, or"):
         open_measurement(tmp_path)
     with pytest.raises(FileError, match=r"no cloud at .*none.xyz'"):

@@ -100,7 +100,7 @@ def test_a_motion_that_says_nothing_is_refused(tmp_path):
         established_offset(write(tmp_path / "short.mcap", size=50, count=150), PROMPT)
 
 
-def test_two_recordings_in_one_are_told(tmp_path):
+def test_two_recordings_in_one_are_reported(tmp_path):
     path = tmp_path / "two.mcap"
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first in (0, 10**9):

@@ -40,9 +40,9 @@ def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
     facts = run_experiment("vibration", tmp_path / "v")
     quiet, shaken = facts["spectrum"]["scans"]
     assert [p["kind"] for p in quiet["peaks"]] == ["on the part"]
-    folded = next(p for p in shaken["peaks"] if p["kind"] == "folded vibration")
-    assert folded["true_frequency"] == pytest.approx(680.0, abs=0.01)
-    assert folded["frequency"] == pytest.approx(320.0, abs=0.05)
+    aliased = next(p for p in shaken["peaks"] if p["kind"] == "folded vibration")
+    assert aliased["true_frequency"] == pytest.approx(680.0, abs=0.01)
+    assert aliased["frequency"] == pytest.approx(320.0, abs=0.05)
     assert json.loads((tmp_path / "v/experiment.json").read_text())["experiment"] == "vibration"
 
 
@@ -81,7 +81,7 @@ def test_an_experiment_leaves_what_is_measured_alone(tmp_path, monkeypatch):
         assert (tmp_path / "chirp.mcap").read_text() == f"of seed {seed}"
 
 
-def test_bands_that_a_motion_does_not_excite_are_not_told():
+def test_bands_that_a_motion_does_not_excite_are_not_reported():
     """A chirp to 15 Hz with the encoder's noise: nothing at 45 Hz."""
     time = np.arange(25_000) * 1e-3
     z = 20e-6 * np.cos(np.pi * 0.6 * time**2)

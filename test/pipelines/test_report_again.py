@@ -94,7 +94,7 @@ def test_a_folder_without_a_measurement_is_refused(tmp_path, true_calibration):
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "told"),
+    ("path", "value", "reported"),
     [
         (["dynamic_error_before"], 1e-9, "dynamic_error_before is 1e-09, expected names and"),
         (["deviation", "corrected"], {"rms": 1e-9}, "peak_to_valley is required"),
@@ -109,7 +109,7 @@ def test_a_folder_without_a_measurement_is_refused(tmp_path, true_calibration):
         (["warnings"], "slow", "warnings is 'slow', expected a list"),
     ],
 )
-def test_a_summary_that_was_changed_is_refused(shop, tmp_path, capsys, path, value, told):
+def test_a_summary_that_was_changed_is_refused(shop, tmp_path, capsys, path, value, reported):
     folder = shutil.copytree(shop / "result", tmp_path / "result")
     summary = json.loads((folder / "summary.json").read_text())
     place = summary
@@ -121,5 +121,5 @@ def test_a_summary_that_was_changed_is_refused(shop, tmp_path, capsys, path, val
     assert cli.main(["report", str(folder), "--calibration", str(shop / "cal.json")]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
-    assert told in err
+    assert reported in err
     assert (folder / "report.html").read_bytes() == before

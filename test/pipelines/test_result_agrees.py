@@ -18,7 +18,7 @@ from page_tables import PageTables, says
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.pipelines.measure import Registering, measure
+from omsm_ros.pipelines.measure import RegistrationOptions, measure
 
 FOCAL, AWAY = 0.0254, 0.0508
 
@@ -42,7 +42,7 @@ def result(tmp_path_factory, small_scan_blocks, true_calibration):
     out = folder / "out"
     measure(
         folder / "scan.mcap", true_calibration, out, nominal=PAPER_MIRROR, accuracy=1e-6,
-        register=Registering(("piston", "tip", "tilt"), tolerance=1e-6),
+        register=RegistrationOptions(("piston", "tip", "tilt"), tolerance=1e-6),
     )  # fmt: skip
     return out
 
@@ -109,18 +109,18 @@ def test_the_deviation_is_that_of_the_points_from_the_mirror(cloud, summary):
     """In double precision of the height; x and y have single precision, 0.1 nm on these slopes."""
     away = cloud["height"] - mirror(cloud["x"], cloud["y"])
     for name, values in (("corrected", away), ("raw", away + cloud["dynamic_error"])):
-        told = summary["deviation"][name]
-        assert told["peak_to_valley"] == pytest.approx(np.ptp(values), abs=1e-9)
+        reported = summary["deviation"][name]
+        assert reported["peak_to_valley"] == pytest.approx(np.ptp(values), abs=1e-9)
         # About some mean: piston is no form.
-        assert told["rms"] == pytest.approx(np.std(values), rel=0.02)
+        assert reported["rms"] == pytest.approx(np.std(values), rel=0.02)
 
 
 def test_the_budget_adds_up_to_the_uncertainty_of_the_points(cloud, summary):
     """Root of the sum of squares: the mean square over the scan of what each source adds."""
     parts = [size for name, size in summary["uncertainty_budget"].items()]
-    told = math.sqrt(sum(part**2 for part in parts))
+    reported = math.sqrt(sum(part**2 for part in parts))
     found = math.sqrt(float(np.mean(cloud["uncertainty"] ** 2)))
-    assert told == pytest.approx(found, rel=1e-3)
+    assert reported == pytest.approx(found, rel=1e-3)
 
 
 def test_the_page_says_what_the_summary_says(page, summary):
@@ -154,9 +154,9 @@ def test_the_form_is_one_in_its_file_in_the_summary_and_on_the_page(result, summ
     for name in ("pose", "deviation", "removed", "points"):
         assert summary["form"][name] == form[name]
     rms = form["deviation"]["rms"]
-    (told,) = page.table("Figures of the form")["rms"]
-    found = re.fullmatch(r"([\d.]+) (nm|µm|pm) ± ([\d.]+) \2 \(k = 2\)", told)
-    assert found or told.startswith("at most"), told
+    (reported,) = page.table("Figures of the form")["rms"]
+    found = re.fullmatch(r"([\d.]+) (nm|µm|pm) ± ([\d.]+) \2 \(k = 2\)", reported)
+    assert found or reported.startswith("at most"), reported
     if found:
         unit = {"nm": 1e-9, "µm": 1e-6}[found[2]]
         assert float(found[1]) * unit == pytest.approx(rms["value"], rel=0.05)
@@ -190,7 +190,7 @@ def test_the_same_bag_gives_the_same_bytes(result, summary, true_calibration, tm
     measure(
         result.parent / "scan.mcap", true_calibration, tmp_path, nominal=PAPER_MIRROR,
         accuracy=1e-6, report=False,
-        register=Registering(("piston", "tip", "tilt"), tolerance=1e-6),
+        register=RegistrationOptions(("piston", "tip", "tilt"), tolerance=1e-6),
     )  # fmt: skip
     for name in ("cloud.ply", "deviation.ply", "form.json", "curves.json"):
         one, other = ((at / name).read_bytes() for at in (result, tmp_path))

@@ -15,7 +15,7 @@ from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines.record_twin import acceleration_blocks, write_recording
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.part import Spokes
+from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.sensors import Accelerometer
 from omsm_ros.twin.vibration import VibrationLine
@@ -34,7 +34,7 @@ def scan(name, rpm):
     )
     cell = Cell(seed=3, probe=Probe(noise=3e-9, resolution=1e-9), disturbances=errors)
     motion = Circle(Flat(), RADIUS, rpm, turns=SECONDS * rpm / 60)
-    return record(cell, motion, Spokes(Flat(), RADIUS))
+    return record(cell, motion, AzimuthalRipple(Flat(), RADIUS))
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.calibration import declared
+from omsm_ros.core.calibration.calibration import declared_latency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.report.measurement.surface_map import CloudView
 from omsm_ros.twin.part import FigureError
@@ -49,7 +49,9 @@ def certified(true_calibration):
     for index in range(1, len(true_calibration.dynamics.numerator)):
         covariance[index, index] = variance[index - 1]
     certificate = {"verdict": "accepted up to 100 Hz", "chi_square": 1.01, "edges": 20}
-    certificate["latency"] = declared(3.4e-4, 0.0, 1e-6, "the twin's probe is prompt").entry()
+    certificate["latency"] = declared_latency(
+        3.4e-4, 0.0, 1e-6, "the twin's probe is prompt"
+    ).entry()
     return replace(
         true_calibration, covariance=covariance, certificate=certificate, valid_up_to=100.0
     )

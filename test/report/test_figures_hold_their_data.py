@@ -12,14 +12,14 @@ from matplotlib.colors import to_hex
 from matplotlib.image import imread
 
 from omsm_ros.core.calibration.verification import PathCheck
-from omsm_ros.core.comparison.agreement import TermNumber
-from omsm_ros.core.comparison.compare import compare
-from omsm_ros.core.comparison.stated_errors import Measurement as Measured
+from omsm_ros.core.comparison.agreement import ComparedTerm
+from omsm_ros.core.comparison.compare import compare_measurements_of_part
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement as Measured
 from omsm_ros.core.ripple.density import density
-from omsm_ros.core.ripple.ripple_guard import Named
+from omsm_ros.core.ripple.ripple_guard import NamedLine
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, ScanSignal
 from omsm_ros.core.ripple.source_hypotheses import KINDS, PART, VIBRATION
-from omsm_ros.core.ripple.spectral_line import Line
+from omsm_ros.core.ripple.spectral_line import SpectralLine
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.report import campaign, style
 from omsm_ros.report import campaign as campaign_page
@@ -62,7 +62,7 @@ def found():
         points = MeasuredPoints(x=x, y=y, height=height)
         return Measured(name=name, points=points, common=2e-9)
 
-    return compare(one("a", 300e-9, 0), one("b", 260e-9, 1))
+    return compare_measurements_of_part(one("a", 300e-9, 0), one("b", 260e-9, 1))
 
 
 @pytest.mark.parametrize("name", ["profile_x", "profile_y", "profile_radius"])
@@ -77,7 +77,7 @@ def test_the_difference_below_is_a_less_b_above(found, name):
     assert np.all(np.diff(a.get_xdata()) > 0)
 
 
-def test_a_profile_is_the_mean_of_the_places_beside_its_line(found):
+def test_a_profile_is_the_mean_of_the_points_along_its_line(found):
     """By a loop over all places: each value lies among those near its place on the line."""
     lower = difference_figures.profiles(found)["profile_x"].axes[1]
     (line,) = points_of(lower, "A − B")
@@ -87,9 +87,9 @@ def test_a_profile_is_the_mean_of_the_places_beside_its_line(found):
     near = np.abs(y) <= 1.5 * side * (1 + 1e-9)
     x = matched.x - (matched.x.min() + matched.x.max()) / 2
     for at, value in zip(line.get_xdata(), line.get_ydata(), strict=True):
-        beside = matched.difference[near & (np.abs(x - at * 1e-3) <= 1.5 * side)] * 1e9
-        assert beside.min() <= value <= beside.max()
-        assert value == pytest.approx(np.mean(beside), abs=np.ptp(beside) / 2)
+        adjacent = matched.difference[near & (np.abs(x - at * 1e-3) <= 1.5 * side)] * 1e9
+        assert adjacent.min() <= value <= adjacent.max()
+        assert value == pytest.approx(np.mean(adjacent), abs=np.ptp(adjacent) / 2)
     (band,) = lower.collections
     heights = band.get_paths()[0].vertices[:, 1]
     spread = found.agreement.uncertainty[near] * 1e9
@@ -99,7 +99,7 @@ def test_a_profile_is_the_mean_of_the_places_beside_its_line(found):
 
 def test_every_term_is_a_bar_of_its_e_n_and_beyond_one_it_is_red():
     e_n = [0.3, -0.9, 1.2, -4.0, 0.0]
-    numbers = [TermNumber(n, n - 2, 1e-9, 1e-9, 1e-9, v) for n, v in enumerate(e_n, 2)]
+    numbers = [ComparedTerm(n, n - 2, 1e-9, 1e-9, 1e-9, v) for n, v in enumerate(e_n, 2)]
     (axes,) = difference_figures.terms(numbers).axes
     assert [bar.get_height() for bar in axes.patches] == e_n
     red = [to_hex(bar.get_facecolor()).upper() == style.BEFORE for bar in axes.patches]
@@ -115,7 +115,7 @@ def test_every_term_is_a_bar_of_its_e_n_and_beyond_one_it_is_red():
 
 def bag(k, rms, days=None):
     summary = {"deviation": {"corrected": {"rms_area_weighted": rms, "peak_to_valley": 5 * rms}}}
-    return campaign_page.Measurement(
+    return campaign_page.CampaignEntry(
         f"{k}.mcap", "done", "", None if days is None else int(days * DAY_NS), "", summary
     )
 
@@ -125,8 +125,8 @@ def test_a_campaign_is_drawn_over_its_days_or_its_order(drawn, true_calibration,
     rms = 20e-9 + 1e-9 * np.sin(np.arange(12.0))
     rms[7] = 90e-9
     days = np.sort(np.random.default_rng(4).uniform(100, 130, 12)) if timed else [None] * 12
-    told = [bag(k, *pair) for k, pair in enumerate(zip(rms, days, strict=True))]
-    campaign_page.render("C", told, true_calibration)
+    reported = [bag(k, *pair) for k, pair in enumerate(zip(rms, days, strict=True))]
+    campaign_page.render("C", reported, true_calibration)
     (figure,) = drawn
     first, second = figure.axes
     place = np.asarray(days, float) - days[0] if timed else np.arange(12.0)
@@ -238,8 +238,10 @@ def studied(name="scan", count=4096, speed=0.01, seed=0, tone=None):
 
 
 def named(kind, amplitude, **possible):
-    line = Line(coordinate=TIME, frequency=1.0, cosine=amplitude, sine=0.0, possible=possible)
-    return Named(line=line, kind=kind)
+    line = SpectralLine(
+        coordinate=TIME, frequency=1.0, cosine=amplitude, sine=0.0, possible=possible
+    )
+    return NamedLine(line=line, kind=kind)
 
 
 def test_white_noise_stands_at_its_density_over_time_and_along_the_path():

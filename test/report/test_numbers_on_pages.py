@@ -125,8 +125,8 @@ def test_samples_are_whole_numbers_in_their_stream(streams):
     if "distance" in streams:
         value, detail = page.headlines["Surface points"]
         assert int(value.replace(" ", "")) == streams["distance"][0]
-        told = detail.removeprefix("of ").removesuffix(" samples received")
-        assert int(told.replace(" ", "")) == sum(streams["distance"])
+        reported = detail.removeprefix("of ").removesuffix(" samples received")
+        assert int(reported.replace(" ", "")) == sum(streams["distance"])
 
 
 @FEW
@@ -171,9 +171,9 @@ def peak(kind="part", **changes):
 @FEW
 @given(st.floats(1e-3, 1e5), st.floats(1e-7, 1e-1), LENGTH, st.floats(3, 900))
 def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, significance):
-    told = peak(PART, frequency=frequency, wavelength_along_path=wavelength, amplitude=amplitude,
+    reported = peak(PART, frequency=frequency, wavelength_along_path=wavelength, amplitude=amplitude,
                 significance=significance)  # fmt: skip
-    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([told]), {})))
+    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([reported]), {})))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[0] == PART
     for cell, value, digits in zip(
@@ -199,20 +199,20 @@ def test_what_a_line_truly_is_is_said_in_one_way(change, truly):
 
 
 def test_a_line_across_the_path_has_its_radial_wavelength_and_what_it_needs():
-    told = peak(wavelength_along_path=None, needs="another speed", evidence=["a", "b"])
-    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([told]), {})))
+    reported = peak(wavelength_along_path=None, needs="another speed", evidence=["a", "b"])
+    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([reported]), {})))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[2] == "2.000 mm"
     assert cells[6] == "a; b; another speed"
 
 
-def test_scans_sampling_and_band_stop_are_told_in_their_units():
+def test_scans_sampling_and_band_stop_are_reported_in_their_units():
     stop = {"bands": [[310.0, 330.0], [40.0, 50.0]], "rms_before": 5e-9, "rms_after": 3e-9,
             "rms_removed": 4e-9, "settling_at_the_ends": 0.25}  # fmt: skip
     summary = spectrum_summary([peak()], stop=stop)
-    felt = {"axis": "z", "frequency": 680.0, "acceleration": 0.0912, "displacement": 5e-9,
+    acceleration_lines = {"axis": "z", "frequency": 680.0, "acceleration": 0.0912, "displacement": 5e-9,
             "significance": 44.0}  # fmt: skip
-    summary["scans"][0]["accelerometer"] = {"lines": [felt]}
+    summary["scans"][0]["accelerometer"] = {"lines": [acceleration_lines]}
     page = PageTables(render_spectrum(SpectrumPage(summary, {})))
     (scans,) = (t for t in page.tables if "duration" in t["columns"])
     (row,) = scans["rows"]
@@ -239,10 +239,10 @@ def test_scans_sampling_and_band_stop_are_told_in_their_units():
 )  # fmt: skip
 def test_the_verdict_counts_the_lines(peaks, level, word):
     kinds = [getattr(source_hypotheses, name) for name in peaks]
-    told = [
+    reported = [
         peak(k, needs="one more scan" if k == source_hypotheses.UNDECIDED else None) for k in kinds
     ]
-    html = render_spectrum(SpectrumPage(spectrum_summary(told), {}))
+    html = render_spectrum(SpectrumPage(spectrum_summary(reported), {}))
     assert f'class="verdict {level}"' in html
     assert word in html
     items = PageTables(html).items
@@ -250,7 +250,7 @@ def test_the_verdict_counts_the_lines(peaks, level, word):
     assert ("one more scan" in items) is (level == "unknown")
 
 
-def test_the_papers_figures_stand_beside_ours_in_their_own_rows():
+def test_paper_figures_and_ours_stand_in_the_same_rows():
     rows = [Compared("error", "7.85 nm", "7.91 nm", "as read"), Compared("lag", "340 µs", "339 µs")]
     page = PageTables(render_experiment(ExperimentPage("Fig. 9", "as it is", rows)))
     (table,) = page.tables

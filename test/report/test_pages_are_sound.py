@@ -16,7 +16,7 @@ from parsed_page import Page
 from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel, free_run
 from omsm_ros.core.ripple.source_hypotheses import KINDS
 from omsm_ros.live_page.server import render as render_live
-from omsm_ros.report.campaign import Measurement
+from omsm_ros.report.campaign import CampaignEntry
 from omsm_ros.report.campaign import render as render_campaign
 from omsm_ros.report.certificate.model_page import ModelPage, render_model
 from omsm_ros.report.certificate.page import CertificatePage
@@ -30,7 +30,7 @@ from omsm_ros.report.page_parts import Section, StudyPage, fill_study
 from omsm_ros.report.spectrum import SpectrumPage
 from omsm_ros.report.spectrum import render as render_spectrum
 from omsm_ros.report.tables import Table
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 
 # One for each place that text can stand in: an element, an attribute, a script, a comment, a
 # template. No digit with a minus before it, and none with a unit behind: those are typeset.
@@ -79,7 +79,7 @@ def report(text, calibration):
 
 
 def spectrum(text, _):
-    told = {
+    reported = {
         "kind": text, "frequency": 1.0, "wavelength_along_path": 1.0, "amplitude": 1.0,
         "wavelength_along_radius": None, "significance": 4.0, "true_frequency": None,
         "true_wavelength": None, "order": text, "evidence": [text], "needs": text,
@@ -90,7 +90,7 @@ def spectrum(text, _):
         "name": text, "duration": 1.0, "spindle_speed_rpm": 1.0, "path_length": 1.0,
         "samples": {"analysed": 1}, "form": {"rms_removed": 1.0}, "sampling": [],
         "noise": {"rms": 1.0, "amplitude": 1.0}, "motion": {"outside_band_rms": None},
-        "accelerometer": {"lines": [line]}, "peaks": [told], "band_stop": None,
+        "accelerometer": {"lines": [line]}, "peaks": [reported], "band_stop": None,
     }  # fmt: skip
     counts = dict.fromkeys(KINDS, 1)
     return render_spectrum(
@@ -102,7 +102,7 @@ def study(text, _):
     table = Table(text, (text,), [(text, text)], prose=text)
     sections = (Section(text, ("a",), (table,), text),)
     return fill_study(
-        StudyPage(text, text, Verdict("good", text, (text,)), sections, {"a": text}, {"a": PNG},
+        StudyPage(text, text, PageVerdict("good", text, (text,)), sections, {"a": text}, {"a": PNG},
                   footer=text)
     )  # fmt: skip
 
@@ -115,7 +115,7 @@ def experiment(text, _):
 def campaign(text, calibration):
     def one(k, state):
         summary = {"warnings": [text]} if state == "done" else {}
-        return Measurement(f"{text}{'abcdef'[k]}", state, text, None, text, summary)
+        return CampaignEntry(f"{text}{'abcdef'[k]}", state, text, None, text, summary)
 
     return render_campaign(
         text, [one(0, "done"), one(1, "refused"), one(2, "crashed")], calibration
@@ -222,6 +222,6 @@ def test_a_map_in_a_page_is_json_whatever_its_layer_is_called(true_calibration):
 def test_a_link_of_a_campaign_leads_where_the_page_lies(true_calibration):
     """A name that begins with a minus, as of an angle, must not be typeset in its address."""
     names = ["-5", "a/-12.5", "-30%20mm", "b 7 mm", 'q"uote']
-    rows = [Measurement(n, "done", "", None, f"{n}/report.html", {}) for n in names]
+    rows = [CampaignEntry(n, "done", "", None, f"{n}/report.html", {}) for n in names]
     page = Page(render_campaign("Campaign", rows, true_calibration))
     assert [v for k, v in page.attributes if k == "href"] == [f"{n}/report.html" for n in names]

@@ -52,7 +52,7 @@ def test_the_map_grows_lighter_all_the_way(sight):
 
 
 @pytest.mark.parametrize("sight", SIGHTS.values(), ids=SIGHTS)
-def test_before_after_and_truth_are_told_apart(sight):
+def test_before_after_and_truth_are_distinguished(sight):
     colours = lab([to_rgb(c) for c in (style.BEFORE, style.AFTER, style.TRUTH)], sight)
     for one in range(3):
         for other in range(one):

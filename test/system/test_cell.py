@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import DeviceTimeoutError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
-from omsm_ros.nodes.cell_demo_node import Stage, perform
+from omsm_ros.nodes.cell_demo_node import DemoStage, perform
 from omsm_ros.pipelines import demonstrate as demonstration
 
 pytestmark = pytest.mark.timeout(120)
@@ -46,8 +46,8 @@ def test_calibrate_scan_correct_and_replay(cell, device):
         device=device,
     )
     plan.prepare()
-    perform(cell.operator, cell.processes, plan, Stage(quiet=True))
-    summary = demonstration.conclude(plan)
+    perform(cell.operator, cell.processes, plan, DemoStage(quiet=True))
+    summary = demonstration.finish_demonstration(plan)
 
     for stream in ("axes", "distance"):
         samples = summary["samples"][stream]

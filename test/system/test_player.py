@@ -238,9 +238,9 @@ def test_pause_step_and_what_was_latched_before_the_start(
     hear(cell, DistanceBlock, "/omsm/confocal")
     play(cell, path, rate=0.0, start=1.0, paused=True)
     assert first_step(cell).startswith("calibration")
-    told = hear(cell, Calibration, "/omsm/calibration", LATCHED_QOS)  # who comes late
-    cell.wait("the calibration", lambda: told)
-    assert told[0].id == true_calibration.id
+    reported = hear(cell, Calibration, "/omsm/calibration", LATCHED_QOS)  # who comes late
+    cell.wait("the calibration", lambda: reported)
+    assert reported[0].id == true_calibration.id
     assert cell.call(Trigger, "player/step").success
     cell.wait("one message", lambda: len(axes) == 1)
     assert axes[0].first_sample == pairs[10][0].first_sample

@@ -121,7 +121,7 @@ def test_a_bag_that_exists_is_refused(cell):
     assert path.read_bytes() == b"precious"
 
 
-def test_one_that_is_started_again_goes_on_beside_what_was_recorded(cell):
+def test_a_restarted_recorder_writes_a_new_bag_next_to_the_old_one(cell):
     path = cell.folder / "scan.mcap"
     path.write_bytes(b"precious")
     cell.processes.start("recorder", path=str(path), numbered=True)

@@ -30,7 +30,7 @@ def reference_block(axes, random):
     )
 
 
-def test_a_reference_over_dds_is_told_apart_and_can_be_the_input(cell, step_test):
+def test_a_reference_over_dds_is_distinguished_and_can_be_the_input(cell, step_test):
     output = cell.folder / "cal.json"
     cell.processes.start("calibrator", output=str(output))
     messages, random = message_mapping.ros_messages(), np.random.default_rng(5)

@@ -38,7 +38,7 @@ def until(cell, node, level, words=""):
     )
 
 
-def test_a_gap_is_told_by_who_sees_it_and_is_history_later(
+def test_a_gap_is_reported_while_recent_and_then_only_counted(
     cell, true_calibration, small_scan_blocks
 ):
     """Starved, correcting, a gap, every block refused: each a level of its own, and each ends."""
@@ -72,7 +72,7 @@ def test_a_gap_is_told_by_who_sees_it_and_is_history_later(
     until(cell, "corrector", STALE, "no sample of axes for")
 
 
-def test_two_of_a_kind_are_told_by_both(cell):
+def test_two_of_a_kind_are_reported_by_both(cell):
     for label in ("corrector", "second"):
         cell.processes.start_as(label, "corrector", ["-r", f"__node:={label}"])
     for node in ("corrector", "second"):
@@ -101,7 +101,7 @@ def test_a_second_emulator_is_refused_and_the_first_keeps_its_port(cell):
 
 
 @pytest.mark.soak
-def test_simulated_time_that_nobody_tells_is_told(cell):
+def test_simulated_time_that_nobody_tells_is_reported(cell):
     cell.processes.start("calibrator", use_sim_time=True, output=str(cell.folder / "cal.json"))
     until(cell, "calibrator", WARN, "nobody publishes /clock")
 

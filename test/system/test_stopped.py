@@ -20,7 +20,7 @@ from system.test_soak import longest_delay_s
 PROCESS = """
 import sys
 from omsm_ros.nodes import memory, start
-memory.share_one_pool()
+memory.use_single_malloc_arena()
 start.set_up_fast_dds()
 import rclpy
 from omsm_ros.nodes.topics import SAMPLES_QOS
@@ -43,7 +43,7 @@ for line in sys.stdin:
     print("published", flush=True)
     sys.stdin.readline()
     assert publisher.wait_for_all_acked(Duration(seconds=20))
-    memory.give_back()
+    memory.return_free_memory()
     print(held_bytes("self"), flush=True)
 """
 
@@ -62,7 +62,7 @@ def queues_in_shared_memory(pid):
     return found
 
 
-def test_nodes_do_not_hear_through_shared_memory_unless_told(cell, monkeypatch):
+def test_nodes_do_not_hear_through_shared_memory_unless_requested(cell, monkeypatch):
     assert queues_in_shared_memory(os.getpid())  # as a process does that is none of ours
     cell.start_emulator()
     monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "DEFAULT")

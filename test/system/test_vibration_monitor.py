@@ -40,10 +40,10 @@ def test_the_emulated_cells_vibration_is_measured_and_warned_of(cell):
     cell.wait("levels in the bag", lambda: recorded() >= 1)
     cell.processes.end("recorder")
     with bags.BagReader(path) as bag:
-        told = bag.vibration()[-1]
-    assert told["bands"][-1] == [500.0, 2000.0]
-    assert told["height"][-1] == pytest.approx(50e-9 / 2**0.5, rel=0.05)
-    assert told["line"]["frequency"] == pytest.approx(680.0, abs=1.5)
+        reported = bag.vibration()[-1]
+    assert reported["bands"][-1] == [500.0, 2000.0]
+    assert reported["height"][-1] == pytest.approx(50e-9 / 2**0.5, rel=0.05)
+    assert reported["line"]["frequency"] == pytest.approx(680.0, abs=1.5)
 
 
 def test_the_alarm_ends_when_it_is_quiet(cell):

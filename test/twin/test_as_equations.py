@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.part import PartPose, Spokes
-from omsm_ros.twin.plant import PAPER_DYNAMICS, Grid, Movement, Plant, move, respond
+from omsm_ros.twin.part import AzimuthalRipple, PartPose
+from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, move, respond
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.sensors import Accelerometer, ClockErrors, EncoderErrors, Pitch, acceleration_of
@@ -68,7 +68,7 @@ def test_servo_and_probe_obey_their_equations(bandwidth):
     x, _, q0, q1, q2 = integrated(rate, 5, times)
     # Of second order in the step: a quarter of it leaves a sixteenth, and is a picometre.
     found = respond(plant, motion, 150, STEP, substeps=64)
-    np.testing.assert_allclose(found.carriage[1:], x, atol=1.5e-12)
+    np.testing.assert_allclose(found.slide[1:], x, atol=1.5e-12)
     np.testing.assert_allclose(found.probe[1:], b[0] * q0 + b[1] * q1 + b[2] * q2, atol=1.5e-12)
 
 
@@ -96,7 +96,7 @@ def test_what_creeps_and_swings_obeys_its_equations():
     errors = StructureErrors(creep=(creep,), soft_modes=(mode,))
     moved = deform(errors, Movement(probe, probe), probe)
     np.testing.assert_allclose(moved.probe.values[after], expected, atol=1e-12)
-    assert moved.carriage is probe
+    assert moved.slide is probe
 
 
 def test_friction_obeys_dahl_s_law_in_time():
@@ -139,7 +139,7 @@ def test_a_hardening_spring_carries_what_the_linear_one_does(scale):
 def test_pitch_under_acceleration_is_a_mode_that_is_shaken():
     """α'' + 2ζω α' + ω² α = k ω² z'', of which the encoder sees the arm's part."""
     pitch = Pitch(arm_m=0.1, rad_per_m_s2=2e-6, frequency_hz=15.0, damping_ratio=0.2)
-    omega, carriage = 2 * np.pi * 15.0, swing()
+    omega, slide = 2 * np.pi * 15.0, swing()
 
     def rate(t, s):
         a, w = s
@@ -149,13 +149,13 @@ def test_pitch_under_acceleration_is_a_mode_that_is_shaken():
         total = beta + 2e-6 * omega**2 * z
         return [w - 0.4 * omega * total, -(omega**2) * total]
 
-    beta, _ = integrated(rate, 2, carriage.times[1:])
-    angle = beta + 2e-6 * omega**2 * carriage.values[1:]
-    np.testing.assert_allclose(pitch.angle(carriage)[1:], angle, atol=2e-4 * np.ptp(angle))
+    beta, _ = integrated(rate, 2, slide.times[1:])
+    angle = beta + 2e-6 * omega**2 * slide.values[1:]
+    np.testing.assert_allclose(pitch.angle(slide)[1:], angle, atol=2e-4 * np.ptp(angle))
     # A place to begin with is no acceleration.
-    moved = Trajectory(0.0, carriage.step, carriage.values + 0.05)
-    np.testing.assert_allclose(pitch.angle(moved), pitch.angle(carriage), atol=1e-12)
-    seen = EncoderErrors(pitch=pitch).seen(carriage).values - carriage.values
+    moved = Trajectory(0.0, slide.step, slide.values + 0.05)
+    np.testing.assert_allclose(pitch.angle(moved), pitch.angle(slide), atol=1e-12)
+    seen = EncoderErrors(pitch=pitch).seen(slide).values - slide.values
     np.testing.assert_allclose(seen[1:], 0.1 * angle, atol=2e-5 * np.ptp(angle))
 
 
@@ -163,19 +163,19 @@ def test_an_accelerometer_feels_the_second_derivative_through_its_high_pass():
     """y' = a' - y / τ, and a = d²z/dt² of a sine."""
     omega, amplitude, tau = 2 * np.pi * 3.0, 1e-3, 1 / (2 * np.pi * 0.5)
     motion = Trajectory(0.0, STEP, amplitude * np.sin(omega * np.arange(3000) * STEP))
-    felt = acceleration_of(motion)
+    acceleration_lines = acceleration_of(motion)
     expected = -(omega**2) * motion.values[1:-1]
-    np.testing.assert_allclose(felt.values, expected, atol=1e-3 * np.ptp(expected))
+    np.testing.assert_allclose(acceleration_lines.values, expected, atol=1e-3 * np.ptp(expected))
 
     def rate(t, s):
         a = -(omega**2) * amplitude * np.sin(omega * (t + STEP))
         return [a - s[0] / tau]
 
     quiet = Accelerometer(noise_m_per_s2=0.0, cross_talk=0.02, scale_ppm=500.0)
-    block = quiet.read(felt.values, STEP, np.random.default_rng(1))
-    times = np.arange(1, len(felt.values)) * STEP
+    block = quiet.read(acceleration_lines.values, STEP, np.random.default_rng(1))
+    times = np.arange(1, len(acceleration_lines.values)) * STEP
     (held,) = integrated(rate, 1, times)
-    passed = (felt.values[1:] - held / tau) * 1.0005
+    passed = (acceleration_lines.values[1:] - held / tau) * 1.0005
     np.testing.assert_allclose(block.z[1:], passed, atol=5e-3 * np.ptp(passed))
     np.testing.assert_allclose(block.x, 0.02 * block.z, atol=1e-15)
 
@@ -183,7 +183,7 @@ def test_an_accelerometer_feels_the_second_derivative_through_its_high_pass():
 @pytest.mark.parametrize(("exposure", "averages"), [(0.0, 1), (2e-4, 1), (2e-4, 4)])
 def test_the_looks_of_an_exposure_are_its_integral(exposure, averages):
     errors = ProbeErrors(latency_s=1e-4, exposure_s=exposure, averages=averages)
-    before, weight = errors.looks()
+    before, weight = errors.exposure_instants()
     window = exposure * averages
     assert weight.sum() == pytest.approx(1.0, abs=1e-14)
     assert errors.lag_s == pytest.approx(1e-4 + window / 2)
@@ -237,12 +237,12 @@ def test_a_pose_turns_about_x_then_y_then_z(angles):
     np.testing.assert_allclose(pose.rotation, expected, atol=1e-15)
 
 
-def test_spokes_are_two_waves_of_a_whole_number_on_a_circle():
+def test_azimuthal_ripple_is_two_waves_of_whole_number_on_a_circle():
     class Tilted:
         def height(self, x, y):
             return 1e-3 * x
 
-    marks = Spokes(Tilted(), radius=2e-3, wavelength=0.5e-3, rms=20e-9, second=0.25)
+    marks = AzimuthalRipple(Tilted(), radius=2e-3, wavelength=0.5e-3, rms=20e-9, second=0.25)
     waves = round(2 * np.pi * 2e-3 / 0.5e-3)
     assert marks.count == waves == 25
     angle = np.linspace(0, 2 * np.pi, 4000, endpoint=False)
@@ -253,7 +253,7 @@ def test_spokes_are_two_waves_of_a_whole_number_on_a_circle():
     assert 2 * spectrum[50].real == pytest.approx(np.sqrt(2) * 5e-9, rel=1e-9)
     spectrum[[25, 50]] = 0
     assert np.max(np.abs(spectrum)) < 1e-18
-    assert Spokes(Tilted(), radius=1e-6, wavelength=1.0).count == 1
+    assert AzimuthalRipple(Tilted(), radius=1e-6, wavelength=1.0).count == 1
 
 
 def test_no_draw_of_a_clock_lies_beyond_its_reach():
@@ -300,13 +300,13 @@ def test_a_record_is_its_default_until_something_is_set():
 
 def test_what_is_kept_of_the_simulation_lies_where_it_says():
     """Each kept value at its own time, however fine the steps are and whichever are kept."""
-    grid = Grid(lead=50, samples=200, sample_period=STEP, substeps=16, every=8)
+    grid = TimeGrid(lead=50, samples=200, sample_period=STEP, substeps=16, every=8)
     moved = move(Plant(), Swing(), grid)
     coarse = respond(Plant(), Swing(), 200, STEP)
-    times = moved.carriage.times
+    times = moved.slide.times
     assert times[0] == pytest.approx(-50 * STEP + STEP / 2)
     np.testing.assert_allclose(np.diff(times), STEP / 2)
     at = np.arange(1, 200) * STEP
-    np.testing.assert_allclose(moved.carriage.at(at), coarse.carriage[1:], atol=1e-16)
+    np.testing.assert_allclose(moved.slide.at(at), coarse.slide[1:], atol=1e-16)
     np.testing.assert_allclose(moved.probe.at(at), coarse.probe[1:], atol=1e-16)
     assert PAPER_DYNAMICS.dc_gain == pytest.approx(1.0)

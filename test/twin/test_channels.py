@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Circle, StepTest
-from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
@@ -45,10 +45,10 @@ def _amplitude(values, frequency, period=1e-3):
     return abs(2 * np.mean((settled - settled.mean()) * basis))
 
 
-def test_the_reference_reads_the_carriage():
+def test_the_reference_reads_the_slide():
     sensor = ReferenceSensor(noise_m=0.0, scale_ppm=50.0, cubic_m=30e-9)
     made = _seen(StepTest(), reference=sensor)
-    z = made.truth.carriage
+    z = made.truth.slide
     expected = z * (1 + 50e-6) + 30e-9 * (z / 125e-6) ** 3
     np.testing.assert_allclose(made.reference.distance, expected, atol=1e-18)
     np.testing.assert_array_equal(made.motion_record().reference, made.reference.distance)
@@ -65,11 +65,11 @@ def test_a_late_reference_is_late_by_its_latency(late):
 
 def test_the_reference_has_noise_and_a_range():
     made = _seen(Swing(1.0, amplitude=200e-6), reference=ReferenceSensor(noise_m=3e-9))
-    beyond = abs(made.truth.carriage) > 125e-6
+    beyond = abs(made.truth.slide) > 125e-6
     assert 0.3 < np.mean(beyond) < 0.7
     np.testing.assert_array_equal(made.reference.ok, ~beyond)
     assert set(made.reference.status[beyond]) == {Status.OUT_OF_RANGE}
-    error = (made.reference.distance - made.truth.carriage)[~beyond]
+    error = (made.reference.distance - made.truth.slide)[~beyond]
     assert np.std(error) == pytest.approx(3e-9, rel=0.05)
 
 
@@ -86,7 +86,7 @@ def test_the_accelerometer_feels_the_probe(frequency):
 def test_it_feels_a_vibration_that_the_probe_sees_at_its_own_rate():
     line = VibrationLine(amplitude_m=20e-9, frequency_hz=680.0)
     expected = (2 * np.pi * 680) ** 2 * 20e-9
-    for period, seen_at in ((None, folded_frequency(680.0, 1000.0)), (1e-4, 680.0)):
+    for period, seen_at in ((None, aliased_frequency(680.0, 1000.0)), (1e-4, 680.0)):
         sensor = Accelerometer(**SILENT, sample_period_s=period)
         made = _seen(Swing(0.0), vibration=(line,), accelerometer=sensor)
         block = made.acceleration

@@ -72,7 +72,7 @@ def test_late_latches_are_later_and_only_theirs():
     np.testing.assert_allclose(_probe_time(made), NOMINAL, atol=1e-8)
     assert made.truth.response.latency_s == pytest.approx(0.1e-3)
     # The truth of the carriage is at the trigger, whenever the encoder was latched.
-    np.testing.assert_allclose(made.truth.carriage / SPEED + SERVO_LAG_S, NOMINAL, atol=1e-8)
+    np.testing.assert_allclose(made.truth.slide / SPEED + SERVO_LAG_S, NOMINAL, atol=1e-8)
 
 
 def test_jitter_of_the_trigger_is_common_to_all():

@@ -91,14 +91,14 @@ def test_the_servo_follows_a_ramp_late_by_two_over_its_bandwidth(bandwidth):
     made = _seen(errors, motion=Ramp(1e-3), surface=Flat())
     command = Ramp(1e-3).positions(made.truth.time).z
     expected = 1e-3 * 2 / (2 * np.pi * bandwidth)
-    np.testing.assert_allclose(command - made.truth.carriage, expected, rtol=1e-5)
+    np.testing.assert_allclose(command - made.truth.slide, expected, rtol=1e-5)
 
 
 def test_too_fast_a_scan_loses_its_target():
     """At 1221 rpm Z follows a tenth of a millimetre late, and the probe has ± 50 µm."""
     fast = Scenario(spindle_speed=1221.0)
     made = scan_of(fast)
-    late = spiral_of(fast).positions(made.truth.time).z - made.truth.carriage
+    late = spiral_of(fast).positions(made.truth.time).z - made.truth.slide
     assert np.max(abs(late)) == pytest.approx(113e-6, rel=0.02)
     lost = np.mean(~made.distance.ok)
     assert lost == pytest.approx(0.22, abs=0.01)

@@ -9,7 +9,7 @@ import pytest
 
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral, StepTest
-from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together
@@ -170,7 +170,7 @@ def test_a_line_is_seen_at_its_folded_frequency(frequency):
     made = quiet(Disturbances(vibration=(line,)), Swing(0.0, 10.0))
     where, amplitude = _spectrum(made.distance.distance)
     peak = np.argmax(amplitude)
-    assert where[peak] == pytest.approx(folded_frequency(frequency, 1000), abs=0.11)
+    assert where[peak] == pytest.approx(aliased_frequency(frequency, 1000), abs=0.11)
     assert amplitude[peak] == pytest.approx(20e-9, rel=0.15)  # the window's scallop
 
 

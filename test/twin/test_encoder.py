@@ -38,7 +38,7 @@ def _seen(errors, motion=None, **cell):
 
 def test_the_scale_stretches_the_reading_and_nothing_else():
     made = _seen(EncoderErrors(scale_ppm=100.0))
-    np.testing.assert_allclose(made.axes.z, made.truth.carriage * (1 + 100e-6), atol=1e-18)
+    np.testing.assert_allclose(made.axes.z, made.truth.slide * (1 + 100e-6), atol=1e-18)
     assert made.truth.response.static_gain == pytest.approx(1 / (1 + 100e-6))
     clean = _seen(EncoderErrors())
     np.testing.assert_allclose(made.distance.distance, clean.distance.distance, atol=1e-18)
@@ -46,7 +46,7 @@ def test_the_scale_stretches_the_reading_and_nothing_else():
 
 def test_interpolation_repeats_with_the_signal_period():
     made = _seen(EncoderErrors(interpolation_m=5e-9, signal_period_m=2e-6), Swing(1.0))
-    z = made.truth.carriage
+    z = made.truth.slide
     np.testing.assert_allclose(made.axes.z - z, 5e-9 * np.sin(2 * np.pi * z / 2e-6), atol=1e-18)
 
 
@@ -59,7 +59,7 @@ def test_counts_are_whole():
 def test_abbe_error_is_arm_times_angle(arm):
     pitch = Pitch(arm_m=arm, rad_per_m=1e-3, periodic_rad=0.5e-6, period_m=7e-6)
     made = _seen(EncoderErrors(pitch=pitch), Swing(1.0))
-    z = made.truth.carriage
+    z = made.truth.slide
     angle = 1e-3 * z + 0.5e-6 * np.sin(2 * np.pi * z / 7e-6)
     np.testing.assert_allclose(made.axes.z - z, arm * angle, atol=1e-17)
 
@@ -84,7 +84,7 @@ def test_pitch_under_acceleration_is_in_the_true_response(frequency):
 
 def test_the_noise_is_the_cells_own():
     made = _seen(EncoderErrors(scale_ppm=1.0), encoder_noise=0.4e-9)
-    error = made.axes.z - made.truth.carriage
+    error = made.axes.z - made.truth.slide
     assert np.std(error - error.mean()) == pytest.approx(0.4e-9, rel=0.05)
 
 

@@ -14,7 +14,7 @@ def behind(position, width):
     return backlash(Trajectory(0.0, 1.0, position), width)
 
 
-def test_the_loop_of_backlash_is_as_wide_as_stated():
+def test_the_backlash_loop_has_the_stated_width():
     turn = np.linspace(0, 6 * np.pi, 60_001)
     position = 1e-6 * np.sin(turn)
     followed = behind(position, 60e-9).values

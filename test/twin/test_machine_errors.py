@@ -105,7 +105,7 @@ def test_a_bowed_slide_makes_a_bowed_profile():
     np.testing.assert_allclose(made.distance.distance, expected, atol=1e-18)
 
 
-def test_a_crooked_z_slide_carries_the_probe_sideways():
+def test_a_crooked_z_slide_carries_the_probe_laterally():
     """On a slope of 0.1 the place is off by the straightness at that Z."""
     crooked = Straightness(bow_m=1e-6, half_travel_m=1e-3)
 

@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.kinematics.trajectories import Spiral, StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.plant import PAPER_EQ_12, Plant, respond
 
@@ -73,7 +73,7 @@ def _errors(plant, scan):
     spiral, period = scan
     samples = round(spiral.duration / period)
     moved = respond(plant, spiral, samples, period)
-    error = moved.probe - moved.carriage
+    error = moved.probe - moved.slide
     radius = spiral.positions(np.arange(samples) * period).x
     mean = np.average(error, weights=radius)
     return np.ptp(error), np.sqrt(np.average((error - mean) ** 2, weights=radius))
@@ -96,15 +96,15 @@ def test_error_at_a_step_edge():
     motion = StepTest(step=10e-6, count=1, rise=0.0)
     fine = 1 / 64e3
     moved = respond(Plant(PAPER_EQ_12), motion, round(1.0 / fine), fine, substeps=1)
-    error = moved.carriage - moved.probe
+    error = moved.slide - moved.probe
     assert error.max() == pytest.approx(2.288e-6, abs=2e-9)
     assert error[-1] == pytest.approx(0.079e-6, abs=1e-9)
 
 
 def test_680_hz_folds_to_320_hz():
-    assert folded_frequency(680, 1000) == 320
+    assert aliased_frequency(680, 1000) == 320
     # Halves round up: 500 Hz stays where it is, as does its mirror image.
-    np.testing.assert_array_equal(folded_frequency([500, 1500, 1000, 60], 1000), [500, 500, 0, 60])
+    np.testing.assert_array_equal(aliased_frequency([500, 1500, 1000, 60], 1000), [500, 500, 0, 60])
 
 
 def test_chirp_of_figure_9():

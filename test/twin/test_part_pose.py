@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.part import PartPose, PosedSurface, posed
+from omsm_ros.twin.part import MountedSurface, PartPose, mounted_surface
 
 ALL_SIX = PartPose(
     x_m=5e-6, y_m=-3e-6, z_m=1e-6, tilt_x_rad=1e-3, tilt_y_rad=-2e-3, clocking_rad=0.3
@@ -22,7 +22,7 @@ def _plane():
 def test_a_tilted_flat_is_a_plane():
     x, y = _plane()
     a, b = 1e-3, 2e-3
-    found = PosedSurface(Flat(), PartPose(tilt_x_rad=a, tilt_y_rad=b)).height(x, y)
+    found = MountedSurface(Flat(), PartPose(tilt_x_rad=a, tilt_y_rad=b)).height(x, y)
     # Normal of the flat after a turn about x, then y: (cos a sin b, -sin a, cos a cos b).
     expected = -(x * np.cos(a) * np.sin(b) - y * np.sin(a)) / (np.cos(a) * np.cos(b))
     np.testing.assert_allclose(found, expected, atol=1e-17)
@@ -30,7 +30,7 @@ def test_a_tilted_flat_is_a_plane():
 
 def test_a_shifted_sphere_is_a_sphere_elsewhere():
     x, y = _plane()
-    found = PosedSurface(Sphere(0.1), PartPose(x_m=1e-3, y_m=2e-3, z_m=3e-6)).height(x, y)
+    found = MountedSurface(Sphere(0.1), PartPose(x_m=1e-3, y_m=2e-3, z_m=3e-6)).height(x, y)
     expected = 3e-6 + 0.1 - np.sqrt(0.01 - (x - 1e-3) ** 2 - (y - 2e-3) ** 2)
     np.testing.assert_allclose(found, expected, atol=1e-16)
 
@@ -41,13 +41,13 @@ def test_a_sphere_turned_about_its_centre_is_the_same():
     pose = PartPose(tilt_y_rad=tilt, x_m=-r * np.sin(tilt), z_m=r * (1 - np.cos(tilt)))
     x, y = _plane()
     np.testing.assert_allclose(
-        PosedSurface(Sphere(r), pose).height(x, y), Sphere(r).height(x, y), atol=1e-15
+        MountedSurface(Sphere(r), pose).height(x, y), Sphere(r).height(x, y), atol=1e-15
     )
 
 
 def test_every_point_of_a_posed_mirror_lies_on_the_mirror_when_put_back():
     x, y = _plane()
-    z = PosedSurface(PAPER_MIRROR, ALL_SIX).height(x, y)
+    z = MountedSurface(PAPER_MIRROR, ALL_SIX).height(x, y)
     shift = np.array([[ALL_SIX.x_m], [ALL_SIX.y_m], [ALL_SIX.z_m]])
     back = ALL_SIX.rotation.T @ (np.array([x, y, z]) - shift)
     np.testing.assert_allclose(back[2], PAPER_MIRROR.height(back[0], back[1]), atol=1e-13)
@@ -55,12 +55,12 @@ def test_every_point_of_a_posed_mirror_lies_on_the_mirror_when_put_back():
 
 def test_clocking_turns_the_part_about_the_spindle():
     x, y = _plane()
-    turned = PosedSurface(PAPER_MIRROR, PartPose(clocking_rad=np.pi / 2)).height(x, y)
+    turned = MountedSurface(PAPER_MIRROR, PartPose(clocking_rad=np.pi / 2)).height(x, y)
     np.testing.assert_allclose(turned, PAPER_MIRROR.height(y, -x), atol=1e-17)
 
 
 def test_a_part_that_sits_right_is_itself():
-    assert posed(PAPER_MIRROR, PartPose()) is PAPER_MIRROR
+    assert mounted_surface(PAPER_MIRROR, PartPose()) is PAPER_MIRROR
 
 
 def test_angles_must_be_numbers():

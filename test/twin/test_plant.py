@@ -32,7 +32,7 @@ def test_halving_the_step_changes_nothing_above_a_tenth_of_a_nanometre(plant, mo
     substeps = 80 if plant.dynamics.delay else 16
     default = respond(plant, motion, samples, PERIOD, substeps)
     halved = respond(plant, motion, samples, PERIOD, 2 * substeps)
-    assert np.max(np.abs(halved.carriage - default.carriage)) < 0.1 * NANOMETRE_M
+    assert np.max(np.abs(halved.slide - default.slide)) < 0.1 * NANOMETRE_M
     assert np.max(np.abs(halved.probe - default.probe)) < 0.1 * NANOMETRE_M
 
 
@@ -56,9 +56,9 @@ def test_a_swing_comes_out_with_the_gain_and_phase_of_the_transfer_function(freq
     plant = Plant(dynamics)
     moved = respond(plant, Swing(frequency), 2000, PERIOD, substeps=64)
     turning = np.exp(2j * np.pi * frequency * np.arange(2000) * PERIOD)
-    carriage = plant.servo.response(frequency)
-    probe = carriage * dynamics.response(frequency)
-    np.testing.assert_allclose(moved.carriage, 1e-6 * (carriage * turning).real, atol=2e-11)
+    slide = plant.servo.response(frequency)
+    probe = slide * dynamics.response(frequency)
+    np.testing.assert_allclose(moved.slide, 1e-6 * (slide * turning).real, atol=2e-11)
     np.testing.assert_allclose(moved.probe, 1e-6 * (probe * turning).real, atol=2e-11)
 
 

@@ -83,7 +83,7 @@ def test_dropouts_have_their_probability_and_leave_the_noise_alone():
 
 def test_the_looks_of_an_exposure_stand_for_its_mean():
     errors = ProbeErrors(latency_s=0.1e-3, exposure_s=0.2e-3, averages=3)
-    before, weight = errors.looks()
+    before, weight = errors.exposure_instants()
     assert weight.sum() == pytest.approx(1.0)
     assert before.min() > 0.1e-3
     assert before.max() < 0.7e-3
@@ -94,8 +94,8 @@ def test_the_looks_of_an_exposure_stand_for_its_mean():
 
 
 def test_what_sees_no_slope_says_so():
-    assert not ProbeErrors(latency_s=1e-3, cubic_m=1e-9).sees_slope
-    assert ProbeErrors(dropout_slope_rad=0.1).sees_slope
+    assert not ProbeErrors(latency_s=1e-3, cubic_m=1e-9).is_slope_sensitive
+    assert ProbeErrors(dropout_slope_rad=0.1).is_slope_sensitive
     slope = slope_of(PAPER_MIRROR, np.zeros(1), np.zeros(1), np.zeros(1))
     assert abs(slope.x[0]) < 1e-9
 

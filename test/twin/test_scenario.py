@@ -40,4 +40,4 @@ def test_any_motion_stays_in_range_before_the_flat(motion):
 def test_the_step_test_is_the_papers():
     made = step_test_of(Scenario())
     assert len(made.axes) == 10_500
-    assert np.ptp(made.truth.carriage) == pytest.approx(98e-6, rel=1e-4)
+    assert np.ptp(made.truth.slide) == pytest.approx(98e-6, rel=1e-4)

@@ -21,9 +21,9 @@ from omsm_ros.twin.trajectory import Trajectory
 STEP_S = 1e-3
 
 
-def _deformed(errors, carriage, probe=None, start=-10.0):
+def _deformed(errors, slide, probe=None, start=-10.0):
     """Motion of the probe where the clean one would be ``probe``, by default the carriage's."""
-    made = [Trajectory(start, STEP_S, z) for z in (carriage, carriage if probe is None else probe)]
+    made = [Trajectory(start, STEP_S, z) for z in (slide, slide if probe is None else probe)]
     slide_x = Trajectory(start, 1.0, np.arange(60) * 1e-4)
     return deform(errors, Movement(*made), slide_x).probe.values
 
@@ -93,17 +93,17 @@ def test_a_hardening_spring_obeys_its_law():
 
 
 def test_stiffness_changes_the_deflection_along_z():
-    carriage = np.linspace(-1e-3, 1e-3, 2001)
-    probe = carriage - 300e-9
-    found = _deformed(StructureErrors(compliance_per_m_of_z=100.0), carriage, probe)
-    np.testing.assert_allclose(carriage - found, 300e-9 * (1 + 100 * carriage), atol=1e-18)
+    slide = np.linspace(-1e-3, 1e-3, 2001)
+    probe = slide - 300e-9
+    found = _deformed(StructureErrors(compliance_per_m_of_z=100.0), slide, probe)
+    np.testing.assert_allclose(slide - found, 300e-9 * (1 + 100 * slide), atol=1e-18)
 
 
 def test_stiffness_changes_the_deflection_along_x():
-    carriage = np.zeros(2001)
-    found = _deformed(StructureErrors(compliance_per_m_of_x=50.0), carriage, carriage - 300e-9)
+    slide = np.zeros(2001)
+    found = _deformed(StructureErrors(compliance_per_m_of_x=50.0), slide, slide - 300e-9)
     x = np.arange(2001) * STEP_S * 1e-4  # a tenth of a millimetre a second
-    np.testing.assert_allclose(carriage - found, 300e-9 * (1 + 50 * x), atol=1e-18)
+    np.testing.assert_allclose(slide - found, 300e-9 * (1 + 50 * x), atol=1e-18)
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ from omsm_ros.core.adjustment.scan_model import CURVATURE, DYNAMIC, GAIN, LAG, L
 from omsm_ros.core.adjustment.scan_reader import ScanColumns
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_HARMONICS,
-    WIDE_CURVATURE_S2,
-    WIDE_GAIN,
-    WIDE_S,
+    UNINFORMATIVE_CURVATURE_S2,
+    UNINFORMATIVE_GAIN,
+    UNINFORMATIVE_S,
     Prior,
     SelfCalibration,
     self_calibrate,
@@ -26,7 +26,7 @@ from omsm_ros.core.calibration.calibration import (
     SPEEDS,
     Calibration,
     Latency,
-    share_of,
+    latency_share_of,
 )
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian
@@ -40,7 +40,7 @@ SCOPE = (
     "of the structure, for surfaces followed as closely; a step test would determine the latency"
 )
 # One clean run in a thousand.
-_SURPRISE_P, _SURPRISE_SIGMAS = 1e-3, 3.0
+_PRIOR_CONFLICT_P, _PRIOR_CONFLICT_SIGMAS = 1e-3, 3.0
 # A spindle keeps its speed to better than that.
 _SAME_SPEED = 0.01
 # The low-order model's own poles, well above what moved and well below Nyquist.
@@ -60,12 +60,15 @@ def unit_calibration(sample_period: float, static_gain: float = 1.0) -> Calibrat
     )
 
 
-def without_step_test(gain_uncertainty: float = WIDE_GAIN) -> Prior:
+def without_step_test(gain_uncertainty: float = UNINFORMATIVE_GAIN) -> Prior:
     """Return what is known of a machine that was never tested: next to nothing.
 
     gain_uncertainty: of the static gain, as a share of it
     """
-    return Prior(np.diag([WIDE_S, WIDE_CURVATURE_S2, gain_uncertainty, WIDE_S]) ** 2)
+    return Prior(
+        np.diag([UNINFORMATIVE_S, UNINFORMATIVE_CURVATURE_S2, gain_uncertainty, UNINFORMATIVE_S])
+        ** 2
+    )
 
 
 def after_step_test(calibration: Calibration) -> Prior:
@@ -75,7 +78,7 @@ def after_step_test(calibration: Calibration) -> Prior:
     covariance[:GAIN, :GAIN] = jacobian @ calibration.covariance @ jacobian.T
     relative = calibration.static_gain_uncertainty / calibration.static_gain
     covariance[GAIN, GAIN] = relative**2
-    covariance[LATENCY, LATENCY] = WIDE_S**2
+    covariance[LATENCY, LATENCY] = UNINFORMATIVE_S**2
     return Prior(covariance)
 
 
@@ -88,7 +91,7 @@ def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
     g, sigma = _moved(calibration, float(found.values[LAG]), float(found.values[CURVATURE]))
     jacobian = slow_motion_jacobian(g)
     prior = jacobian @ sigma @ jacobian.T
-    gain = sigma @ jacobian.T @ _inverse_of_what_varies(prior)
+    gain = sigma @ jacobian.T @ _inverse_of_varying(prior)
     remaining = found.covariance[:GAIN, :GAIN].copy()
     if len(g.numerator) <= CURVATURE + 1:
         # A numerator of the first degree has no room for the curvature: it stays, and counts.
@@ -145,7 +148,7 @@ def from_scans_alone(
         "low_frequency_delay_s": dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
         "warnings": [] if found.known[LATENCY] else [SCOPE],
-        "reasons": _early(total, float(np.sqrt(found.covariance[LAG, LAG]))),
+        "reasons": _early_reason(total, float(np.sqrt(found.covariance[LAG, LAG]))),
         "verdict": f"accepted up to {quantity(trusted, 'Hz')}",
     }
     return Calibration(
@@ -185,12 +188,12 @@ def _latency(found: SelfCalibration, lag: float) -> Latency:
     source = REVERSAL if _same(np.abs(found.speeds)) else SPEEDS
     _, structure = found.structure
     # What the lag of Z, in the covariance of the dynamics, does not hold already.
-    beside = float(np.sqrt(max(structure**2 - found.covariance[LAG, LAG], 0.0)))
+    structural_uncertainty = float(np.sqrt(max(structure**2 - found.covariance[LAG, LAG], 0.0)))
     if not found.known[LATENCY]:
         return Latency(
             delay_s=0.0,
             uncertainty_s=None,
-            beside_z_s=beside,
+            beside_z_s=structural_uncertainty,
             share=None,
             source=source,
             reason=SCOPE,
@@ -200,8 +203,8 @@ def _latency(found: SelfCalibration, lag: float) -> Latency:
     return Latency(
         delay_s=delay,
         uncertainty_s=float(np.sqrt(found.covariance[LATENCY, LATENCY])),
-        beside_z_s=beside,
-        share=share_of(delay, lag),
+        beside_z_s=structural_uncertainty,
+        share=latency_share_of(delay, lag),
         source=source,
         reason=f"{len(found.speeds)} scans of one part at {rpm} rpm",
     )
@@ -219,7 +222,7 @@ def _entries(found: SelfCalibration) -> dict[str, object]:
             "residual_rms_m": found.residual,
             "left_on_this_surface_m": found.followed,
             "agreement": asdict(found.agreement),
-            "surprise_chi2": found.surprise,
+            "surprise_chi2": found.prior_conflict,
             "between_scans": [
                 {
                     name: {"value": float(value), "uncertainty": float(spread)}
@@ -261,17 +264,17 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
             f"rms, {plain(found.agreement.ratio, 2)} times what noise explains; the part moved, or "
             "something else than speed changed between them: let the machine settle and repeat"
         )
-    if stats.chi2.sf(found.surprise, GAIN) < _SURPRISE_P:
+    if stats.chi2.sf(found.prior_conflict, GAIN) < _PRIOR_CONFLICT_P:
         shift = quantity(float(found.values[LAG]), "s")
         reasons.append(
             f"scans and step test contradict each other: the lag would have to change by "
-            f"{shift}, beyond what the step test allows (χ² {found.surprise:.0f} of 2); "
+            f"{shift}, beyond what the step test allows (χ² {found.prior_conflict:.0f} of 2); "
             "repeat the step test with the settings of the scans"
         )
     latency, spread = (
         float(v) for v in (found.values[LATENCY], found.covariance[LATENCY, LATENCY])
     )
-    if latency < -_SURPRISE_SIGMAS * np.sqrt(spread):
+    if latency < -_PRIOR_CONFLICT_SIGMAS * np.sqrt(spread):
         reasons.append(
             f"the probe would have to be {quantity(-latency, 's')} early: the structure "
             "lags more in the scans than in the step test; repeat the step test"
@@ -283,9 +286,9 @@ def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str,
     return certificate | {"reasons": all_reasons, "verdict": REJECTED}
 
 
-def _early(lag: float, uncertainty: float) -> list[str]:
+def _early_reason(lag: float, uncertainty: float) -> list[str]:
     """Return the reason against scans alone whose Z would have to follow the probe."""
-    if lag >= -_SURPRISE_SIGMAS * uncertainty:
+    if lag >= -_PRIOR_CONFLICT_SIGMAS * uncertainty:
         return []
     return [
         f"Z would have to move {quantity(-lag, 's')} after what the probe sees of it: the sign of "
@@ -303,7 +306,7 @@ def _highest_excited(found: SelfCalibration) -> float:
     return highest * max(map(abs, found.speeds)) / (2 * np.pi)
 
 
-def _inverse_of_what_varies(matrix: FloatArray) -> FloatArray:
+def _inverse_of_varying(matrix: FloatArray) -> FloatArray:
     """Return the inverse of a covariance (2, 2) whose rows have different units and may be zero."""
     deviation = np.sqrt(np.diag(matrix))
     scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)

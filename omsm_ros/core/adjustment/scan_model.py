@@ -149,7 +149,7 @@ _PORTION = 5_000
 
 
 @dataclass(frozen=True, eq=False)
-class Portion:
+class IntervalRows:
     """Points of one interval of radius: which (n,), and the surface's terms there."""
 
     interval: int
@@ -157,12 +157,12 @@ class Portion:
     rows: PolarRows
 
 
-Columns = Callable[[Portion], tuple[FloatArray, FloatArray]]
+Columns = Callable[[IntervalRows], tuple[FloatArray, FloatArray]]
 """From a portion of n points to X (n, p) and y (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
-class NormalEquations:
+class ReducedNormalEquations:
     """Of the parameters alone.
 
     matrix, right, square: (p, p), (p,) and yᵀy, the surface eliminated
@@ -186,7 +186,7 @@ class NormalEquations:
 
 def portions(
     basis: PolarBasis, order: IntArray, interval: IntArray, radius: FloatArray, angle: FloatArray
-) -> Iterator[Portion]:
+) -> Iterator[IntervalRows]:
     """Yield all points in portions of one interval each.
 
     order: points sorted by their interval, in time within it;  interval: of each point
@@ -196,12 +196,12 @@ def portions(
     for number, (first, last) in enumerate(pairwise(edges)):
         for begin in range(first, last, _PORTION):
             points = order[begin : min(begin + _PORTION, last)]
-            yield Portion(number, points, basis.rows(number, radius[points], angle[points]))
+            yield IntervalRows(number, points, basis.rows(number, radius[points], angle[points]))
 
 
 def normal_equations(
-    basis: PolarBasis, parts: Iterator[Portion], columns: Columns
-) -> NormalEquations:
+    basis: PolarBasis, parts: Iterator[IntervalRows], columns: Columns
+) -> ReducedNormalEquations:
     """Gather ``parts`` and eliminate the surface."""
     size = basis.size
     of_surface, mixed, own = np.zeros((size, size)), np.zeros((size, 0)), np.zeros((0, 0))
@@ -218,7 +218,7 @@ def normal_equations(
     of_surface[diagonal] += _RIDGE * np.max(of_surface[diagonal])
     shares = linalg.cho_solve(linalg.cho_factor(of_surface), mixed)
     reduced = own - mixed.T @ shares
-    return NormalEquations(
+    return ReducedNormalEquations(
         matrix=reduced[:-1, :-1],
         right=reduced[:-1, -1],
         square=float(reduced[-1, -1]),
@@ -240,7 +240,7 @@ _MOST_DRIFT_INTERVALS, _TURNS_A_DRIFT = 8, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ScanPlacement:
     """Where the surface is evaluated: latency [s], and clocking of each scan [rad], (scans,)."""
 
     latency: float
@@ -312,15 +312,15 @@ class ScanModel:
         """Number of parameters."""
         return int(self.own(self.number).start)
 
-    def radius(self, part: Portion) -> FloatArray:
+    def radius(self, part: IntervalRows) -> FloatArray:
         """Return the radius of the points of ``part`` [m]."""
         return np.asarray(self._column["radius"][part.points])
 
-    def angle(self, part: Portion) -> FloatArray:
+    def angle(self, part: IntervalRows) -> FloatArray:
         """Return the angle of the points of ``part``, on the part [rad]."""
         return np.asarray(self._column["angle"][part.points])
 
-    def portions(self, place: Place, every: int) -> Iterator[Portion]:
+    def portions(self, place: ScanPlacement, every: int) -> Iterator[IntervalRows]:
         """Yield one point in ``every``, the surface's terms evaluated at ``place``."""
         column = self._column
         radius = column["radius"] - place.latency * column["radial_rate"]
@@ -329,7 +329,7 @@ class ScanModel:
         return portions(self.basis, self._order[::every], self._interval, radius, angle)
 
     def columns(
-        self, part: Portion, place: Place, surface: FloatArray | None
+        self, part: IntervalRows, place: ScanPlacement, surface: FloatArray | None
     ) -> tuple[FloatArray, FloatArray]:
         """Return X (n, parameters) and y (n,) of the points of ``part``.
 

@@ -93,14 +93,14 @@ class ScanReader:
         self.points += len(points)
         self._points.append(points)
         if sum(map(len, self._points)) > _PORTION_SAMPLES:
-            self._digest(last=False)
+            self._keep_complete(last=False)
 
     def columns(self) -> ScanColumns:
         """Return the points kept, once all have come.
 
         Raises DataError for a scan that is too short.
         """
-        self._digest(last=True)
+        self._keep_complete(last=True)
         if self.used < _LEAST_POINTS:
             raise DataError(
                 f"scan of {self.points} points, {self.used} of them with all their neighbours; "
@@ -108,7 +108,7 @@ class ScanReader:
             )
         return ScanColumns(**dict(zip(_COLUMNS, self._kept.rows().T, strict=True)))
 
-    def _digest(self, *, last: bool) -> None:
+    def _keep_complete(self, *, last: bool) -> None:
         """Keep the points whose neighbourhood is known; those at the ends of a run have none."""
         points = join_points(self._points)
         if not self._axes or not len(points):

@@ -21,9 +21,9 @@ from omsm_ros.core.adjustment.scan_model import (
     GAIN,
     LAG,
     LATENCY,
-    Place,
-    Portion,
+    IntervalRows,
     ScanModel,
+    ScanPlacement,
     normal_equations,
 )
 from omsm_ros.core.adjustment.scan_reader import ScanColumns
@@ -45,7 +45,7 @@ _LEAST_DISAGREEMENT_M = 2e-9
 
 
 @dataclass(frozen=True)
-class Agreement:
+class ScanConsistency:
     """How far the scans differ where they should not.
 
     ratio: mean square of what is left in rings and harmonics over what noise predicts [1]
@@ -63,7 +63,7 @@ class Agreement:
         return self.ratio < _GREATEST_RATIO or self.disagreement < _LEAST_DISAGREEMENT_M
 
 
-class AgreementSums:
+class ScanConsistencySums:
     """Gathers residuals of ``scans`` scans between the radii ``inner`` and ``outer`` [m]."""
 
     def __init__(self, scans: int, inner: float, outer: float) -> None:
@@ -85,7 +85,7 @@ class AgreementSums:
         self._jumps += float(np.sum(np.diff(residual) ** 2))
         self._jump_count += max(len(residual) - 1, 0)
 
-    def result(self) -> Agreement:
+    def result(self) -> ScanConsistency:
         """Weigh all that came."""
         variance = self._jumps / max(2 * self._jump_count, 1)
         seen = self._counts > 0
@@ -95,7 +95,7 @@ class AgreementSums:
         ratio = float(np.mean(power / (count * variance))) if variance > 0 else 0.0
         excess = np.maximum(2 * (power - count * variance) / count**2, 0.0)
         mean_square = np.average(np.sum(excess, axis=1), weights=count[:, 0])
-        return Agreement(ratio, float(np.sqrt(mean_square)), float(np.sqrt(variance)))
+        return ScanConsistency(ratio, float(np.sqrt(mean_square)), float(np.sqrt(variance)))
 
 
 # How far do residuals let parameters vary, if a whole ring of the part varies as one?
@@ -121,11 +121,11 @@ class RingScores:
         self._second = np.zeros((DYNAMIC, DYNAMIC))
         self.square = 0.0
         basis = model.basis
-        self.agreement = AgreementSums(model.number, basis.inner, basis.outer)
+        self.agreement = ScanConsistencySums(model.number, basis.inner, basis.outer)
 
     def add(
         self,
-        part: Portion,
+        part: IntervalRows,
         x: FloatArray,
         y: FloatArray,
         parameters: FloatArray,
@@ -151,7 +151,7 @@ class RingScores:
             mine = scan == k
             self.agreement.add(int(k), radius[mine], angle[mine], residual[mine])
 
-    def meat(self) -> FloatArray:
+    def score_covariance(self) -> FloatArray:
         """Return the scores' covariance, (parameters, parameters); a ring varies as a whole."""
         rings = len(self._scores)
         return np.asarray(self._scores.T @ self._scores * (rings / (rings - 1)))
@@ -184,7 +184,7 @@ _FLOOR = np.array([1e-9, 1e-13, 1e-9, 1e-9])
 _REMOUNTED_RAD = 1e-4
 _NONE: BoolArray = np.zeros(DYNAMIC, np.bool_)
 # Without them the rest is still worth having; the one that costs least goes first.
-_MAY_STAY_UNKNOWN = (LATENCY, CURVATURE)
+_MAY_REMAIN_UNDETERMINED = (LATENCY, CURVATURE)
 # Each step squares the error that is left; 10 ns are 0.02 nm on the paper's scan.
 _ITERATIONS = 6
 _CONVERGED_S = 1e-8
@@ -212,11 +212,11 @@ class Prior:
     tilt: float = DEFAULT_TILT_RAD
 
 
-WIDE_S = _LONGEST_LAG_S
+UNINFORMATIVE_S = _LONGEST_LAG_S
 # A mode at 2.5 Hz with a thousandth of the motion has 4e-6 s².
-WIDE_CURVATURE_S2 = 1e-4
+UNINFORMATIVE_CURVATURE_S2 = 1e-4
 # The paper's probe is 0.8 % off.
-WIDE_GAIN = 1e-2
+UNINFORMATIVE_GAIN = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +228,7 @@ class SelfCalibration:
     known: which of them the scans or the prior determine, (4,);  speeds: of the scans [rad/s]
     residual: rms [m];  followed: standard uncertainty that the four leave on the heights of
         this surface, rms [m];  agreement: of the scans with each other
-    surprise: χ² of lag and curvature against the prior, 2 degrees of freedom
+    prior_conflict: χ² of lag and curvature against the prior, 2 degrees of freedom
     own, own_uncertainty: clocking [rad], shift [m] and tilt [rad] of each scan but the first
     amplitudes: rms over the part of each harmonic of the surface, from 1 [m]
     points: fitted
@@ -240,8 +240,8 @@ class SelfCalibration:
     speeds: tuple[float, ...]
     residual: float
     followed: float
-    agreement: Agreement
-    surprise: float
+    agreement: ScanConsistency
+    prior_conflict: float
     own: FloatArray
     own_uncertainty: FloatArray
     amplitudes: FloatArray
@@ -268,7 +268,7 @@ def self_calibrate(
     fit = _Fit(model, prior)
     if not fit.tells:
         raise DataError(_undetermined(model, prior))
-    for index in _MAY_STAY_UNKNOWN:
+    for index in _MAY_REMAIN_UNDETERMINED:
         if fit.unknown[index]:
             fit = fit.without(index)
     return fit.result()
@@ -298,16 +298,16 @@ class _Fit:
     def __init__(self, model: ScanModel, prior: Prior, omitted: BoolArray = _NONE) -> None:
         self._model, self._prior, self._omitted = model, prior, omitted
         self._precision = _precision(
-            model, replace(prior, covariance=_held(prior.covariance, GAIN))
+            model, replace(prior, covariance=_with_fixed(prior.covariance, GAIN))
         )
-        self._place = Place(0.0, np.zeros(model.number))
+        self._place = ScanPlacement(0.0, np.zeros(model.number))
         self._surface: FloatArray | None = None
         self._variance = _NOISE_M**2
         self._iterate()
 
     def without(self, index: int) -> _Fit:
         """Return the same fit with one of the four held, which the scans do not determine."""
-        covariance = _held(self._prior.covariance, index)
+        covariance = _with_fixed(self._prior.covariance, index)
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
         return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
 
@@ -324,12 +324,16 @@ class _Fit:
         inverse = _inverse(self._matrix)
         posterior = np.diag(inverse + self._by_gain(inverse))[:DYNAMIC]
         assumed = np.diag(self._prior.covariance)
-        wide = assumed >= np.array([WIDE_S, WIDE_CURVATURE_S2, np.inf, WIDE_S]) ** 2 / 4
+        uninformative = (
+            assumed
+            >= np.array([UNINFORMATIVE_S, UNINFORMATIVE_CURVATURE_S2, np.inf, UNINFORMATIVE_S]) ** 2
+            / 4
+        )
         limit = _KNOWN**2 * assumed
-        if wide[LAG]:
+        if uninformative[LAG]:
             # Without a step test latency shows in third order of the following error alone.
             limit[LATENCY] = _USEFUL_S**2
-        return np.asarray(self._omitted | (wide & (posterior > limit)))
+        return np.asarray(self._omitted | (uninformative & (posterior > limit)))
 
     def _iterate(self) -> None:
         """Converge on some of the points; for that is only to know where to linearise."""
@@ -358,7 +362,7 @@ class _Fit:
         self._surface = equations.surface_of(parameters)
         self._equations, self._parameters = equations, parameters
         clocking = [parameters[model.own(k).start + CLOCKING] for k in range(1, model.number)]
-        self._place = Place(float(parameters[LATENCY]), np.array([0.0, *clocking]))
+        self._place = ScanPlacement(float(parameters[LATENCY]), np.array([0.0, *clocking]))
 
     def result(self) -> SelfCalibration:
         """Return the residuals, covariance by rings, and what is said of the scans."""
@@ -371,8 +375,8 @@ class _Fit:
                 part, *model.columns(part, self._place, self._surface), parameters, self._surface
             )
         inverse = _inverse(self._matrix)
-        meat = seen.meat() / self._variance**2 + self._precision
-        by_rings = inverse @ meat @ inverse
+        score_covariance = seen.score_covariance() / self._variance**2 + self._precision
+        by_rings = inverse @ score_covariance @ inverse
         covariance = by_rings + self._by_gain(inverse)
         two, four = slice(GAIN), slice(DYNAMIC)
         own = np.array([model.own(k) for k in range(1, model.number)], object)
@@ -385,7 +389,7 @@ class _Fit:
             residual=float(np.sqrt(seen.square / len(model))),
             followed=seen.followed(covariance[four, four]),
             agreement=seen.agreement.result(),
-            surprise=_surprise(
+            prior_conflict=_prior_conflict(
                 parameters[two],
                 self._prior.covariance[two, two],
                 inverse[two, two],
@@ -434,14 +438,14 @@ def _precision(model: ScanModel, prior: Prior) -> FloatArray:
     return precision
 
 
-def _held(covariance: FloatArray, index: int) -> FloatArray:
+def _with_fixed(covariance: FloatArray, index: int) -> FloatArray:
     """Return the same with one quantity at its value."""
     held = covariance.copy()
     held[index], held[:, index] = 0.0, 0.0
     return held
 
 
-def _surprise(
+def _prior_conflict(
     values: FloatArray, prior: FloatArray, inverse: FloatArray, covariance: FloatArray
 ) -> float:
     """Return χ² of lag and curvature against what was known before, harmless moves set aside.

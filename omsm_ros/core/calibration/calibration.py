@@ -112,10 +112,10 @@ def latency_of(calibration: Calibration) -> Latency:
     """Return what ``calibration`` says of its latency; unresolved if it says nothing."""
     if ENTRY in calibration.certificate:
         return Latency.of_entry(calibration.certificate[ENTRY])
-    return unresolved(calibration.dynamics.low_frequency_delay)
+    return unresolved_latency(calibration.dynamics.low_frequency_delay)
 
 
-def unresolved(lag: float) -> Latency:
+def unresolved_latency(lag: float) -> Latency:
     """Return what is known without a test: any part of ``lag`` [s] may be latency.
 
     X and C are not delayed, for nothing says that they should be. The true delay lies anywhere
@@ -132,7 +132,7 @@ def unresolved(lag: float) -> Latency:
     )
 
 
-def declared(lag: float, delay: float, uncertainty: float, reason: str) -> Latency:
+def declared_latency(lag: float, delay: float, uncertainty: float, reason: str) -> Latency:
     """Return a latency of ``delay`` ± ``uncertainty`` [s] of the whole ``lag`` [s] as stated.
 
     Raises ConfigurationError for a delay or uncertainty that no probe has, or without a reason.
@@ -141,13 +141,15 @@ def declared(lag: float, delay: float, uncertainty: float, reason: str) -> Laten
         delay_s=delay,
         uncertainty_s=uncertainty,
         beside_z_s=uncertainty,
-        share=share_of(delay, lag),
+        share=latency_share_of(delay, lag),
         source=DECLARED,
         reason=reason,
     )
 
 
-def beyond_lag(calibration: Calibration, delay: float, uncertainty: float = 0.0) -> str | None:
+def excess_latency_text(
+    calibration: Calibration, delay: float, uncertainty: float = 0.0
+) -> str | None:
     """Return what is wrong with a ``delay`` ± ``uncertainty`` [s] beyond the whole lag of Z.
 
     What is left of the lag would be a structure that moves before its slide.
@@ -165,7 +167,7 @@ def beyond_lag(calibration: Calibration, delay: float, uncertainty: float = 0.0)
     )
 
 
-def share_of(delay: float, lag: float) -> float | None:
+def latency_share_of(delay: float, lag: float) -> float | None:
     """Return the part of ``lag`` [s] that ``delay`` [s] is, None if there is no lag."""
     return delay / lag if lag else None
 
@@ -386,16 +388,16 @@ class Calibration:
         return np.asarray(stated, np.float64).reshape(self.covariance.shape)
 
     @property
-    def hidden_covariance(self) -> FloatArray:
+    def undetected_error_covariance(self) -> FloatArray:
         """Covariance (p, p) of what the step test could not show, beyond its noise.
 
         Zero where the certificate does not separate the two.
         """
-        hidden = self.covariance - self.noise_covariance
+        undetected = self.covariance - self.noise_covariance
         deviation = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         scale = np.where(deviation > 0, deviation, 1.0)
-        least = float(np.min(np.linalg.eigvalsh(hidden / np.outer(scale, scale))))
-        return hidden if least > -_ROUNDING else np.zeros_like(hidden)
+        least = float(np.min(np.linalg.eigvalsh(undetected / np.outer(scale, scale))))
+        return undetected if least > -_ROUNDING else np.zeros_like(undetected)
 
     @property
     def low_frequency_delay_noise(self) -> float:

@@ -18,8 +18,8 @@ from omsm_ros.core.calibration.calibration import (
     Calibration,
     Latency,
     latency_of,
-    share_of,
-    unresolved,
+    latency_share_of,
+    unresolved_latency,
     verdict_of,
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -166,7 +166,7 @@ def _latency(members: Sequence[Calibration]) -> Latency:
     each = [latency_of(c) for c in members]
     lag = max((c.dynamics.low_frequency_delay for c in members), key=abs)
     if not all(latency.resolved for latency in each):
-        return unresolved(lag)
+        return unresolved_latency(lag)
     delays = [latency.delay_s for latency in each]
     spread = float(np.ptp(delays) / np.sqrt(12.0))
     mean = float(np.mean(delays))
@@ -175,7 +175,7 @@ def _latency(members: Sequence[Calibration]) -> Latency:
         delay_s=mean,
         uncertainty_s=float(np.hypot(own, spread)),
         beside_z_s=float(np.hypot(max(latency.beside_z_s for latency in each), spread)),
-        share=share_of(mean, lag),
+        share=latency_share_of(mean, lag),
         source=each[0].source,
         reason="; ".join(dict.fromkeys(latency.reason for latency in each)),
     )

@@ -17,7 +17,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import CalibrationError
-from omsm_ros.readable import chance, measured, plain, quantity
+from omsm_ros.readable import measured, p_value_text, plain, quantity
 from omsm_ros.units import PPM
 
 # Evenly over the common band; covariances have fewer independent directions than that.
@@ -33,7 +33,7 @@ _LEAST_BAND_HZ = 0.1
 
 
 @dataclass(frozen=True)
-class Change:
+class CalibrationChange:
     """From an old to a new calibration.
 
     delay: change of the low-frequency delay [s];  delay_sigmas: over its uncertainty
@@ -56,16 +56,16 @@ class Change:
     def text(self) -> str:
         """Return one line for a reader."""
         if not self.changed:
-            return f"the same ({chance(self.p_value)})"
+            return f"the same ({p_value_text(self.p_value)})"
         return (
             f"changed: lag by {quantity(self.delay, 's', signed=True)} "
             f"({self.delay_sigmas:.1f} sigma), static gain by "
             f"{quantity(self.static_gain / PPM, 'ppm', signed=True)} "
-            f"({self.static_gain_sigmas:.1f} sigma), {chance(self.p_value)}"
+            f"({self.static_gain_sigmas:.1f} sigma), {p_value_text(self.p_value)}"
         )
 
 
-def compare(old: Calibration, new: Calibration) -> Change:
+def compare_calibrations(old: Calibration, new: Calibration) -> CalibrationChange:
     """Return what changed between two calibrations of one machine, independent of each other.
 
     Raises CalibrationError when there is no band that both know.
@@ -82,7 +82,7 @@ def compare(old: Calibration, new: Calibration) -> Change:
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
     sigma = math.hypot(*(c.low_frequency_delay_noise for c in (old, new)))
     worst = int(np.argmax(np.abs(ratio)))
-    return Change(
+    return CalibrationChange(
         delay=float(delay),
         delay_sigmas=float(abs(delay) / sigma) if sigma else float("inf"),
         frequency=float(lines[worst]),
@@ -171,7 +171,7 @@ class Repeatability:
         verdict = "as repeatable as stated" if self.repeatable else "scatter more than they state"
         lag, gain = self.delay, self.static_gain
         return (
-            f"{self.count} calibrations {verdict} ({chance(self.p_value)}): "
+            f"{self.count} calibrations {verdict} ({p_value_text(self.p_value)}): "
             f"lag {measured(lag.mean, lag.deviation, 's')}{_of_stated(lag)}, "
             f"static gain {measured(gain.mean, gain.deviation, digits=6)}{_of_stated(gain)}"
         )

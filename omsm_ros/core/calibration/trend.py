@@ -36,7 +36,7 @@ def outliers(values: FloatArray) -> BoolArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Trend:
+class LinearTrend:
     """The slope of values over time [unit/s], with the ends of its 95 % interval."""
 
     slope: float
@@ -49,7 +49,7 @@ class Trend:
         return self.low > 0 or self.high < 0
 
 
-def trend(times: FloatArray, values: FloatArray) -> Trend | None:
+def trend(times: FloatArray, values: FloatArray) -> LinearTrend | None:
     """Return the slope of ``values`` (n,) over ``times`` [s] (n,) after Theil and Sen.
 
     The median of all slopes between two points: a third of the points may be wrong. Of more than
@@ -63,4 +63,4 @@ def trend(times: FloatArray, values: FloatArray) -> Trend | None:
         known = known[np.argsort(times[known], kind="stable")]
         known = known[np.linspace(0, len(known) - 1, _MOST).round().astype(np.int64)]
     found = stats.theilslopes(values[known], times[known], alpha=0.95)
-    return Trend(float(found.slope), float(found.low_slope), float(found.high_slope))
+    return LinearTrend(float(found.slope), float(found.low_slope), float(found.high_slope))

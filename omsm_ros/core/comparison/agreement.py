@@ -17,12 +17,12 @@ from scipy.special import chdtrc, ndtri
 
 from omsm_ros.core.comparison.matching import Matched
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 # Of some 95 % (GUM 6.3.3).
 COVERAGE_FACTOR = 2.0
 # From power to the order of the sixth, which tolerances of form name.
-TERMS: tuple[Term, ...] = terms_up_to(6, 2)
+TERMS: tuple[ZernikeIndex, ...] = terms_up_to(6, 2)
 # Of the area (ISO 10110-5:2015 calls for a share to be stated).
 ROBUST_SHARE = 0.995
 
@@ -39,7 +39,7 @@ _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Errors:
+class MeasurementErrors:
     """What one measurement may be wrong by at the places (m,).
 
     shapes: by source, each (k, m) [m], sizes independent with standard deviation one
@@ -53,7 +53,7 @@ class Errors:
 
 
 @dataclass(frozen=True, slots=True)
-class Number:
+class ComparedFigure:
     """A figure of both measurements [m], and its E_n; expanded and e_n None: not evaluated."""
 
     a: float
@@ -63,7 +63,7 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
-class TermNumber:
+class ComparedTerm:
     """A Zernike term of the difference [m], one at the rim; expanded for all terms at once."""
 
     n: int
@@ -75,7 +75,7 @@ class TermNumber:
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Agreement:
+class ComparisonAgreement:
     """E_n of what two measurements were compared in.
 
     figures: peak_to_valley, robust_peak_to_valley, rms
@@ -87,8 +87,8 @@ class Agreement:
     aperture: radius and middle of the disc of the terms [m]
     """
 
-    figures: dict[str, Number]
-    terms: tuple[TermNumber, ...]
+    figures: dict[str, ComparedFigure]
+    terms: tuple[ComparedTerm, ...]
     probability: float
     within: float
     uncertainty: FloatArray
@@ -98,7 +98,7 @@ class Agreement:
     aperture: tuple[float, float, float]
 
     @property
-    def largest(self) -> TermNumber:
+    def largest(self) -> ComparedTerm:
         """The term of the largest |E_n|."""
         return max(self.terms, key=lambda term: abs(term.e_n))
 
@@ -127,16 +127,18 @@ FIGURES: dict[str, Callable[[FloatArray], FloatArray]] = {
 }
 
 
-def figures_of(matched: Matched) -> dict[str, Number]:
+def figures_of(matched: Matched) -> dict[str, ComparedFigure]:
     """Return the figures of both measurements less the fitted freedoms, without any E_n."""
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
     return {
-        name: Number(float(figure(a)), float(figure(b)), None, None)
+        name: ComparedFigure(float(figure(a)), float(figure(b)), None, None)
         for name, figure in FIGURES.items()
     }
 
 
-def shapes_of_difference(errors: tuple[Errors, Errors], shared: Collection[str] = ()) -> FloatArray:
+def shapes_of_difference(
+    errors: tuple[MeasurementErrors, MeasurementErrors], shared: Collection[str] = ()
+) -> FloatArray:
     """Return the shapes (k, m) [m] of what a − b may be wrong by.
 
     shared: sources of one and the same error in both, so that its two shapes are subtracted
@@ -147,8 +149,10 @@ def shapes_of_difference(errors: tuple[Errors, Errors], shared: Collection[str] 
 
 
 def judge(
-    matched: Matched, errors: tuple[Errors, Errors], shared: Collection[str] = ()
-) -> Agreement:
+    matched: Matched,
+    errors: tuple[MeasurementErrors, MeasurementErrors],
+    shared: Collection[str] = (),
+) -> ComparisonAgreement:
     """Return how two measurements agree whose errors at the places are known.
 
     shared: sources of one and the same error in both
@@ -159,9 +163,9 @@ def judge(
     worst = int(np.argmax(score))
     averaged = np.hypot(errors[0].averaged, errors[1].averaged)
     terms, probability, aperture = _terms(matched, shapes, averaged)
-    drawn = _drawn(matched, errors, shared)
+    drawn = _monte_carlo_errors(matched, errors, shared)
     farthest = np.max(np.abs(drawn[0] - drawn[1]) / uncertainty, axis=1)
-    return Agreement(
+    return ComparisonAgreement(
         figures=_figures(matched, drawn),
         terms=terms,
         probability=probability,
@@ -174,7 +178,7 @@ def judge(
     )
 
 
-def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Number]:
+def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, ComparedFigure]:
     """Return figures with the scatter of ``errors`` in them, by Monte Carlo (GUM supplement 1)."""
     plain = figures_of(matched)
     heights = matched.without_fit(np.stack([matched.a, matched.b]))
@@ -185,14 +189,14 @@ def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Number]
         # Noise widens a peak to valley: by as much as one more noise does, of each its own.
         own = (plain[name].a, plain[name].b)
         excess = [float(np.mean(run)) - value for run, value in zip(runs, own, strict=True)]
-        expanded = _factor(len(FIGURES)) * spread
+        expanded = _coverage_factor(len(FIGURES)) * spread
         e_n = ((own[0] - excess[0]) - (own[1] - excess[1])) / expanded if expanded > 0 else None
-        found[name] = Number(*own, expanded, e_n)
+        found[name] = ComparedFigure(*own, expanded, e_n)
     return found
 
 
-def _drawn(
-    matched: Matched, errors: tuple[Errors, Errors], shared: Collection[str]
+def _monte_carlo_errors(
+    matched: Matched, errors: tuple[MeasurementErrors, MeasurementErrors], shared: Collection[str]
 ) -> list[FloatArray]:
     """Return the errors of both, each (draws, m) [m]; the same for the same input."""
     random = np.random.default_rng(0)
@@ -207,7 +211,7 @@ def _drawn(
     return made
 
 
-def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> FloatArray:
+def _noise(matched: Matched, side: MeasurementErrors, random: np.random.Generator) -> FloatArray:
     """Return the independent errors as the local fits pass them on (draws, m) [m].
 
     Places share points with their neighbours: so much smoothed, white noise of the size of means
@@ -228,14 +232,14 @@ def _noise(matched: Matched, side: Errors, random: np.random.Generator) -> Float
     return made * side.single / np.std(made)
 
 
-def _factor(together: int) -> float:
+def _coverage_factor(together: int) -> float:
     """Return the coverage factor with which 95 % hold of so many ``together`` (Šidák, 1967)."""
     return float(ndtri((1 + _TOGETHER ** (1 / together)) / 2))
 
 
 def _terms(
     matched: Matched, fitted: FloatArray, averaged: FloatArray
-) -> tuple[tuple[TermNumber, ...], float, tuple[float, float, float]]:
+) -> tuple[tuple[ComparedTerm, ...], float, tuple[float, float, float]]:
     """Return Zernike terms of the difference beside the fitted freedoms, and how likely all are."""
     x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
     radius = float(np.max(np.hypot(matched.x - x0, matched.y - y0)))
@@ -245,13 +249,13 @@ def _terms(
     shapes = fitted @ rows.T
     covariance = shapes.T @ shapes + (rows * averaged**2) @ rows.T
     spread = np.sqrt(np.diag(covariance))
-    chi_square, told = _chi_square(value / spread, covariance / np.outer(spread, spread))
-    factor = _factor(len(names))
+    chi_square, dof_count = _chi_square(value / spread, covariance / np.outer(spread, spread))
+    factor = _coverage_factor(len(names))
     terms = tuple(
-        TermNumber(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
+        ComparedTerm(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
         for term, d, s in zip(names, value, spread, strict=True)
     )
-    return terms, float(chdtrc(told, chi_square)), (radius, x0, y0)
+    return terms, float(chdtrc(dof_count, chi_square)), (radius, x0, y0)
 
 
 def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]:
@@ -266,7 +270,7 @@ def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]
     return float(np.sum(along**2 / powers[known])), int(np.sum(known))
 
 
-def _rows(matched: Matched, values: FloatArray) -> tuple[list[Term], FloatArray]:
+def _rows(matched: Matched, values: FloatArray) -> tuple[list[ZernikeIndex], FloatArray]:
     """Return the terms that stay identifiable beside the fitted freedoms, and weights (t, m)."""
     free = matched.without_fit(values)
     own = np.linalg.norm(free, axis=1) / np.linalg.norm(values, axis=1)

@@ -7,21 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.comparison.agreement import Agreement, Errors, judge, root_mean_square
+from omsm_ros.core.comparison.agreement import (
+    ComparisonAgreement,
+    MeasurementErrors,
+    judge,
+    root_mean_square,
+)
 from omsm_ros.core.comparison.matching import SEATED, Matched, match
 from omsm_ros.core.comparison.resampling import LocalQuadratic, cell_side
 from omsm_ros.core.comparison.stated_errors import (
     ESTIMATED,
     NOT_KNOWN,
-    Half,
-    Measurement,
+    ComparedMeasurement,
+    ComparisonSide,
     drift_size,
     errors_of,
 )
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
-from omsm_ros.readable import chance, count, figure, percent, plain, quantity
+from omsm_ros.readable import count, figure, p_value_text, percent, plain, quantity
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 # Agree, differ, or cannot tell; and why.
@@ -33,13 +38,13 @@ _LEAST_PROBABILITY = 0.01
 # A term beyond one, which of pairs that agree one in twenty has, and all terms as unlikely as that.
 _UNLIKELY = 0.05
 # What is beyond one but not by this is as well chance as a difference.
-_PLAINLY_BEYOND = 1.25
+_CLEARLY_BEYOND = 1.25
 # Of the smaller area: of less, the figures are those of another part.
 _LEAST_SHARED = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ComparisonVerdict:
     """verdict: AGREE, DIFFER or CANNOT_TELL;  reasons: for it, the weightiest first
     reservations: what it rests on beside the stated uncertainties
     """
@@ -51,11 +56,11 @@ class Verdict:
 
 def verdict_of(
     matched: Matched,
-    agreement: Agreement | None,
+    agreement: ComparisonAgreement | None,
     unknown: tuple[str, ...],
     shared: float,
     reservations: tuple[str, ...],
-) -> Verdict:
+) -> ComparisonVerdict:
     """Return the verdict.
 
     agreement: None if the uncertainty of a measurement is not known;  unknown: why
@@ -64,36 +69,36 @@ def verdict_of(
     if shared < _LEAST_SHARED:
         unknown += (f"they share {percent(shared)} of the smaller area, expected 50 % or more",)
     if agreement is None or shared < _LEAST_SHARED:
-        return Verdict(CANNOT_TELL, unknown, reservations)
+        return ComparisonVerdict(CANNOT_TELL, unknown, reservations)
     differs = _differences(agreement)
     if differs:
-        return Verdict(DIFFER, differs, reservations)
-    doubts = _doubts(matched, agreement)
+        return ComparisonVerdict(DIFFER, differs, reservations)
+    doubts = _reservation_texts(matched, agreement)
     if doubts:
-        return Verdict(CANNOT_TELL, doubts, reservations)
+        return ComparisonVerdict(CANNOT_TELL, doubts, reservations)
     largest = agreement.largest
-    return Verdict(
+    return ComparisonVerdict(
         AGREE,
         (
             f"all {len(agreement.terms)} Zernike terms: the largest |E_n| is "
             f"{plain(abs(largest.e_n))}, of {_named(largest.n, largest.m)}",
-            f"a difference like theirs or larger: {chance(agreement.probability)}",
+            f"a difference like theirs or larger: {p_value_text(agreement.probability)}",
             f"|E_n| < 1 on {percent(agreement.within, 3)} of the area",
-            "what may differ unseen, term by term: up to " + _least_sure(agreement),
+            "what may differ unseen, term by term: up to " + _most_uncertain_terms(agreement),
         ),
         reservations,
     )
 
 
-def _least_sure(found: Agreement) -> str:
+def _most_uncertain_terms(found: ComparisonAgreement) -> str:
     """Return the terms of the largest uncertainty, with it."""
     terms = sorted(found.terms, key=lambda term: -term.expanded)[:3]
     return ", ".join(f"{quantity(t.expanded, 'm')} of {_named(t.n, t.m)}" for t in terms)
 
 
-def _differences(found: Agreement) -> tuple[str, ...]:
+def _differences(found: ComparisonAgreement) -> tuple[str, ...]:
     largest, probability = found.largest, found.probability
-    plainly = abs(largest.e_n) > _PLAINLY_BEYOND
+    plainly = abs(largest.e_n) > _CLEARLY_BEYOND
     both = abs(largest.e_n) > 1 and probability < _UNLIKELY
     reasons = []
     if plainly or both:
@@ -103,9 +108,9 @@ def _differences(found: Agreement) -> tuple[str, ...]:
         )
     if probability < _LEAST_PROBABILITY or both:
         reasons.append(
-            f"all terms together: {chance(probability)} if only the stated errors were there"
+            f"all terms together: {p_value_text(probability)} if only the stated errors were there"
         )
-    if found.farthest > _PLAINLY_BEYOND * found.allowed:
+    if found.farthest > _CLEARLY_BEYOND * found.allowed:
         x, y = (quantity(place, "m") for place in found.at)
         reasons.append(
             f"at x = {x}, y = {y} they differ by {plain(found.farthest)} standard "
@@ -114,12 +119,12 @@ def _differences(found: Agreement) -> tuple[str, ...]:
     reasons += [
         f"{figure(name)}: E_n = {plain(number.e_n)}"
         for name, number in found.figures.items()
-        if number.e_n is not None and abs(number.e_n) > _PLAINLY_BEYOND and reasons
+        if number.e_n is not None and abs(number.e_n) > _CLEARLY_BEYOND and reasons
     ]
     return tuple(reasons)
 
 
-def _doubts(matched: Matched, found: Agreement) -> tuple[str, ...]:
+def _reservation_texts(matched: Matched, found: ComparisonAgreement) -> tuple[str, ...]:
     beyond = {_named(t.n, t.m): t.e_n for t in found.terms if abs(t.e_n) > 1}
     beyond |= {
         figure(name): number.e_n
@@ -170,7 +175,7 @@ _CORRELATED_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Side:
+class SideSummary:
     """What a measurement brought to the comparison, lengths [m].
 
     scatter: of a point about its neighbours
@@ -198,22 +203,22 @@ class Comparison:
     """
 
     matched: Matched
-    sides: tuple[Side, Side]
-    agreement: Agreement | None
+    sides: tuple[SideSummary, SideSummary]
+    agreement: ComparisonAgreement | None
     shared: float
     length: float
     common: tuple[str, ...]
-    verdict: Verdict
+    verdict: ComparisonVerdict
 
 
-def compare(
-    a: Measurement,
-    b: Measurement,
-    freedoms: Sequence[str] = SEATED,
+def compare_measurements_of_part(
+    a: ComparedMeasurement,
+    b: ComparedMeasurement,
+    dofs: Sequence[str] = SEATED,
     spacing: float | None = None,
     length: float | None = None,
 ) -> Comparison:
-    """Compare two measurements of one part, the second moved onto the first by ``freedoms``.
+    """Compare two measurements of one part, the second moved onto the first by ``dofs``.
 
     spacing: of the places [m], None: as the coarser of both allows
     length: over which errors of unknown form are correlated [m], None: half the radius
@@ -225,11 +230,11 @@ def compare(
     first, second = (
         LocalQuadratic(m.points, max(c, side)) for m, c in zip((a, b), cells, strict=True)
     )
-    matched = match(first, second, _places(a.points, b.points, side), freedoms)
+    matched = match(first, second, _places(a.points, b.points, side), dofs)
     halves = (
-        Half(a, first, matched.from_a, matched.x, matched.y,
+        ComparisonSide(a, first, matched.from_a, matched.x, matched.y,
              first.method_error(matched.x, matched.y)),
-        Half(b, second, matched.from_b, matched.b_x, matched.b_y,
+        ComparisonSide(b, second, matched.from_b, matched.b_x, matched.b_y,
              second.method_error(matched.b_x, matched.b_y)),
     )  # fmt: skip
     reach = length or _CORRELATED_SHARE * float(max(np.ptp(matched.x), np.ptp(matched.y))) / 2
@@ -275,7 +280,9 @@ def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
     return HeightGrid(height=np.zeros(counts[::-1]), x0=x0, y0=y0, dx=side, dy=side)
 
 
-def _side(half: Half, errors: Errors | None, agreement: Agreement | None) -> Side:
+def _side(
+    half: ComparisonSide, errors: MeasurementErrors | None, agreement: ComparisonAgreement | None
+) -> SideSummary:
     sources = None
     if errors is not None:
         sources = {
@@ -284,7 +291,7 @@ def _side(half: Half, errors: Errors | None, agreement: Agreement | None) -> Sid
         }
     m = half.measurement
     estimated = m.drift_from == ESTIMATED and agreement is None
-    return Side(
+    return SideSummary(
         name=m.name,
         points=len(m.points),
         scatter=half.surface.scatter,
@@ -296,7 +303,7 @@ def _side(half: Half, errors: Errors | None, agreement: Agreement | None) -> Sid
     )
 
 
-def _reservations(sides: tuple[Side, Side], matched: Matched) -> tuple[str, ...]:
+def _reservations(sides: tuple[SideSummary, SideSummary], matched: Matched) -> tuple[str, ...]:
     found: tuple[str, ...] = ()
     drifts = [side.drift for side in sides if side.drift_from == ESTIMATED]
     if any(drifts):
@@ -305,21 +312,21 @@ def _reservations(sides: tuple[Side, Side], matched: Matched) -> tuple[str, ...]
             f"{quantity(max(drifts), 'm', 2)}, is taken for it; a true difference of that form, "
             "as rings or power of a spiral scan, is not seen; state it, as --drift 20e-9",
         )
-    sideways = [name for name in ("x", "y", "clocking") if name in matched.freedoms]
-    if sideways:
+    lateral_dofs = [name for name in ("x", "y", "clocking") if name in matched.dofs]
+    if lateral_dofs:
         found += (
-            f"{', '.join(sideways)} were fitted: a true difference that looks like such a move is "
+            f"{', '.join(lateral_dofs)} were fitted: a true difference that looks like such a move is "
             "not seen",
         )
-    found += _beside_each_other(matched)
+    found += _steepness_warning(matched)
     return found + tuple(f"{name} was not fitted: {why}" for name, why in matched.refused.items())
 
 
-def _beside_each_other(matched: Matched) -> tuple[str, ...]:
+def _steepness_warning(matched: Matched) -> tuple[str, ...]:
     """Return what a small shift between the two would do to heights that are steep."""
     there = matched.from_b
     each = {"x": there.slope_x, "y": there.slope_y}
-    slopes = [slope for name, slope in each.items() if name not in matched.freedoms]
+    slopes = [slope for name, slope in each.items() if name not in matched.dofs]
     if not slopes:
         return ()
     left = matched.without_fit(np.stack(slopes))

@@ -19,12 +19,12 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.readable import quantity
 
-FREEDOMS = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
+DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
 """In this order, with the signs of a pose: tip raises the side of +y, tilt lowers that of +x,
 clocking turns from x towards y."""
 
 SEATED = ("piston", "tip", "tilt")
-_SIDEWAYS = ("x", "y", "clocking")
+_LATERAL = ("x", "y", "clocking")
 # Each turn squares what is left; a thousandth of a place is beneath what resampling knows.
 _TURNS = 8
 _SETTLED = 1e-3
@@ -45,7 +45,7 @@ class Matched:
     filled: which of the grid's places have one, flat
     x, y: [m];  a, b: heights [m], b less the fitted piston, tip, tilt and power
     columns: change of a − b by each fitted freedom (p, m)
-    freedoms: fitted;  moved: b by how much, [m], [rad], power [1/m]
+    dofs: fitted;  moved: b by how much, [m], [rad], power [1/m]
     refused: freedoms that the surface does not determine, and why
     from_a, from_b: the local fits
     b_x, b_y: the places in the second measurement's own frame [m]
@@ -58,7 +58,7 @@ class Matched:
     a: FloatArray
     b: FloatArray
     columns: FloatArray
-    freedoms: tuple[str, ...]
+    dofs: tuple[str, ...]
     moved: dict[str, float]
     refused: dict[str, str]
     from_a: LocalHeights
@@ -78,25 +78,25 @@ class Matched:
         return np.asarray(values - (design @ solved).T, np.float64)
 
 
-def freedoms_named(names: Sequence[str]) -> tuple[str, ...]:
+def ordered_dofs(names: Sequence[str]) -> tuple[str, ...]:
     """Return freedoms in their order; ConfigurationError for a name that is none."""
     for name in names:
-        if name not in FREEDOMS:
-            raise ConfigurationError(f"freedom {name!r} is unknown, expected one of {[*FREEDOMS]}")
-    return tuple(name for name in FREEDOMS if name in names)
+        if name not in DEGREES_OF_FREEDOM:
+            raise ConfigurationError(
+                f"freedom {name!r} is unknown, expected one of {[*DEGREES_OF_FREEDOM]}"
+            )
+    return tuple(name for name in DEGREES_OF_FREEDOM if name in names)
 
 
-def match(
-    a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, freedoms: Sequence[str]
-) -> Matched:
-    """Move ``b`` onto ``a`` by ``freedoms`` and take both at the places of ``grid``.
+def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence[str]) -> Matched:
+    """Move ``b`` onto ``a`` by ``dofs`` and take both at the places of ``grid``.
 
     grid: whose heights do not matter
 
     Raises DataError where they share too few places, or a fit does not settle.
     """
     places = _Places(a, b, grid)
-    wanted = freedoms_named(freedoms)
+    wanted = ordered_dofs(dofs)
     moved = dict.fromkeys(wanted, 0.0)
     seen = places.seen(moved, wanted)
     refused = _not_determined(seen.columns, places.columns_of_first(seen.filled, wanted), grid.dx)
@@ -104,10 +104,10 @@ def match(
     for _ in range(_TURNS):
         seen = places.seen(moved, left)
         step = seen.step()
-        sideways = {name: step.pop(name) for name in _SIDEWAYS if name in step}
-        if _small(sideways, grid.dx, float(np.ptp(places.x))):
+        lateral_step = {name: step.pop(name) for name in _LATERAL if name in step}
+        if _is_converged(lateral_step, grid.dx, float(np.ptp(places.x))):
             return places.matched(seen, {**moved, **step}, step, refused)
-        for name, value in sideways.items():
+        for name, value in lateral_step.items():
             moved[name] += value
     raise DataError(
         "shift and clocking of the second measurement do not settle; place it nearer, or fit "
@@ -143,9 +143,9 @@ class _Places:
         self.x, self.y = (part.ravel() for part in np.meshgrid(grid.x, grid.y))
         self._here = a.at(self.x, self.y)
 
-    def seen(self, moved: Mapping[str, float], freedoms: Sequence[str]) -> _Seen:
+    def seen(self, moved: Mapping[str, float], dofs: Sequence[str]) -> _Seen:
         """Take the second measurement once it is ``moved``."""
-        there, u, v = _taken(self._b, self.x, self.y, moved)
+        there, u, v = _resampled_after_move(self._b, self.x, self.y, moved)
         filled = np.isfinite(self._here.value) & np.isfinite(there.value)
         if np.sum(filled) < _FEWEST_PLACES:
             raise DataError(
@@ -153,14 +153,14 @@ class _Places:
                 f"{quantity(self._grid.dx, 'm')}, expected {_FEWEST_PLACES} or more; "
                 "do they lie in one frame, and in one unit?"
             )
-        columns = {n: _column(n, u, v, there)[filled] for n in freedoms}
+        columns = {n: _column(n, u, v, there)[filled] for n in dofs}
         heights = (self._here.value[filled], there.value[filled])
         return _Seen(filled, *heights, columns, there, u[filled], v[filled])
 
-    def columns_of_first(self, filled: BoolArray, freedoms: Sequence[str]) -> dict[str, FloatArray]:
+    def columns_of_first(self, filled: BoolArray, dofs: Sequence[str]) -> dict[str, FloatArray]:
         """Return what each freedom does to the first measurement where both have heights (n,)."""
-        here, x, y = _part(self._here, filled), self.x[filled], self.y[filled]
-        return {name: _column(name, x, y, here) for name in freedoms}
+        here, x, y = _heights_at(self._here, filled), self.x[filled], self.y[filled]
+        return {name: _column(name, x, y, here) for name in dofs}
 
     def matched(
         self, seen: _Seen, moved: dict[str, float], step: dict[str, float], refused: dict[str, str]
@@ -178,17 +178,17 @@ class _Places:
             a=seen.a,
             b=seen.b + level,
             columns=np.stack(list(seen.columns.values())),
-            freedoms=tuple(seen.columns),
+            dofs=tuple(seen.columns),
             moved={name: value for name, value in moved.items() if name not in refused},
             refused=refused,
-            from_a=_part(self._here, seen.filled),
-            from_b=_part(seen.there, seen.filled),
+            from_a=_heights_at(self._here, seen.filled),
+            from_b=_heights_at(seen.there, seen.filled),
             b_x=seen.u,
             b_y=seen.v,
         )
 
 
-def _taken(
+def _resampled_after_move(
     b: LocalQuadratic, x: FloatArray, y: FloatArray, moved: Mapping[str, float]
 ) -> tuple[LocalHeights, FloatArray, FloatArray]:
     """Return b where its points lie once moved to x, y, and those places in b's own frame."""
@@ -220,11 +220,13 @@ def _not_determined(
     the surface; the rest is the noise of their slopes.
     """
     refused: dict[str, str] = {}
-    for name in _SIDEWAYS:
+    for name in _LATERAL:
         if name not in columns:
             continue
         others = [n for n in columns if n != name and n not in refused]
-        own, first = (_own(of[name], [of[n] for n in others]) for of in (columns, of_first))
+        own, first = (
+            _independent_part(of[name], [of[n] for n in others]) for of in (columns, of_first)
+        )
         share = float(np.linalg.norm(own)) / max(float(np.linalg.norm(columns[name])), 1e-300)
         # By one place, or by what that is at the rim: a smaller change nobody would see.
         reach = place if name != "clocking" else 1e-2
@@ -240,7 +242,7 @@ def _not_determined(
     return refused
 
 
-def _own(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
+def _independent_part(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
     """Return the part of a column (n,) that the others, if there are any, do not explain."""
     if not others:
         return column
@@ -248,10 +250,10 @@ def _own(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(column - design @ np.linalg.lstsq(design, column, rcond=1e-10)[0])
 
 
-def _small(sideways: dict[str, float], place: float, extent: float) -> bool:
+def _is_converged(lateral_step: dict[str, float], place: float, extent: float) -> bool:
     reach = {"x": place, "y": place, "clocking": 2 * place / extent}
-    return all(abs(value) < _SETTLED * reach[name] for name, value in sideways.items())
+    return all(abs(value) < _SETTLED * reach[name] for name, value in lateral_step.items())
 
 
-def _part(heights: LocalHeights, place: BoolArray) -> LocalHeights:
+def _heights_at(heights: LocalHeights, place: BoolArray) -> LocalHeights:
     return LocalHeights(*(getattr(heights, name)[place] for name in LocalHeights.__slots__))

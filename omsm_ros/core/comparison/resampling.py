@@ -39,7 +39,7 @@ _PORTION = 20_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cells:
+class AveragedCells:
     """Means of the points in square cells, each (k,).
 
     xx, xy, yy: mean products of the points' distances from the middle of their cell [m²]
@@ -57,7 +57,7 @@ class Cells:
     points: FloatArray
 
 
-class Trend:
+class SurfaceTrend:
     """A polynomial of the whole surface, by least squares."""
 
     def __init__(self, points: MeasuredPoints) -> None:
@@ -99,14 +99,14 @@ def _powers(degree: int) -> list[tuple[int, int]]:
 
 def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
     """Return the least side [m] of cells that points (n,) fill, no more than ``most`` across."""
-    wide, high = float(np.ptp(x)), float(np.ptp(y))
-    extent = max(wide, high)
-    if min(wide, high) < MAP_SPACING.low:
+    width, high = float(np.ptp(x)), float(np.ptp(y))
+    extent = max(width, high)
+    if min(width, high) < MAP_SPACING.low:
         raise DataError(
-            f"the points cover {quantity(wide, 'm')} × {quantity(high, 'm')}, which is no area; "
+            f"the points cover {quantity(width, 'm')} × {quantity(high, 'm')}, which is no area; "
             "a profile cannot be made into a map; give points that cover one"
         )
-    side = max(float(np.sqrt(wide * high / len(x))), extent / most)
+    side = max(float(np.sqrt(width * high / len(x))), extent / most)
     while extent / side > _FEWEST_CELLS_ACROSS:
         if _occupied(x, y, side) >= _FILLED * _occupied(x, y, 2 * side):
             break
@@ -123,7 +123,9 @@ def _place(values: FloatArray, side: float) -> IntArray:
     return np.asarray(np.floor((values - values.min()) / side), np.int64)
 
 
-def averaged(points: MeasuredPoints, height: FloatArray, side: float) -> tuple[Cells, IntArray]:
+def averaged(
+    points: MeasuredPoints, height: FloatArray, side: float
+) -> tuple[AveragedCells, IntArray]:
     """Return the means of the cells, and the cell of each point (n,)."""
     column, row = _place(points.x, side), _place(points.y, side)
     _, cell, count = np.unique(
@@ -136,7 +138,7 @@ def averaged(points: MeasuredPoints, height: FloatArray, side: float) -> tuple[C
     x, y = mean(points.x), mean(points.y)
     dx, dy = points.x - x[cell], points.y - y[cell]
     spread = np.full(len(points), np.nan) if points.uncertainty is None else points.uncertainty
-    cells = Cells(
+    cells = AveragedCells(
         x=x,
         y=y,
         height=mean(height),
@@ -211,7 +213,7 @@ class LocalQuadratic:
 
     def __init__(self, points: MeasuredPoints, cell: float) -> None:
         self.cell = cell
-        self._trend = Trend(points)
+        self._trend = SurfaceTrend(points)
         self._cells, self._cell = averaged(
             points, points.height - self._trend.at(points.x, points.y), cell
         )

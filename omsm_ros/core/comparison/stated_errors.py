@@ -16,7 +16,11 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.special import erf
 
-from omsm_ros.core.comparison.agreement import COVERAGE_FACTOR, Errors, shapes_of_difference
+from omsm_ros.core.comparison.agreement import (
+    COVERAGE_FACTOR,
+    MeasurementErrors,
+    shapes_of_difference,
+)
 from omsm_ros.core.comparison.matching import Matched
 from omsm_ros.core.comparison.resampling import LocalHeights, LocalQuadratic
 from omsm_ros.core.correction.source_kinds import components, random_walk
@@ -126,7 +130,7 @@ AT_ONCE, STATED, ESTIMATED, NOT_KNOWN = (
 )  # fmt: skip
 
 
-class Fields(Protocol):
+class ErrorFields(Protocol):
     """What systematic errors do to points, as a scan's ``ScanFields`` has it."""
 
     @property
@@ -145,7 +149,7 @@ class Fields(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Measurement:
+class ComparedMeasurement:
     """Points and what is known of their errors beside the scatter that they show themselves.
 
     name: in messages
@@ -160,11 +164,11 @@ class Measurement:
 
     name: str
     points: MeasuredPoints
-    fields: Fields | None = None
+    fields: ErrorFields | None = None
     common: float | None = None
     drift: float | None = None
     calibration: str = ""
-    pose: Fields | None = None
+    pose: ErrorFields | None = None
 
     @property
     def drift_from(self) -> str:
@@ -181,14 +185,14 @@ class Measurement:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Half:
+class ComparisonSide:
     """One measurement in a comparison.
 
     surface: between its points;  taken: its heights at the places;  x, y: those in its own frame
     interpolation: rms error between the points, from above [m]
     """
 
-    measurement: Measurement
+    measurement: ComparedMeasurement
     surface: LocalQuadratic
     taken: LocalHeights
     x: FloatArray
@@ -197,8 +201,8 @@ class Half:
 
 
 def errors_of(
-    halves: tuple[Half, Half], matched: Matched, length: float
-) -> tuple[tuple[Errors | None, Errors | None], tuple[str, ...]]:
+    halves: tuple[ComparisonSide, ComparisonSide], matched: Matched, length: float
+) -> tuple[tuple[MeasurementErrors | None, MeasurementErrors | None], tuple[str, ...]]:
     """Return the errors of both, None for one of which nobody states any, and what they share."""
     one, other = (_known(half, matched, length) for half in halves)
     if one is None or other is None:
@@ -212,7 +216,10 @@ def errors_of(
     return (first, second), shared
 
 
-def _shared(halves: tuple[Half, Half], errors: tuple[Errors, Errors]) -> tuple[str, ...]:
+def _shared(
+    halves: tuple[ComparisonSide, ComparisonSide],
+    errors: tuple[MeasurementErrors, MeasurementErrors],
+) -> tuple[str, ...]:
     """Return sources of one and the same error in both: those of the calibration that both used."""
     ids = {half.measurement.calibration for half in halves}
     if len(ids) > 1 or not all(ids):
@@ -227,19 +234,19 @@ def _shared(halves: tuple[Half, Half], errors: tuple[Errors, Errors]) -> tuple[s
     )
 
 
-def _known(half: Half, matched: Matched, length: float) -> Errors | None:
+def _known(half: ComparisonSide, matched: Matched, length: float) -> MeasurementErrors | None:
     shapes = _shapes(half, matched, length)
     if shapes is None:
         return None
     noise, taken = half.surface.scatter**2, half.taken
-    return Errors(
+    return MeasurementErrors(
         shapes=shapes,
         single=np.sqrt(noise * taken.gain + half.interpolation**2),
         averaged=np.sqrt(noise / taken.density + half.interpolation**2),
     )
 
 
-def _shapes(half: Half, matched: Matched, length: float) -> dict[str, FloatArray] | None:
+def _shapes(half: ComparisonSide, matched: Matched, length: float) -> dict[str, FloatArray] | None:
     """Return the shapes by source, each (k, m) [m]; None if nobody states any."""
     m = half.measurement
     pose = {} if m.pose is None else _carried(half, m.pose)
@@ -251,7 +258,7 @@ def _shapes(half: Half, matched: Matched, length: float) -> dict[str, FloatArray
     return {UNKNOWN_FORM: unknown_form(matched.x, matched.y, size, length), **pose}
 
 
-def _carried(half: Half, fields: Fields) -> dict[str, FloatArray]:
+def _carried(half: ComparisonSide, fields: ErrorFields) -> dict[str, FloatArray]:
     """Return the fields of the points as shapes at the places, by source, each (k, m) [m]."""
     if not fields.names:
         return {}
@@ -263,9 +270,9 @@ def _carried(half: Half, fields: Fields) -> dict[str, FloatArray]:
 
 
 def _drifts(
-    halves: tuple[Half, Half],
+    halves: tuple[ComparisonSide, ComparisonSide],
     matched: Matched,
-    known: tuple[Errors, Errors],
+    known: tuple[MeasurementErrors, MeasurementErrors],
     shared: tuple[str, ...],
 ) -> list[dict[str, FloatArray]]:
     """Return shapes of both drifts; one that nobody states is estimated from the difference."""
@@ -293,7 +300,7 @@ def _drifts(
     return found
 
 
-def drift_size(errors: Errors | None) -> float:
+def drift_size(errors: MeasurementErrors | None) -> float:
     """Return the largest standard deviation of a drift over the places [m]."""
     rows = [] if errors is None else [r for n, r in errors.shapes.items() if n.startswith(DRIFT)]
     if not rows or not sum(len(r) for r in rows):

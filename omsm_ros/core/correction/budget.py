@@ -39,12 +39,12 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import quantity
 
-_RANDOM_SAYS = {each.name: each.metadata["says"] for each in fields(ErrorSources)} | {
+_RANDOM_DESCRIPTIONS = {each.name: each.metadata["says"] for each in fields(ErrorSources)} | {
     SCAN_SCATTER: "scatter of this scan beyond what is stated"
 }
 # The noise that a step test tells is that of encoder plus probe at rest: it holds these.
 _HELD = ("probe_resolution", "encoder_noise", "encoder_resolution")
-_HELD_BY_NOISE = "held by probe_noise, which is the scatter of heights at rest"
+_BOUND_BY_NOISE = "held by probe_noise, which is the scatter of heights at rest"
 
 
 @dataclass(frozen=True)
@@ -156,12 +156,14 @@ def _random_rows(
         elif size or stated.of(name):
             status, reason = origin_of(name, calibration, stated)
         elif name in _HELD and at_rest:
-            status, reason, size, height = EVALUATED, _HELD_BY_NOISE, None, None
+            status, reason, size, height = EVALUATED, _BOUND_BY_NOISE, None, None
         elif height:
             status, reason, size = EVALUATED, "on the path of this scan", height
         else:
             size = height = None
-        yield BudgetRow(name, _RANDOM_SAYS[name], "random", status, size, "m", height, reason)
+        yield BudgetRow(
+            name, _RANDOM_DESCRIPTIONS[name], "random", status, size, "m", height, reason
+        )
 
 
 def _systematic_rows(
@@ -248,7 +250,7 @@ _GROUPS: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 
 @dataclass(frozen=True)
-class Reason:
+class TrafficLightReason:
     """What stands against green;  remedy: what to do about it at the machine, or nothing."""
 
     what: str
@@ -259,7 +261,7 @@ class Reason:
 
 
 @dataclass(frozen=True)
-class Light:
+class TrafficLight:
     """level: GREEN, AMBER or RED;  word: for the reader;  reasons: all that speaks against green.
 
     accuracy: that it is held against, k = 2 [m];  uncertainty: of what all heights share, k = 2,
@@ -270,14 +272,14 @@ class Light:
     word: str
     accuracy: float
     uncertainty: float
-    reasons: tuple[Reason, ...]
+    reasons: tuple[TrafficLightReason, ...]
 
     def entry(self) -> dict[str, Any]:
         """Return the JSON values of ``summary.json``."""
         return asdict(self)
 
 
-def light_of(
+def traffic_light_of(
     calibration: Calibration,
     heights: Mapping[str, float],
     stated: MachineSources,
@@ -285,8 +287,8 @@ def light_of(
     accuracy: float | None = None,
     pose_open: Sequence[str] = POSE,
     registered: bool = False,
-    doubts: Iterable[Reason] = (),
-) -> Light:
+    doubts: Iterable[TrafficLightReason] = (),
+) -> TrafficLight:
     """Return the light of a scan.
 
     heights: standard uncertainty of the heights from each systematic source, rms [m]
@@ -300,28 +302,31 @@ def light_of(
     asked = uncertainty if accuracy is None else accuracy
     verdict, reasons = verdict_of(calibration)
     if verdict == REJECTED:
-        found = [Reason("the calibration was rejected", "identify again"), *map(Reason, reasons)]
-        return _light(RED, calibration, asked, uncertainty, found)
+        found = [
+            TrafficLightReason("the calibration was rejected", "identify again"),
+            *map(TrafficLightReason, reasons),
+        ]
+        return _traffic_light(RED, calibration, asked, uncertainty, found)
     open_ = [
         *_latency(calibration, heights, accuracy),
         *_not_settled(stated, pose_open, registered),
     ]
     if not verdict:
-        open_.insert(0, Reason("the calibration has no certificate", "identify again"))
+        open_.insert(0, TrafficLightReason("the calibration has no certificate", "identify again"))
     if uncertainty > asked:
         largest = max(heights, key=lambda name: heights[name])
-        too_large = Reason(
+        too_large = TrafficLightReason(
             f"uncertainty {quantity(uncertainty, 'm')} (k = 2) exceeds the accuracy of "
             f"{quantity(asked, 'm')} asked for",
             f"begin with {largest.replace('_', ' ')}, which alone makes "
             + quantity(2 * heights[largest], "m"),
         )
-        return _light(RED, calibration, asked, uncertainty, [too_large, *open_, *doubts])
+        return _traffic_light(RED, calibration, asked, uncertainty, [too_large, *open_, *doubts])
     open_ += doubts
-    return _light(AMBER if open_ else GREEN, calibration, asked, uncertainty, open_)
+    return _traffic_light(AMBER if open_ else GREEN, calibration, asked, uncertainty, open_)
 
 
-def noisier(budget: Mapping[str, float]) -> Iterator[Reason]:
+def excess_noise_reasons(budget: Mapping[str, float]) -> Iterator[TrafficLightReason]:
     """Yield a reason where readings scatter by more than is stated of them.
 
     budget: rms of the heights by each source [m]
@@ -330,7 +335,7 @@ def noisier(budget: Mapping[str, float]) -> Iterator[Reason]:
     beyond = variances.pop(SCAN_SCATTER)
     stated = sum(variances.values())
     if stated > 0 and stated + beyond > _NOISIER**2 * stated:
-        yield Reason(
+        yield TrafficLightReason(
             f"heights of this scan scatter by {quantity((stated + beyond) ** 0.5, 'm')}, "
             f"{quantity(stated**0.5, 'm')} by what is stated of single readings",
             "compare exposure, intensity and vibration with those of the step test; where the "
@@ -338,21 +343,25 @@ def noisier(budget: Mapping[str, float]) -> Iterator[Reason]:
         )
 
 
-def _light(
-    level: str, calibration: Calibration, asked: float, uncertainty: float, reasons: list[Reason]
-) -> Light:
+def _traffic_light(
+    level: str,
+    calibration: Calibration,
+    asked: float,
+    uncertainty: float,
+    reasons: list[TrafficLightReason],
+) -> TrafficLight:
     supported = f"supported by data up to {quantity(calibration.valid_up_to, 'Hz')}"
     word = {
         GREEN: f"{supported}, to {quantity(asked, 'm')} (k = 2)",
         AMBER: f"{supported}, but not everything was looked at",
         RED: "not supported by data",
     }[level]
-    return Light(level, word, asked, uncertainty, tuple(reasons))
+    return TrafficLight(level, word, asked, uncertainty, tuple(reasons))
 
 
 def _latency(
     calibration: Calibration, heights: Mapping[str, float], accuracy: float | None
-) -> Iterator[Reason]:
+) -> Iterator[TrafficLightReason]:
     if latency_of(calibration).resolved:
         return
     share = 2 * heights.get("lateral_lag", 0.0)
@@ -361,15 +370,15 @@ def _latency(
             "any part of the lag may be latency of the probe, which makes "
             f"{quantity(share, 'm')} (k = 2)"
         )
-        yield Reason(what, REMEDY)
+        yield TrafficLightReason(what, REMEDY)
 
 
 def _not_settled(
     stated: MachineSources, pose_open: Sequence[str], registered: bool
-) -> Iterator[Reason]:
+) -> Iterator[TrafficLightReason]:
     missing = [name for name in pose_open if not stated.of(name)]
     if missing:
-        yield Reason(
+        yield TrafficLightReason(
             f"pose of the part not evaluated ({', '.join(missing)})",
             "these are held; state them, or fit them too (--fit auto)"
             if registered
@@ -378,4 +387,4 @@ def _not_settled(
         )
     for group, (names, remedy) in _GROUPS.items():
         if not any(stated.of(name) for name in names):
-            yield Reason(f"{group} not evaluated", remedy)
+            yield TrafficLightReason(f"{group} not evaluated", remedy)

@@ -22,7 +22,7 @@ from omsm_ros.core.correction.motion_filter import (
     Blend,
     MotionFilter,
     MotionFilters,
-    hidden_rows,
+    undetected_rows,
 )
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanPoints, ScanTrace, SystematicSource
@@ -30,7 +30,7 @@ from omsm_ros.core.correction.uncertainty import (
     SCAN_SCATTER,
     ErrorSources,
     contributions,
-    of_readings,
+    reading_variances,
 )
 from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface, workpiece_points
 from omsm_ros.core.streams.blocks import (
@@ -41,13 +41,13 @@ from omsm_ros.core.streams.blocks import (
     BoolArray,
     DistanceBlock,
     FloatArray,
-    Reason,
+    RejectionReason,
     joined,
 )
 from omsm_ros.core.streams.continuity import Arrival
-from omsm_ros.core.streams.pairing import Intake, Pairing, Run
+from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.statistics import RunningScatter
-from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, TriggerSlipDetector
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.quantities import GAIN, LAG, WAIT
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -117,7 +117,7 @@ class Corrector:
         self._static_gain = options.static_gain or calibration.static_gain
         self._sources = options.sources or ErrorSources.of(calibration)
         self._period: float | None = None
-        self._axes, self._distance = Intake(), Intake(options.trigger.counter_offset)
+        self._axes, self._distance = StreamInput(), StreamInput(options.trigger.counter_offset)
         self._pairing = Pairing(self._axes, self._distance, options.trigger)
         self._motion: MotionFilter | None = None
         self._noise_gain = 1.0
@@ -208,7 +208,7 @@ class Corrector:
         return self._pairing.axes.held
 
     @property
-    def slips(self) -> SlipWatch:
+    def slips(self) -> TriggerSlipDetector:
         """Whether the two counters have slipped against each other, and by how much."""
         return self._pairing.watch
 
@@ -243,26 +243,26 @@ class Corrector:
         members = known.members if isinstance(known, CalibrationSet) else (known,)
         filters = [MotionFilters.of(member, period, lag) for member in members]
         self._noise_gain = max(each.height.noise_gain for each in filters)
-        stated = of_readings(self._sources, self._noise_gain, self._static_gain)
+        stated = reading_variances(self._sources, self._noise_gain, self._static_gain)
         self._scatter = RunningScatter(float(np.sqrt(sum(stated.values()))))
-        self.trace.hidden = hidden_rows(filters)
+        self.trace.undetected = undetected_rows(filters)
         blend = Blend(known) if isinstance(known, CalibrationSet) else None
         return MotionFilter(*filters, blend=blend)
 
     def _join(self) -> None:
         self._correct(self._pairing.pairs())
 
-    def _correct(self, pairs: Iterable[tuple[Run, Run]]) -> None:
+    def _correct(self, pairs: Iterable[tuple[SampleRun, SampleRun]]) -> None:
         for axes, distance in pairs:
             points = self._points(axes, distance)
             if len(points):
                 self._ready.append(points)
 
-    def _points(self, axes: Run, distance: Run) -> SurfacePoints:
+    def _points(self, axes: SampleRun, distance: SampleRun) -> SurfacePoints:
         sample = np.arange(axes.first, axes.end)
         axis_values, probe_values = axes.values, distance.values
         if axes.reasons.any() or distance.reasons.any():
-            good = _without_gaps((axes.reasons | distance.reasons) == Reason.NONE)
+            good = _as_slice((axes.reasons | distance.reasons) == RejectionReason.NONE)
             sample = sample[good]
             axis_values, probe_values = axis_values[:, good], probe_values[:, good]
         x, y, b, c, dynamic_error, moved = axis_values[:RATE]
@@ -286,13 +286,13 @@ class Corrector:
             stamp_ns=round(axes.stamp_of(int(sample[0]))) if len(sample) else 0,
         )
 
-    def _of_dynamics(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
+    def _dynamics_variances(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
         """Return the variances of H(z) [m²], (n,), by the step test's noise and by hidden terms."""
-        noise, hidden = np.zeros((2, len(points)))
-        for row, may_hide in zip(points.dynamics, points.hidden, strict=True):
-            total = hidden if may_hide else noise
+        noise, undetected = np.zeros((2, len(points)))
+        for row, may_be_undetected in zip(points.dynamics, points.undetected, strict=True):
+            total = undetected if may_be_undetected else noise
             total += row**2
-        return noise, hidden
+        return noise, undetected
 
     def _uncertainty(
         self, reading: FloatArray, points: ScanPoints, excess: FloatArray
@@ -302,7 +302,7 @@ class Corrector:
             self._noise_gain,
             self._static_gain,
             reading,
-            *self._of_dynamics(points),
+            *self._dynamics_variances(points),
             points.z_rate,
             self._options.geometry.abbe_arm,
         )
@@ -317,7 +317,7 @@ class Corrector:
         return np.sqrt(sum(variances.values()))
 
 
-def _without_gaps(chosen: BoolArray) -> BoolArray | slice:
+def _as_slice(chosen: BoolArray) -> BoolArray | slice:
     """Return ``chosen`` (n,), as a slice where it is one: then nothing is copied."""
     first, last = int(np.argmax(chosen)), len(chosen) - int(np.argmax(chosen[::-1]))
     return slice(first, last) if np.sum(chosen) == last - first else chosen
@@ -329,12 +329,12 @@ def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
     return latency_of(calibration).delay_s if stated is None else stated
 
 
-def _axes_run(block: AxisBlock, arrival: Arrival) -> Run:
+def _axes_run(block: AxisBlock, arrival: Arrival) -> SampleRun:
     values = np.array([block.x, block.y, block.z, block.b, block.c], np.float64)
-    return Run.of(block, arrival, np.zeros(len(block), np.uint8), values)
+    return SampleRun.of(block, arrival, np.zeros(len(block), np.uint8), values)
 
 
-def _distance_run(block: DistanceBlock, arrival: Arrival) -> Run:
+def _distance_run(block: DistanceBlock, arrival: Arrival) -> SampleRun:
     intensity = block.intensity if len(block.intensity) else np.full(len(block), np.nan)
-    reasons = np.where(block.ok, Reason.NONE, Reason.INVALID).astype(np.uint8)
-    return Run.of(block, arrival, reasons, np.array([block.distance, intensity], np.float64))
+    reasons = np.where(block.ok, RejectionReason.NONE, RejectionReason.INVALID).astype(np.uint8)
+    return SampleRun.of(block, arrival, reasons, np.array([block.distance, intensity], np.float64))

@@ -203,8 +203,10 @@ class LiveOffset:
         if isinstance(block, AxisBlock):
             anew = self._axes.add(block.first_sample, block.z, block.sample_period)
         else:
-            told = np.where(block.ok, block.distance, np.nan)
-            anew = self._distance.add(block.first_sample + self.in_use, told, block.sample_period)
+            valid_distance = np.where(block.ok, block.distance, np.nan)
+            anew = self._distance.add(
+                block.first_sample + self.in_use, valid_distance, block.sample_period
+            )
         if anew:
             self.established = self._found = None
 

@@ -14,7 +14,7 @@ from omsm_ros.core.calibration.calibration import Calibration, latency_of
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.source_kinds import KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
-from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, uncertain_parts
+from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, covariance_parts
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import UNCERTAINTY, shown
@@ -103,7 +103,7 @@ class MachineSources:
         """Return what is stated of the source ``name``."""
         return tuple(stated for stated in self.stated if stated.source == name)
 
-    def of_points(self) -> dict[str, float]:
+    def point_uncertainties(self) -> dict[str, float]:
         """Return standard uncertainties of single points, fields of ``ErrorSources`` by name."""
         return {
             stated.source: stated.standard_uncertainty
@@ -111,7 +111,7 @@ class MachineSources:
             if stated.source in POINT_SOURCES
         }
 
-    def of_the_scan(self) -> tuple[SystematicSource, ...]:
+    def scan_sources(self) -> tuple[SystematicSource, ...]:
         """Return the systematic sources that neither a calibration nor a point has."""
         return tuple(s.systematic() for s in self.stated if s.source not in POINT_SOURCES)
 
@@ -136,7 +136,7 @@ def whole_scan_sources(
     found = []
     members = calibration.members if isinstance(calibration, CalibrationSet) else (calibration,)
     for name, part in zip(_OF_CALIBRATION, (0, 1), strict=True):
-        if any(uncertain_parts(member)[part].covariance.any() for member in members):
+        if any(covariance_parts(member)[part].covariance.any() for member in members):
             reason = "covariance of the calibration"
             found.append(source_of(name, 1.0, EVALUATED, reason, {}))
     parameters: dict[str, Mapping[str, float]] = {
@@ -147,7 +147,7 @@ def whole_scan_sources(
         if size := getattr(points, name):
             how, reason = origin_of(name, calibration, stated)
             found.append(source_of(name, size, how, reason, parameters.get(name, {})))
-    return (*found, *stated.of_the_scan())
+    return (*found, *stated.scan_sources())
 
 
 def upper_bounds(calibration: Calibration, stated: MachineSources) -> tuple[str, ...]:

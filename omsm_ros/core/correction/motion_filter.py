@@ -16,16 +16,16 @@ from numpy.polynomial import polynomial
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.uncertainty import (
+    covariance_parts,
     derivative_filter,
-    past_of,
+    filter_history,
     sensitivity_filters,
-    uncertain_parts,
 )
 from omsm_ros.core.lti.discretisation import DEFAULT_ORDER, DigitalFilter, discretise
 from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, past_motion
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.blocks import BoolArray, CountingOn, FloatArray, Reason
-from omsm_ros.core.streams.pairing import Run
+from omsm_ros.core.streams.blocks import AngleUnwrapper, BoolArray, FloatArray, RejectionReason
+from omsm_ros.core.streams.pairing import SampleRun
 
 # The share of a wrong start that may be left in the first published point.
 SETTLED = 1e-6
@@ -45,7 +45,7 @@ class MotionFilters:
         calibration's covariance: those of its noise, then those of what could hide
     lateral: on x, y, b, c, where the lag is latency; None where it is not
     forgotten: samples after which the poles of G have forgotten a wrong start
-    hidden: how many of ``dynamics``, the last, are of what could hide
+    undetected: how many of ``dynamics``, the last, are of what could hide
     pasts: what each of ``dynamics`` takes for the past of its first samples
     """
 
@@ -54,7 +54,7 @@ class MotionFilters:
     rate: DigitalFilter
     lateral: DigitalFilter | None
     forgotten: int = 2**31
-    hidden: int = 0
+    undetected: int = 0
     pasts: tuple[Past, ...] = ()
 
     @classmethod
@@ -69,18 +69,18 @@ class MotionFilters:
         g = calibration.dynamics
         rate = np.append(0.0, g.numerator)
         delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
-        noise, hidden = (
-            [(f, past_of(part)) for f in sensitivity_filters(part, sample_period)]
-            for part in uncertain_parts(calibration)
+        noise, undetected = (
+            [(f, filter_history(part)) for f in sensitivity_filters(part, sample_period)]
+            for part in covariance_parts(calibration)
         )
         return cls(
             height=discretise(g, sample_period, order),
-            dynamics=[f for f, _ in noise + hidden],
+            dynamics=[f for f, _ in noise + undetected],
             rate=derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles()),
             lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
-            forgotten=forgotten_after(g, sample_period),
-            hidden=len(hidden),
-            pasts=tuple(past for _, past in noise + hidden),
+            forgotten=forgetting_samples(g, sample_period),
+            undetected=len(undetected),
+            pasts=tuple(past for _, past in noise + undetected),
         )
 
     def settling_samples(self) -> int:
@@ -91,14 +91,14 @@ class MotionFilters:
         return max([settled, *([self.lateral.settling_samples(SETTLED)] if self.lateral else [])])
 
 
-def hidden_rows(filters: Sequence[MotionFilters]) -> BoolArray:
+def undetected_rows(filters: Sequence[MotionFilters]) -> BoolArray:
     """Return which sensitivities of a :class:`MotionFilter` are of what could hide, (r,)."""
-    rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.hidden for f in filters]
+    rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.undetected for f in filters]
     # How members of a set differ is none of them.
     return np.concatenate([*rows, np.zeros(len(filters) - 1, np.bool_)])
 
 
-def forgotten_after(dynamics: TransferFunction, sample_period: float) -> int:
+def forgetting_samples(dynamics: TransferFunction, sample_period: float) -> int:
     """Return the samples after which G has forgotten a wrong start to ``SETTLED`` of itself.
 
     Of a millimetre that is a nanometre, a tenth of a reading's noise. Each pole p has the share
@@ -158,7 +158,7 @@ class Blend:
         self._places = places
         self._axis = {"x": _X, "z": _Z, "b": _B}[places.along]
 
-    def mixed(self, axes: FloatArray, outputs: Sequence[FloatArray]) -> FloatArray:
+    def blended(self, axes: FloatArray, outputs: Sequence[FloatArray]) -> FloatArray:
         """Return H(z), its rate and its sensitivities of all, (2 + r, n).
 
         What is uncertain of one member may be of all alike: their variances are mixed, not the
@@ -193,20 +193,20 @@ class MotionFilter:
         self._blend = blend
         lateral = filters[0].lateral
         self._lateral = {axis: Recursion(lateral) for axis in _LATERAL} if lateral else {}
-        self._turned = CountingOn()
+        self._turned = AngleUnwrapper()
         settling = max(each.settling_samples() for each in filters)
         self._start_samples = max(settling // 2, START_SAMPLES)
         self._settling = max(settling, self._start_samples)
         self._unsettled = self._settling
         self._next: tuple[int, int] | None = None
-        self._waiting: list[Run] = []
+        self._waiting: list[SampleRun] = []
 
     @property
     def pending(self) -> int:
         """Samples that wait until there are enough to start on."""
         return sum(map(len, self._waiting))
 
-    def push(self, run: Run) -> list[Run]:
+    def push(self, run: SampleRun) -> list[SampleRun]:
         """Filter a run that follows the last one or comes after a gap."""
         done = [] if (run.session, run.first) == self._next else self.end()
         self._next = (run.session, run.end)
@@ -219,29 +219,29 @@ class MotionFilter:
             if finite[start]:
                 done += self._push_finite(piece)
             else:
-                done += [*self._break(), self._unfiltered(piece, Reason.INVALID)]
+                done += [*self._break(), self._unfiltered(piece, RejectionReason.INVALID)]
         return done
 
-    def end(self) -> list[Run]:
+    def end(self) -> list[SampleRun]:
         """End the stream; return what was too short to start on, as settling."""
         self._next = None
         return self._break()
 
-    def _break(self) -> list[Run]:
+    def _break(self) -> list[SampleRun]:
         short, self._waiting = self._waiting, []
         self._unsettled = self._settling
-        return [self._unfiltered(run, Reason.SETTLING) for run in short]
+        return [self._unfiltered(run, RejectionReason.SETTLING) for run in short]
 
-    def _counting_on(self, run: Run) -> Run:
+    def _unwrapped(self, run: SampleRun) -> SampleRun:
         """Return the run with C counting on, as what delays it needs it."""
         c = run.values[_C]
         if (turned := self._turned.of(c)) is c:
             return run
         return replace(run, values=np.concatenate([run.values[:_C], turned[np.newaxis]]))
 
-    def _push_finite(self, run: Run) -> list[Run]:
+    def _push_finite(self, run: SampleRun) -> list[SampleRun]:
         if self._lateral:
-            run = self._counting_on(run)
+            run = self._unwrapped(run)
         if self._unsettled < self._settling:
             return [self._filtered(run)]
         self._waiting.append(run)
@@ -257,7 +257,7 @@ class MotionFilter:
         for axis, recursion in self._lateral.items():
             recursion.start(past_motion(first[axis].copy()))
 
-    def _filtered(self, run: Run) -> Run:
+    def _filtered(self, run: SampleRun) -> SampleRun:
         out = np.empty((self._outputs, len(run)))
         self._moved(run.values, out[MOVED:])
         for row, axis in enumerate(_LATERAL):
@@ -266,10 +266,10 @@ class MotionFilter:
         out[ERROR] = run.values[_Z] - out[MOVED]
         reasons = np.zeros(len(run), np.uint8)
         if self._blend:
-            reasons[self._blend.beyond(run.values)] = Reason.BEYOND
-        reasons[: self._unsettled] = Reason.SETTLING
+            reasons[self._blend.beyond(run.values)] = RejectionReason.BEYOND
+        reasons[: self._unsettled] = RejectionReason.SETTLING
         self._unsettled = max(self._unsettled - len(run), 0)
-        return Run(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
+        return SampleRun(run.session, run.first, run.stamp_ns, run.period_ns, reasons, out)
 
     def _moved(self, axes: FloatArray, out: FloatArray) -> None:
         """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""
@@ -278,15 +278,15 @@ class MotionFilter:
         outputs = [np.empty((bank.outputs, axes.shape[1])) for bank in self._banks]
         for bank, rows in zip(self._banks, outputs, strict=True):
             bank.run(axes[_Z], rows)
-        out[:] = self._blend.mixed(axes, outputs)
+        out[:] = self._blend.blended(axes, outputs)
 
     @property
     def _outputs(self) -> int:
         between = len(self._banks) - 1
         return SENSITIVITIES + between + sum(bank.outputs - 2 for bank in self._banks)
 
-    def _unfiltered(self, run: Run, reason: Reason) -> Run:
-        return Run(
+    def _unfiltered(self, run: SampleRun, reason: RejectionReason) -> SampleRun:
+        return SampleRun(
             run.session,
             run.first,
             run.stamp_ns,

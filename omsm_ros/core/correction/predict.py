@@ -18,9 +18,9 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.motion_filter import SETTLED
 from omsm_ros.core.correction.uncertainty import (
     ErrorSources,
-    past_of,
+    covariance_parts,
+    filter_history,
     sensitivity_filters,
-    uncertain_parts,
 )
 from omsm_ros.core.kinematics.limits import (
     FASTEST,
@@ -72,8 +72,8 @@ class Residual:
         self._linear = ErrorSources.of(calibration).motion_error ** 2
         self._digital = discretise(calibration.dynamics, sample_period)
         self._parts = [
-            (sensitivity_filters(part, sample_period), past_of(part))
-            for part in uncertain_parts(calibration)
+            (sensitivity_filters(part, sample_period), filter_history(part))
+            for part in covariance_parts(calibration)
         ]
 
     def variances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -81,17 +81,17 @@ class Residual:
 
         The first is of all but what could hide in the step test, the second of that.
         """
-        noise, hidden = (self._variance(*part, z) for part in self._parts)
+        noise, undetected = (self._variance(*part, z) for part in self._parts)
         known = noise + self._linear
-        known += _missed_beyond(self._trusted, self._digital, z)
+        known += _missed_above(self._trusted, self._digital, z)
         settling = max(self._digital.settling_samples(SETTLED), START_SAMPLES)
         settling = min(settling, len(z) // 4)
-        return known[settling:], hidden[settling:]
+        return known[settling:], undetected[settling:]
 
     def largest(self, z: FloatArray) -> float:
         """Return the largest standard uncertainty that is left of ``z`` [m]."""
-        known, hidden = self.variances(z)
-        return float(np.sqrt(np.max(known + hidden)))
+        known, undetected = self.variances(z)
+        return float(np.sqrt(np.max(known + undetected)))
 
     @staticmethod
     def _variance(
@@ -109,7 +109,7 @@ class Residual:
         return variance
 
 
-def _missed_beyond(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
+def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
     """Return the mean square of (1 - G) z above ``up_to`` [Hz], running over the record, (n,)."""
     kernel = _band_kernel(up_to, digital.sample_period, len(z))
     half = len(kernel) // 2
@@ -221,18 +221,18 @@ def predict_error(
     path = replace(path, z=checked_motion(path.z))
     error = dynamic_error(calibration.dynamics, path.z, path.sample_period)
     spread = float(np.ptp(error))
-    dynamics, hidden = _dynamics_limit(calibration, path, budget)
+    dynamics, undetected = _dynamics_limit(calibration, path, budget)
     others, missing = speed_limits(
         path, limits or MachineLimits(), calibration.valid_up_to, budget, calibration.dynamics
     )
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
-    message = _message(calibration, spread, (dynamics.value, hidden), budget, binding)
+    message = _message(calibration, spread, (dynamics.value, undetected), budget, binding)
     return Prediction(
         peak_to_valley=spread,
         rms=float(np.std(error)),
         residual=dynamics.value,
-        residual_hidden=hidden,
+        residual_hidden=undetected,
         outside_band_fraction=_outside_fraction(calibration, path),
         speed_factor=binding.speed_factor,
         safe=binding.speed_factor >= 1,
@@ -264,8 +264,8 @@ def _dynamics_limit(
     With it the part of that residual, as the path is, that could hide in the step test [m].
     """
     z, period, allowed = path.z, path.sample_period, budget / 2
-    known, hidden = Residual(calibration, period).variances(z)
-    here = np.sqrt(known + hidden)
+    known, undetected = Residual(calibration, period).variances(z)
+    here = np.sqrt(known + undetected)
     residual = float(np.max(here))
     stretches = _worst_stretches(z, here)
 
@@ -279,7 +279,7 @@ def _dynamics_limit(
         whole = Residual(calibration, period / factor).largest(z)
         factor *= min(allowed / whole, 1.0) if whole > 0 else 1.0
     limit = SpeedLimit(DYNAMICS, residual, allowed, "m", float(factor))
-    return limit, float(np.sqrt(hidden[np.argmax(known + hidden)]))
+    return limit, float(np.sqrt(undetected[np.argmax(known + undetected)]))
 
 
 def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
@@ -301,13 +301,13 @@ def _outside_fraction(calibration: Calibration, path: ScanPath) -> float:
     return float(power[frequency > calibration.valid_up_to].sum()) / total if total > 0 else 0.0
 
 
-def _what_could_hide(calibration: Calibration, hidden: float) -> str:
+def _undetected_share_text(calibration: Calibration, undetected: float) -> str:
     """Return the name the part of the residual that the step test could not have shown."""
     mostly = calibration.certificate.get("hidden_mostly")
-    if hidden == 0 or not isinstance(mostly, str):
+    if undetected == 0 or not isinstance(mostly, str):
         return ""
     return (
-        f"; {quantity(2 * hidden, 'm')} of it are what the step test could not have shown, "
+        f"; {quantity(2 * undetected, 'm')} of it are what the step test could not have shown, "
         f"mostly {mostly}"
     )
 
@@ -320,9 +320,9 @@ def _better_calibration(
     The noise of a slow term falls with the square root of the test's duration, and so does
     the largest relaxation that it would miss.
     """
-    residual, hidden = residuals
+    residual, undetected = residuals
     plateau = calibration.certificate.get("plateau_s")
-    if type(plateau) is not float or not hidden**2 > 0.5 * residual**2:
+    if type(plateau) is not float or not undetected**2 > 0.5 * residual**2:
         return "calibrate better (longer plateaus and more steps, omsm plan steps)"
     longer = plateau * (2 * residual / budget) ** 2
     return f"calibrate with rests of {longer:.2g} s or more (omsm plan steps --dwell {longer:.2g})"
@@ -335,7 +335,7 @@ def _message(
     budget: float,
     binding: SpeedLimit,
 ) -> str:
-    residual, hidden = residuals
+    residual, undetected = residuals
     verdict = "within" if 2 * residual <= budget else "beyond"
     factor = binding.speed_factor
     if factor == 0 and binding.name == DYNAMICS:
@@ -355,7 +355,7 @@ def _message(
     return (
         f"dynamic error {quantity(peak_to_valley, 'm')} peak to valley; corrected within "
         f"{quantity(2 * residual, 'm')} (k = 2, largest on the path"
-        f"{_what_could_hide(calibration, hidden)}), {verdict} the budget "
+        f"{_undetected_share_text(calibration, undetected)}), {verdict} the budget "
         f"of {quantity(budget, 'm')}; {advice} (trusted up to "
         f"{quantity(calibration.valid_up_to, 'Hz')})"
     )

@@ -85,22 +85,22 @@ def tilt(p: ScanPoints, _: Parameters) -> FloatArray:
 def decentre(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the shift of the part along x and along y."""
     one, zero = np.ones(len(p)), np.zeros(len(p))
-    return np.stack([p.sideways(one, zero), p.sideways(zero, one)])
+    return np.stack([p.height_change_of_shift(one, zero), p.height_change_of_shift(zero, one)])
 
 
 def clocking(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the turn of the part about the spindle."""
-    return p.sideways(-p.y, p.x)
+    return p.height_change_of_shift(-p.y, p.x)
 
 
 def expansion(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the growth of the part in all directions."""
-    return p.height + p.sideways(p.x, p.y)
+    return p.height + p.height_change_of_shift(p.x, p.y)
 
 
 def _across(p: ScanPoints, x: FloatArray, y: FloatArray) -> FloatArray:
     """Return what a shift by x, y [m] of the machine's frame does to the heights."""
-    return p.sideways(*workpiece_xy(x, y, p.c))
+    return p.height_change_of_shift(*workpiece_xy(x, y, p.c))
 
 
 def centre_x(p: ScanPoints, _: Parameters) -> FloatArray:
@@ -132,16 +132,16 @@ def parallelism(p: ScanPoints, _: Parameters) -> FloatArray:
 
 def straightness_x(p: ScanPoints, parameters: Parameters) -> FloatArray:
     """Return an unknown curve over X, towards the probe."""
-    return _unknown_over(p.slide_x, parameters)
+    return _curve_components(p.slide_x, parameters)
 
 
 def straightness_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
     """Return an unknown curve over Z, along X."""
     zero = np.zeros(len(p))
-    return np.stack([_across(p, bow, zero) for bow in _unknown_over(p.z, parameters)])
+    return np.stack([_across(p, bow, zero) for bow in _curve_components(p.z, parameters)])
 
 
-def _unknown_over(position: FloatArray, parameters: Parameters) -> FloatArray:
+def _curve_components(position: FloatArray, parameters: Parameters) -> FloatArray:
     """Return components of a curve over ``position`` (n,), smooth over half of it by default."""
     length = parameters.get("correlation_length", float(np.ptp(position)) / 2)
     return components(smooth(length), position)
@@ -183,7 +183,7 @@ def encoder_interpolation(p: ScanPoints, parameters: Parameters) -> FloatArray:
 
 def pitch(p: ScanPoints, parameters: Parameters) -> FloatArray:
     """Return an unknown angle over Z times the Abbe arm."""
-    return parameters["arm"] * _unknown_over(p.z, parameters)
+    return parameters["arm"] * _curve_components(p.z, parameters)
 
 
 def backlash(p: ScanPoints, _: Parameters) -> FloatArray:
@@ -203,15 +203,15 @@ def lateral_lag(p: ScanPoints, _: Parameters) -> FloatArray:
 
 def dynamics(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the directions of the covariance that are of noise."""
-    return _rows_or_none(p.dynamics[~p.hidden], p)
+    return _rows_or_empty(p.dynamics[~p.undetected], p)
 
 
-def could_hide(p: ScanPoints, _: Parameters) -> FloatArray:
+def undetected_error(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return those that are of what the step test could not show."""
-    return _rows_or_none(p.dynamics[p.hidden], p)
+    return _rows_or_empty(p.dynamics[p.undetected], p)
 
 
-def _rows_or_none(rows: FloatArray, p: ScanPoints) -> FloatArray:
+def _rows_or_empty(rows: FloatArray, p: ScanPoints) -> FloatArray:
     return rows if len(rows) else np.zeros((1, len(p)))
 
 
@@ -239,7 +239,10 @@ def slope(p: ScanPoints, _: Parameters) -> FloatArray:
 def slope_square(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the square of the slope."""
     one, zero = np.ones(len(p)), np.zeros(len(p))
-    return np.asarray(p.sideways(one, zero) ** 2 + p.sideways(zero, one) ** 2, np.float64)
+    return np.asarray(
+        p.height_change_of_shift(one, zero) ** 2 + p.height_change_of_shift(zero, one) ** 2,
+        np.float64,
+    )
 
 
 def drift_rate(p: ScanPoints, _: Parameters) -> FloatArray:
@@ -257,22 +260,22 @@ def drift(p: ScanPoints, parameters: Parameters) -> FloatArray:
     return components(fading(parameters["correlation_time"]), p.time)
 
 
-def of_a_walk(p: ScanPoints, _: Parameters) -> FloatArray:
+def random_walk_variance(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the sum of squares of a walk."""
     return p.time
 
 
-def of_a_curve(p: ScanPoints, _: Parameters) -> FloatArray:
+def curve_variance(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the sum of squares of an unknown curve."""
     return np.ones(len(p))
 
 
-def of_a_lateral_curve(p: ScanPoints, _: Parameters) -> FloatArray:
+def lateral_curve_variance(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the sum of squares of an unknown curve along X."""
     return np.asarray(_across(p, np.ones(len(p)), np.zeros(len(p))) ** 2, np.float64)
 
 
-def of_pitch(p: ScanPoints, parameters: Parameters) -> FloatArray:
+def pitch_variance(p: ScanPoints, parameters: Parameters) -> FloatArray:
     """Return the sum of squares of an unknown pitch."""
     return np.full(len(p), parameters["arm"] ** 2)
 
@@ -337,7 +340,7 @@ _LENGTH_OPTIONAL = ("correlation_length",)
 
 KINDS: dict[str, SourceKind] = {
     "dynamics": SourceKind("noise of the step test", _SHARE, dynamics),
-    "could_hide": SourceKind("what the step test could not show", _SHARE, could_hide),
+    "could_hide": SourceKind("what the step test could not show", _SHARE, undetected_error),
     "static_gain": SourceKind(
         "static gain of the probe", _SHARE, static_gain, {"gain": quantities.GAIN}
     ),
@@ -361,7 +364,7 @@ KINDS: dict[str, SourceKind] = {
         straightness_x,
         _CORRELATED,
         _LENGTH_OPTIONAL,
-        squares=of_a_curve,
+        squares=curve_variance,
     ),
     "straightness_z": SourceKind(
         "straightness of Z, sideways",
@@ -370,7 +373,7 @@ KINDS: dict[str, SourceKind] = {
         _CORRELATED,
         _LENGTH_OPTIONAL,
         needs_slope=True,
-        squares=of_a_lateral_curve,
+        squares=lateral_curve_variance,
     ),
     "pitch": SourceKind(
         "pitch of Z, over the Abbe arm",
@@ -378,7 +381,7 @@ KINDS: dict[str, SourceKind] = {
         pitch,
         {"arm": quantities.LENGTH, **_CORRELATED},
         _LENGTH_OPTIONAL,
-        squares=of_pitch,
+        squares=pitch_variance,
     ),
     "spindle_axial": SourceKind(
         "axial motion in step with the spindle", _METRES, spindle_axial, _PER_TURN
@@ -418,14 +421,17 @@ KINDS: dict[str, SourceKind] = {
     ),
     "drift_rate": SourceKind("steady drift", quantities.RATE_UNCERTAINTY, drift_rate),
     "drift_walk": SourceKind(
-        "drift as a random walk", quantities.WALK_UNCERTAINTY, drift_walk, squares=of_a_walk
+        "drift as a random walk",
+        quantities.WALK_UNCERTAINTY,
+        drift_walk,
+        squares=random_walk_variance,
     ),
     "drift": SourceKind(
         "drift that fades",
         _METRES,
         drift,
         {"correlation_time": quantities.CORRELATION_TIME},
-        squares=of_a_curve,
+        squares=curve_variance,
     ),
 }
 """Kinds of systematic error by their names."""

@@ -41,7 +41,7 @@ class ScanPoints:
     distance: that the probe measured, growing with height [m]
     slope_x, slope_y: of the surface along the workpiece's x and y [1]; None where it is not known
     dynamics: of the heights by each independent direction of the calibration's covariance, per
-        standard uncertainty [m], (r, n);  hidden: which of them are of what its step test could
+        standard uncertainty [m], (r, n);  undetected: which of them are of what its step test could
         not show (r,)
     """
 
@@ -56,7 +56,7 @@ class ScanPoints:
     slope_x: FloatArray | None = None
     slope_y: FloatArray | None = None
     dynamics: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
-    hidden: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+    undetected: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     def __len__(self) -> int:
         return len(self.time)
@@ -87,7 +87,7 @@ class ScanPoints:
             slope_x, slope_y = slopes_by_differences(surface, self.x, self.y)
         return replace(self, slope_x=slope_x, slope_y=slope_y)
 
-    def sideways(self, x: FloatArray, y: FloatArray) -> FloatArray:
+    def height_change_of_shift(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the change of height [m] at its place of points taken for ``x``, ``y`` [m] off.
 
         A point reported at x + δ has the height of x: against the surface ``-δ ∂S/∂x``.
@@ -243,7 +243,7 @@ def scan_fields(
     return ScanFields(left, np.array([rows[k] for k in kept]), every, known, same)
 
 
-def resolves_turns(points: ScanPoints) -> bool:
+def resolves_per_turn_waves(points: ScanPoints) -> bool:
     """Return whether ``points`` are close enough for what repeats with the spindle's turns."""
     # An angle that is wrapped jumps by a turn once a turn.
     steps = np.abs(np.diff(np.unwrap(points.c)))
@@ -282,7 +282,7 @@ class ScanTrace:
     """Points of a scan, evenly chosen while they pass; time and Z count from the first one.
 
     seen: points that passed
-    hidden: which changes by the covariance are of what the step test could not show, (r,)
+    undetected: which changes by the covariance are of what the step test could not show, (r,)
     """
 
     def __init__(self, most: int = MOST_TRACED) -> None:
@@ -290,7 +290,7 @@ class ScanTrace:
         self._session: int | None = None
         self._late = self._last = 0.0
         self._first_z = 0.0
-        self.hidden: BoolArray = np.zeros(0, np.bool_)
+        self.undetected: BoolArray = np.zeros(0, np.bool_)
         self.seen = 0
 
     def add(
@@ -324,7 +324,7 @@ class ScanTrace:
             c=c,
             distance=distance,
             dynamics=motion[2:],
-            hidden=self.hidden,
+            undetected=self.undetected,
         )
         self._keep(points)
         return points
@@ -344,4 +344,4 @@ class ScanTrace:
         """Return those kept, in the order of time."""
         rows = self._kept.rows() if self.seen else np.empty((0, len(_COLUMNS)))
         columns = dict(zip(_COLUMNS, rows.T, strict=False))
-        return ScanPoints(**columns, dynamics=rows.T[len(_COLUMNS) :], hidden=self.hidden)
+        return ScanPoints(**columns, dynamics=rows.T[len(_COLUMNS) :], undetected=self.undetected)

@@ -19,7 +19,7 @@ from omsm_ros.core.calibration.calibration import Calibration, latency_of
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
-from omsm_ros.core.lti.recursion import past_motion, past_rest
+from omsm_ros.core.lti.recursion import past_motion, past_stationary
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
@@ -103,22 +103,22 @@ def contributions(
     static_gain: float,
     distance: FloatArray,
     dynamics: FloatArray,
-    hidden: FloatArray,
+    undetected: FloatArray,
     z_rate: FloatArray,
     abbe_arm: float = 0.0,
 ) -> dict[str, FloatArray | float]:
     """Return variances of the heights [m²] by their source, each (n,) or the same for all points.
 
     noise_gain: of H for white noise;  distance: readings [m], (n,)
-    dynamics, hidden: variance of H(z) [m²] from the noise of the step test, and from what the
+    dynamics, undetected: variance of H(z) [m²] from the noise of the step test, and from what the
         test could not show, (n,);  z_rate: of H(z) [m/s], (n,)
     abbe_arm: from the Z encoder's line to the beam [m]
     """
     scale = sources.static_gain / static_gain**2
-    scatter: dict[str, FloatArray | float] = {**of_readings(sources, noise_gain, static_gain)}
+    scatter: dict[str, FloatArray | float] = {**reading_variances(sources, noise_gain, static_gain)}
     return {
         "dynamics": dynamics,
-        "could_hide": hidden,
+        "could_hide": undetected,
         "lateral_lag": (sources.lateral_lag * z_rate) ** 2,
         "static_gain": (scale * distance) ** 2,
         **scatter,
@@ -128,7 +128,9 @@ def contributions(
     }
 
 
-def of_readings(sources: ErrorSources, noise_gain: float, static_gain: float) -> dict[str, float]:
+def reading_variances(
+    sources: ErrorSources, noise_gain: float, static_gain: float
+) -> dict[str, float]:
     """Return the variances of a height [m²] by what scatters from reading to reading.
 
     noise_gain: of H for white noise
@@ -142,7 +144,9 @@ def of_readings(sources: ErrorSources, noise_gain: float, static_gain: float) ->
     }
 
 
-def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> SurfacePoints:
+def with_lateral_uncertainty(
+    points: SurfacePoints, surface: Surface, lateral: float
+) -> SurfacePoints:
     """Return the points with ``lateral`` [m], their lateral standard uncertainty, times the slope.
 
     The slope is the nominal ``surface``'s; ``lateral`` is that of each of two directions.
@@ -152,12 +156,12 @@ def with_lateral(points: SurfacePoints, surface: Surface, lateral: float) -> Sur
     return replace(points, uncertainty=np.sqrt(variance))
 
 
-def uncertain_parts(calibration: Calibration) -> tuple[Calibration, Calibration]:
+def covariance_parts(calibration: Calibration) -> tuple[Calibration, Calibration]:
     """Return the calibration with the covariance of noise alone, and with that of hidden terms."""
-    hidden = calibration.hidden_covariance
+    undetected = calibration.undetected_error_covariance
     return (
-        replace(calibration, covariance=calibration.covariance - hidden),
-        replace(calibration, covariance=hidden),
+        replace(calibration, covariance=calibration.covariance - undetected),
+        replace(calibration, covariance=undetected),
     )
 
 
@@ -166,7 +170,7 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
     g = calibration.dynamics
     square = np.asarray(polynomial.polymul(g.denominator, g.denominator), np.float64)
     combined, poles = sensitivity_numerators(calibration), np.tile(g.poles(), 2)
-    slow = at_rest_until(calibration)
+    slow = static_until(calibration)
     if slow > 0:
         # G(0) is one for certain: what is uncertain of the gain moves, see at_rest_until.
         combined = slow * np.column_stack([np.zeros(len(combined)), combined])
@@ -182,7 +186,7 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
     ]
 
 
-def at_rest_until(calibration: Calibration) -> float:
+def static_until(calibration: Calibration) -> float:
     """Return the time [s] over which a motion counts as rest, whose gain is one; 0 without one.
 
     A calibration that leaves open how slow relaxations go carries a variance of the whole
@@ -192,9 +196,9 @@ def at_rest_until(calibration: Calibration) -> float:
     return 1 / (2 * np.pi * lowest) if lowest > 0 and calibration.covariance[0, 0] > 0 else 0.0
 
 
-def past_of(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
+def filter_history(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
     """Return what the sensitivity filters take for the past of their first samples (k,)."""
-    return past_rest if at_rest_until(calibration) > 0 else past_motion
+    return past_stationary if static_until(calibration) > 0 else past_motion
 
 
 def derivative_filter(

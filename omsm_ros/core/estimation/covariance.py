@@ -106,7 +106,7 @@ def parameter_covariance(
     on_grid = np.zeros((size, len(problem.used)))
     on_grid[:, problem.used] = columns.T
     uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
-    meat = weighted_gram(on_grid, length, noise) + uneven.T @ uneven
+    score_covariance = weighted_gram(on_grid, length, noise) + uneven.T @ uneven
     gram = columns.T @ columns
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0] = 1.0
@@ -114,7 +114,7 @@ def parameter_covariance(
     least = _RANK_TOLERANCE * float(values[-1])
     strong, weak = directions[:, values > least], directions[:, values <= least]
     bread = strong / values[values > least] @ strong.T
-    inside = bread @ (meat / np.outer(scale, scale)) @ bread
+    inside = bread @ (score_covariance / np.outer(scale, scale)) @ bread
     # A direction lost in rounding gets at least the variance of the weakest one that is not.
     inside += weak @ weak.T * float(np.mean(residual**2)) / (least or 1.0)
     covariance = inside / np.outer(scale, scale)
@@ -123,7 +123,7 @@ def parameter_covariance(
 
 def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
     """Return the relative standard uncertainty of the gain with lag and curvature fitted too."""
-    every = parameter_covariance(problem, problem.bent(fitted), fitted.residual)
+    every = parameter_covariance(problem, problem.low_order_sensitivity(fitted), fitted.residual)
     return float(np.sqrt(every[0, 0]) / abs(fitted.gain))
 
 
@@ -135,7 +135,7 @@ def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: i
     return np.asarray(np.where(moves, power, 0.0))
 
 
-def hidden_motion_covariance(
+def inter_sample_motion_covariance(
     dynamics: TransferFunction, delay_bound: float, sample_period: float
 ) -> FloatArray:
     """Return the covariance (p, p) of the coefficients due to motion hidden between samples.

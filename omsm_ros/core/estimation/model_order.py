@@ -16,8 +16,8 @@ from functools import cached_property
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
-from omsm_ros.core.estimation.optimisation import Effort
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, fit
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction, ascending_roots
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -33,7 +33,7 @@ _LEAST_PARAMETERS = 3
 # Of the critical damping: a resonance beyond half the sampling rate shows in no sample.
 _DAMPED_BEYOND = 0.1
 # Radians a sample, some thirty times half the sampling rate: from there on it is a constant.
-_OUT_OF_SIGHT = 100.0
+_UNOBSERVABLE = 100.0
 # Distance of a zero from a pole, relative: nearer than the data could ever tell apart.
 _CANCELLING = 0.005
 
@@ -73,7 +73,7 @@ def explore(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
     order: int = 0,
     colour: float = 1.0,
-    effort: Effort | None = None,
+    effort: EvaluationBudget | None = None,
 ) -> list[Candidate]:
     """Fit structures of rising order until two more poles in a row gain nothing.
 
@@ -147,7 +147,7 @@ def identifiable(dynamics: TransferFunction, period: float, duration: float) -> 
     rate, decay = np.abs(poles), -poles.real
     lasting = decay * duration < 1
     turned = rate * period
-    beyond = (np.pi < turned) & (turned < _OUT_OF_SIGHT)
+    beyond = (np.pi < turned) & (turned < _UNOBSERVABLE)
     ringing = beyond & (decay < _DAMPED_BEYOND * rate)
     return not bool(np.any(lasting | ringing))
 
@@ -210,7 +210,7 @@ class StartingPoints:
         if self.coarser is not None and structure.poles:
             coarse = self.coarser
             return [fit(coarse.problem, structure, coarse.of(structure, smaller)).nonlinear]
-        scaled = Scaled(structure, self.problem.rate)
+        scaled = ScaledStructure(structure, self.problem.rate)
         delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
         if structure.poles == 0:
             return [self.pure_delay.nonlinear]
@@ -292,7 +292,7 @@ def coarser(problem: Problem, every: int) -> Problem:
         background=np.column_stack([thinned(column) for column in problem.background.T]),
         noise=problem.noise / np.sqrt(every),
         plateau=None,
-        unfollowed=None,
+        errors_in_variables=None,
     )
 
 
@@ -310,7 +310,7 @@ def _bridged(used: BoolArray, every: int) -> BoolArray:
     return np.asarray(used[picked] | (inside & short[np.where(inside, after - 1, 0)]))
 
 
-def _guess(scaled: Scaled, delay: float) -> FloatArray:
+def _guess(scaled: ScaledStructure, delay: float) -> FloatArray:
     poles: list[complex] = []
     for index in range(scaled.structure.pairs):
         upper = complex((index + 1) * _GUESSED_RATE * np.exp(1j * _GUESSED_ANGLE))
@@ -330,7 +330,7 @@ def _stable(poles: ComplexArray) -> ComplexArray:
     return np.asarray(np.concatenate([damped, np.conj(damped), slow]), np.complex128)
 
 
-def _grown(scaled: Scaled, fit: Fit, delay: float) -> FloatArray:
+def _grown(scaled: ScaledStructure, fit: Fit, delay: float) -> FloatArray:
     """Return the smaller fit with fast poles added; their zeros follow linearly."""
     added = _ADDED_POLE * 1.5 ** np.arange(scaled.structure.poles - fit.structure.poles)
     own = _stable(fit.dynamics.poles() / scaled.rate)

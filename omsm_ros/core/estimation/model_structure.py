@@ -52,7 +52,7 @@ class Structure:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scaled:
+class ScaledStructure:
     """A structure with ``s`` in units of ``rate`` [rad/s], which keeps coefficients near 1.
 
     Its *nonlinear parameters* ψ (n + delay,) hold α of each section, β of each pair, and the

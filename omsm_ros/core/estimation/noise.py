@@ -14,7 +14,7 @@ from math import comb
 import numpy as np
 from scipy import fft
 
-from omsm_ros.core.estimation.optimisation import Effort
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Edge, Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
@@ -40,7 +40,9 @@ def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatA
     Each row is that of one standard deviation, so that with rows E their covariance is EᵀE.
     scatter: variance of the time of a reading [s²], see :func:`scatter_in_time`
     """
-    return np.concatenate([_rounded(problem, columns), _late(problem, columns, scatter)])
+    return np.concatenate(
+        [_rounding_rows(problem, columns), _timing_rows(problem, columns, scatter)]
+    )
 
 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
@@ -58,7 +60,7 @@ def rate_of(problem: Problem) -> FloatArray:
     return np.asarray(np.gradient(problem.input, problem.period))
 
 
-def _rounded(problem: Problem, columns: FloatArray) -> FloatArray:
+def _rounding_rows(problem: Problem, columns: FloatArray) -> FloatArray:
     """Return rows of rounding errors: one a plateau, whose readings share it, one a moving reading.
 
     The noise at rest does not show the latter.
@@ -73,7 +75,7 @@ def _rounded(problem: Problem, columns: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(problem.shared) * np.concatenate([sums[1:], moving]))
 
 
-def _late(problem: Problem, columns: FloatArray, variance: float) -> FloatArray:
+def _timing_rows(problem: Problem, columns: FloatArray, variance: float) -> FloatArray:
     if variance == 0:
         return np.zeros((0, columns.shape[1]))
     rate = rate_of(problem)[problem.used, np.newaxis]
@@ -91,7 +93,7 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
     known = np.isfinite(second)
     second, weight = second[known], weight[known]
     still = weight < _STILL * np.max(weight, initial=0.0)
-    if np.sum(still) < _LEAST_STILL or _lasts(on_grid, rate):
+    if np.sum(still) < _LEAST_STILL or _persists(on_grid, rate):
         return 0.0
     at_rest = float(np.mean(second[still] ** 2))
     total = float(np.sum(weight**2))
@@ -102,7 +104,7 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
     return found if found > _CLEARLY * spread else 0.0
 
 
-def _lasts(on_grid: FloatArray, rate: FloatArray) -> bool:
+def _persists(on_grid: FloatArray, rate: FloatArray) -> bool:
     """Return True if neighbours in ``on_grid`` resemble each other where the axis moves."""
     moving = rate**2 > _STILL * np.max(rate**2)
     value = np.where(moving & np.isfinite(on_grid), on_grid, 0.0)
@@ -211,7 +213,9 @@ _TINY = float(np.finfo(np.float64).tiny)
 _BANDS_AN_OCTAVE, _NARROWEST = 3, 64
 
 
-def without_unfollowed(problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()) -> Problem | None:
+def correct_errors_in_variables(
+    problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()
+) -> Problem | None:
     """Return the problem without that part of the input's noise that the probe did not follow.
 
     edges: of the input, if it has any
@@ -219,7 +223,7 @@ def without_unfollowed(problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()
         Where some of it did, its expected motion stays (Carroll et al. 2006, ch. 4).
     None where the probe followed all, as far as the residual shows, or it was taken out before.
     """
-    if problem.noise <= 0 or problem.unfollowed is not None:
+    if problem.noise <= 0 or problem.errors_in_variables is not None:
         return None
     smooth, left = smoothed(problem.input, problem.noise, edges)
     noise = problem.input - smooth
@@ -227,21 +231,21 @@ def without_unfollowed(problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()
     made = np.where(problem.used, problem.modelled(fitted) - quiet.modelled(fitted), 0.0)
     if not np.any(made):
         return None
-    share, band = _not_followed(problem.on_grid(fitted.residual, 0.0), made)
+    share, band = _unfollowed_share(problem.on_grid(fitted.residual, 0.0), made)
     if share is None:
         return None
-    unfollowed = fft.irfft(share[band] * fft.rfft(noise), len(noise))
+    errors_in_variables = fft.irfft(share[band] * fft.rfft(noise), len(noise))
     # It is fitted from the start; what was tried with the noise in it counts no more.
     return replace(
         problem,
-        input=problem.input - unfollowed,
+        input=problem.input - errors_in_variables,
         noise=left,
-        unfollowed=unfollowed,
-        effort=Effort(),
+        errors_in_variables=errors_in_variables,
+        effort=EvaluationBudget(),
     )
 
 
-def _not_followed(residual: FloatArray, made: FloatArray) -> tuple[FloatArray | None, IntArray]:
+def _unfollowed_share(residual: FloatArray, made: FloatArray) -> tuple[FloatArray | None, IntArray]:
     """Return the share of what was ``made`` (n,) that ``residual`` (n,) lacks, of each band.
 
     The second is the band of each line of their spectra. Bands that do not differ have one share;

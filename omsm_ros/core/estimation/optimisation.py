@@ -29,7 +29,7 @@ _ENOUGH_SAMPLES, _ENOUGH_OF_ALL = 30_000_000, 300
 
 
 @dataclass(eq=False)
-class Effort:
+class EvaluationBudget:
     """How often a record was compared with a model, in all the problems that were made of it.
 
     comparisons: with all of its samples, or half of them

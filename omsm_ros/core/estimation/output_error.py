@@ -19,8 +19,8 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import fft, linalg, ndimage
 
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
-from omsm_ros.core.estimation.optimisation import Effort, Projection, descend
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.optimisation import EvaluationBudget, Projection, descend
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -33,9 +33,9 @@ _BRIDGE_S = 0.3
 # Where samples are slow a bridge must still be smooth to them.
 _MIN_BRIDGE_SAMPLES = 64
 # In it a light mode rings down.
-_REST_S = 1.0
+_STATIONARY_S = 1.0
 # A record of milliseconds tells of no mode that rings for a second: so many times as long it rests.
-_RESTS_OF_RECORD = 4.0
+_PLATEAU_SHARE = 4.0
 # Power is then known to 10 %.
 _SMOOTHING_BINS = 101
 
@@ -47,7 +47,7 @@ def close_period(motion: FloatArray, period: float) -> FloatArray:
     """
     duration = len(motion) * period
     bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
-    rest = round(min(_REST_S, _RESTS_OF_RECORD * duration) / period)
+    rest = round(min(_STATIONARY_S, _PLATEAU_SHARE * duration) / period)
     total = fft.next_fast_len(len(motion) + bridge + rest, real=True)
     phase = np.arange(1, total - len(motion) + 1) / bridge
     way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
@@ -105,7 +105,7 @@ class Problem:
     fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
-    unfollowed: what was taken out of the input, (n,) [m], see ``encoder_noise``; or None
+    errors_in_variables: what was taken out of the input, (n,) [m], see ``encoder_noise``; or None
     effort: what was tried of this problem, and of those made of it
     """
 
@@ -119,8 +119,8 @@ class Problem:
     fits_initial_condition: bool = False
     plateau: IntArray | None = None
     shared: float = 0.0
-    unfollowed: FloatArray | None = None
-    effort: Effort = field(default_factory=Effort)
+    errors_in_variables: FloatArray | None = None
+    effort: EvaluationBudget = field(default_factory=EvaluationBudget)
 
     @cached_property
     def closed_length(self) -> int:
@@ -148,9 +148,9 @@ class Problem:
         omega = 2 * np.pi * fft.rfftfreq(self.closed_length, self.period)
         return np.asarray(1j * omega[: len(self._spectrum)] / self.rate, np.complex128)
 
-    def parametrised(self, structure: Structure) -> Scaled:
+    def parametrised(self, structure: Structure) -> ScaledStructure:
         """Return how ``structure`` is parametrised over ``s``."""
-        return Scaled(structure, self.rate)
+        return ScaledStructure(structure, self.rate)
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """Return what drives the system: spectra (k,), each with its number of numerator terms."""
@@ -197,7 +197,7 @@ class Problem:
             np.take(values, self._places, axis=-1, out=found[part])
         return found
 
-    def project(self, scaled: Scaled, nonlinear: FloatArray) -> Projection:
+    def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
         self.effort.count(len(self._places))
         structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
@@ -277,9 +277,9 @@ class Problem:
         slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
         by_nonlinear = slopes * (fitted.driven @ driven)
         by_gain = (fitted.numerator @ driven[:terms])[np.newaxis]
-        return self._beside_background([by_numerator, by_nonlinear, by_gain, driven[terms:]])
+        return self._with_background_columns([by_numerator, by_nonlinear, by_gain, driven[terms:]])
 
-    def _beside_background(self, spectra: Sequence[ComplexArray]) -> FloatArray:
+    def _with_background_columns(self, spectra: Sequence[ComplexArray]) -> FloatArray:
         """Return columns (k, …) of all ``spectra`` (…, k), then those of the background."""
         count = sum(map(len, spectra))
         rows = np.empty((count + self.background.shape[1], len(self._places)))
@@ -290,7 +290,7 @@ class Problem:
             first += len(part)
         return rows.T
 
-    def bent(self, fitted: Fit) -> FloatArray:
+    def low_order_sensitivity(self, fitted: Fit) -> FloatArray:
         """Return d output / d(gain, lag, curvature, further drives, background), (k, …).
 
         That is by coefficients of 1, s and s² in front of it: any response bends like that.
@@ -299,7 +299,7 @@ class Problem:
         driven = self._driven(fitted.structure, lag)
         terms = len(fitted.numerator)
         bends = self.s ** np.arange(3)[:, np.newaxis] * (fitted.numerator @ driven[:terms])
-        return self._beside_background([bends, driven[terms:]])
+        return self._with_background_columns([bends, driven[terms:]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,7 +310,7 @@ class Fit:
     background: coefficients (q,);  residual: (k,) [m]
     """
 
-    scaled: Scaled
+    scaled: ScaledStructure
     nonlinear: FloatArray
     driven: FloatArray
     background: FloatArray
@@ -390,6 +390,6 @@ def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> 
     return _fit_at(problem, scaled, problem.project(scaled, nonlinear))
 
 
-def _fit_at(problem: Problem, scaled: Scaled, at: Projection) -> Fit:
+def _fit_at(problem: Problem, scaled: ScaledStructure, at: Projection) -> Fit:
     terms = len(at.linear) - problem.background.shape[1]
     return Fit(scaled, at.nonlinear, at.linear[:terms], at.linear[terms:], at.residual)

@@ -21,8 +21,8 @@ from omsm_ros.core.estimation.steps import (
     TRAVEL_PART,
     Steps,
     check_usable,
+    extended,
     find_steps,
-    lasting,
     sample_noise,
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -69,7 +69,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     """
     check_usable(record)
     motion, axis_spikes = _bridged(_motion(record, source))
-    steps = _recorded_whole(find_steps(motion, record.sample_period), record)
+    steps = _complete_edges(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps)
     if steps.edges:
         # Of a motion that never rests a lag of half a period is another gain; the fit tells.
@@ -126,10 +126,10 @@ def _bridged(motion: FloatArray) -> tuple[FloatArray, int]:
 
 def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     samples = len(record)
-    used = record.ok & ~_after_loss(record)
+    used = record.ok & ~_affected_by_loss(record)
     used[: min(round(_SETTLING_S / record.sample_period), samples // 10)] = False
     used[samples - min(_EDGE_GUARD, samples // 10) :] = False
-    carried = from_rest_to_rest(motion, steps.moving, record.sample_period)
+    carried = faded_to_stationary(motion, steps.moving, record.sample_period)
     used &= carried == motion
     if np.sum(used) < LEAST_SAMPLES:
         raise StepTestError(
@@ -150,7 +150,7 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     )
 
 
-def from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
+def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
     """Return ``motion`` (n,), where it starts or ends moving faded to its mean there.
 
     A motion that breaks off would have content at all frequencies, where there was none.
@@ -171,17 +171,17 @@ def from_rest_to_rest(motion: FloatArray, moving: BoolArray, period: float) -> F
     return carried
 
 
-def _after_loss(record: MotionRecord) -> BoolArray:
+def _affected_by_loss(record: MotionRecord) -> BoolArray:
     """Return True where the response still remembers a motion that was lost, shape (n,)."""
     samples = len(record)
     if record.z_lost is None:
         return np.zeros(samples, np.bool_)
     ahead = np.concatenate([record.z_lost, np.zeros(_EDGE_GUARD, np.bool_)])
     memory = round(_SETTLING_S / record.sample_period) + _EDGE_GUARD
-    return lasting(ahead, memory)[_EDGE_GUARD:]
+    return extended(ahead, memory)[_EDGE_GUARD:]
 
 
-def _recorded_whole(steps: Steps, record: MotionRecord) -> Steps:
+def _complete_edges(steps: Steps, record: MotionRecord) -> Steps:
     """Return the steps without those edges of which a part was lost."""
     if record.z_lost is None:
         return steps
@@ -283,13 +283,15 @@ def check_axis_steps(prepared: Prepared) -> None:
     problem = prepared.problem
     positions = problem.input[problem.used]
     step, noise = reading_step(positions), sample_noise(problem.output[problem.used])
-    if step**2 / 12 <= noise**2 or not _advances_unevenly(positions, step):
+    if step**2 / 12 <= noise**2 or not _moves_unevenly(positions, step):
         return
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     plain = fit(problem, _PLAIN, StartingPoints(problem, lag).of(_PLAIN, [lag]))
     moving = prepared.steps.moving[problem.used]
     left = float(np.mean(plain.residual[moving] ** 2)) - noise**2 if np.any(moving) else 0.0
-    low, high = (part * _left_by_rounding(plain, step, problem.period) for part in _AS_ROUNDING)
+    low, high = (
+        part * _rounding_error_variance(plain, step, problem.period) for part in _AS_ROUNDING
+    )
     if left > _SEEN * noise**2 and low < left < high:
         raise IdentificationError(
             f"the positions of the axis come in steps of {quantity(step, 'm')}; where it moves "
@@ -299,7 +301,7 @@ def check_axis_steps(prepared: Prepared) -> None:
         )
 
 
-def _advances_unevenly(positions: FloatArray, step: float) -> bool:
+def _moves_unevenly(positions: FloatArray, step: float) -> bool:
     """Return True if the speed changes at many of the samples where the axis moves."""
     advance = np.diff(positions)
     moves = (np.abs(advance[:-1]) > step / 2) | (np.abs(advance[1:]) > step / 2)
@@ -307,7 +309,7 @@ def _advances_unevenly(positions: FloatArray, step: float) -> bool:
     return bool(np.sum(changes & moves) > _UNEVEN * np.sum(moves))
 
 
-def _left_by_rounding(fitted: Fit, step: float, period: float) -> float:
+def _rounding_error_variance(fitted: Fit, step: float, period: float) -> float:
     """Return the variance [m²] of evenly spread errors of ``step`` [m] through ``fitted``."""
     lines = np.linspace(0, 0.5 / period, _FREQUENCIES)
     passed = float(np.mean(np.abs(fitted.dynamics.response(lines)) ** 2))

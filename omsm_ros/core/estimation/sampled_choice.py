@@ -19,10 +19,10 @@ from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import Fit, fit
 from omsm_ros.core.estimation.sampled_fit import (
     RATE_SAMPLES,
-    DiscreteScaled,
     DiscreteStarts,
-    HeldProblem,
-    grown,
+    ScaledDiscreteStructure,
+    ZeroOrderHoldProblem,
+    grown_starts,
     with_fast_pole,
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -37,12 +37,12 @@ _FIRST_PART = 0.75
 # Orders that are judged on every hidden part: so many of the best over the last part, and of
 # the lowest within this factor of the least error. One part alone misjudges by about as much.
 _FINALISTS = 3
-_ABOUT_AS_GOOD = 2.0
+_EQUIVALENT = 2.0
 # So many orders in a row that predict no better than the best so far end the search.
 _FRUITLESS = 5
 # By so many standard errors a model has to predict better to beat another. A pole too few costs a
 # record with disturbances more than one too many (docs/design/identification-ablation.md).
-_BEATS_BY = 0.5
+_IMPROVES_BY = 0.5
 # Order of the model by which the delay is chosen.
 _DELAY_ORDER = 3
 # Samples for each parameter: with fewer, an order is not tried.
@@ -51,7 +51,7 @@ _LEAST_SAMPLES_EACH = 3
 _MOST_SAMPLES = 200_000
 # Of the refit without a hidden part, which starts at the minimum over all of them: what more would
 # gain is less than what one part misjudges by, and on orders beyond ten takes most of the time.
-_HIDDEN_EVALUATIONS = 5
+_HELD_OUT_EVALUATIONS = 5
 # Of the power of the strongest direction: what is weaker is rounding of a text with six digits.
 _UNEXCITED = 1e-12
 
@@ -61,14 +61,14 @@ class SampledCandidate:
     """A fit to all used samples, and how it predicts.
 
     order: poles;  whitened: fitted with its residual made white
-    hidden: mean square error of free runs over each hidden part (folds,), empty if not judged
+    held_out: mean square error of free runs over each hidden part (folds,), empty if not judged
     """
 
-    problem: HeldProblem
+    problem: ZeroOrderHoldProblem
     fit: Fit
     order: int
     whitened: bool
-    hidden: FloatArray
+    held_out: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,16 +114,16 @@ def choose_sampled(
     fits, by_order = _explored(early, late, most, order)
     finalists = _finalists(by_order, order)
     tried = [
-        SampledCandidate(problem, refitted(problem, fits[n], white), n, white, np.empty(0))
+        SampledCandidate(problem, refit(problem, fits[n], white), n, white, np.empty(0))
         for n in finalists
         for white in ((False, True) if n else (False,))
     ]
-    judged = [replace(c, hidden=hidden_errors(c, part)) for c in tried]
+    judged = [replace(c, held_out=held_out_errors(c, part)) for c in tried]
     starts = DiscreteStarts(problem.input, problem.output, problem.used, most)
-    free = _finished(plainest(judged), starts)
+    free = _finished(simplest_undominated(judged), starts)
     chosen = free
     if order and order != free.order:
-        chosen = _finished(plainest([c for c in judged if c.order == order]), starts)
+        chosen = _finished(simplest_undominated([c for c in judged if c.order == order]), starts)
     return SampledChoice(chosen, free, delay, by_order)
 
 
@@ -141,13 +141,15 @@ def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCan
     """Return the candidate at the best minimum that starts from all used samples lead to."""
     if candidate.order == 0 or candidate.whitened:
         return candidate
-    every = [candidate.fit.nonlinear, *proposed(candidate.problem, candidate.order, starts)]
+    every = [candidate.fit.nonlinear, *proposed_starts(candidate.problem, candidate.order, starts)]
     return replace(candidate, fit=fit(candidate.problem, candidate.fit.structure, every))
 
 
-def proposed(problem: HeldProblem, order: int, starts: DiscreteStarts) -> list[FloatArray]:
+def proposed_starts(
+    problem: ZeroOrderHoldProblem, order: int, starts: DiscreteStarts
+) -> list[FloatArray]:
     """Return ψ of what ``starts`` propose for ``order``, as far as they are any."""
-    scaled = DiscreteScaled(Structure(order, order, False), problem.rate)
+    scaled = ScaledDiscreteStructure(Structure(order, order, False), problem.rate)
     every = [scaled.of_discrete(poles) for poles in starts.poles(order)]
     return [p for p in every if len(p) == order and np.all(np.isfinite(p))]
 
@@ -201,10 +203,10 @@ def parts(used: BoolArray) -> FloatArray:
 
 def delayed(
     input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
-) -> HeldProblem:
+) -> ZeroOrderHoldProblem:
     """Return the problem whose ``input`` (n,) comes ``delay`` samples later."""
     late = np.roll(input, delay)
-    return HeldProblem(
+    return ZeroOrderHoldProblem(
         input=late - np.mean(late),
         output=output,
         used=used & (np.arange(len(used)) >= delay),
@@ -233,7 +235,7 @@ def _best_delay(
 
 
 def _explored(
-    early: HeldProblem, late: BoolArray, most: int, at_least: int
+    early: ZeroOrderHoldProblem, late: BoolArray, most: int, at_least: int
 ) -> tuple[list[Fit], FloatArray]:
     """Return fits of rising order and their errors over ``late``; stop when some predict no better.
 
@@ -250,17 +252,19 @@ def _explored(
     return fits, np.array(errors)
 
 
-def next_order(problem: HeldProblem, smaller: Sequence[Fit], starts: DiscreteStarts) -> Fit:
+def next_order(
+    problem: ZeroOrderHoldProblem, smaller: Sequence[Fit], starts: DiscreteStarts
+) -> Fit:
     """Fit as many poles as there are ``smaller`` fits, and return the best."""
     order = len(smaller)
     structure = Structure(order, order, False)
     if order == 0:
         return fit(problem, structure, [np.empty(0)])
-    larger = grown([f.nonlinear for f in smaller], len(problem.output))
-    return fit(problem, structure, proposed(problem, order, starts) + larger)
+    larger = grown_starts([f.nonlinear for f in smaller], len(problem.output))
+    return fit(problem, structure, proposed_starts(problem, order, starts) + larger)
 
 
-def refitted(problem: HeldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
+def refit(problem: ZeroOrderHoldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
     """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``.
 
     evaluations: of a fit, as of :func:`fit` if not given
@@ -282,9 +286,9 @@ def refitted(problem: HeldProblem, start: Fit, whitened: bool, *evaluations: int
     return fit(white, start.structure, [found.nonlinear], *evaluations)
 
 
-def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
+def _missed(problem: ZeroOrderHoldProblem, fitted: Fit, held_out: BoolArray) -> float:
     """Return the mean square error of a free run over samples that are not used in ``problem``."""
-    missed = (problem.output - problem.free_run(fitted))[hidden]
+    missed = (problem.output - problem.free_run(fitted))[held_out]
     value = float(np.mean(missed**2))
     return value if np.isfinite(value) else np.inf
 
@@ -292,12 +296,12 @@ def _missed(problem: HeldProblem, fitted: Fit, hidden: BoolArray) -> float:
 def _finalists(by_order: FloatArray, order: int) -> list[int]:
     """Return the orders worth judging: the best, the lowest about as good, 0, 1 and ``order``."""
     best = np.argsort(by_order, kind="stable")[:_FINALISTS]
-    about_as_good = np.flatnonzero(by_order <= _ABOUT_AS_GOOD * np.min(by_order))[:_FINALISTS]
+    about_as_good = np.flatnonzero(by_order <= _EQUIVALENT * np.min(by_order))[:_FINALISTS]
     return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
 
 
-def hidden_errors(
-    candidate: SampledCandidate, part: FloatArray, evaluations: int = _HIDDEN_EVALUATIONS
+def held_out_errors(
+    candidate: SampledCandidate, part: FloatArray, evaluations: int = _HELD_OUT_EVALUATIONS
 ) -> FloatArray:
     """Return the mean square error over each hidden part, the candidate fitted without it.
 
@@ -307,26 +311,26 @@ def hidden_errors(
     drifts, because the data hold the model at both ends. No model has to run backwards.
     """
     problem, number = candidate.problem, np.floor(part)
-    hidden = [number == i for i in range(1, _PARTS)]
-    hidden += [number >= i for i in range(_PARTS // 2, _PARTS - 1)]
+    held_out = [number == i for i in range(1, _PARTS)]
+    held_out += [number >= i for i in range(_PARTS // 2, _PARTS - 1)]
     errors = []
-    for samples in hidden:
+    for samples in held_out:
         rest = replace(problem, used=problem.used & ~samples)
-        found = refitted(rest, candidate.fit, candidate.whitened, evaluations)
+        found = refit(rest, candidate.fit, candidate.whitened, evaluations)
         errors.append(_missed(rest, found, samples))
     return np.array(errors)
 
 
-def plainest(judged: Sequence[SampledCandidate]) -> SampledCandidate:
+def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate:
     """Return the simplest of those that no other beats: not whitened, then with fewest poles.
 
     One beats another that is better in the mean by more than half a standard error of their
     difference (after Breiman et al. 1984, paired).
     """
-    errors = np.array([c.hidden for c in judged])
+    errors = np.array([c.held_out for c in judged])
     with np.errstate(invalid="ignore"):
         worse = errors[:, np.newaxis] - errors[np.newaxis]
-        allowed = _BEATS_BY * np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
+        allowed = _IMPROVES_BY * np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
         unbeaten = np.all(np.mean(worse, axis=2) <= allowed, axis=1)
     best = int(np.argmin(np.mean(errors, axis=1)))
     every = {best, *np.flatnonzero(unbeaten).tolist()}
@@ -353,7 +357,7 @@ _POLES_MORE = 2
 _HIDDEN_EVALUATIONS_LONG_RECORD = 2
 
 
-def choose_of_any_length(
+def choose_sampled_long(
     input: FloatArray,
     output: FloatArray,
     used: BoolArray,
@@ -366,7 +370,7 @@ def choose_of_any_length(
     check_record(input, output, used, order)
     if int(np.sum(used)) <= CHOSEN_ON:
         return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
-    part = telling_part(input, used)
+    part = most_exciting_part(input, used)
     try:
         choice = choose_sampled(
             input[part], output[part], used[part], period, order=order, max_delay=max_delay
@@ -375,10 +379,10 @@ def choose_of_any_length(
         # No part excites as much as the whole does.
         return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
     centred = np.where(used, output - np.mean(output[used]), 0.0)
-    return _on_the_whole(delayed(input, centred, used, period, choice.delay), choice)
+    return _on_full_record(delayed(input, centred, used, period, choice.delay), choice)
 
 
-def telling_part(input: FloatArray, used: BoolArray) -> slice:
+def most_exciting_part(input: FloatArray, used: BoolArray) -> slice:
     """Return the part with CHOSEN_ON samples ``used`` (n,) in which ``input`` (n,) excites most."""
     places = np.flatnonzero(used)
     count = len(places) // CHOSEN_ON
@@ -387,41 +391,44 @@ def telling_part(input: FloatArray, used: BoolArray) -> slice:
         slice(int(places[i * CHOSEN_ON]), int(places[(i + 1) * CHOSEN_ON - 1]) + 1) for i in tried
     ]
 
-    def told(part: slice) -> tuple[int, float]:
+    def information(part: slice) -> tuple[int, float]:
         varied = input[part]
         excited = excited_parameters(varied, 2 * MAX_ORDER + 1) if np.ptp(varied) > 0 else 0
         return excited, float(np.var(varied))
 
-    return max(every, key=told)
+    return max(every, key=information)
 
 
-def _on_the_whole(problem: HeldProblem, choice: SampledChoice) -> SampledChoice:
+def _on_full_record(problem: ZeroOrderHoldProblem, choice: SampledChoice) -> SampledChoice:
     part = parts(problem.used)
     starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_ORDER)
     lowest: list[Fit] = []
     while len(lowest) <= _LOWEST:
         lowest.append(next_order(problem, lowest, starts))
     tried = [SampledCandidate(problem, f, f.structure.poles, False, np.empty(0)) for f in lowest]
-    free = _of_part(problem, choice.free)
-    tried += [free, *_with_poles_more(problem, free, starts)]
+    free = _refit_on_full_record(problem, choice.free)
+    tried += [free, *_with_further_poles(problem, free, starts)]
     judged = [
-        replace(c, hidden=hidden_errors(c, part, _HIDDEN_EVALUATIONS_LONG_RECORD)) for c in tried
+        replace(c, held_out=held_out_errors(c, part, _HIDDEN_EVALUATIONS_LONG_RECORD))
+        for c in tried
     ]
-    best = plainest(judged)
+    best = simplest_undominated(judged)
     if choice.chosen is choice.free:
         return replace(choice, chosen=best, free=best)
-    asked = _of_part(problem, choice.chosen)
-    asked = replace(asked, hidden=hidden_errors(asked, part, _HIDDEN_EVALUATIONS_LONG_RECORD))
+    asked = _refit_on_full_record(problem, choice.chosen)
+    asked = replace(asked, held_out=held_out_errors(asked, part, _HIDDEN_EVALUATIONS_LONG_RECORD))
     return replace(choice, chosen=asked, free=best)
 
 
-def _of_part(problem: HeldProblem, found: SampledCandidate) -> SampledCandidate:
+def _refit_on_full_record(
+    problem: ZeroOrderHoldProblem, found: SampledCandidate
+) -> SampledCandidate:
     """Return the candidate that was ``found`` on a part, fitted to the whole ``problem``."""
-    return replace(found, problem=problem, fit=refitted(problem, found.fit, found.whitened))
+    return replace(found, problem=problem, fit=refit(problem, found.fit, found.whitened))
 
 
-def _with_poles_more(
-    problem: HeldProblem, found: SampledCandidate, starts: DiscreteStarts
+def _with_further_poles(
+    problem: ZeroOrderHoldProblem, found: SampledCandidate, starts: DiscreteStarts
 ) -> list[SampledCandidate]:
     order = found.order + _POLES_MORE
     if order > MAX_ORDER:
@@ -430,6 +437,6 @@ def _with_poles_more(
     for _ in range(_POLES_MORE):
         grown = with_fast_pole(grown)
     larger = fit(
-        problem, Structure(order, order, False), [*proposed(problem, order, starts), grown]
+        problem, Structure(order, order, False), [*proposed_starts(problem, order, starts), grown]
     )
     return [replace(found, fit=larger, order=order, whitened=False)]

@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.polynomial import polynomial
 from scipy import fft, signal
 
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -33,7 +33,7 @@ _OFF_BORDER = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DiscreteScaled(Scaled):
+class ScaledDiscreteStructure(ScaledStructure):
     """Sections in w of a denominator in q; numerators are polynomials in q."""
 
     def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
@@ -94,7 +94,7 @@ def inside_unit_circle(poles: ComplexArray) -> ComplexArray:
     return np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)
 
 
-class HeldProblem(Problem):
+class ZeroOrderHoldProblem(Problem):
     """A problem whose input is held between samples; ``s`` is q = z⁻¹, the rate 0.5 / period."""
 
     @cached_property
@@ -116,9 +116,9 @@ class HeldProblem(Problem):
         angle = 2 * np.pi * fft.rfftfreq(self.closed_length)
         return np.asarray(np.exp(-1j * angle), np.complex128)
 
-    def parametrised(self, structure: Structure) -> DiscreteScaled:
+    def parametrised(self, structure: Structure) -> ScaledDiscreteStructure:
         """Return how ``structure`` is parametrised over q."""
-        return DiscreteScaled(structure, self.rate)
+        return ScaledDiscreteStructure(structure, self.rate)
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """Return the input, and a pulse at the first sample whose terms make any initial state.
@@ -188,10 +188,10 @@ def coefficients(fitted: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return numerator (n+1,) and denominator (n+1,) in q, its first 1, and their derivatives.
 
     The derivatives (2n + 1, 2n + 1) are of numerator, denominator[1:] by the terms of the
-    numerator, ψ, as :meth:`HeldProblem.columns` orders them.
+    numerator, ψ, as :meth:`ZeroOrderHoldProblem.columns` orders them.
     """
     scaled, order = fitted.scaled, fitted.structure.poles
-    assert isinstance(scaled, DiscreteScaled)
+    assert isinstance(scaled, ScaledDiscreteStructure)
     factors = scaled.polynomials(fitted.nonlinear)
     whole = _product(factors)
     terms = fitted.driven[: order + 1]
@@ -213,7 +213,7 @@ def _product(factors: list[FloatArray]) -> FloatArray:
 
 
 def _changes(
-    scaled: DiscreteScaled, nonlinear: FloatArray, factors: list[FloatArray]
+    scaled: ScaledDiscreteStructure, nonlinear: FloatArray, factors: list[FloatArray]
 ) -> list[FloatArray]:
     """Return the derivatives of the product of ``factors`` by each of ψ, ascending in q."""
     up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
@@ -243,7 +243,7 @@ _APART = 1e-6
 _LEAST = 1e-9
 
 
-def held_equivalent(
+def zero_order_hold_equivalent(
     numerator: FloatArray, denominator: FloatArray, period: float, hold: str
 ) -> TransferFunction | None:
     """Return G(s) of which ``numerator``/``denominator``, ascending in z⁻¹, is the sampled form.
@@ -414,7 +414,7 @@ def _poles(coefficients: FloatArray) -> ComplexArray:
     return np.asarray(np.roots(np.concatenate([[1.0], coefficients])), np.complex128)
 
 
-def grown(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
+def grown_starts(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
     """Return the starts for one pole more than the last of ``smaller``.
 
     A pole too fast to matter, so that a larger model never fits worse; and two as slow as the

@@ -265,7 +265,7 @@ def free_run(
             f"at least {_LEAST_SAMPLES} of both are needed; record longer"
         )
     check_input(input)
-    check_changes(output[counted], "output")
+    check_varies(output[counted], "output")
     driven, free = _responses(model, input - model.working_point[0])
     columns = np.column_stack([*free, np.ones(len(input))])
     unknown = least_squares(columns[counted], (output - driven)[counted])
@@ -287,10 +287,10 @@ def check_input(input: FloatArray) -> None:
             f"the input has {missing!r} values that are not finite; cut the record there, or fill "
             "them in"
         )
-    check_changes(input, "input")
+    check_varies(input, "input")
 
 
-def check_changes(values: FloatArray, name: str) -> None:
+def check_varies(values: FloatArray, name: str) -> None:
     """Raise IdentificationError for a column that does not change; what is finite of it counts."""
     values = values[np.isfinite(values)]
     change = float(np.ptp(values)) if len(values) else 0.0
@@ -301,11 +301,11 @@ def check_changes(values: FloatArray, name: str) -> None:
         )
 
 
-def resting_output(
+def stationary_output(
     discrete: Discrete, input: FloatArray, output: FloatArray, used: BoolArray
 ) -> float:
     """Return the output at which ``discrete`` rests where ``input`` (n,) has its mean."""
-    driven, free = _held_responses(discrete, input - np.mean(input))
+    driven, free = _zero_order_hold_responses(discrete, input - np.mean(input))
     columns = np.column_stack([*free, np.ones(len(input))])
     return float(least_squares(columns[used], (output - driven)[used])[-1])
 
@@ -313,7 +313,7 @@ def resting_output(
 def _responses(model: SampledModel, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return response (n,) to ``motion``, and (k, n) to each state that the model may start in."""
     if model.discrete is not None:
-        return _held_responses(model.discrete, motion)
+        return _zero_order_hold_responses(model.discrete, motion)
     assert model.continuous is not None  # a band-limited model has nothing else
     recursion = Recursion(discretise(model.continuous, model.sample_period))
     recursion.start(motion[:1])
@@ -321,7 +321,9 @@ def _responses(model: SampledModel, motion: FloatArray) -> tuple[FloatArray, Flo
     return recursion.run(motion), _decays(np.real(np.poly(poles)), len(poles), len(motion))
 
 
-def _held_responses(discrete: Discrete, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _zero_order_hold_responses(
+    discrete: Discrete, motion: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     late = np.roll(motion, discrete.delay)
     late[: discrete.delay] = 0.0
     driven = signal.lfilter(discrete.numerator, discrete.denominator, late)

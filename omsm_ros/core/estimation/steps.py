@@ -15,7 +15,7 @@ from scipy import special
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
-from omsm_ros.readable import counted, quantity
+from omsm_ros.readable import counts_text, quantity
 
 # A fit of even one parameter with its offset, drift and gain needs a multiple of them.
 LEAST_SAMPLES = 50
@@ -28,7 +28,7 @@ NOISE_FACTOR = 20.0
 TRAVEL_PART = 2e-3
 _DIFFERENCES = (2, 4, 6, 8)
 # Rest is the axis staying put for this long, and an edge ends when it begins.
-_REST_S = 20e-3
+_STATIONARY_S = 20e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +94,13 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
 
 def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
     """Return True where z leaves its value by more than ``threshold`` within a rest's duration."""
-    width = min(max(round(_REST_S / sample_period), 2), len(z) - 1)
+    width = min(max(round(_STATIONARY_S / sample_period), 2), len(z) - 1)
     changes = np.abs(z[width:] - z[:-width]) > threshold
     # A change between k and k + width lies anywhere between: close the window over it.
-    return lasting(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
+    return extended(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
 
 
-def lasting(flags: BoolArray, samples: int) -> BoolArray:
+def extended(flags: BoolArray, samples: int) -> BoolArray:
     """Return True where ``flags`` (n,) is, and for ``samples`` after it, (n,)."""
     count = np.concatenate([[0], np.cumsum(flags)])
     before = np.maximum(np.arange(len(flags)) - samples, 0)
@@ -172,7 +172,7 @@ def check_usable(record: MotionRecord) -> None:
     usable = int(np.sum(record.ok))
     if usable < LEAST_SAMPLES:
         raise StepTestError(
-            f"{usable!r} of {len(record)} samples are usable ({counted(record.counts)}); "
+            f"{usable!r} of {len(record)} samples are usable ({counts_text(record.counts)}); "
             "check the probe's target and range, and the encoder"
         )
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import (
-    Cells,
     DeviationMap,
-    Figure,
-    noise_beside,
+    GridCells,
+    UncertainValue,
+    neighbour_noise,
     root_mean_square,
 )
 from omsm_ros.core.form.part_figures import (
@@ -28,8 +28,8 @@ from omsm_ros.core.form.part_figures import (
 )
 from omsm_ros.core.form.texture import (
     Bands,
-    Curve,
     PowerDensity,
+    UncertainCurve,
     bands_of,
     power_density,
     profiles,
@@ -40,12 +40,17 @@ from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.degrees_of_freedom import Registration
-from omsm_ros.core.registration.placement import Aperture, Placed, Portion, Portions, placed
+from omsm_ros.core.registration.placement import Aperture, Placed, PointBatch, PointBatches, placed
 from omsm_ros.core.registration.register import CHUNK, register
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_slopes, zernike_values
+from omsm_ros.core.surface.zernike_terms import (
+    ZernikeIndex,
+    first_terms,
+    zernike_slopes,
+    zernike_values,
+)
 from omsm_ros.errors import DataError
 
 # Where on the part do its terms lie, if points tell badly how it was turned or shifted?
@@ -58,7 +63,7 @@ from omsm_ros.errors import DataError
 _MOST_POINTS = 4_000
 
 
-def with_open_place(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
+def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
     """Return the fit with what the open place of the part may do to its terms.
 
     Of each freedom that no points determine, and of each error of the pose beside what that does
@@ -70,7 +75,9 @@ def with_open_place(fit: ZernikeFit, map_: DeviationMap, found: Registration) ->
         fit.coefficients @ along / fit.disc.radius
         for along in zernike_slopes(*fit.disc.scaled(few.x, few.y), fit.terms)
     )
-    moves = np.concatenate([found.displaced(few.x, few.y), found.glides(few.x, few.y)])
+    moves = np.concatenate(
+        [found.displaced(few.x, few.y), found.undetermined_displacements(few.x, few.y)]
+    )
     changes = -np.einsum("rin,in->rn", moves, np.stack(list(slopes)))
     made = fit_zernikes(
         few.x, few.y, few.deviation, fit.terms, fit.disc, weights=few.area, effects=changes
@@ -85,7 +92,7 @@ def with_open_place(fit: ZernikeFit, map_: DeviationMap, found: Registration) ->
 # The terms of ISO 10110-5 for the form of an optic, from its deviation along the normal.
 
 
-def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, Figure]:
+def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainValue]:
     """Return sagitta deviation (A), irregularity (B), its symmetric part (C), and rms, each [m].
 
     A is the extent over the disc of the power that fits best beside piston and tilts alone; B the
@@ -110,7 +117,9 @@ def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
 
     It has no noise of single points: what they do to its few terms is in its effects.
     """
-    of_noise = replace(map_, effects=np.concatenate([map_.effects, _shaken(map_, disc)]), noise=0.0)
+    of_noise = replace(
+        map_, effects=np.concatenate([map_.effects, _noise_effects(map_, disc)]), noise=0.0
+    )
     irregular, uneven = without_power(of_noise, disc), asymmetric(of_noise, disc)
     return replace(
         irregular,
@@ -119,7 +128,7 @@ def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     )
 
 
-def _shaken(map_: DeviationMap, disc: Aperture) -> FloatArray:
+def _noise_effects(map_: DeviationMap, disc: Aperture) -> FloatArray:
     """Return independent effects (k, n) [m] of the noise of points on the symmetric terms."""
     columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
     weighted = columns * map_.area
@@ -129,15 +138,15 @@ def _shaken(map_: DeviationMap, disc: Aperture) -> FloatArray:
     return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T @ columns, np.float64)
 
 
-def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> Figure:
+def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
     """Return twice the power that fits best beside piston and tilts, over the area.
 
     On a whole disc that is the term of the fit. On a strip or a ring the terms of a fit share what
     a sphere alone would take, and are extrapolated to where nobody measured. What the fit leaves
     has no power, so that a sum of its terms is the power with all that is uncertain of it.
     """
-    if Term(2, 0) not in fit.terms:
-        return Figure(None, None)
+    if ZernikeIndex(2, 0) not in fit.terms:
+        return UncertainValue(None, None)
     places = [fit.terms.index(term) for term in POWER]
     gram, right = np.zeros((len(POWER), len(POWER))), np.zeros((len(POWER), len(fit.terms)))
     for begin in range(0, len(map_), ZERNIKE_FIT_CHUNK):
@@ -146,11 +155,11 @@ def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> Figure:
         chosen = columns[places] * map_.area[chunk]
         right += chosen @ columns.T
         gram += chosen @ columns[places].T
-    shares = np.linalg.solve(gram, right)[POWER.index(Term(2, 0))]
+    shares = np.linalg.solve(gram, right)[POWER.index(ZernikeIndex(2, 0))]
     variance = shares @ fit.covariance @ shares + np.sum(np.square(shares @ fit.effects))
     # Of heights that are metres off, rounding is all that is left of it.
     uncertainty = float(2 * np.sqrt(variance)) if variance >= 0 else None
-    return Figure(float(2 * np.abs(shares @ fit.coefficients)), uncertainty)
+    return UncertainValue(float(2 * np.abs(shares @ fit.coefficients)), uncertainty)
 
 
 ZERNIKES = first_terms(37, "fringe")
@@ -159,7 +168,7 @@ MOST_WEIGHED = 2**19
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Form:
+class FormResult:
     """The form of a part.
 
     registration: how it sits;  aperture: the disc of the part on which it is judged
@@ -172,17 +181,17 @@ class Form:
     registration: Registration
     aperture: Aperture
     map: DeviationMap
-    deviation: dict[str, Figure]
+    deviation: dict[str, UncertainValue]
     zernike: ZernikeFit
     bands: Bands
-    profiles: dict[str, Curve]
+    profiles: dict[str, UncertainCurve]
     density: PowerDensity
     counts: dict[str, int]
 
 
 def analyse_form(
     surface: Surface,
-    portions: Portions,
+    portions: PointBatches,
     asked: Sequence[str],
     *,
     sources: Sequence[str] = (),
@@ -190,10 +199,10 @@ def analyse_form(
     aperture: Aperture | None = None,
     even: bool = False,
     filters: tuple[float | None, float | None] = (None, None),
-) -> Form:
+) -> FormResult:
     """Register the points and judge what they deviate by.
 
-    portions: reads the points, see :class:`omsm_ros.core.registration.placement.Portion`
+    portions: reads the points, see :class:`omsm_ros.core.registration.placement.PointBatch`
     asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
     bounds: of these, the ones of which only an upper bound is known
     aperture: of the part; None: the disc about the part's origin that holds all points
@@ -206,17 +215,17 @@ def analyse_form(
     gathered = _Gathered(surface, found, aperture)
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
-            gathered.add(Portion(*(v[..., begin : begin + CHUNK] for v in portion)))
+            gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
     bounded = [n for n, name in enumerate(sources) if name in bounds]
     # What is held may be where it should: how far off it is at most is all that is known.
     bounded += range(len(sources), found.moved.shape[1])
     map_ = gathered.map(found, even, bounded)
     points = (map_.x, map_.y, map_.deviation)
     zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
-    zernike = with_open_place(zernike, map_, found)
-    cells = Cells.of(map_)
+    zernike = with_pose_uncertainty(zernike, map_, found)
+    cells = GridCells.of(map_)
     bands = bands_of(cells, *filters)
-    return Form(
+    return FormResult(
         registration=found,
         aperture=found.disc,
         map=map_,
@@ -231,7 +240,9 @@ def analyse_form(
     )
 
 
-def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> dict[str, Figure]:
+def _figures(
+    map_: DeviationMap, gathered: _Gathered, found: Registration
+) -> dict[str, UncertainValue]:
     rest = without_second_order(map_)
     whole, robust = extents_of_part(map_, found.disc)
     fitted = best_fit(map_)
@@ -244,20 +255,20 @@ def _figures(map_: DeviationMap, gathered: _Gathered, found: Registration) -> di
         "peak_to_valley_without_second_order": extents_of_part(rest, found.disc)[0],
         "rms_without_second_order": rms_of_part(rest),
         # As measured: what errors have added is in them.
-        "peak_to_valley_of_points": Figure(gathered.extent, None),
-        "rms_of_points": Figure(root_mean_square(map_), None),
-        "point_noise": Figure(map_.noise, None),
+        "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
+        "rms_of_points": UncertainValue(root_mean_square(map_), None),
+        "point_noise": UncertainValue(map_.noise, None),
         # Before the fit the pose is part of the deviation, and its uncertainty is not asked for.
-        "rms_before_fit": Figure(found.before, None),
+        "rms_before_fit": UncertainValue(found.before, None),
     }
 
 
 def _textures(
-    map_: DeviationMap, cells: Cells, bands: Bands, found: Registration
-) -> dict[str, Figure]:
+    map_: DeviationMap, cells: GridCells, bands: Bands, found: Registration
+) -> dict[str, UncertainValue]:
     formless, rest = without_form(map_, found.disc), without_second_order(map_)
-    return texture(cells, Cells.of(formless), bands) | slopes_without_second_order(
-        Cells.of(rest), bands
+    return texture(cells, GridCells.of(formless), bands) | slopes_without_second_order(
+        GridCells.of(rest), bands
     )
 
 
@@ -273,7 +284,7 @@ class _Gathered:
             ("read", "used", "not_finite", "beyond_surface", "outside_aperture", "outliers"), 0
         )
 
-    def add(self, portion: Portion) -> None:
+    def add(self, portion: PointBatch) -> None:
         """Take in the next points."""
         finite = np.isfinite(portion.x) & np.isfinite(portion.y) & np.isfinite(portion.height)
         at, found = self._found.placement, self._found
@@ -331,7 +342,7 @@ class _Gathered:
             area=area_weights(rows[0], rows[1], even=even),
             effects=rows[3:],
             # Points need not come in the order of a path; then their neighbours are elsewhere.
-            noise=min(float(np.median(self._noise)), noise_beside(*rows[:3]), found.noise),
+            noise=min(float(np.median(self._noise)), neighbour_noise(*rows[:3]), found.noise),
             # The sources' effects stand behind those of the pose.
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
             moves=found.moves,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.form.deviation_map import Cells, DeviationMap
+from omsm_ros.core.form.deviation_map import DeviationMap, GridCells
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import gradient_of
@@ -65,7 +65,7 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
 
     Raises DataError for a wavelength that is finer than four cells of the measured points.
     """
-    cells = Cells.of(map_)
+    cells = GridCells.of(map_)
     if low_pass < _LEAST_CELLS * cells.pitch:
         raise DataError(
             f"low-pass of {low_pass!r} m is finer than the points resolve, expected "

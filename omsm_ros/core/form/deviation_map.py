@@ -12,7 +12,7 @@ from omsm_ros.core.streams.statistics import noise_of
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class UncertainValue:
     """A value and its standard uncertainty, in one unit; None: not evaluated."""
 
     value: float | None
@@ -80,7 +80,7 @@ def weighted_quantiles(
     return tuple(float(value) for value in found)
 
 
-def noise_beside(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
+def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
     """Return the same of points (n,) in any order: from each to those beside it in strips of y."""
     span_x, span_y = float(np.ptp(x)), float(np.ptp(y))
     spacing = np.sqrt(span_x * span_y / max(len(x), 1))
@@ -103,7 +103,7 @@ _ALPHA = float(np.sqrt(np.log(2) / np.pi))
 
 
 @dataclass(frozen=True, eq=False)
-class Cells:
+class GridCells:
     """Means on cells, rows along y.
 
     x, y: middles of the columns (c,) and rows (r,) [m];  pitch: of the cells [m]
@@ -121,7 +121,7 @@ class Cells:
     effects: FloatArray
 
     @classmethod
-    def of(cls, map_: DeviationMap) -> Cells:
+    def of(cls, map_: DeviationMap) -> GridCells:
         """Return the means of a map on cells as fine as its points allow, at most 256 across."""
         spans = float(np.ptp(map_.x)), float(np.ptp(map_.y))
         # Of a strip fewer are needed across; eight points a cell where the area is filled.
@@ -205,7 +205,7 @@ class Conformity:
         return asdict(self)
 
 
-def conformity(figure: Figure, tolerance: float) -> Conformity | None:
+def conformity(figure: UncertainValue, tolerance: float) -> Conformity | None:
     """Return whether ``figure`` is at most ``tolerance`` [m]; None for a figure without a value."""
     if figure.value is None:
         return None

@@ -30,14 +30,14 @@ import numpy as np
 
 from omsm_ros.core.form.deviation_map import (
     DeviationMap,
-    Figure,
+    UncertainValue,
     gaussian_weights,
     weighted_quantiles,
 )
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 # Means of scattered values around each of their points, over the width that takes most noise.
 #
@@ -50,7 +50,7 @@ _CUTOFFS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 _SEED_LOCAL_MEANS = 11
 
 
-class Chosen(NamedTuple):
+class ChosenMeans(NamedTuple):
     """The width whose means come closest to what is there without noise.
 
     means: of its values (n,);  rest: share of the noise of a point in what they leave of it
@@ -112,7 +112,7 @@ class LocalMeans:
         return np.asarray(self.along_y @ sums.reshape(self.total.shape) @ self.along_x, np.float64)
 
 
-def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float) -> Chosen:
+def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float) -> ChosenMeans:
     """Return the means whose expected error is least for ``values`` at x, y, each (n,).
 
     The error is told by the values themselves (C. Stein's unbiased estimate), with the trace from
@@ -125,7 +125,7 @@ def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float
         left = float(np.mean((values - means(values)) ** 2))
         kept = means(signs)
         error = left - noise**2 * (1 - 2 * float(np.mean(signs * kept)))
-        found.append(Chosen(means, float(np.mean((signs - kept) ** 2)), error))
+        found.append(ChosenMeans(means, float(np.mean((signs - kept) ** 2)), error))
     return min(found, key=lambda each: each.error)
 
 
@@ -142,7 +142,7 @@ _DRAWS, _SEED = 200, 7
 _NOISES = 40
 
 
-def rms_of_part(map_: DeviationMap) -> Figure:
+def rms_of_part(map_: DeviationMap) -> UncertainValue:
     """Return the area-weighted rms about zero that the part has, by closed form.
 
     The mean square of deviations s + e is that of s, of e, and twice their mean product.
@@ -167,7 +167,7 @@ def rms_of_part(map_: DeviationMap) -> Figure:
     return _of_square(square, float(np.sqrt(variance)))
 
 
-def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]:
+def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue, UncertainValue]:
     """Return the peak to valley of the part, and the extent of 99.5 % of its area.
 
     disc: on which the smooth terms are
@@ -201,7 +201,7 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[Figure, Figure]
         of_blur = 2 * of_some * float(np.sqrt(2)) * blurred
         spread = _length(of_errors, _rms(more - again), of_taken, of_blur)
         figure = _of_square(square, spread)
-        found.append(Figure((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
+        found.append(UncertainValue((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
 
 
@@ -305,7 +305,7 @@ def _variance_by_noise(map_: DeviationMap, share: FloatArray) -> float:
     return float(np.sum(share**2 * (4 * map_.deviation**2 * noise + 4 * noise**2)))
 
 
-def _of_square(square: float, spread: float) -> Figure:
+def _of_square(square: float, spread: float) -> UncertainValue:
     """Return the root of a ``square`` [m²] known to ``spread``, k = 1.
 
     Its uncertainty is half of the larger side of the interval that k = 2 of the square is. Errors
@@ -315,7 +315,7 @@ def _of_square(square: float, spread: float) -> Figure:
     value = float(np.sqrt(max(square, 0.0)))
     high = float(np.sqrt(max(square + 2 * spread, spread)))
     low = float(np.sqrt(max(square - 2 * spread, 0.0)))
-    return Figure(value, max(high - value, value - low) / 2)
+    return UncertainValue(value, max(high - value, value - low) / 2)
 
 
 # Maps without some of their terms: what bending, focus or turning would take away.
@@ -324,12 +324,12 @@ def _of_square(square: float, spread: float) -> Figure:
 
 # Piston, both tilts and power; what a Gaussian of a quarter of the side takes for form; what a
 # turned part has all around, to order 12.
-POWER = (Term(0, 0), Term(1, -1), Term(1, 1), Term(2, 0))
+POWER = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1), ZernikeIndex(2, 0))
 _FORM = terms_up_to(4)
-SYMMETRIC = tuple(Term(n, 0) for n in range(4, 14, 2))
+SYMMETRIC = tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
 
 
-def without(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
+def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
     """Return the map without its area-weighted best sum of ``columns`` (k, n)."""
     weighted = columns * map_.area
     # Of points on a line some columns are the same; then the least solution serves.
@@ -347,23 +347,23 @@ def best_fit(map_: DeviationMap) -> DeviationMap:
     """
     moves = map_.effects[map_.moves]
     size = np.sqrt(np.mean(moves**2, axis=1))
-    return without(map_, moves[size > 0] / size[size > 0, np.newaxis])
+    return without_columns(map_, moves[size > 0] / size[size > 0, np.newaxis])
 
 
 def without_second_order(map_: DeviationMap) -> DeviationMap:
     """Return the map without its best ``Σ c_ij x^i y^j``, i + j ≤ 2."""
     u, v = (_scaled(values) for values in (map_.x, map_.y))
-    return without(map_, np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]))
+    return without_columns(map_, np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]))
 
 
 def without_tilt(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map without piston and tilts."""
-    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER[:3]))
+    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER[:3]))
 
 
 def without_power(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map without piston, tilts and power: the irregularity of ISO 10110-5."""
-    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER))
+    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER))
 
 
 def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
@@ -371,12 +371,12 @@ def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
 
     A Gaussian filter would leave them along the rim, where its window is cut off.
     """
-    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), _FORM))
+    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), _FORM))
 
 
 def asymmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map without power and without what is the same all around, up to order 12."""
-    return without(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER + SYMMETRIC))
+    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER + SYMMETRIC))
 
 
 def _scaled(values: FloatArray) -> FloatArray:

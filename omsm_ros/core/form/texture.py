@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.form.deviation_map import Cells, DeviationMap, Figure
+from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
@@ -32,7 +32,9 @@ class Bands:
     rms_bands: dict[str, tuple[float | None, float]]
 
 
-def bands_of(cells: Cells, s_filter: float | None = None, l_filter: float | None = None) -> Bands:
+def bands_of(
+    cells: GridCells, s_filter: float | None = None, l_filter: float | None = None
+) -> Bands:
     """Return the wavelengths asked for, or else three cells, and a quarter of the longest side.
 
     Raises DataError where the two leave nothing between them.
@@ -54,22 +56,22 @@ def bands_of(cells: Cells, s_filter: float | None = None, l_filter: float | None
 
 
 @dataclass(frozen=True, eq=False)
-class _Filtered:
+class _FilteredBand:
     """One band of the cells: the map, the map under as much noise again, and what errors do."""
 
     values: FloatArray
     noisier: FloatArray
     effects: FloatArray
 
-    def figure(self, of: Callable[[FloatArray], float]) -> Figure:
+    def figure(self, of: Callable[[FloatArray], float]) -> UncertainValue:
         """Return a figure of the values, its uncertainty from noise and from every effect."""
         value = of(self.values)
         noise = (of(self.noisier) - value) / (np.sqrt(2) - 1)
         shares = [(of(self.values + e) - of(self.values - e)) / 2 for e in self.effects]
-        return Figure(value, float(np.sqrt(noise**2 + np.sum(np.square(shares)))))
+        return UncertainValue(value, float(np.sqrt(noise**2 + np.sum(np.square(shares)))))
 
 
-def texture(cells: Cells, formless: Cells, bands: Bands) -> dict[str, Figure]:
+def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, UncertainValue]:
     """Return Sa, Sq, Sz [m], Ssk, Sku [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation, of which the L-filter leaves the fine part
@@ -81,22 +83,22 @@ def texture(cells: Cells, formless: Cells, bands: Bands) -> dict[str, Figure]:
     return found | _slope_figures(cells, bands)
 
 
-def slopes_without_second_order(rest: Cells, bands: Bands) -> dict[str, Figure]:
+def slopes_without_second_order(rest: GridCells, bands: Bands) -> dict[str, UncertainValue]:
     """Return the rms slope [1] of cells whose second order was taken off."""
     return {"slope_rms_without_second_order": _slope_figures(rest, bands)["slope_rms"]}
 
 
-def _slope_figures(cells: Cells, bands: Bands) -> dict[str, Figure]:
+def _slope_figures(cells: GridCells, bands: Bands) -> dict[str, UncertainValue]:
     smooth = _band(cells, None, bands.s_filter, whole=True)
     if not len(_slopes(smooth.values, cells)):
-        return dict.fromkeys(("slope_rms", "slope_largest"), Figure(None, None))
+        return dict.fromkeys(("slope_rms", "slope_largest"), UncertainValue(None, None))
     return {
         "slope_rms": smooth.figure(lambda image: _rms_about_zero(_slopes(image, cells))),
         "slope_largest": smooth.figure(lambda image: float(np.max(_slopes(image, cells)))),
     }
 
 
-def _band(cells: Cells, long: float | None, short: float, whole: bool = False) -> _Filtered:
+def _band(cells: GridCells, long: float | None, short: float, whole: bool = False) -> _FilteredBand:
     """Return what has wavelengths from ``short`` to ``long``: present cells, or whole images.
 
     The L-filter takes its share of what the S-filter left (ISO 25178-2), not of the cells.
@@ -107,7 +109,7 @@ def _band(cells: Cells, long: float | None, short: float, whole: bool = False) -
     if long is not None:
         fine = fine - cells.smoothed(fine, long)
     rows = fine if whole else fine[:, cells.present]
-    return _Filtered(rows[0], rows[0] + rows[1], rows[2:])
+    return _FilteredBand(rows[0], rows[0] + rows[1], rows[2:])
 
 
 def _rms(values: FloatArray) -> float:
@@ -132,7 +134,7 @@ def _rms_about_zero(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _slopes(image: FloatArray, cells: Cells) -> FloatArray:
+def _slopes(image: FloatArray, cells: GridCells) -> FloatArray:
     """Return the slopes (k,) over two cells where all neighbours are there; of a row, along it."""
     ways = [axis for axis, size in enumerate(image.shape) if size > 1]
     inside = cells.present.copy()
@@ -165,7 +167,7 @@ _NOISE_SEED_POWER_DENSITY = 22
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class UncertainCurve:
     """A function on the points where it was taken, and its standard uncertainty, each (k,)."""
 
     position: FloatArray
@@ -190,8 +192,8 @@ class PowerDensity:
     y: FloatArray
     areal: FloatArray
     mean_square: float
-    radial: Curve
-    azimuthal: Curve
+    radial: UncertainCurve
+    azimuthal: UncertainCurve
     band: tuple[float, float]
     mean_square_in_band: float
 
@@ -210,7 +212,7 @@ class PowerDensity:
         return x.mean(axis=1), y.mean(axis=1), np.asarray(blocks.mean(axis=(1, 3)))
 
 
-def power_density(cells: Cells) -> PowerDensity:
+def power_density(cells: GridCells) -> PowerDensity:
     """Return the densities of a map; their uncertainty is from the scatter of the periodogram.
 
     A mean over k independent cells of frequency is uncertain by its k-th root, and noise of the
@@ -230,14 +232,14 @@ def power_density(cells: Cells) -> PowerDensity:
     return PowerDensity(x, y, areal, mean_square, radial, azimuthal, band, inside)
 
 
-def _window(cells: Cells) -> FloatArray:
+def _window(cells: GridCells) -> FloatArray:
     """Return a taper (r, c) that falls to zero at the rim of an ellipse about the cells."""
     across = [np.linspace(-1, 1, size + 2)[1:-1] for size in cells.present.shape]
     radius = np.minimum(np.hypot(across[0][:, np.newaxis], across[1][np.newaxis]), 1.0)
     return np.asarray(np.cos(np.pi * radius / 2) ** 2 * cells.present)
 
 
-def _areal(cells: Cells, image: FloatArray, window: FloatArray) -> tuple[FloatArray, float]:
+def _areal(cells: GridCells, image: FloatArray, window: FloatArray) -> tuple[FloatArray, float]:
     square = float(np.sum(window**2))
     # The mean under the window is no content, and would leak into the lowest frequencies.
     level = float(np.sum(window * image) / np.sum(window))
@@ -255,7 +257,7 @@ def _steps(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 def _over_frequency(
     x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray
-) -> tuple[Curve, float]:
+) -> tuple[UncertainCurve, float]:
     """Return S over radial frequency, and the width of its rings [1/m]."""
     steps = _steps(x, y)
     cell, step = steps[0] * steps[1], max(steps)
@@ -276,10 +278,12 @@ def _over_frequency(
     value, floor = (total[1:] * cell / _PARTS**2 / area for total in (content, of_noise))
     # Of a real map each frequency stands twice.
     independent = np.maximum(area / cell / 2, 1.0)
-    return Curve(position, value, np.hypot(value / np.sqrt(independent), floor)), step
+    return UncertainCurve(position, value, np.hypot(value / np.sqrt(independent), floor)), step
 
 
-def _over_direction(x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray) -> Curve:
+def _over_direction(
+    x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray
+) -> UncertainCurve:
     steps = _steps(x, y)
     angle = np.arctan2(y[:, np.newaxis] + 0 * x, x[np.newaxis] + 0 * y[:, np.newaxis]).ravel()
     sector = np.floor((angle % np.pi) / np.pi * _SECTORS).astype(np.int64) % _SECTORS
@@ -290,7 +294,7 @@ def _over_direction(x: FloatArray, y: FloatArray, areal: FloatArray, noise: Floa
     )
     scatter = np.sqrt(np.bincount(sector, areal.ravel() ** 2, _SECTORS)) * per_angle
     directions = np.asarray((np.arange(_SECTORS) + 0.5) * np.pi / _SECTORS, np.float64)
-    return Curve(directions, content, np.asarray(np.hypot(scatter, of_noise)))
+    return UncertainCurve(directions, content, np.asarray(np.hypot(scatter, of_noise)))
 
 
 # Profiles of a map: along x, y and 45°, over the radius, and around.
@@ -305,7 +309,7 @@ _RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
 Averaging = Callable[[FloatArray], Profile]
 
 
-def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, Curve]:
+def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     """Return the mean deviations [m] over x, y, the diagonal, radius [m], and angle [rad].
 
     Uncertainties are from the points' noise and from all sources of error. A profile that no point
@@ -349,9 +353,9 @@ def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) 
     return Profile(position=mean(angle), value=mean(deviation[outer]), points=points[filled])
 
 
-def _curve(map_: DeviationMap, average: Averaging) -> Curve:
+def _curve(map_: DeviationMap, average: Averaging) -> UncertainCurve:
     profile = average(map_.deviation)
     variance = map_.noise**2 / np.maximum(profile.points, 1)
     for effect in map_.effects:
         variance = variance + average(effect).value ** 2
-    return Curve(profile.position, profile.value, np.sqrt(variance))
+    return UncertainCurve(profile.position, profile.value, np.sqrt(variance))

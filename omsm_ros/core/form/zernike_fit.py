@@ -16,7 +16,7 @@ import numpy as np
 
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.core.surface.zernike_terms import Term, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 from omsm_ros.errors import DataError
 
 # Where does a path come past its own neighbourhood again: turns of a spiral, lines of a raster?
@@ -47,9 +47,9 @@ def _crossings(position: FloatArray) -> IntArray:
     """Return the points (g,) at which ``position`` (n,) has come from below to above its middle."""
     low, high = float(position.min()), float(position.max())
     middle, near = (low + high) / 2, _NEAR_MIDDLE * (high - low)
-    aside = np.flatnonzero(np.abs(position - middle) > near)
-    above = position[aside] > middle
-    return np.asarray(aside[1:][above[1:] & ~above[:-1]], np.int64)
+    off_middle = np.flatnonzero(np.abs(position - middle) > near)
+    above = position[off_middle] > middle
+    return np.asarray(off_middle[1:][above[1:] & ~above[:-1]], np.int64)
 
 
 # Points at a time: 37 terms of them stay in a cache of 2.5 MB; all at once take thrice as long.
@@ -77,10 +77,10 @@ class ZernikeFit:
     """
 
     disc: Aperture
-    terms: tuple[Term, ...]
+    terms: tuple[ZernikeIndex, ...]
     coefficients: FloatArray
     covariance: FloatArray
-    left_out: tuple[Term, ...]
+    left_out: tuple[ZernikeIndex, ...]
     effects: FloatArray
 
     @property
@@ -103,7 +103,7 @@ def fit_zernikes(
     x: FloatArray,
     y: FloatArray,
     deviation: FloatArray,
-    terms: Sequence[Term],
+    terms: Sequence[ZernikeIndex],
     disc: Aperture,
     *,
     weights: FloatArray | None = None,
@@ -141,7 +141,7 @@ def fit_zernikes(
         disc=disc,
         terms=used,
         coefficients=found[:, 0],
-        covariance=_no_less(*(inverse @ each @ inverse for each in scores)),
+        covariance=_with_variance_floor(*(inverse @ each @ inverse for each in scores)),
         left_out=tuple(t for t in terms if t not in used),
         effects=found[:, 1:],
     )
@@ -151,7 +151,7 @@ def _normal_equations(
     x: FloatArray,
     y: FloatArray,
     values: FloatArray,
-    terms: Sequence[Term],
+    terms: Sequence[ZernikeIndex],
     disc: Aperture,
     weights: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
@@ -165,7 +165,7 @@ def _normal_equations(
     return gram, right
 
 
-def _separable(gram: FloatArray, terms: Sequence[Term]) -> list[int]:
+def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex]) -> list[int]:
     """Return the places of the terms up to the highest order that is well conditioned."""
     for order in range(max(t.n for t in terms), -1, -1):
         kept = [k for k, t in enumerate(terms) if t.n <= order]
@@ -183,7 +183,7 @@ def _scores(
     y: FloatArray,
     deviation: FloatArray,
     coefficients: FloatArray,
-    terms: Sequence[Term],
+    terms: Sequence[ZernikeIndex],
     disc: Aperture,
     weights: FloatArray | None,
     inverse: FloatArray,
@@ -212,20 +212,20 @@ def _scores(
         residual = deviation[chunk] - coefficients @ columns
         weighted = columns if weights is None else columns * weights[chunk]
         products = weighted * residual
-        alone = weighted * _from_point_to_point(residual) if differences else products
+        alone = weighted * _uncorrelated_residual(residual) if differences else products
         single += alone @ alone.T
         sizes = ends[groups] - begins[groups]
-        sums[:, groups] = _sums(products, columns, weighted, inverse, sizes)
+        sums[:, groups] = _group_sums(products, columns, weighted, inverse, sizes)
         first = last
     scatter = np.diff(sums, differences, axis=1) / np.sqrt(comb(2 * differences, differences))
     count = max(scatter.shape[1], 2)
     # The sum over all groups is zero: where they are taken as they are, one of them is not free.
     free = count if differences else count - 1
-    freedom = max(1 - len(terms) / len(x), 1e-3)
-    return scatter @ scatter.T * len(begins) / free / freedom, single / freedom
+    dof = max(1 - len(terms) / len(x), 1e-3)
+    return scatter @ scatter.T * len(begins) / free / dof, single / dof
 
 
-def _from_point_to_point(residual: FloatArray) -> FloatArray:
+def _uncorrelated_residual(residual: FloatArray) -> FloatArray:
     """Return what neighbours of a path do not share of the ``residual`` (n,), as large as noise."""
     if len(residual) < 3:
         return residual
@@ -245,7 +245,7 @@ def _groups(x: FloatArray, y: FloatArray, terms: int) -> tuple[IntArray, int]:
     return np.arange(0, len(x), size), 0
 
 
-def _sums(
+def _group_sums(
     products: FloatArray,
     columns: FloatArray,
     weighted: FloatArray,
@@ -266,7 +266,7 @@ def _sums(
     return np.asarray(sums, np.float64)
 
 
-def _no_less(covariance: FloatArray, floor: FloatArray) -> FloatArray:
+def _with_variance_floor(covariance: FloatArray, floor: FloatArray) -> FloatArray:
     """Return the covariance (k, k), no variance below that of the ``floor``.
 
     Few groups lie at the rim: by chance they may state far too little.

@@ -15,8 +15,8 @@ from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.covariance import gain_uncertainty_alone, parameter_covariance
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.identification.covariance_terms import HARMLESS_DELAY_S
-from omsm_ros.core.identification.evidence import Evidence
-from omsm_ros.core.identification.model_error_search import ModelledTerm, Searched
+from omsm_ros.core.identification.evidence import IdentificationEvidence
+from omsm_ros.core.identification.model_error_search import ModelledTerm, SearchResult
 from omsm_ros.core.identification.residual_tests import response_agreement
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
@@ -35,11 +35,11 @@ from omsm_ros.core.model_errors.families import (
     PERIODIC,
     STIFFENING,
     VIBRATION,
-    Term,
+    ModelErrorTerm,
 )
-from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Judged
+from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, ScoreTest
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.readable import chance, percent, plain, quantity
+from omsm_ros.readable import p_value_text, percent, plain, quantity
 
 # Say which departures from a linear, steady response were found, and what to do at the machine.
 #
@@ -69,46 +69,52 @@ _REMEDY = {
 }
 
 
-def departures(searched: Searched) -> Finding:
+def model_errors(searched: SearchResult) -> Finding:
     """Report the departures that were modelled, and those that could not be."""
     fit, problem = searched.model.chosen.fit, searched.prepared.problem
-    beside, turning = _sizes(problem, fit, searched.beside)
+    nuisance_terms, turning = _sizes(problem, fit, searched.nuisance_terms)
     costs = [turning] + [
         _ON_SCAN.get(modelled.term.family, 0.0) * float(np.hypot(size, uncertainty))
-        for modelled, (size, uncertainty) in zip(searched.beside, beside, strict=True)
+        for modelled, (size, uncertainty) in zip(
+            searched.nuisance_terms, nuisance_terms, strict=True
+        )
     ]
     entries = [
         _entry(modelled.term, size, uncertainty)
-        for modelled, (size, uncertainty) in zip(searched.beside, beside, strict=True)
+        for modelled, (size, uncertainty) in zip(
+            searched.nuisance_terms, nuisance_terms, strict=True
+        )
     ]
     backlash = [
         2 * size
-        for modelled, (size, _) in zip(searched.beside, beside, strict=True)
+        for modelled, (size, _) in zip(searched.nuisance_terms, nuisance_terms, strict=True)
         if modelled.term.family == BACKLASH
     ]
     return Finding(
         {
-            "departures": entries + [_entry(term, None, None) for term in searched.in_response],
+            "departures": entries + [_entry(term, None, None) for term in searched.added_poles],
             "motion_error_m": float(np.sqrt(np.sum(np.square(costs)))),
             "backlash_m": max(backlash, default=0.0),
         },
         {"false_alarm_p": FALSE_ALARM},
-        reasons=tuple(_unmodelled(judged) for judged in searched.unmodelled),
+        reasons=tuple(_unmodelled_text(judged) for judged in searched.unmodelled),
         reservations=(
             *(
-                f"{_words(modelled.term, size)}; it is modelled beside the response: "
+                f"{_term_text(modelled.term, size)}; it is modelled beside the response: "
                 + _REMEDY[modelled.term.family]
-                for modelled, (size, _) in zip(searched.beside, beside, strict=True)
+                for modelled, (size, _) in zip(searched.nuisance_terms, nuisance_terms, strict=True)
             ),
             *(
-                f"{_words(term, None)}; it is part of the response: {_REMEDY[term.family]}"
-                for term in searched.in_response
+                f"{_term_text(term, None)}; it is part of the response: {_REMEDY[term.family]}"
+                for term in searched.added_poles
             ),
         ),
     )
 
 
-def _entry(term: Term, size: float | None, uncertainty: float | None) -> dict[str, object]:
+def _entry(
+    term: ModelErrorTerm, size: float | None, uncertainty: float | None
+) -> dict[str, object]:
     return {
         "family": term.family,
         "parameter": term.parameter,
@@ -119,20 +125,20 @@ def _entry(term: Term, size: float | None, uncertainty: float | None) -> dict[st
 
 
 def _sizes(
-    problem: Problem, fit: Fit, beside: Sequence[ModelledTerm]
+    problem: Problem, fit: Fit, nuisance_terms: Sequence[ModelledTerm]
 ) -> tuple[list[tuple[float, float]], float]:
     """Return each modelled term's size and standard uncertainty [m]; what turning costs [m].
 
     Backlash and friction look alike, and what one has too much the other has too little.
     """
-    if not beside:
+    if not nuisance_terms:
         return [], 0.0
     columns = problem.sensitivity(fit)
     covariance = parameter_covariance(problem, columns, fit.residual)
     first = columns.shape[1] - problem.background.shape[1]
     sides = np.zeros(problem.background.shape[1])
     found = []
-    for modelled in beside:
+    for modelled in nuisance_terms:
         coefficients = fit.background[modelled.columns]
         part = slice(first + modelled.columns.start, first + modelled.columns.stop)
         spread = covariance[part, part]
@@ -151,7 +157,7 @@ def _sizes(
     return found, float(np.hypot(sides @ fit.background, np.sqrt(variance)))
 
 
-def _words(term: Term, size: float | None) -> str:
+def _term_text(term: ModelErrorTerm, size: float | None) -> str:
     large = "" if size is None else f" of {quantity(size, 'm')}"
     half = quantity(size or 0.0, "m")
     length = quantity(term.parameter, "m")
@@ -170,11 +176,11 @@ def _words(term: Term, size: float | None) -> str:
     }[term.family]
 
 
-def _unmodelled(judged: Judged) -> str:
+def _unmodelled_text(judged: ScoreTest) -> str:
     size = float(np.linalg.norm(judged.score.size))
-    by_chance = chance(float(np.exp(max(judged.log_p, -690))))
+    by_chance = p_value_text(float(np.exp(max(judged.log_p, -690))))
     return (
-        f"the residual shows {_words(judged.term, size)} (by chance: {by_chance}) that no model "
+        f"the residual shows {_term_text(judged.term, size)} (by chance: {by_chance}) that no model "
         f"describes: {_REMEDY[judged.term.family]}, and repeat the test"
     )
 
@@ -195,7 +201,9 @@ def independence(p_value: float, scatter: float = 0.0) -> Finding:
                 f"readings that scatter in time by {quantity(scatter, 's')} hide the response; "
                 "latch encoder and probe by one trigger, and repeat the test"
             )
-        reasons = (f"the residual follows the motion (by chance: {chance(p_value)}): {cause}",)
+        reasons = (
+            f"the residual follows the motion (by chance: {p_value_text(p_value)}): {cause}",
+        )
     return Finding({"independence_p": p_value}, {"independence_p_least": FALSE_ALARM}, reasons)
 
 
@@ -233,9 +241,9 @@ _CLEARLY = 5.0
 # Exposure, averaging and transmission of a probe take milliseconds, of a slow one some samples.
 _LONGEST_LAG_S, _LONGEST_LAG_SAMPLES = 0.1, 5.0
 # Linear probes keep a per cent, and see Z at 10° as 0.985.
-_SCALE_OFF = 0.05
+_SCALE_MISMATCH = 0.05
 # Of the variance of the probe's noise; the heights of a scan are noisier by a twentieth.
-_WORTH_TELLING = 0.1
+_REPORTABLE = 0.1
 
 
 def misfit(
@@ -277,15 +285,15 @@ def timing(scatter: float, of_axis: float = 0.0) -> Finding:
     )
 
 
-def encoder_noise(unfollowed: FloatArray | None, noise: float) -> Finding:
-    """Tell of noise that was ``unfollowed`` by the probe, (n,) [m], and taken out of the input.
+def encoder_noise(errors_in_variables: FloatArray | None, noise: float) -> Finding:
+    """Tell of noise that was ``errors_in_variables`` by the probe, (n,) [m], and taken out of the input.
 
     noise: standard deviation of a reading of the probe [m]; what adds little to it is not warned of
     """
-    if unfollowed is None:
+    if errors_in_variables is None:
         return Finding({"encoder_noise_m": None})
-    found = float(np.sqrt(np.mean(unfollowed**2)))
-    worth_telling = found**2 > _WORTH_TELLING * noise**2
+    found = float(np.sqrt(np.mean(errors_in_variables**2)))
+    worth_telling = found**2 > _REPORTABLE * noise**2
     return Finding(
         {"encoder_noise_m": found},
         warnings=(
@@ -364,7 +372,7 @@ def late(lag: float, period: float) -> Finding:
 
 def scale(gain: float) -> Finding:
     """Reserve a static ``gain`` [1] that no probe has before an encoder that is right."""
-    if abs(gain - 1) < _SCALE_OFF:
+    if abs(gain - 1) < _SCALE_MISMATCH:
         return Finding()
     return Finding(
         reservations=(
@@ -426,7 +434,7 @@ def trusted_range(valid_up_to: float, limits: ResponseLimits) -> Finding:
 
 
 def requested_order(order: int, factor: float) -> Finding:
-    """Warn of uncertainties that were taken ``factor`` times as large, see ``no_surer``."""
+    """Warn of uncertainties that were taken ``factor`` times as large, see ``inflate_to_free_choice``."""
     if factor <= 1:
         return Finding()
     return Finding(
@@ -437,7 +445,9 @@ def requested_order(order: int, factor: float) -> Finding:
     )
 
 
-def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float) -> Finding:
+def poles_beyond_valid_range(
+    dynamics: TransferFunction, valid_up_to: float, nyquist: float
+) -> Finding:
     """Warn of poles beyond ``valid_up_to`` [Hz]: they shape the response, but are not known.
 
     One that is ten times faster than half the sampling rate shapes nothing, and is not named;
@@ -453,7 +463,7 @@ def poles_beyond(dynamics: TransferFunction, valid_up_to: float, nyquist: float)
     )
 
 
-CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
+CHECKS: tuple[Callable[[IdentificationEvidence], Finding], ...] = (
     # What the motion cannot tell makes every other finding meaningless.
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: misfit(
@@ -468,20 +478,22 @@ CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
     lambda e: late(e.dynamics.low_frequency_delay, e.prepared.problem.period),
     lambda e: scale(abs(e.fit.gain)),
     lambda e: timing(e.residual.timing, e.residual.axis_timing),
-    lambda e: encoder_noise(e.prepared.problem.unfollowed, e.residual.noise),
+    lambda e: encoder_noise(e.prepared.problem.errors_in_variables, e.residual.noise),
     lambda e: dropouts(e.prepared.axis_spikes),
     lambda e: two_clocks(e.record.by_stamps),
-    lambda e: departures(e.searched),
+    lambda e: model_errors(e.searched),
     lambda e: independence(
-        e.searched.survey.independence, max(e.residual.timing, e.residual.axis_timing)
+        e.searched.diagnostics.independence, max(e.residual.timing, e.residual.axis_timing)
     ),
     lambda e: agreement(e.prepared.problem, e.fit, e.known.valid_up_to),
 )
 """What may be wrong with the record or the model."""
 
-RANGE_CHECKS: tuple[Callable[[Evidence], Finding], ...] = (
+RANGE_CHECKS: tuple[Callable[[IdentificationEvidence], Finding], ...] = (
     lambda e: trusted_range(e.known.valid_up_to, e.limits),
     lambda e: requested_order(e.fit.structure.poles, e.known.widened),
-    lambda e: poles_beyond(e.dynamics, e.known.valid_up_to, 0.5 / e.prepared.problem.period),
+    lambda e: poles_beyond_valid_range(
+        e.dynamics, e.known.valid_up_to, 0.5 / e.prepared.problem.period
+    ),
 )
 """How far the result is trusted: what is open comes before how far that reaches."""

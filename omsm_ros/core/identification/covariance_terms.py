@@ -2,7 +2,7 @@
 
 A term is a source of error that the data cannot show. It adds to the covariance of the
 coefficients, and its finding stands in the certificate. To add one, write a function of the same
-signature as :func:`hidden_motion` and append it to :data:`COVARIANCE_TERMS`.
+signature as :func:`inter_sample_motion` and append it to :data:`COVARIANCE_TERMS`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from omsm_ros.core.calibration.finding import Finding
-from omsm_ros.core.estimation.covariance import hidden_motion_covariance
+from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps
@@ -24,13 +24,13 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
     SIZES,
     UP_DOWN,
     Contrast,
-    Survey,
+    ResidualDiagnostics,
     contrasts,
 )
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.linear_algebra import unit_columns
-from omsm_ros.readable import chance, percent, quantity
+from omsm_ros.readable import p_value_text, percent, quantity
 
 # Bound the bias of the lag from motion that an edge hides between samples.
 #
@@ -137,7 +137,7 @@ class CovarianceTerm:
     finding: Finding = field(default_factory=Finding)
 
 
-def hidden_motion(prepared: Prepared, fit: Fit, from_noise: FloatArray) -> CovarianceTerm:
+def inter_sample_motion(prepared: Prepared, fit: Fit, from_noise: FloatArray) -> CovarianceTerm:
     """Return the term of motion that an edge may hide between two samples.
 
     from_noise: (p, p) covariance of the coefficients from the noise of probe and encoder
@@ -146,12 +146,12 @@ def hidden_motion(prepared: Prepared, fit: Fit, from_noise: FloatArray) -> Covar
     bound = inter_sample_delay_bound(problem.input, prepared.steps, problem.period)
     delay_noise = low_frequency_delay_uncertainty(fit.dynamics, from_noise)
     return CovarianceTerm(
-        hidden_motion_covariance(fit.dynamics, bound, problem.period),
-        hidden_motion_finding(bound, delay_noise),
+        inter_sample_motion_covariance(fit.dynamics, bound, problem.period),
+        inter_sample_motion_finding(bound, delay_noise),
     )
 
 
-def hidden_motion_finding(bound: float, delay_noise: float) -> Finding:
+def inter_sample_motion_finding(bound: float, delay_noise: float) -> Finding:
     """Reject edges whose bound on the bias of the delay [s] exceeds its noise [s]."""
     reasons: tuple[str, ...] = ()
     if bound > max(delay_noise, HARMLESS_DELAY_S):
@@ -193,7 +193,7 @@ def reference_finding(lag: ReferenceLag) -> Finding:
 
 
 COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit, FloatArray], CovarianceTerm], ...] = (
-    hidden_motion,
+    inter_sample_motion,
 )
 
 
@@ -206,14 +206,14 @@ _REMEDY = {
 }
 
 
-def consistency(survey: Survey) -> CovarianceTerm:
+def consistency(diagnostics: ResidualDiagnostics) -> CovarianceTerm:
     """Return the term of parts that differ, and its finding; nothing is added where none do.
 
     The whole difference counts as a standard uncertainty: nothing says that a scan, which moves
     less than a step, lies between the two.
     """
-    found = contrasts(survey)
-    fitted = survey.fitted
+    found = contrasts(diagnostics)
+    fitted = diagnostics.fitted
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
     lag = np.zeros_like(gain)
     lag[-1] = 1.0
@@ -231,7 +231,7 @@ def consistency_finding(found: Sequence[Contrast]) -> Finding:
     return Finding(
         {"consistency": [_entry(contrast) for contrast in found]},
         {"consistency_p_least": FALSE_ALARM} if found else {},
-        reservations=tuple(_words(contrast) for contrast in found if contrast.significant),
+        reservations=tuple(_contrast_text(contrast) for contrast in found if contrast.significant),
     )
 
 
@@ -246,10 +246,10 @@ def _entry(contrast: Contrast) -> dict[str, object]:
     return {"parts": contrast.parts, **finite, "p": contrast.p}
 
 
-def _words(contrast: Contrast) -> str:
+def _contrast_text(contrast: Contrast) -> str:
     first, second = contrast.parts.split(" against ")
     return (
         f"{first} and {second} differ by {quantity(contrast.lag, 's', 2)} in lag and "
-        f"{percent(contrast.gain)} in gain (by chance: {chance(contrast.p)}), and the band holds "
+        f"{percent(contrast.gain)} in gain (by chance: {p_value_text(contrast.p)}), and the band holds "
         f"that: {_REMEDY[contrast.parts]}, and repeat the test"
     )

@@ -7,8 +7,8 @@ from functools import cached_property
 
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.identification.model_choice import Model
-from omsm_ros.core.identification.model_error_search import Searched
+from omsm_ros.core.identification.model_choice import ChosenModel
+from omsm_ros.core.identification.model_error_search import SearchResult
 from omsm_ros.core.identification.residual_tests import ResidualTests, residual_tests
 from omsm_ros.core.identification.response_uncertainty import ResponseUncertainty
 from omsm_ros.core.lti.frequency_response import ResponseLimits
@@ -17,7 +17,7 @@ from omsm_ros.core.streams.motion_record import MotionRecord
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class IdentificationEvidence:
     """The record, the problem fitted, the chosen model, and how well it is known.
 
     limits: of the 95 % band, within which the response is trusted
@@ -26,10 +26,10 @@ class Evidence:
 
     record: MotionRecord
     prepared: Prepared
-    model: Model
+    model: ChosenModel
     known: ResponseUncertainty
     limits: ResponseLimits
-    searched: Searched
+    searched: SearchResult
 
     @property
     def fit(self) -> Fit:

@@ -8,7 +8,7 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 | a model is chosen and fitted | :mod:`model_choice` |
 | what the residual shows besides is modelled | :mod:`departure_search` |
 | its covariance from noise | :mod:`response_uncertainty` |
-| further terms of it | :mod:`covariance_terms`, :mod:`hidden_terms`, :mod:`consistency` |
+| further terms of it | :mod:`covariance_terms`, :mod:`undetected_terms`, :mod:`consistency` |
 | checks | :mod:`checks` |
 | certificate and verdict | :mod:`certificate` |
 """
@@ -30,7 +30,7 @@ from omsm_ros.core.calibration.calibration import (
     REJECTED,
     RESERVED,
     Calibration,
-    unresolved,
+    unresolved_latency,
 )
 from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.model_order import Candidate
@@ -39,14 +39,14 @@ from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, che
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.checks import CHECKS, RANGE_CHECKS
 from omsm_ros.core.identification.covariance_terms import consistency, reference_delay
-from omsm_ros.core.identification.evidence import Evidence
-from omsm_ros.core.identification.model_choice import Model, model_from_start
-from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.identification.evidence import IdentificationEvidence
+from omsm_ros.core.identification.model_choice import ChosenModel, model_from_start
+from omsm_ros.core.identification.model_error_search import search_model_errors
 from omsm_ros.core.identification.response_uncertainty import (
-    hidden_covariance,
-    no_surer,
-    other_modes,
+    alternative_modes,
+    inflate_to_free_choice,
     response_uncertainty,
+    undetected_error_covariance,
 )
 from omsm_ros.core.lti.frequency_response import ResponseLimits, low_frequency_delay_uncertainty
 from omsm_ros.core.lti.modes import (
@@ -57,7 +57,7 @@ from omsm_ros.core.lti.modes import (
     modal_remainder,
     mode_entries,
     oscillations,
-    shape,
+    response_features,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import DRIFT
@@ -141,7 +141,7 @@ _LEAST_PLATEAUS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Gain:
+class GainEstimate:
     """A ratio of travels [1] and its standard uncertainty."""
 
     value: float
@@ -152,9 +152,9 @@ class Gain:
 class StaticGains:
     """Travel of one per travel of the other, magnitudes; None without a reference sensor."""
 
-    probe_per_encoder: Gain
-    probe_per_reference: Gain | None
-    reference_per_encoder: Gain | None
+    probe_per_encoder: GainEstimate
+    probe_per_reference: GainEstimate | None
+    reference_per_encoder: GainEstimate | None
 
 
 def static_gains(record: MotionRecord) -> StaticGains:
@@ -164,7 +164,7 @@ def static_gains(record: MotionRecord) -> StaticGains:
     them scatter: noise, backlash, slip. Raises StepTestError with fewer than four plateaus.
     """
     steps = find_steps(record.z, record.sample_period)
-    rests = _rests(steps.edges, len(record), round(_SETTLE_S / record.sample_period))
+    rests = _stationary_segments(steps.edges, len(record), round(_SETTLE_S / record.sample_period))
     readings = np.where(record.ok, record.distance, np.nan)
     time = _means(np.arange(len(record), dtype=np.float64), rests)
     encoder, probe = _means(record.z, rests), _means(np.asarray(readings), rests)
@@ -178,7 +178,9 @@ def static_gains(record: MotionRecord) -> StaticGains:
     )
 
 
-def _rests(edges: tuple[Edge, ...], samples: int, settle: int) -> list[tuple[int, int]]:
+def _stationary_segments(
+    edges: tuple[Edge, ...], samples: int, settle: int
+) -> list[tuple[int, int]]:
     starts = [0, *(edge.stop + settle for edge in edges)]
     stops = [*(edge.start for edge in edges), samples]
     rests = [(a, b) for a, b in zip(starts, stops, strict=True) if b - a >= 5]
@@ -198,7 +200,7 @@ def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:
     return np.asarray(means)
 
 
-def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> Gain:
+def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> GainEstimate:
     known = np.isfinite(travel) & np.isfinite(other)
     if np.sum(known) < _LEAST_PLATEAUS:
         raise StepTestError(
@@ -212,20 +214,23 @@ def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> Gain:
     residual = y - unit @ solved
     variance = float(residual @ residual) / max(len(y) - 3, 1)
     uncertainty = np.sqrt(variance * (inverse[0] @ inverse[0])) / scale[0]
-    return Gain(float(abs(solved[0]) / scale[0]), float(uncertainty))
+    return GainEstimate(float(abs(solved[0]) / scale[0]), float(uncertainty))
 
 
 # The certificate of a calibration: how it was obtained, and whether to trust it.
 
 
 def certificate_of(
-    evidence: Evidence, findings: Sequence[Finding], table_mass: float | None
+    evidence: IdentificationEvidence, findings: Sequence[Finding], table_mass: float | None
 ) -> dict[str, object]:
     """Return a dict of JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
 
     table_mass: moving mass of the table [kg], None if it is not known
     """
-    known, valid_from = evidence.known, 1 / (2 * np.pi * evidence.searched.survey.slowest_creep)
+    known, valid_from = (
+        evidence.known,
+        1 / (2 * np.pi * evidence.searched.diagnostics.longest_time_constant),
+    )
     limits = dict(chain.from_iterable(finding.limits.items() for finding in findings))
     entries = dict(chain.from_iterable(finding.entries.items() for finding in findings))
     reasons = list(chain.from_iterable(finding.reasons for finding in findings))
@@ -263,7 +268,7 @@ def verdict(
     return f"{kept}, supported by data from {low} to {high}"
 
 
-def _order_entries(model: Model) -> dict[str, object]:
+def _order_entries(model: ChosenModel) -> dict[str, object]:
     return {
         "order": model.chosen.fit.structure.poles,
         "structure": _structure(model.chosen),
@@ -278,7 +283,7 @@ def _structure(candidate: Candidate) -> dict[str, object]:
     return {"poles": structure.poles, "zeros": structure.zeros, "delay": structure.delay}
 
 
-def _residual_entries(evidence: Evidence) -> dict[str, object]:
+def _residual_entries(evidence: IdentificationEvidence) -> dict[str, object]:
     prepared, tests = evidence.prepared, evidence.residual
     compared = {"spikes": prepared.spikes, "compared": evidence.fit.samples}
     compared |= {"axis_spikes": prepared.axis_spikes} if prepared.axis_spikes else {}
@@ -291,22 +296,22 @@ def _residual_entries(evidence: Evidence) -> dict[str, object]:
     }
 
 
-def _response_entries(evidence: Evidence) -> dict[str, object]:
+def _response_entries(evidence: IdentificationEvidence) -> dict[str, object]:
     dynamics, known = evidence.dynamics, evidence.known
     return {
-        ENTRY: unresolved(dynamics.low_frequency_delay).entry(),
+        ENTRY: unresolved_latency(dynamics.low_frequency_delay).entry(),
         "low_frequency_delay_s": dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty_s": low_frequency_delay_uncertainty(
             dynamics, known.covariance
         ),
-        "shown_up_to_hz": known.shown_up_to,
-        "shape": finite_values(shape(dynamics, 0.5 / evidence.prepared.problem.period)),
+        "shown_up_to_hz": known.excited_up_to,
+        "shape": finite_values(response_features(dynamics, 0.5 / evidence.prepared.problem.period)),
         "modes": mode_entries(dynamics, known.covariance),
         "modal_remainder": modal_remainder(dynamics, known.valid_up_to),
     }
 
 
-def _gain_entries(evidence: Evidence) -> dict[str, object]:
+def _gain_entries(evidence: IdentificationEvidence) -> dict[str, object]:
     """Return what the fit finds beside the response: gain and drift."""
     best = evidence.fit
     duration = len(evidence.record) * evidence.record.sample_period
@@ -330,10 +335,10 @@ def _attributed(record: MotionRecord) -> dict[str, object] | None:
 DEFAULT_LIMITS = ResponseLimits()
 Parameters = ParamSpec("Parameters")
 # A calibration that is trusted nowhere says so by a frequency below anything that moves.
-_TRUSTED_NOWHERE_HZ = 1e-3
+_UNTRUSTED_HZ = 1e-3
 # What creep, drift or play beside the first model may still change of its gain; beyond it the probe
 # saw something else, and to look for departures in that takes half a minute.
-_STILL_THE_SAME_SIGNAL = 10.0
+_SAME_SIGNAL_CORRELATION = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,25 +397,31 @@ def identify(
     mass, limits = table_mass(settings or {}), DEFAULT_LIMITS
     prepared = prepare(record, input)
     check_axis_steps(prepared)
-    searched = search(prepared, lambda prepared: _chosen(prepared, order), may_grow=not order)
+    searched = search_model_errors(
+        prepared, lambda prepared: _chosen(prepared, order), may_grow=not order
+    )
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
-    drift = [beside.columns for beside in searched.beside if beside.term.family == DRIFT]
-    hidden = hidden_covariance(searched.survey, settings or {}, limits, drift)
-    hidden += other_modes(searched.without, searched.in_response, model.chosen.fit)
-    hidden += [consistency(searched.survey)]
-    hidden += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
-    known = response_uncertainty(prepared, model, limits, hidden)
+    drift = [
+        nuisance_terms.columns
+        for nuisance_terms in searched.nuisance_terms
+        if nuisance_terms.term.family == DRIFT
+    ]
+    undetected = undetected_error_covariance(searched.diagnostics, settings or {}, limits, drift)
+    undetected += alternative_modes(searched.without, searched.added_poles, model.chosen.fit)
+    undetected += [consistency(searched.diagnostics)]
+    undetected += [reference_delay(record, model.chosen.fit)] if input == "reference" else []
+    known = response_uncertainty(prepared, model, limits, undetected)
     if model.free is not None:
-        known = no_surer(known, prepared, model, model.free, limits)
-    evidence = Evidence(record, prepared, model, known, limits, searched)
+        known = inflate_to_free_choice(known, prepared, model, model.free, limits)
+    evidence = IdentificationEvidence(record, prepared, model, known, limits, searched)
     findings = _findings(evidence)
     best, origin = model.chosen.fit, {"input": input, RECORDED: recorded_ns}
     calibration = Calibration(
         dynamics=best.dynamics,
         static_gain=abs(best.gain),
         sample_period=record.sample_period,
-        valid_up_to=max(known.valid_up_to, _TRUSTED_NOWHERE_HZ),
+        valid_up_to=max(known.valid_up_to, _UNTRUSTED_HZ),
         covariance=known.covariance,
         settings=dict(settings or {}),
         certificate=origin | certificate_of(evidence, findings, mass),
@@ -418,13 +429,13 @@ def identify(
     return Identification(calibration, prepared, best)
 
 
-def _chosen(prepared: Prepared, order: int) -> tuple[Prepared, Model]:
+def _chosen(prepared: Prepared, order: int) -> tuple[Prepared, ChosenModel]:
     prepared, model = model_from_start(prepared, order)
-    check_gain(model.chosen.fit.gain, slack=_STILL_THE_SAME_SIGNAL)
+    check_gain(model.chosen.fit.gain, slack=_SAME_SIGNAL_CORRELATION)
     return prepared, model
 
 
-def _findings(evidence: Evidence) -> list[Finding]:
+def _findings(evidence: IdentificationEvidence) -> list[Finding]:
     """Return what is wrong, then what a right model leaves open, then how far that reaches."""
     wrong, range_ = ([check(evidence) for check in part] for part in (CHECKS, RANGE_CHECKS))
     return [*wrong, *evidence.known.findings, *range_]

@@ -35,7 +35,7 @@ _OVER = 10.0
 _SPANNED = 1e-6
 
 
-def starts_ringing(
+def has_initial_response(
     problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
 ) -> bool:
     """Return whether decays at the poles of ``fitted`` reach into the samples that count.
@@ -74,11 +74,11 @@ _ALIKE_BIC = 2.0
 # Beyond the first ones, of a fit that starts at the minimum over fewer samples.
 _NEARLY_EVALUATIONS = 2
 # Probability by chance below which what moves faster than fewer samples show tells more.
-_NOTHING_BEYOND = 0.01
+_NO_FURTHER_GAIN = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Model:
+class ChosenModel:
     """The chosen candidate among those of its kind that were tried.
 
     free: the choice without asking, where an order was asked for; else None
@@ -86,10 +86,10 @@ class Model:
 
     chosen: Candidate
     candidates: Sequence[Candidate]
-    free: Model | None = None
+    free: ChosenModel | None = None
 
 
-def choose_model(prepared: Prepared, order: int = 0) -> Model:
+def choose_model(prepared: Prepared, order: int = 0) -> ChosenModel:
     """Fit structures to the prepared problem and choose among them; ``order`` poles, or 0.
 
     The free choice is made in any case; an order that is asked for is picked beside it.
@@ -98,11 +98,11 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     points, before = StartingPoints(problem, lag), None
     if points.coarser is not None:
-        model = _chosen_on_fewer(prepared, points.coarser, lag, order)
+        model = _chosen_on_subset(prepared, points.coarser, lag, order)
         before = model.chosen.fit
         if (
             problem.effort.spent
-            or follows_beyond(problem, before, points.coarser.problem) > _NOTHING_BEYOND
+            or follows_beyond(problem, before, points.coarser.problem) > _NO_FURTHER_GAIN
         ):
             return model
 
@@ -111,10 +111,10 @@ def choose_model(prepared: Prepared, order: int = 0) -> Model:
 
     colour = noise_colour(problem, lag, prepared.steps)
     found = _model(problem, explore(fit_structure, order, colour, problem.effort), order)
-    return found if before is None else no_worse(problem, found, before)
+    return found if before is None else keep_better(problem, found, before)
 
 
-def no_worse(problem: Problem, found: Model, before: Fit) -> Model:
+def keep_better(problem: Problem, found: ChosenModel, before: Fit) -> ChosenModel:
     """Return ``found``, or with the structure of ``before`` where that describes more.
 
     before: fitted to the problem as it was. When so much was tried that no further order is begun,
@@ -130,7 +130,7 @@ def no_worse(problem: Problem, found: Model, before: Fit) -> Model:
     return replace(found, chosen=candidate, candidates=[*found.candidates, candidate])
 
 
-def chosen_alike(problem: Problem, before: Model) -> Model | None:
+def rechosen(problem: Problem, before: ChosenModel) -> ChosenModel | None:
     """Return ``before``, which was chosen while the problem was another, fitted to it as it is.
 
     None where the change lets some candidates describe more than others: then a structure that
@@ -155,16 +155,18 @@ def chosen_alike(problem: Problem, before: Model) -> Model | None:
     return replace(before, chosen=chosen, candidates=[*others, chosen])
 
 
-def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Model:
+def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> ChosenModel:
     candidates = _identifiable(problem, explored)
-    free = Model(choose(candidates), candidates)
+    free = ChosenModel(choose(candidates), candidates)
     if not order:
         return free
     asked = [c for c in explored if c.fit.structure.poles == order]
-    return Model(choose(asked), asked, free)
+    return ChosenModel(choose(asked), asked, free)
 
 
-def _chosen_on_fewer(prepared: Prepared, points: StartingPoints, lag: Fit, order: int) -> Model:
+def _chosen_on_subset(
+    prepared: Prepared, points: StartingPoints, lag: Fit, order: int
+) -> ChosenModel:
     """Explore structures at the samples of ``points``; fit to all those that may be chosen.
 
     lag: the fit of a delay alone to all samples
@@ -215,7 +217,7 @@ def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence
     return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
 
 
-def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, Model]:
+def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, ChosenModel]:
     """Choose a model, with the initial-condition response fitted where the record begins in it.
 
     Returns the problem as it was fitted, and the model.
@@ -223,7 +225,7 @@ def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, Mode
     model = choose_model(prepared, order)
     colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
     at_rest = not prepared.steps.moving[0]
-    if not starts_ringing(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
+    if not has_initial_response(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
         return prepared, model
     prepared = replace(prepared, problem=replace(prepared.problem, fits_initial_condition=True))
     return prepared, choose_model(prepared, order)

@@ -16,10 +16,10 @@ import numpy as np
 from omsm_ros.core.estimation.model_order import Candidate, information
 from omsm_ros.core.estimation.model_order import choose as choose_candidate
 from omsm_ros.core.estimation.model_structure import Structure
-from omsm_ros.core.estimation.noise import without_unfollowed
+from omsm_ros.core.estimation.noise import correct_errors_in_variables
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
-from omsm_ros.core.identification.model_choice import Model, chosen_alike, no_worse
+from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
     CREEP,
@@ -29,14 +29,14 @@ from omsm_ros.core.model_errors.families import (
     MODE,
     PERIODIC,
     VIBRATION,
-    Term,
+    ModelErrorTerm,
 )
-from omsm_ros.core.model_errors.residual_diagnostics import Judged, Survey
-from omsm_ros.core.model_errors.undetected import as_fitted, poles_of, with_poles
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics, ScoreTest
+from omsm_ros.core.model_errors.undetected import at_fitted_pole, fit_with_added_poles, poles_of
 
 # Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
-_BESIDE = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
+_NUISANCE_FAMILIES = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
 # Their columns follow the fitted response, which they improve.
 _TURNING = {BACKLASH, FRICTION}
 _SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
@@ -46,13 +46,13 @@ _UNDECIDED = 5.0
 _LEAST_DECAYS = 1.0
 # A ring that has decayed by fewer e-folds at the end of the record is still felt at its beginning,
 # where the period begins anew: a thousandth of it is left after seven.
-_FORGOTTEN_DECAYS = 7.0
+_SETTLED_DECAYS = 7.0
 # A structure and its roll-off; what is not linear looks like many more.
 _PLAIN_POLES = 2
 # Two time constants a decade apart look much the same: the fit starts at several. Of modes those
 # looked for lie six per cent apart.
 _FASTER = (1.0, 2.0, 5.0)
-_BESIDE_MODE = (1.0, 0.97, 1.03)
+_MODE_FREQUENCY_RATIOS = (1.0, 0.97, 1.03)
 # As a logarithm; a mode that rings seven times is as wide.
 _SAME_LINE = 0.1
 
@@ -61,57 +61,63 @@ _SAME_LINE = 0.1
 class ModelledTerm:
     """A departure with columns of its own in the background, at ``columns``."""
 
-    term: Term
+    term: ModelErrorTerm
     columns: slice
 
 
 @dataclass(frozen=True, eq=False)
-class Searched:
+class SearchResult:
     """What was fitted in the end.
 
-    beside: departures in the background;  in_response: those that became poles
-    unmodelled: significant, but no model describes them;  survey: of the last fit
-    without: survey of the fit before each of ``in_response`` was added
+    nuisance_terms: departures in the background;  added_poles: those that became poles
+    unmodelled: significant, but no model describes them;  diagnostics: of the last fit
+    without: survey of the fit before each of ``added_poles`` was added
     """
 
     prepared: Prepared
-    model: Model
-    survey: Survey
-    beside: Sequence[ModelledTerm] = ()
-    in_response: Sequence[Term] = ()
-    unmodelled: Sequence[Judged] = ()
-    without: Sequence[Survey] = ()
+    model: ChosenModel
+    diagnostics: ResidualDiagnostics
+    nuisance_terms: Sequence[ModelledTerm] = ()
+    added_poles: Sequence[ModelErrorTerm] = ()
+    unmodelled: Sequence[ScoreTest] = ()
+    without: Sequence[ResidualDiagnostics] = ()
 
 
-Choose = Callable[[Prepared], tuple[Prepared, Model]]
+Choose = Callable[[Prepared], tuple[Prepared, ChosenModel]]
 
 
-def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Searched:
+def search_model_errors(
+    prepared: Prepared, choose: Choose, *, may_grow: bool = True
+) -> SearchResult:
     """Add departures to the problem or to the model until the residual shows no more.
 
     choose: fits a prepared problem anew;  may_grow: poles may be added to the model
     """
-    prepared, beside, model = _first(prepared, choose)
-    grown: list[Term] = []
-    without: list[Survey] = []
+    prepared, nuisance_terms, model = _initial_model(prepared, choose)
+    grown: list[ModelErrorTerm] = []
+    without: list[ResidualDiagnostics] = []
     settled: set[str] = set()
     modes: list[float] = []
     refused: set[str] = set() if may_grow else {CREEP, MODE}
-    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
+    diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
-        shown = _but_lines(survey.significant(refused | settled), modes)
+        shown = _without_modelled_lines(diagnostics.significant(refused | settled), modes)
         if not shown or prepared.problem.effort.spent:
             break
-        columns = _beside(survey, shown)
-        again = {c.term.family for c in columns} & _TURNING & {b.term.family for b in beside}
+        columns = _select_nuisance_terms(diagnostics, shown)
+        again = (
+            {c.term.family for c in columns} & _TURNING & {b.term.family for b in nuisance_terms}
+        )
         if again:
-            prepared, beside = _renewed(prepared, survey, beside, again)
+            prepared, nuisance_terms = _recomputed_columns(
+                prepared, diagnostics, nuisance_terms, again
+            )
             settled |= again
-            prepared, model = _again(prepared, model, choose)
+            prepared, model = _rechoose(prepared, model, choose)
         elif columns:
-            prepared, added = _with_columns(prepared, columns, beside)
-            beside += added
-            prepared, model = _again(prepared, model, choose)
+            prepared, added = _with_columns(prepared, columns, nuisance_terms)
+            nuisance_terms += added
+            prepared, model = _rechoose(prepared, model, choose)
             grown, without = [], []
         else:
             larger = _grown(prepared, model, shown[0].term)
@@ -120,60 +126,74 @@ def search(prepared: Prepared, choose: Choose, *, may_grow: bool = True) -> Sear
                 refused.add(shown[0].term.family)
                 continue
             prepared, model = larger
-            grown.append(as_fitted(shown[0].term, model.chosen.fit))
-            without.append(survey)
-        survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
-    return Searched(prepared, model, survey, beside, grown, survey.significant(settled), without)
+            grown.append(at_fitted_pole(shown[0].term, model.chosen.fit))
+            without.append(diagnostics)
+        diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
+    return SearchResult(
+        prepared,
+        model,
+        diagnostics,
+        nuisance_terms,
+        grown,
+        diagnostics.significant(settled),
+        without,
+    )
 
 
-def _first(prepared: Prepared, choose: Choose) -> tuple[Prepared, list[ModelledTerm], Model]:
+def _initial_model(
+    prepared: Prepared, choose: Choose
+) -> tuple[Prepared, list[ModelledTerm], ChosenModel]:
     """Return the problem and its model, beside what shows first or what its poles imitate."""
-    prepared, beside = _with_columns(prepared, _drift(prepared))
-    prepared, model = _quieter(*choose(prepared), choose)
-    columns = _imitated(prepared, model)
+    prepared, nuisance_terms = _with_columns(prepared, _drift(prepared))
+    prepared, model = _with_errors_in_variables(*choose(prepared), choose)
+    columns = _modelled_as_poles(prepared, model)
     if columns:
-        prepared, added = _with_columns(prepared, columns, beside)
-        beside += added
-        prepared, model = _again(prepared, model, choose)
-    return prepared, beside, model
+        prepared, added = _with_columns(prepared, columns, nuisance_terms)
+        nuisance_terms += added
+        prepared, model = _rechoose(prepared, model, choose)
+    return prepared, nuisance_terms, model
 
 
-def _again(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, Model]:
+def _rechoose(
+    prepared: Prepared, model: ChosenModel, choose: Choose
+) -> tuple[Prepared, ChosenModel]:
     """Return a problem that has changed since ``model`` was chosen, and the model chosen anew."""
     prepared, found = choose(prepared)
-    return prepared, no_worse(prepared.problem, found, model.chosen.fit)
+    return prepared, keep_better(prepared.problem, found, model.chosen.fit)
 
 
-def _quieter(prepared: Prepared, model: Model, choose: Choose) -> tuple[Prepared, Model]:
+def _with_errors_in_variables(
+    prepared: Prepared, model: ChosenModel, choose: Choose
+) -> tuple[Prepared, ChosenModel]:
     """Return both without the encoder's own noise, if that describes more."""
-    problem = without_unfollowed(prepared.problem, model.chosen.fit, prepared.steps.edges)
+    problem = correct_errors_in_variables(prepared.problem, model.chosen.fit, prepared.steps.edges)
     if problem is None:
         return prepared, model
     quieter = replace(prepared, problem=problem)
-    found = chosen_alike(problem, model)
+    found = rechosen(problem, model)
     if found is None:
         quieter, found = choose(quieter)
     better = information(found.chosen.fit) < information(model.chosen.fit)
     return (quieter, found) if better else (prepared, model)
 
 
-def _drift(prepared: Prepared) -> list[Judged]:
+def _drift(prepared: Prepared) -> list[ScoreTest]:
     """Return drift, if it shows before any model does: a model would take it for a slow pole."""
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    survey = Survey(problem, lag, prepared.steps, (CREEP, DRIFT))
+    diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT))
     # What does not show in fewer samples of a long record need not be looked for in all.
-    if survey.thinned is not None and not _shown_drift(survey.thinned):
+    if diagnostics.thinned is not None and not _detected_drift(diagnostics.thinned):
         return []
-    return _shown_drift(survey)
+    return _detected_drift(diagnostics)
 
 
-def _shown_drift(survey: Survey) -> list[Judged]:
-    shown = _beside(survey, survey.significant())
+def _detected_drift(diagnostics: ResidualDiagnostics) -> list[ScoreTest]:
+    shown = _select_nuisance_terms(diagnostics, diagnostics.significant())
     return [judged for judged in shown if judged.term.family == DRIFT]
 
 
-def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
+def _modelled_as_poles(prepared: Prepared, model: ChosenModel) -> list[ScoreTest]:
     """Return departures that poles of ``model`` imitate: beside them a plain model describes more.
 
     What is not linear is not bent into poles where fewer of them and its own columns do better.
@@ -181,30 +201,34 @@ def _imitated(prepared: Prepared, model: Model) -> list[Judged]:
     chosen, best = model.chosen, _best_plain(model)
     if chosen.fit.structure.poles <= _PLAIN_POLES or best is None:
         return []
-    survey = Survey(prepared.problem, best, prepared.steps, _BESIDE)
-    fewer = survey.thinned
+    diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
+    fewer = diagnostics.thinned
     # As above: of a long record not all are looked at where fewer do not ask for it.
     if fewer is not None:
         there = evaluated(fewer.problem, chosen.fit.structure, chosen.fit.nonlinear)
-        if not _describing_more(prepared, fewer, there):
+        if not _improving_terms(prepared, fewer, there):
             return []
-    return _describing_more(prepared, survey, chosen.fit)
+    return _improving_terms(prepared, diagnostics, chosen.fit)
 
 
-def _describing_more(prepared: Prepared, survey: Survey, chosen: Fit) -> list[Judged]:
-    """Return what shows, if the fit of ``survey`` describes more beside it than ``chosen`` does."""
-    columns = _beside(survey, survey.significant())
+def _improving_terms(
+    prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit
+) -> list[ScoreTest]:
+    """Return what shows, if the fit of ``diagnostics`` describes more beside it than ``chosen`` does."""
+    columns = _select_nuisance_terms(diagnostics, diagnostics.significant())
     if not columns:
         return []
-    plain, before = survey.fitted, replace(prepared, problem=survey.problem)
+    plain, before = diagnostics.fitted, replace(prepared, problem=diagnostics.problem)
     problem = _with_columns(before, columns)[0].problem
-    beside = fit(problem, plain.structure, [plain.nonlinear])
-    further = problem.background.shape[1] - survey.problem.background.shape[1]
-    better = information(beside) + further * np.log(beside.samples) < information(chosen)
+    nuisance_terms = fit(problem, plain.structure, [plain.nonlinear])
+    further = problem.background.shape[1] - diagnostics.problem.background.shape[1]
+    better = information(nuisance_terms) + further * np.log(nuisance_terms.samples) < information(
+        chosen
+    )
     return columns if better else []
 
 
-def _but_lines(shown: Sequence[Judged], modes: Sequence[float]) -> list[Judged]:
+def _without_modelled_lines(shown: Sequence[ScoreTest], modes: Sequence[float]) -> list[ScoreTest]:
     """Return ``shown`` without lines of vibration at ``modes`` [Hz] that described more.
 
     A light mode that the steps keep ringing looks like a line, and one that a fit has not met, or
@@ -218,7 +242,9 @@ def _but_lines(shown: Sequence[Judged], modes: Sequence[float]) -> list[Judged]:
     ]
 
 
-def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
+def _select_nuisance_terms(
+    diagnostics: ResidualDiagnostics, shown: Sequence[ScoreTest]
+) -> list[ScoreTest]:
     """Return those to fit in the background now: the clearest, and its equals among the slow."""
     if not shown:
         return []
@@ -227,16 +253,16 @@ def _beside(survey: Survey, shown: Sequence[Judged]) -> list[Judged]:
         other
         for other in shown[1:]
         if {first.term.family, other.term.family} <= _SLOW
-        and survey.evidence(other) > survey.evidence(first) - _UNDECIDED
+        and diagnostics.evidence(other) > diagnostics.evidence(first) - _UNDECIDED
     ]
-    chosen = [judged for judged in (first, *equals) if judged.term.family in _BESIDE]
+    chosen = [judged for judged in (first, *equals) if judged.term.family in _NUISANCE_FAMILIES]
     turning = [judged for judged in chosen if judged.term.family in _TURNING]
     # Backlash and friction look so much alike that both at once cancel at any size.
     return [judged for judged in chosen if judged not in turning[1:]]
 
 
 def _with_columns(
-    prepared: Prepared, shown: Sequence[Judged], before: Sequence[ModelledTerm] = ()
+    prepared: Prepared, shown: Sequence[ScoreTest], before: Sequence[ModelledTerm] = ()
 ) -> tuple[Prepared, list[ModelledTerm]]:
     background = prepared.problem.background
     added = []
@@ -251,31 +277,36 @@ def _with_columns(
     return replace(prepared, problem=problem), added
 
 
-def _renewed(
-    prepared: Prepared, survey: Survey, beside: Sequence[ModelledTerm], families: set[str]
+def _recomputed_columns(
+    prepared: Prepared,
+    diagnostics: ResidualDiagnostics,
+    nuisance_terms: Sequence[ModelledTerm],
+    families: set[str],
 ) -> tuple[Prepared, list[ModelledTerm]]:
-    """Return the problem with the columns of ``families`` as the fit of ``survey`` has them."""
+    """Return the problem with the columns of ``families`` as the fit of ``diagnostics`` has them."""
     background, renewed = prepared.problem.background.copy(), []
-    for modelled in beside:
+    for modelled in nuisance_terms:
         term = modelled.term
         if term.family in families:
-            term = survey.departures.again(term)
+            term = diagnostics.model_errors.again(term)
             background[:, modelled.columns] = term.columns
         renewed.append(ModelledTerm(term, modelled.columns))
     return replace(prepared, problem=replace(prepared.problem, background=background)), renewed
 
 
-def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Model] | None:
+def _grown(
+    prepared: Prepared, model: ChosenModel, term: ModelErrorTerm
+) -> tuple[Prepared, ChosenModel] | None:
     """Return the model with the poles of ``term``, or None where that describes nothing better."""
     if term.family not in (CREEP, MODE):
         return None
     problem, new = prepared.problem, poles_of(term)
     decays = float(np.min(-new.real)) * len(problem.input) * problem.period
-    if term.family == CREEP or decays < _FORGOTTEN_DECAYS:
+    if term.family == CREEP or decays < _SETTLED_DECAYS:
         # What has not died away at the end has not when a period begins anew.
         problem = replace(problem, fits_initial_condition=True)
-    starts = _FASTER if term.family == CREEP else _BESIDE_MODE
-    tried = [with_poles(problem, base, new, starts) for base in _bases(model)]
+    starts = _FASTER if term.family == CREEP else _MODE_FREQUENCY_RATIOS
+    tried = [fit_with_added_poles(problem, base, new, starts) for base in _bases(model)]
     # The chosen one may owe poles to what ``term`` describes: with it, fewer may do.
     found = [
         Candidate(fitted, information(fitted))
@@ -293,24 +324,24 @@ def _grown(prepared: Prepared, model: Model, term: Term) -> tuple[Prepared, Mode
     return replace(prepared, problem=problem), grown
 
 
-def _bases(model: Model) -> list[Fit]:
+def _bases(model: ChosenModel) -> list[Fit]:
     """Return the fits that a pole may be added to: the chosen one, and a plain one.
 
     That one is chosen by the same rule: a single lag beside a relaxation has no roll-off, so its
     band would be far too narrow at the upper end.
     """
-    chosen, candidates = model.chosen.fit, _plain(model)
+    chosen, candidates = model.chosen.fit, _plain_candidates(model)
     plain = choose_candidate(candidates).fit if candidates else chosen
     return [chosen] if plain is chosen else [chosen, plain]
 
 
-def _best_plain(model: Model) -> Fit | None:
+def _best_plain(model: ChosenModel) -> Fit | None:
     """Return the best fit of a structure and its roll-off alone, if one was tried."""
-    plain = _plain(model)
+    plain = _plain_candidates(model)
     return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
 
 
-def _plain(model: Model) -> list[Candidate]:
+def _plain_candidates(model: ChosenModel) -> list[Candidate]:
     return [c for c in model.candidates if c.fit.structure.poles <= _PLAIN_POLES]
 
 

@@ -15,7 +15,7 @@ from scipy import fft, stats
 from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.noise import motion_scatter, rate_of, reading_step, scatter_in_time
 from omsm_ros.core.estimation.output_error import Fit, Problem
-from omsm_ros.core.estimation.steps import Steps, lasting
+from omsm_ros.core.estimation.steps import Steps, extended
 from omsm_ros.core.lti.frequency_response import FrequencyResponse
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.linear_algebra import orthonormal
@@ -25,7 +25,7 @@ _LAGS = 25
 # After an edge the response is looked at for this long.
 _AFTER_EDGE_S = 50e-3
 # Then a standard deviation is known to a twentieth.
-_LEAST_REST_SAMPLES = 200
+_LEAST_STATIONARY_SAMPLES = 200
 # Then it is known to a tenth.
 _LEAST_CROSSINGS = 50
 # Up to half the sampling rate, for the mean power of a response.
@@ -65,7 +65,7 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
         # Readings that hardly change at rest do not tell the noise: rounding holds it. Where the
         # axis crosses a step from sample to sample, it scatters over the whole step.
         active = crossing
-        noise = max(noise, step / np.sqrt(12.0), _noise_of_neighbours(on_grid[crossing]))
+        noise = max(noise, step / np.sqrt(12.0), _white_noise_deviation(on_grid[crossing]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
     lost = fitted.structure.size
     timing = scatter_in_time(problem, fitted.residual)
@@ -90,7 +90,11 @@ def _axis_timing(
     """
     rate = rate_of(problem)
     # Noise that was taken out at rest only would look like scatter where the axis moves.
-    recorded = problem.input if problem.unfollowed is None else problem.input + problem.unfollowed
+    recorded = (
+        problem.input
+        if problem.errors_in_variables is None
+        else problem.input + problem.errors_in_variables
+    )
     scatter = motion_scatter(recorded, rate)
     lines = np.linspace(0.0, 0.5 / problem.period, _LINES)
     passed = float(np.mean(np.abs(fitted.gain * fitted.dynamics.response(lines)) ** 2))
@@ -103,7 +107,7 @@ def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
     on_grid = problem.output - problem.modelled(fitted)
     rest = on_grid[problem.used & ~_active(steps, problem.period)]
     # Readings that hardly change at rest do not tell it either.
-    if len(rest) < _LEAST_REST_SAMPLES or problem.shared > 0:
+    if len(rest) < _LEAST_STATIONARY_SAMPLES or problem.shared > 0:
         return 1.0
     rest = rest - np.mean(rest)
     coefficients, variance = autoregression(rest)
@@ -112,16 +116,16 @@ def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
 
 
 def _active(steps: Steps, period: float) -> BoolArray:
-    return lasting(steps.moving, round(_AFTER_EDGE_S / period))
+    return extended(steps.moving, round(_AFTER_EDGE_S / period))
 
 
 def _noise(on_grid: FloatArray, used: BoolArray, rest: BoolArray) -> float:
-    if np.sum(rest) >= _LEAST_REST_SAMPLES:
+    if np.sum(rest) >= _LEAST_STATIONARY_SAMPLES:
         return float(np.std(on_grid[rest]))
-    return _noise_of_neighbours(on_grid[used])
+    return _white_noise_deviation(on_grid[used])
 
 
-def _noise_of_neighbours(values: FloatArray) -> float:
+def _white_noise_deviation(values: FloatArray) -> float:
     """Return the standard deviation of white noise: what neighbouring samples do not share."""
     return float(np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0))
 

@@ -13,24 +13,24 @@ from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covari
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.covariance_terms import COVARIANCE_TERMS, CovarianceTerm
-from omsm_ros.core.identification.model_choice import Model
+from omsm_ros.core.identification.model_choice import ChosenModel
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
     Band,
     ResponseLimits,
+    excited_up_to,
     response_band,
-    shown_up_to,
     trusted_up_to,
     widening,
 )
-from omsm_ros.core.model_errors.families import CREEP, MODE, Term
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.families import CREEP, MODE, ModelErrorTerm
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.model_errors.undetected import (
-    HIDING,
-    HiddenTerm,
-    hidden_terms,
-    spread_of_modes,
-    with_slower_creep,
+    UNDETECTED,
+    UndetectedTerm,
+    alternative_mode_covariance,
+    undetected_terms,
+    with_slow_creep,
 )
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
@@ -49,7 +49,7 @@ class ResponseUncertainty:
 
     covariance: (p, p) of the coefficients, all terms included;  from_noise: (p, p) without them
     gain_variance: of the gain of the probe per travel at rest [1]
-    shown_up_to: [Hz] beyond which the motion would show no error of the response
+    excited_up_to: [Hz] beyond which the motion would show no error of the response
     valid_up_to: [Hz] up to which the response is trusted; 0 if nowhere
     findings: of the terms of the covariance
     widened: factor on the uncertainties, and clearly_better: number of poles, see no_surer
@@ -58,7 +58,7 @@ class ResponseUncertainty:
     covariance: FloatArray
     from_noise: FloatArray
     gain_variance: float
-    shown_up_to: float
+    excited_up_to: float
     valid_up_to: float
     findings: Sequence[Finding] = ()
     widened: float = 1.0
@@ -67,13 +67,13 @@ class ResponseUncertainty:
 
 def response_uncertainty(
     prepared: Prepared,
-    model: Model,
+    model: ChosenModel,
     limits: ResponseLimits,
-    hidden: Sequence[CovarianceTerm] = (),
+    undetected: Sequence[CovarianceTerm] = (),
 ) -> ResponseUncertainty:
     """Return how well the chosen fit of ``model`` is known: noise, then each further term.
 
-    hidden: terms of what the residual of this very fit could hide
+    undetected: terms of what the residual of this very fit could hide
     """
     problem, best = prepared.problem, model.chosen.fit
     size, dynamics = best.structure.size, best.dynamics
@@ -81,25 +81,25 @@ def response_uncertainty(
     every = parameter_covariance(problem, problem.sensitivity(best), best.residual, passed)
     transform = best.scaled.coefficient_jacobian(best.nonlinear)
     from_noise = _symmetric(transform @ every[:size, :size] @ transform.T)
-    terms = [*(term(prepared, best, from_noise) for term in COVARIANCE_TERMS), *hidden]
+    terms = [*(term(prepared, best, from_noise) for term in COVARIANCE_TERMS), *undetected]
     covariance = _symmetric(from_noise + np.sum([t.covariance for t in terms], axis=0))
-    shown = _shown_up_to(problem, best, limits)
+    shown = _excited_up_to(problem, best, limits)
     band = response_band(dynamics, covariance, _frequencies(problem))
     return ResponseUncertainty(
         covariance=covariance,
         from_noise=from_noise,
         gain_variance=float(every[size, size]),
-        shown_up_to=shown,
+        excited_up_to=shown,
         valid_up_to=_trusted_up_to(model, band, limits, shown),
         findings=tuple(term.finding for term in terms),
     )
 
 
-def no_surer(
+def inflate_to_free_choice(
     known: ResponseUncertainty,
     prepared: Prepared,
-    model: Model,
-    free: Model,
+    model: ChosenModel,
+    free: ChosenModel,
     limits: ResponseLimits,
 ) -> ResponseUncertainty:
     """Return what is known of an order that was asked for, no surer than the ``free`` choice.
@@ -124,17 +124,17 @@ def no_surer(
     return replace(
         known,
         covariance=covariance,
-        valid_up_to=_trusted_up_to(model, band, limits, known.shown_up_to),
+        valid_up_to=_trusted_up_to(model, band, limits, known.excited_up_to),
         widened=factor,
         clearly_better=other.structure.poles if better else None,
     )
 
 
-def _trusted_up_to(model: Model, band: Band, limits: ResponseLimits, shown: float) -> float:
+def _trusted_up_to(model: ChosenModel, band: Band, limits: ResponseLimits, shown: float) -> float:
     return min(trusted_up_to(band, limits, _disagreement(model, band)), shown)
 
 
-def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
+def _excited_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
     """Return the frequency [Hz] beyond which the data could not contradict the model ``best``."""
     length = len(problem.used)
     compared = np.flatnonzero(problem.used)
@@ -144,7 +144,7 @@ def _shown_up_to(problem: Problem, best: Fit, limits: ResponseLimits) -> float:
     answer = problem.modelled(best) - problem.background @ best.background
     compared_share = best.samples / (compared[-1] + 1 - compared[0])
     noise = noise_spectrum(best.residual, length) * float(taper @ taper) / compared_share
-    return shown_up_to(
+    return excited_up_to(
         np.asarray(fft.rfftfreq(length, problem.period)),
         np.asarray(fft.rfft(taper * (answer - np.mean(answer))), np.complex128),
         noise,
@@ -161,7 +161,7 @@ def _frequencies(problem: Problem) -> FloatArray:
     return np.asarray(np.geomspace(1e-4 * nyquist, nyquist, _FREQUENCIES))
 
 
-def _disagreement(model: Model, band: Band) -> Band:
+def _disagreement(model: ChosenModel, band: Band) -> Band:
     """Return the largest difference from a candidate that describes the data about as well."""
     chosen = model.chosen.fit.dynamics.response(band.frequency)
     gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
@@ -183,8 +183,8 @@ def _disagreement(model: Model, band: Band) -> Band:
 # size is added to the covariance, unless the user declares a smaller prior.
 
 
-def hidden_covariance(
-    survey: Survey,
+def undetected_error_covariance(
+    diagnostics: ResidualDiagnostics,
     settings: Mapping[str, object],
     limits: ResponseLimits,
     drift: Sequence[slice] = (),
@@ -199,44 +199,46 @@ def hidden_covariance(
     Raises ConfigurationError for a prior of another family, or that is no positive number.
     """
     priors = _priors(settings)
-    terms = hidden_terms(survey, drift)
+    terms = undetected_terms(diagnostics, drift)
     entries = [_entry(term, priors) for term in terms]
     covariance = [term.covariance(_carried(term, priors)) for term in terms]
     open_gain, slow = max(
         ((_carried(t, priors) * t.above, t.parameter) for t in terms if t.family == CREEP),
         default=(0.0, 0.0),
     )
-    finding = gain_above_rest(open_gain, slow, survey.plateau, limits.gain)
+    finding = dynamic_gain_finding(open_gain, slow, diagnostics.plateau, limits.gain)
     finding = replace(
         finding,
         entries={
             **finding.entries,
             "could_hide": entries,
-            "hidden_mostly": _mostly(terms, priors),
-            "plateau_s": survey.plateau,
-            "assumed": _assumptions(survey),
+            "hidden_mostly": _dominant_term_text(terms, priors),
+            "plateau_s": diagnostics.plateau,
+            "assumed": _assumptions(diagnostics),
         },
     )
     return [CovarianceTerm(c) for c in covariance] + [
-        CovarianceTerm(np.zeros((_size(survey.fitted),) * 2), finding)
+        CovarianceTerm(np.zeros((_size(diagnostics.fitted),) * 2), finding)
     ]
 
 
-def other_modes(
-    without: Sequence[Survey], terms: Sequence[Term], fitted: Fit
+def alternative_modes(
+    without: Sequence[ResidualDiagnostics], terms: Sequence[ModelErrorTerm], fitted: Fit
 ) -> list[CovarianceTerm]:
     """Return the terms of what each light mode among ``terms`` may be instead.
 
     without: survey of the fit before each of ``terms`` became a part of ``fitted``
     """
     return [
-        CovarianceTerm(spread_of_modes(before, term, fitted))
+        CovarianceTerm(alternative_mode_covariance(before, term, fitted))
         for before, term in zip(without, terms, strict=True)
         if term.family == MODE
     ]
 
 
-def gain_above_rest(size: float, time_constant: float, plateau: float, limit: float) -> Finding:
+def dynamic_gain_finding(
+    size: float, time_constant: float, plateau: float, limit: float
+) -> Finding:
     """Reject a test that leaves the gain of what moves too open against that at rest.
 
     size: standard uncertainty of it, relative, from a relaxation of ``time_constant`` [s]
@@ -245,18 +247,17 @@ def gain_above_rest(size: float, time_constant: float, plateau: float, limit: fl
     entries = {"gain_above_rest_u": size, "plateau_that_would_tell_s": time_constant}
     if COVERAGE_FACTOR * size <= limit:
         return Finding(entries)
-    wide, allowed = percent(COVERAGE_FACTOR * size), percent(limit)
+    open_gain, allowed = percent(COVERAGE_FACTOR * size), percent(limit)
     return Finding(
         entries,
         reasons=(
-            f"drift or creep leaves the gain of what moves open by {wide} against that at "
-            f"rest, at most {allowed} are allowed: "
-            + _plateau_that_would_tell(time_constant, plateau),
+            f"drift or creep leaves the gain of what moves open by {open_gain} against that at "
+            f"rest, at most {allowed} are allowed: " + _plateau_needed(time_constant, plateau),
         ),
     )
 
 
-def _plateau_that_would_tell(time_constant: float, plateau: float) -> str:
+def _plateau_needed(time_constant: float, plateau: float) -> str:
     slow, rest = quantity(time_constant, "s", 2), quantity(plateau, "s", 2)
     if time_constant <= plateau:
         return (
@@ -279,10 +280,10 @@ def _priors(settings: Mapping[str, object]) -> dict[str, float]:
     if not isinstance(stated, Mapping):
         raise ConfigurationError(f"settings: priors is {stated!r}, expected an object")
     for name, value in stated.items():
-        if name not in HIDING:
+        if name not in UNDETECTED:
             raise ConfigurationError(
                 f"settings: the prior of {shown(name)} is unknown, expected one of "
-                f"{', '.join(map(repr, HIDING))}"
+                f"{', '.join(map(repr, UNDETECTED))}"
             )
         if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
             raise ConfigurationError(
@@ -291,11 +292,11 @@ def _priors(settings: Mapping[str, object]) -> dict[str, float]:
     return {str(name): float(value) for name, value in stated.items()}
 
 
-def _carried(term: HiddenTerm, priors: Mapping[str, float]) -> float:
+def _carried(term: UndetectedTerm, priors: Mapping[str, float]) -> float:
     return min(term.carried, priors.get(term.family, np.inf))
 
 
-def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
+def _entry(term: UndetectedTerm, priors: Mapping[str, float]) -> dict[str, object]:
     carried = _carried(term, priors)
     return {
         "family": term.family,
@@ -310,7 +311,7 @@ def _entry(term: HiddenTerm, priors: Mapping[str, float]) -> dict[str, object]:
     }
 
 
-def _mostly(terms: Sequence[HiddenTerm], priors: Mapping[str, float]) -> str:
+def _dominant_term_text(terms: Sequence[UndetectedTerm], priors: Mapping[str, float]) -> str:
     """Return the words for what costs most of what could hide; empty where nothing could."""
     if not terms:
         return ""
@@ -321,9 +322,9 @@ def _mostly(terms: Sequence[HiddenTerm], priors: Mapping[str, float]) -> str:
     }.get(worst.family, "a stiffness that grows with the deflection")
 
 
-def _assumptions(survey: Survey) -> list[str]:
-    slowest = with_slower_creep(survey).slowest_creep
+def _assumptions(diagnostics: ResidualDiagnostics) -> list[str]:
+    slowest = with_slow_creep(diagnostics).longest_time_constant
     return [
         f"no relaxation slower than {quantity(slowest, 's')}",
-        f"no mode below {quantity(1 / survey.plateau, 'Hz', 2)}, the rate of the steps",
+        f"no mode below {quantity(1 / diagnostics.plateau, 'Hz', 2)}, the rate of the steps",
     ]

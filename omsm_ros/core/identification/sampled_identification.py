@@ -23,42 +23,45 @@ from omsm_ros.core.calibration.calibration import REJECTED
 from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.estimation.model_order import held_out_rms
 from omsm_ros.core.estimation.output_error import Fit, Problem
-from omsm_ros.core.estimation.preparation import Prepared, from_rest_to_rest, input_bandwidth
+from omsm_ros.core.estimation.preparation import Prepared, faded_to_stationary, input_bandwidth
 from omsm_ros.core.estimation.sampled_choice import (
     SampledCandidate,
     SampledChoice,
-    choose_of_any_length,
+    choose_sampled_long,
 )
 from omsm_ros.core.estimation.sampled_fit import (
     FIRST_ORDER,
     ZERO_ORDER,
     coefficients,
-    held_equivalent,
+    zero_order_hold_equivalent,
 )
 from omsm_ros.core.estimation.sampled_model import (
     BAND_LIMITED,
     Discrete,
     SampledModel,
-    check_changes,
     check_input,
-    resting_output,
+    check_varies,
+    stationary_output,
 )
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps, held_out, sample_noise
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.residual_tests import independence, whiteness
-from omsm_ros.core.identification.response_uncertainty import no_surer, response_uncertainty
+from omsm_ros.core.identification.response_uncertainty import (
+    inflate_to_free_choice,
+    response_uncertainty,
+)
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
     Band,
     ResponseLimits,
+    is_detectable,
     response_band,
     widening,
-    would_show,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError, IdentificationError
-from omsm_ros.readable import chance, percent, plain, quantity
+from omsm_ros.readable import p_value_text, percent, plain, quantity
 
 # May a sampled model be used, and between which frequencies?
 
@@ -70,7 +73,7 @@ _LEAST_PREDICTED = 0.5
 _LEAST_INDEPENDENCE_P = 1e-4
 
 
-def longest_range(
+def widest_valid_range(
     band: Band, limits: ResponseLimits, shown: BoolArray | None = None
 ) -> tuple[float, float]:
     """Return the widest range [Hz], in octaves, in which the 95 % band keeps within ``limits``.
@@ -148,7 +151,7 @@ def _warnings(independent: object, order: int, free_order: int, widened: float) 
     warnings = []
     if isinstance(independent, float) and independent < _LEAST_INDEPENDENCE_P:
         warnings.append(
-            f"the residual follows the input ({chance(independent)}): more poles, a longer delay, "
+            f"the residual follows the input ({p_value_text(independent)}): more poles, a longer delay, "
             "or something that is not linear"
         )
     if order != free_order:
@@ -183,11 +186,11 @@ def band_limited(
     known = response_uncertainty(prepared, model, limits)
     free = model.free or model
     if model.free is not None:
-        known = no_surer(known, prepared, model, free, limits)
+        known = inflate_to_free_choice(known, prepared, model, free, limits)
     best, problem, slower = model.chosen.fit, prepared.problem, period / _NOMINAL_PERIOD_S
     lines = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / problem.period
-    low, high = longest_range(response_band(best.dynamics, known.covariance, lines), limits)
-    high = max(min(high, known.shown_up_to), low)
+    low, high = widest_valid_range(response_band(best.dynamics, known.covariance, lines), limits)
+    high = max(min(high, known.excited_up_to), low)
     dynamics, covariance = _slower(best.dynamics, known.covariance, best.gain, slower)
     valid = (low / slower, high / slower)
     return SampledModel(
@@ -214,11 +217,11 @@ def _entries_of_band_limited(
     prepared: Prepared, best: Fit, output: FloatArray
 ) -> dict[str, object]:
     problem, variance = prepared.problem, float(np.var(output)) or 1.0
-    hidden = held_out_rms(problem, best, held_out(prepared.steps, len(problem.input)))
+    held_out = held_out_rms(problem, best, held_out(prepared.steps, len(problem.input)))
     return {
         "residual_rms": best.rms,
         "explained": 1 - best.rms**2 / variance,
-        "predicted": 1 - hidden**2 / variance,
+        "predicted": 1 - held_out**2 / variance,
         "whiteness_p": whiteness(best.residual),
         "independence_p": independence(best.residual, np.gradient(problem.input)[problem.used]),
         "samples": {"received": len(problem.input), "compared": best.samples},
@@ -234,7 +237,7 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
     samples = len(input)
     moving = np.ones(samples, np.bool_)
     # In units of its own spread, as a machine's motion is of its travel.
-    faded = from_rest_to_rest(input, moving, _NOMINAL_PERIOD_S)
+    faded = faded_to_stationary(input, moving, _NOMINAL_PERIOD_S)
     used = used & (faded == input)
     problem = Problem(
         input=faded - np.mean(input),
@@ -320,13 +323,13 @@ def identify_samples(
         raise ConfigurationError(f"hold {hold!r}, expected one of {HOLDS}")
     used = np.isfinite(output) if used is None else used & np.isfinite(output)
     check_input(input)
-    check_changes(output[used], "output")
+    check_varies(output[used], "output")
     if hold == BAND_LIMITED:
         return band_limited(input, output, used, period, order, SAMPLED_LIMITS)
-    choice = choose_of_any_length(input, output, used, period, order=order, max_delay=max_delay)
+    choice = choose_sampled_long(input, output, used, period, order=order, max_delay=max_delay)
     known = _Known.of(choice.chosen, choice.delay, period)
-    known, factor = _no_surer(known, choice, period)
-    low, high = longest_range(known.band, SAMPLED_LIMITS, _shown(known, choice.chosen))
+    known, factor = _inflate_to_free_choice(known, choice, period)
+    low, high = widest_valid_range(known.band, SAMPLED_LIMITS, _shown(known, choice.chosen))
     return SampledModel(
         hold=hold,
         sample_period=period,
@@ -335,7 +338,10 @@ def identify_samples(
         covariance=None,
         valid_from=low,
         valid_up_to=high,
-        working_point=(float(np.mean(input)), resting_output(known.discrete, input, output, used)),
+        working_point=(
+            float(np.mean(input)),
+            stationary_output(known.discrete, input, output, used),
+        ),
         certificate=sampled_certificate(
             order=choice.chosen.order,
             free_order=choice.free.order,
@@ -356,11 +362,13 @@ def _shown(known: _Known, candidate: SampledCandidate) -> BoolArray:
     share = float(np.mean(problem.used))
     noise = noise_spectrum(problem.residual(candidate.fit), samples) * float(taper @ taper) / share
     lines = np.asarray(np.fft.rfftfreq(samples, problem.period), np.float64)
-    found = would_show(known.frequency, lines, answer, noise, SAMPLED_LIMITS)
+    found = is_detectable(known.frequency, lines, answer, noise, SAMPLED_LIMITS)
     return np.asarray(np.logical_or.accumulate(found) & np.logical_or.accumulate(found[::-1])[::-1])
 
 
-def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Known, float]:
+def _inflate_to_free_choice(
+    known: _Known, choice: SampledChoice, period: float
+) -> tuple[_Known, float]:
     """Return ``known`` with uncertainties that hold those of the free choice, and their factor."""
     if choice.chosen.order == choice.free.order:
         return known, 1.0
@@ -368,7 +376,7 @@ def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Kno
     ratio = free.discrete.response(known.frequency, period) / known.discrete.response(
         known.frequency, period
     )
-    low, high = longest_range(known.band, SAMPLED_LIMITS)
+    low, high = widest_valid_range(known.band, SAMPLED_LIMITS)
     trusted = (known.frequency >= low) & (known.frequency <= high)
     cut = [
         Band(b.frequency[trusted], b.gain[trusted], b.phase[trusted])
@@ -381,7 +389,7 @@ def _no_surer(known: _Known, choice: SampledChoice, period: float) -> tuple[_Kno
 
 
 def _continuous(discrete: Discrete, period: float, hold: str) -> TransferFunction | None:
-    found = held_equivalent(discrete.numerator, discrete.denominator, period, hold)
+    found = zero_order_hold_equivalent(discrete.numerator, discrete.denominator, period, hold)
     return None if found is None else replace(found, delay=discrete.delay * period)
 
 
@@ -394,7 +402,7 @@ def _entries(choice: SampledChoice, output: FloatArray) -> dict[str, object]:
         "whitened": chosen.whitened,
         "residual_rms": float(np.sqrt(np.mean(residual**2))),
         "explained": 1 - float(np.mean(residual**2)) / variance,
-        "predicted": 1 - float(np.mean(chosen.hidden)) / variance,
+        "predicted": 1 - float(np.mean(chosen.held_out)) / variance,
         "last_part_by_order": [_finite(1 - float(e) / variance) for e in choice.by_order],
         "whiteness_p": whiteness(residual),
         "independence_p": independence(residual, drive),

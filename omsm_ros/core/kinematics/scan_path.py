@@ -39,7 +39,7 @@ class ScanPath:
     left_out: str = ""
 
 
-class PathStart:
+class ScanPathReader:
     """The first samples of a path, gathered from the blocks of a stream while they pass.
 
     Across a gap in the counter, or where Z was lost, or to another sample period, no motion is
@@ -149,11 +149,14 @@ def content_frequency(z: FloatArray, sample_period: float) -> float:
         velocity = velocity[: _with_small_factors(len(velocity))]
     steady = np.full(len(velocity), np.mean(velocity))
     return min(
-        _content_beside(slow, velocity, sample_period) for slow in (steady, _slow_part(velocity))
+        _content_frequency_around(slow, velocity, sample_period)
+        for slow in (steady, _slow_part(velocity))
     )
 
 
-def _content_beside(slow: FloatArray, velocity: FloatArray, sample_period: float) -> float:
+def _content_frequency_around(
+    slow: FloatArray, velocity: FloatArray, sample_period: float
+) -> float:
     power = np.abs(np.fft.rfft(velocity - slow)) ** 2
     # White noise of z, differenced.
     shape = 4 * np.sin(0.5 * np.pi * np.arange(len(power)) / (len(power) - 1)) ** 2

@@ -49,18 +49,18 @@ class _StateSpace(NamedTuple):
     d: float
 
 
-def held_zeros(
-    zeros: ComplexArray, poles: ComplexArray, order: int, at_rest: int = 0
+def polynomial_hold_zeros(
+    zeros: ComplexArray, poles: ComplexArray, order: int, dc_zeros: int = 0
 ) -> ComplexArray:
     """Return the zeros in the z plane of the system with these roots, in radians a sample.
 
-    at_rest: zeros at s = 0, which the interpolation maps to z = 1 exactly if it reproduces
+    dc_zeros: zeros at s = 0, which the interpolation maps to z = 1 exactly if it reproduces
         polynomials of that degree; among eigenvalues that coincide they would be blurred
     """
     if not len(poles):
         return np.empty(0, np.complex128)
     system = _series(zeros, poles)
-    step, weights = _held_integrals(system.a, system.b, order)
+    step, weights = _hold_integrals(system.a, system.b, order)
     n = len(step)
     # States (x[k-1], u[k-1] … u[k-m]).
     transition = np.block([[step, weights[:, 1:]], [np.zeros((order, n)), np.eye(order, k=-1)]])
@@ -71,7 +71,7 @@ def held_zeros(
     finite = np.diag(np.append(np.ones(n + order), 0.0))
     found = generalised_eigenvalues(pencil, finite)
     found = found[np.isfinite(found) & (abs(found) < _FAR_ZERO)]
-    found = _with_exact_ones(found, at_rest)
+    found = _with_exact_ones(found, dc_zeros)
     upper = found[found.imag > 0]
     return np.concatenate([upper, upper.conj(), found[found.imag == 0]])
 
@@ -160,7 +160,7 @@ def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
     return _StateSpace(a, omega * np.eye(n)[-1], c, direct)
 
 
-def _held_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
+def _hold_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Return exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1], … from k-1 to k."""
     n = len(a)
     # Driving states by a chain of integrators makes one exponential hold ∫ e^{a(1-v)} b v^j/j! dv.
@@ -296,8 +296,8 @@ class DigitalFilter:
         """Standard deviation out per standard deviation in, for white noise."""
         pulse = np.zeros(self.settling_samples(1e-9) + 1)
         pulse[0] = 1.0
-        at_rest = np.zeros((len(self.sections), 2))
-        return float(np.linalg.norm(sosfilt(self.sections, pulse, at_rest)))
+        dc_zeros = np.zeros((len(self.sections), 2))
+        return float(np.linalg.norm(sosfilt(self.sections, pulse, dc_zeros)))
 
 
 def discretise(
@@ -317,8 +317,8 @@ def discretise(
         raise ConfigurationError(f"interpolation order {order!r}, expected 1 to 7")
     SAMPLE_PERIOD.checked(sample_period, ConfigurationError, "sample_period")
     continuous = (dynamics.poles() if poles is None else poles) * sample_period
-    at_rest = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
-    zeros = held_zeros(dynamics.zeros() * sample_period, continuous, order, at_rest)
+    dc_zeros = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
+    zeros = polynomial_hold_zeros(dynamics.zeros() * sample_period, continuous, order, dc_zeros)
     discrete = np.append(np.exp(continuous), np.zeros(order if len(continuous) else 0))
     late, delay_zeros = _lagrange_delay(dynamics.delay / sample_period, order)
     late += len(discrete) - len(zeros)
@@ -431,7 +431,7 @@ def velocity_spectrum(
     that transforms fast.
     """
     velocity = np.diff(checked_motion(z)) / sample_period
-    weights = _fading(len(velocity)) if faded else _leaking_least(len(velocity))
+    weights = _fading(len(velocity)) if faded else _low_leakage(len(velocity))
     samples = fast_length(len(velocity))
     frequency = np.fft.rfftfreq(samples, sample_period)
     spectrum = np.fft.rfft(velocity * weights, samples) / np.sinc(frequency * sample_period)
@@ -451,7 +451,7 @@ def fast_length(samples: int) -> int:
     )
 
 
-def _leaking_least(samples: int) -> FloatArray:
+def _low_leakage(samples: int) -> FloatArray:
     # cos kx as polynomials of cos x: one cosine instead of three.
     a0, a1, a2, a3 = BLACKMAN_HARRIS
     cosine = np.cos(2 * np.pi / samples * np.arange(samples))

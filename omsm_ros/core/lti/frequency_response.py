@@ -152,7 +152,7 @@ def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None)
     return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
 
 
-def would_show(
+def is_detectable(
     centres: FloatArray,
     frequency: FloatArray,
     answer: ComplexArray,
@@ -178,13 +178,13 @@ def would_show(
     return np.asarray(energy * allowed > np.sqrt(0.5 * disturbed), np.bool_)
 
 
-def shown_up_to(
+def excited_up_to(
     frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
 ) -> float:
     """Return the highest frequency [Hz] at which the data would show a response off by ``limits``.
 
-    Arguments as of :func:`would_show`; 0 where they show it nowhere.
+    Arguments as of :func:`is_detectable`; 0 where they show it nowhere.
     """
     centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
-    found = np.flatnonzero(would_show(centres, frequency, answer, noise, limits))
+    found = np.flatnonzero(is_detectable(centres, frequency, answer, noise, limits))
     return float(centres[found[0]]) if len(found) else 0.0

@@ -281,8 +281,8 @@ def fit_two_mass(
 
     best = _least(residual, _starts(oscillating, table_mass))
     spread = np.linalg.pinv(best.jac) @ whiten @ jacobian
-    freedom = max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1)
-    misfit = np.sqrt(2 * best.cost / freedom) if best.success else np.inf
+    dof = max(np.count_nonzero(np.diag(covariance)) - len(FITTED), 1)
+    misfit = np.sqrt(2 * best.cost / dof) if best.success else np.inf
     return TwoMassFit(model(best.x), spread_along(spread, covariance), float(misfit))
 
 
@@ -343,7 +343,7 @@ def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArra
 
 
 @dataclass(frozen=True)
-class Shape:
+class ResponseFeatures:
     """What a response looks like; Hz, NaN where it has no such point below ``up_to``.
 
     resonance: of the highest peak of the gain, and that gain;  minimum: of the lowest dip
@@ -358,7 +358,7 @@ class Shape:
     bandwidth_1_percent: float
 
 
-def shape(dynamics: TransferFunction, up_to: float) -> Shape:
+def response_features(dynamics: TransferFunction, up_to: float) -> ResponseFeatures:
     """Read the salient points of |G| below ``up_to`` [Hz]."""
     frequency = np.geomspace(1e-3 * up_to, up_to, 20 * _LINES_MASSES_AND_SPRINGS)
     gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
@@ -373,12 +373,12 @@ def shape(dynamics: TransferFunction, up_to: float) -> Shape:
         outside = np.flatnonzero(np.abs(np.log(gain)) > inside)
         return float(frequency[outside[0]]) if len(outside) else float("nan")
 
-    return Shape(
+    return ResponseFeatures(
         *point(highest), *point(lowest), leaves(np.log(10 ** (3 / 20))), leaves(-np.log(0.99))
     )
 
 
-def finite_values(read: Shape) -> dict[str, float | None]:
+def finite_values(read: ResponseFeatures) -> dict[str, float | None]:
     """Return the fields of ``read`` as JSON values, None for NaN."""
     return {name: value if np.isfinite(value) else None for name, value in asdict(read).items()}
 

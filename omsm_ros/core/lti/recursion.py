@@ -44,7 +44,7 @@ def past_motion(first: FloatArray) -> FloatArray:
     return shifted
 
 
-def past_rest(first: FloatArray) -> FloatArray:
+def past_stationary(first: FloatArray) -> FloatArray:
     """Return the coefficient (1,) of a rest where :func:`past_motion` has its first sample.
 
     For a filter that remembers a minute: a parabola through some samples is, so far back,

@@ -30,10 +30,10 @@ _NOISE_HALF_GAP = 2.0
 
 def without_noise(motion: FloatArray, noise: float) -> FloatArray:
     """Return ``motion`` (n,) [m] without the reversals of ``noise`` [m], its deviation."""
-    return through_gap(motion, _NOISE_HALF_GAP * noise) if noise > 0 else motion
+    return through_backlash(motion, _NOISE_HALF_GAP * noise) if noise > 0 else motion
 
 
-def through_gap(motion: FloatArray, half: float) -> FloatArray:
+def through_backlash(motion: FloatArray, half: float) -> FloatArray:
     """Return the output (n,) of a gap of ±``half`` [m] that ``motion`` (n,) drives."""
     change = np.diff(motion, prepend=motion[0])
     moved = np.flatnonzero(change)
@@ -55,18 +55,18 @@ def through_gap(motion: FloatArray, half: float) -> FloatArray:
     return np.asarray(np.minimum(held, near, out=held))
 
 
-def lost_in_gaps(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatArray]:
+def backlash_lead(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatArray]:
     """Yield the lead of ``motion`` (n,) over half of each gap [m], -1 to 1, and its start column.
 
     Until the whole gap is crossed, what is ahead depends on where in it the motion began.
     """
     crossed = np.maximum.accumulate(motion) - np.minimum.accumulate(motion)
     for gap in gaps:
-        yield (motion - through_gap(motion, 0.5 * gap)) / (0.5 * gap)
+        yield (motion - through_backlash(motion, 0.5 * gap)) / (0.5 * gap)
         yield np.clip(1.0 - crossed / gap, 0.0, 1.0)
 
 
-def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
+def dahl_friction(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
     """Return the friction force along ``motion`` (n,), -1 to 1, and the decay of its start value.
 
     dF/dx = (1 - F sgn v) / travel (Dahl 1968).
@@ -88,7 +88,7 @@ def dahl(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, eq=False)
-class Term:
+class ModelErrorTerm:
     """One departure from a linear, steady response.
 
     parameter: time constant [s], frequency [Hz], travel or period [m]; 0 where it has none
@@ -105,7 +105,7 @@ class Term:
 
 
 @dataclass(frozen=True, eq=False)
-class Family:
+class ModelErrorFamily:
     """Terms of one kind.
 
     part: columns (n, terms · c) of the terms from one index to another, side by side, made when
@@ -121,7 +121,9 @@ class Family:
     dampings: FloatArray | None = None
 
     @classmethod
-    def of(cls, name: str, parameters: FloatArray, trials: float, columns: FloatArray) -> Family:
+    def of(
+        cls, name: str, parameters: FloatArray, trials: float, columns: FloatArray
+    ) -> ModelErrorFamily:
         """Return the terms whose ``columns`` (n, terms · c) are known."""
         width = int(columns.shape[1] // len(parameters))
 
@@ -136,12 +138,12 @@ class Family:
         """Those of all terms, (n, terms · c)."""
         return self.part(0, len(self.parameters))
 
-    def term(self, index: int) -> Term:
+    def term(self, index: int) -> ModelErrorTerm:
         """Return the term at ``index``."""
         damping = 0.0 if self.dampings is None else float(self.dampings[index])
         parameter = float(self.parameters[index])
         columns = self.part(index, index + 1)
-        return Term(self.name, parameter, self.trials, columns, damping)
+        return ModelErrorTerm(self.name, parameter, self.trials, columns, damping)
 
 
 CREEP, MODE = "creep", "soft mode"
@@ -179,7 +181,7 @@ _LINES_TRIED = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Departures:
+class ModelErrorFamilies:
     """All families for the fit ``fitted`` of ``problem``.
 
     slower: than the record, by so much may a relaxation be
@@ -190,10 +192,10 @@ class Departures:
     steps: Steps
     slower: float = 1.0
 
-    def families(self, only: Collection[str] = ()) -> Iterator[Family]:
+    def families(self, only: Collection[str] = ()) -> Iterator[ModelErrorFamily]:
         """Return the families that this motion could show at all, or those named of them."""
         turning = cache(self._turning)  # as long as families are asked for: it is large
-        makers: dict[str, Callable[[], Iterator[Family]]] = {
+        makers: dict[str, Callable[[], Iterator[ModelErrorFamily]]] = {
             CREEP: lambda: iter([self.creep()]),
             MODE: lambda: iter([self.modes()]),
             VIBRATION: lambda: iter([self.vibration()]),
@@ -208,14 +210,14 @@ class Departures:
             if not only or name in only:
                 yield from make()
 
-    def again(self, term: Term) -> Term:
+    def again(self, term: ModelErrorTerm) -> ModelErrorTerm:
         """Return the ``term`` of another fit with the columns that it has in this one."""
         for family in self.families((term.family,)):
             for index in np.flatnonzero(family.parameters == term.parameter):
                 return family.term(int(index))
         return term
 
-    def alike(self, family: Family) -> Family:
+    def alike(self, family: ModelErrorFamily) -> ModelErrorFamily:
         """Return the terms of ``family``, of the same record, as this fit has them."""
         if family.name == CREEP:
             return self.creep(family.parameters)
@@ -249,7 +251,7 @@ class Departures:
         decades = np.log10(slowest / FASTEST_CREEP_S)
         return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
 
-    def creep(self, time_constants: FloatArray | None = None) -> Family:
+    def creep(self, time_constants: FloatArray | None = None) -> ModelErrorFamily:
         """Return ``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
 
         In time and from rest: a relaxation longer than the record remembers how it began.
@@ -260,26 +262,26 @@ class Departures:
         def part(first: int, last: int) -> FloatArray:
             columns = []
             for step in self.problem.period / found[first:last]:
-                once = relaxed(answer, step)
-                columns += [once - answer, relaxed(once, step) - once]
+                once = low_pass_response(answer, step)
+                columns += [once - answer, low_pass_response(once, step) - once]
             return np.array(columns).T
 
-        return Family(CREEP, found, 3.0, part, 2)
+        return ModelErrorFamily(CREEP, found, 3.0, part, 2)
 
-    def modes(self, ladder: Sequence[tuple[float, float]] = ()) -> Family:
+    def modes(self, ladder: Sequence[tuple[float, float]] = ()) -> ModelErrorFamily:
         """Return ``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a.
 
         ladder: frequencies [Hz] and dampings, if not all
         """
-        found = ladder or self._ladder()
+        found = ladder or self._mode_frequencies()
 
         def part(first: int, last: int) -> FloatArray:
             return np.concatenate([self.mode(*each).T for each in found[first:last]]).T
 
         frequencies, dampings = np.array(found).T
-        return Family(MODE, frequencies, len(found) / 2, part, 2, dampings)
+        return ModelErrorFamily(MODE, frequencies, len(found) / 2, part, 2, dampings)
 
-    def _ladder(self) -> list[tuple[float, float]]:
+    def _mode_frequencies(self) -> list[tuple[float, float]]:
         lowest = 2 / self.duration
         highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, FASTEST_MODE_HZ)
         return [
@@ -294,7 +296,7 @@ class Departures:
         mode = self._answer / (1 + 2 * damping * s + s * s)
         return self._in_time(np.array([mode - self._answer, s * mode]))
 
-    def vibration(self) -> Family:
+    def vibration(self) -> ModelErrorFamily:
         """Return the sine and cosine at the strongest lines of the residual."""
         used = self.problem.used
         samples = len(used)
@@ -312,17 +314,17 @@ class Departures:
             power[max(peak - 8, 0) : peak + 9] = 0.0
         angles = 2 * np.pi * np.asarray(found) * time[:, np.newaxis]
         columns = np.stack([np.sin(angles), np.cos(angles)], axis=2).reshape(samples, -1)
-        return Family.of(VIBRATION, np.asarray(found), samples / 2, columns)
+        return ModelErrorFamily.of(VIBRATION, np.asarray(found), samples / 2, columns)
 
-    def drift(self) -> Iterator[Family]:
+    def drift(self) -> Iterator[ModelErrorFamily]:
         """Return polynomials of time beyond the first: slow drift, whatever the axis does."""
         time = np.linspace(-1.0, 1.0, len(self.problem.input))
         columns = np.asarray(legendre.legvander(time, max(_DRIFT_DEGREES)), np.float64)
         for degree in _DRIFT_DEGREES:
             scale = np.full(1, self.duration / degree)
-            yield Family.of(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
+            yield ModelErrorFamily.of(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
 
-    def linearity(self) -> Family:
+    def linearity(self) -> ModelErrorFamily:
         """Return square and cube of the place in the travel: a probe that is not linear.
 
         Of the place that the probe sees, late as it is: of the axis's own, a scale that changes by
@@ -331,17 +333,21 @@ class Departures:
         motion, seen = self.problem.input, self._in_time(self._answer) / self.fitted.gain
         middle = 0.5 * (motion.max() + motion.min())
         place = (seen - middle) / (0.5 * np.ptp(motion) or 1.0)
-        return Family.of(LINEARITY, np.zeros(1), 1.0, np.column_stack([place**2, place**3]))
+        return ModelErrorFamily.of(
+            LINEARITY, np.zeros(1), 1.0, np.column_stack([place**2, place**3])
+        )
 
-    def stiffening(self) -> Family:
+    def stiffening(self) -> ModelErrorFamily:
         """Return the cube of the deflection (output less input), over its largest value."""
         answer = self._in_time(self._answer)
         deflection = answer / self.fitted.gain - self.problem.input
         deflection = deflection - np.median(deflection)
         largest = float(np.max(np.abs(deflection))) or 1.0
-        return Family.of(STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3)
+        return ModelErrorFamily.of(
+            STIFFENING, np.zeros(1), 1.0, (deflection[:, np.newaxis] / largest) ** 3
+        )
 
-    def periodic(self, near: float | None = None) -> Family:
+    def periodic(self, near: float | None = None) -> ModelErrorFamily:
         """Return sines of the position, with periods from the whole travel to a fraction of it.
 
         near: a period among those [m], to have periods between it and its neighbours instead
@@ -354,7 +360,7 @@ class Departures:
             cycles = travel / near + np.linspace(-0.9, 0.9, _BETWEEN_CYCLES)
         return self._of_periods(travel / cycles, trials)
 
-    def _of_periods(self, periods: FloatArray, trials: float) -> Family:
+    def _of_periods(self, periods: FloatArray, trials: float) -> ModelErrorFamily:
         """Return sines of the position of ``periods`` (k,) [m], evenly spaced in their inverse."""
         angle = 2 * np.pi * self._in_time(self._answer) / self.fitted.gain
         apart = 1 / periods[1] - 1 / periods[0]
@@ -368,9 +374,9 @@ class Departures:
                 turned *= step
             return rows.T
 
-        return Family(PERIODIC, np.asarray(periods), trials, part, 2)
+        return ModelErrorFamily(PERIODIC, np.asarray(periods), trials, part, 2)
 
-    def friction(self, turning: Callable[[], FloatArray]) -> Iterator[Family]:
+    def friction(self, turning: Callable[[], FloatArray]) -> Iterator[ModelErrorFamily]:
         """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
         if not self.steps.edges:
             return
@@ -378,10 +384,10 @@ class Departures:
         moved = turning()[::_FINER].copy()
 
         def part(first: int, last: int) -> FloatArray:
-            columns = [c for t in _SLIDING_TRAVELS_M[first:last] for c in dahl(moved, t)]
+            columns = [c for t in _SLIDING_TRAVELS_M[first:last] for c in dahl_friction(moved, t)]
             return -self.fitted.gain * np.column_stack(columns)
 
-        yield Family(FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, part, 2)
+        yield ModelErrorFamily(FRICTION, np.asarray(_SLIDING_TRAVELS_M), 2.0, part, 2)
 
     def _turning(self) -> FloatArray:
         """Return the position of the structure, ``_FINER`` values a sample.
@@ -392,18 +398,18 @@ class Departures:
         answer = _FINER * fft.irfft(self._answer / self.fitted.gain, length)
         return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
 
-    def backlash(self, turning: Callable[[], FloatArray]) -> Iterator[Family]:
+    def backlash(self, turning: Callable[[], FloatArray]) -> Iterator[ModelErrorFamily]:
         """Return half of the backlash: by the last reversal, and by the last step."""
 
         def part(first: int, last: int) -> FloatArray:
-            lost = [c[::_FINER] for c in lost_in_gaps(turning(), _GAPS_M[first:last])]
+            lost = [c[::_FINER] for c in backlash_lead(turning(), _GAPS_M[first:last])]
             return -self.fitted.gain * np.column_stack(lost)
 
         if self.steps.edges:
-            yield Family(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
+            yield ModelErrorFamily(BACKLASH, np.asarray(_GAPS_M), 2.0, part, 2)
         columns = backlash_columns(self.steps, len(self.problem.input))
         if columns.shape[1]:
-            yield Family.of(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
+            yield ModelErrorFamily.of(BACKLASH, np.zeros(1), 1.0, -self.fitted.gain * columns)
 
 
 def _vertex(power: FloatArray, peak: int) -> float:
@@ -423,7 +429,7 @@ def _geometric(low: float, high: float, step: float) -> FloatArray:
     return np.geomspace(low, high, int(np.log(high / low) / step) + 1)
 
 
-def relaxed(values: FloatArray, step: float) -> FloatArray:
+def low_pass_response(values: FloatArray, step: float) -> FloatArray:
     """Return ``values`` (n,) through 1 / (1 + sτ), at rest before; ``step``: sample period over τ.
 
     The values run straight from sample to sample.

@@ -25,15 +25,15 @@ from omsm_ros.core.model_errors.families import (
     FRICTION,
     PERIODIC,
     VIBRATION,
-    Departures,
-    Family,
-    Term,
+    ModelErrorFamilies,
+    ModelErrorFamily,
+    ModelErrorTerm,
 )
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.linear_algebra import unit_columns
 
 # Of a column whose remainder is weaker than this, the fit imitates everything but rounding.
-_IMITATED = 1e-4
+_COLLINEAR_SHARE = 1e-4
 # Directions this much weaker than the strongest are rounding.
 _SPANNED = 1e-9
 # That are in memory at a time beside the result.
@@ -88,7 +88,7 @@ class ResidualSpace:
         kept = values > _SPANNED * values[0]
         return left[:, kept], right[kept].T / values[kept] / scale[:, np.newaxis]
 
-    def imitating(self, column: FloatArray) -> FloatArray:
+    def collinear_parameters(self, column: FloatArray) -> FloatArray:
         """Return the parameters (p,) that come nearest to ``column`` (n,) where it is compared."""
         basis, parameters = self._decomposed
         return np.asarray(parameters @ (basis.T @ column[self.problem.used]))
@@ -106,7 +106,7 @@ class ResidualSpace:
     def _places(self) -> IntArray:
         return np.flatnonzero(self.problem.used)
 
-    def freed(self, columns: FloatArray) -> FloatArray:
+    def projected(self, columns: FloatArray) -> FloatArray:
         """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""
         rows = columns.T.copy()
         self._free(rows)
@@ -136,7 +136,7 @@ class ResidualSpace:
                 both = np.einsum("kg,kg->g", compared[:, i::terms], compared[:, j::terms])
                 both -= np.einsum("kg,kg->g", imitated[..., i], imitated[..., j])
                 gram[:, i, j] = gram[:, j, i] = both
-        inverse = np.linalg.pinv(gram, rcond=_IMITATED, hermitian=True)
+        inverse = np.linalg.pinv(gram, rcond=_COLLINEAR_SHARE, hermitian=True)
         explained = np.einsum("gi,gij,gj->g", moment, inverse, moment)
         return np.asarray(explained / (self.fitted.sum_of_squares / self.fitted.samples))
 
@@ -150,14 +150,14 @@ class ResidualSpace:
         before = _lengths(rows)
         self._free(rows)
         unit = _lengths(rows)
-        free = unit > _IMITATED * np.where(before > 0, before, 1.0)
+        free = unit > _COLLINEAR_SHARE * np.where(before > 0, before, 1.0)
         terms = len(rows)
         size, covariance = np.zeros(terms), np.diag(np.full(terms, np.inf))
         if not np.any(free):
             return Score(size, covariance, 0.0, 0)
         rows, unit = rows[free] if not np.all(free) else rows, unit[free]
         rows /= unit[:, np.newaxis]
-        inverse, degrees = _pseudo_inverse(rows @ rows.T, _IMITATED**2)
+        inverse, degrees = _pseudo_inverse(rows @ rows.T, _COLLINEAR_SHARE**2)
         found = inverse @ (rows @ self._residual)
         spread = inverse @ self._noise_of(rows, found) @ inverse.T
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
@@ -178,7 +178,7 @@ class ResidualSpace:
         samples = len(used)
         length = fft.next_fast_len(samples, real=True)
         residual = (self._residual - found @ rows)[used]
-        noise = broad_noise(residual, self._places, samples, length)
+        noise = smoothed_noise_spectrum(residual, self._places, samples, length)
         noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
         even = weighted_gram(rows, length, noise)
         if self._scatter == 0 and self.problem.shared == 0:
@@ -204,7 +204,9 @@ def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int
     return np.asarray(strong / values[kept] @ strong.T), int(np.sum(kept))
 
 
-def broad_noise(residual: FloatArray, place: IntArray, samples: int, length: int) -> FloatArray:
+def smoothed_noise_spectrum(
+    residual: FloatArray, place: IntArray, samples: int, length: int
+) -> FloatArray:
     """Return the variance spectrum of ``residual`` (k,) at ``length`` // 2 + 1 frequencies.
 
     place: index of each among ``samples``
@@ -241,10 +243,10 @@ _BY_ALL = (VIBRATION, BACKLASH, FRICTION)
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class ScoreTest:
     """A term and what the residual says of it."""
 
-    term: Term
+    term: ModelErrorTerm
     score: Score
 
     @property
@@ -263,10 +265,10 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Survey:
+class ResidualDiagnostics:
     """The scores for ``fitted`` of all families, or of those named; each is computed once.
 
-    slower: see :class:`Departures`
+    slower: see :class:`ModelErrorFamilies`
     """
 
     problem: Problem
@@ -281,32 +283,32 @@ class Survey:
         return ResidualSpace(self.problem, self.fitted)
 
     @cached_property
-    def departures(self) -> Departures:
+    def model_errors(self) -> ModelErrorFamilies:
         """The columns of all families."""
-        return Departures(self.problem, self.fitted, self.steps, self.slower)
+        return ModelErrorFamilies(self.problem, self.fitted, self.steps, self.slower)
 
     @cached_property
-    def best(self) -> Mapping[str, Judged]:
+    def best(self) -> Mapping[str, ScoreTest]:
         """Return the most significant term of each family, by the name of the family."""
-        found: dict[str, Judged] = {}
-        for family in self.departures.families(self.only):
+        found: dict[str, ScoreTest] = {}
+        for family in self.model_errors.families(self.only):
             term = self._best_of(family)
             if family.name == PERIODIC:
-                term = self._best_of(self.departures.periodic(term.parameter))
-            judged, before = Judged(term, self.space.score(term.columns)), found.get(family.name)
+                term = self._best_of(self.model_errors.periodic(term.parameter))
+            judged, before = ScoreTest(term, self.space.score(term.columns)), found.get(family.name)
             if before is None or self.evidence(judged) > self.evidence(before):
                 found[family.name] = judged
         return found
 
-    def _best_of(self, family: Family) -> Term:
+    def _best_of(self, family: ModelErrorFamily) -> ModelErrorTerm:
         if len(family.parameters) == 1:
             return family.term(0)
         if self.thinned is None or family.name in _BY_ALL:
-            return family.term(int(np.argmax(self.screened(family))))
-        alike = self.thinned.departures.alike(family)
-        return family.term(int(np.argmax(self.thinned.screened(alike))))
+            return family.term(int(np.argmax(self.screening_scores(family))))
+        alike = self.thinned.model_errors.alike(family)
+        return family.term(int(np.argmax(self.thinned.screening_scores(alike))))
 
-    def screened(self, family: Family) -> FloatArray:
+    def screening_scores(self, family: ModelErrorFamily) -> FloatArray:
         """Return χ² of each term of ``family``, as for white noise, see :class:`ResidualSpace`."""
         every = len(family.parameters)
         step = max(_VALUES // (len(self.problem.input) * family.width), 1)
@@ -318,7 +320,7 @@ class Survey:
         )
 
     @cached_property
-    def thinned(self) -> Survey | None:
+    def thinned(self) -> ResidualDiagnostics | None:
         """The same of fewer samples, of a long step test: what is slow shows there as well.
 
         None where there are few samples, where the motion hardly rests, so that much of it may be
@@ -340,11 +342,11 @@ class Survey:
         return replace(self, problem=fewer, fitted=fitted, steps=moved)
 
     @cached_property
-    def creep(self) -> tuple[Judged, ...]:
+    def creep(self) -> tuple[ScoreTest, ...]:
         """Return relaxations of every time constant that is looked for, each judged alone."""
-        family = self.departures.creep()
+        family = self.model_errors.creep()
         terms = (family.term(index) for index in range(len(family.parameters)))
-        return tuple(Judged(t, self.space.score(t.columns[:, :1])) for t in terms)
+        return tuple(ScoreTest(t, self.space.score(t.columns[:, :1])) for t in terms)
 
     @cached_property
     def independence(self) -> float:
@@ -366,26 +368,26 @@ class Survey:
             columns[:, first : first + _ROWS] = (past[first : first + _ROWS] @ mixed).T
         return float(np.exp(self.space.judged(columns).log_p))
 
-    def significant(self, but: Collection[str] = ()) -> list[Judged]:
+    def significant(self, but: Collection[str] = ()) -> list[ScoreTest]:
         """Return the significant families, the clearest first, without those named ``but``."""
         shown = [j for j in self.best.values() if j.term.family not in but and j.significant]
         return sorted(shown, key=self.evidence, reverse=True)
 
-    def evidence(self, judged: Judged) -> float:
+    def evidence(self, judged: ScoreTest) -> float:
         """Return the logarithm of the odds for ``judged``."""
         return judged.evidence(self.fitted.samples)
 
     @property
-    def slowest_creep(self) -> float:
+    def longest_time_constant(self) -> float:
         """Return the longest time constant [s] that was looked for."""
-        return float(self.departures.time_constants()[-1])
+        return float(self.model_errors.time_constants()[-1])
 
     @property
     def plateau(self) -> float:
         """Time from one edge to the next [s]; of a motion without edges its whole length."""
         starts = [edge.start for edge in self.steps.edges]
         if len(starts) < 2:
-            return self.departures.duration
+            return self.model_errors.duration
         return float(np.median(np.diff(starts))) * self.problem.period
 
 
@@ -424,10 +426,13 @@ class Contrast:
         return self.p < FALSE_ALARM
 
 
-def contrasts(survey: Survey) -> list[Contrast]:
+def contrasts(diagnostics: ResidualDiagnostics) -> list[Contrast]:
     """Return the contrasts that the steps of this test allow."""
-    samples = len(survey.problem.input)
-    return [_of(survey, name, weight) for name, weight in _weights(survey.steps, samples)]
+    samples = len(diagnostics.problem.input)
+    return [
+        _contrast_of(diagnostics, name, weight)
+        for name, weight in _weights(diagnostics.steps, samples)
+    ]
 
 
 def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:
@@ -448,16 +453,16 @@ def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:
             yield name, np.repeat(np.where(first, 1.0, -1.0), length)
 
 
-def _of(survey: Survey, name: str, weight: FloatArray) -> Contrast:
-    fitted, problem = survey.fitted, survey.problem
+def _contrast_of(diagnostics: ResidualDiagnostics, name: str, weight: FloatArray) -> Contrast:
+    fitted, problem = diagnostics.fitted, diagnostics.problem
     answer = fitted.gain * problem.response(fitted)
     by_gain = np.cumsum(weight * np.diff(answer, prepend=answer[0]))
     by_lag = -weight * np.gradient(answer, problem.period)
-    score = survey.space.score(np.column_stack([by_gain, by_lag]))
+    score = diagnostics.space.score(np.column_stack([by_gain, by_lag]))
     gain, lag = 2 * score.size
     gain_uncertainty, lag_uncertainty = 2 * np.sqrt(np.diag(score.covariance))
-    return Contrast(name, gain, gain_uncertainty, lag, lag_uncertainty, _chance(score))
+    return Contrast(name, gain, gain_uncertainty, lag, lag_uncertainty, _p_value(score))
 
 
-def _chance(score: Score) -> float:
+def _p_value(score: Score) -> float:
     return float(np.exp(score.log_p))

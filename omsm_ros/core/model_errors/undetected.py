@@ -15,25 +15,35 @@ from numpy.polynomial import polynomial
 from scipy import stats
 
 from omsm_ros.core.estimation.model_order import MAX_POLES
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import Fit, Problem, fit
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.model_errors.families import CREEP, FASTEST_CREEP_S, MODE, STIFFENING, Term
-from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Judged, Survey
+from omsm_ros.core.model_errors.families import (
+    CREEP,
+    FASTEST_CREEP_S,
+    MODE,
+    STIFFENING,
+    ModelErrorTerm,
+)
+from omsm_ros.core.model_errors.residual_diagnostics import (
+    FALSE_ALARM,
+    ResidualDiagnostics,
+    ScoreTest,
+)
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.linear_algebra import least_squares
 
 # Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
 # area-weighted rms [m]; the mean of each turn moves over minutes and counts as rest.
-PAPER_SCAN = ((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6))
+PAPER_SCAN_LINES = ((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6))
 # Of its rate [m/s], rms.
-_SCAN_RATE = float(np.sqrt(sum((2 * np.pi * f * rms) ** 2 for f, rms in PAPER_SCAN)))
+_SCAN_RATE = float(np.sqrt(sum((2 * np.pi * f * rms) ** 2 for f, rms in PAPER_SCAN_LINES)))
 # A test that alarms with probability α misses with 5 % what lies 1.645 σ above its limit.
 _POWER = 1.645
 # The families whose omission bends the response itself.
 _BENDING = (MODE, STIFFENING)
-HIDING = (CREEP, *_BENDING)
+UNDETECTED = (CREEP, *_BENDING)
 """Every family that may hide in a test, by which priors are named."""
 
 # Decades of time between a structure's slowest motion and the length of a record.
@@ -53,7 +63,7 @@ _STEADY_DRIFT = slice(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
-class HiddenTerm:
+class UndetectedTerm:
     """One family that could hide.
 
     size, uncertainty: of the most significant term of the family, in its unit
@@ -90,62 +100,68 @@ class HiddenTerm:
         return np.asarray(rows.T @ rows)
 
 
-def hidden_terms(survey: Survey, drift: Sequence[slice] = ()) -> list[HiddenTerm]:
+def undetected_terms(
+    diagnostics: ResidualDiagnostics, drift: Sequence[slice] = ()
+) -> list[UndetectedTerm]:
     """Return what could hide: the worst relaxation first, then the families that bend G.
 
     drift: columns of the background that model a drift
     """
     # Of relaxations alone: what the survey found of all else stands.
-    slow = with_slower_creep(survey.thinned or survey)
-    relaxations = [_hidden(slow, judged) for judged in slow.creep]
-    for gone in _taken_for_noise(drift):
-        other = without_drift(slow, gone).creep
-        relaxations = [_smaller(*pair) for pair in zip(relaxations, other, strict=True)]
+    slow = with_slow_creep(diagnostics.thinned or diagnostics)
+    relaxations = [_undetected_terms(slow, judged) for judged in slow.creep]
+    for gone in _drift_models(drift):
+        other = with_drift_as_noise(slow, gone).creep
+        relaxations = [_better_relaxation(*pair) for pair in zip(relaxations, other, strict=True)]
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
-    found = _worst(known, relaxation_found(survey.fitted.dynamics)) if known else []
+    found = (
+        _worst_relaxation(known, fitted_relaxation(diagnostics.fitted.dynamics)) if known else []
+    )
     for name in _BENDING:
-        judged = survey.best.get(name)
+        judged = diagnostics.best.get(name)
         if judged is None or not np.isfinite(judged.score.uncertainty):
             continue
-        if _excited(survey, judged) or _hinted(judged):
-            found.append(_hidden(survey, judged))
+        if _excited(diagnostics, judged) or _hinted_by_data(judged):
+            found.append(_undetected_terms(diagnostics, judged))
     return found
 
 
-def _taken_for_noise(drift: Sequence[slice]) -> list[Sequence[slice]]:
+def _drift_models(drift: Sequence[slice]) -> list[Sequence[slice]]:
     """Return which drifts to take for noise: the steady one, the bent one, and both."""
     steady = [_STEADY_DRIFT]
     return [steady, drift, [*steady, *drift]] if drift else [steady]
 
 
-def with_slower_creep(survey: Survey) -> Survey:
-    """Return ``survey`` with relaxations of a minute, or as slow as this record is long."""
-    slower = min(_MOST_RECORDS, _SLOWEST_CREEP_S / survey.departures.duration)
-    return replace(survey, slower=max(slower, 1.0))
+def with_slow_creep(diagnostics: ResidualDiagnostics) -> ResidualDiagnostics:
+    """Return ``diagnostics`` with relaxations of a minute, or as slow as this record is long."""
+    slower = min(_MOST_RECORDS, _SLOWEST_CREEP_S / diagnostics.model_errors.duration)
+    return replace(diagnostics, slower=max(slower, 1.0))
 
 
-def without_drift(survey: Survey, drift: Sequence[slice]) -> Survey:
-    """Return ``survey`` with the drift that was modelled taken for noise of the readings.
+def with_drift_as_noise(
+    diagnostics: ResidualDiagnostics, drift: Sequence[slice]
+) -> ResidualDiagnostics:
+    """Return ``diagnostics`` with the drift that was modelled taken for noise of the readings.
 
     Columns of any size let a drift of a micrometre undo a relaxation of as much. One that
     wanders by nanometres cannot, and as noise it is no larger than it was found to be. A slow
     relaxation itself looks like a steady drift: where there is none, there is no relaxation.
     """
-    fitted, problem = survey.fitted, survey.problem
+    fitted, problem = diagnostics.fitted, diagnostics.problem
     gone = np.zeros(problem.background.shape[1], np.bool_)
     for columns in drift:
         gone[columns] = True
     drifted = problem.background[:, gone] @ fitted.background[gone]
     noisy = fitted.residual + drifted[problem.used]
-    return Survey(
+    return ResidualDiagnostics(
         replace(problem, background=problem.background[:, ~gone]),
         replace(fitted, background=fitted.background[~gone], residual=noisy),
-        survey.steps,
-        slower=survey.slower,
+        diagnostics.steps,
+        slower=diagnostics.slower,
     )
 
 
-def _smaller(term: HiddenTerm, other: Judged) -> HiddenTerm:
+def _better_relaxation(term: UndetectedTerm, other: ScoreTest) -> UndetectedTerm:
     """Return the relaxation ``term`` as ``other`` has it, where that leaves less of it open."""
     size, uncertainty = float(other.score.size[0]), other.score.uncertainty
     if not np.hypot(size, uncertainty) < term.carried:
@@ -154,7 +170,7 @@ def _smaller(term: HiddenTerm, other: Judged) -> HiddenTerm:
     return replace(term, size=size, uncertainty=uncertainty)
 
 
-def _worst(relaxations: list[HiddenTerm], found: float) -> list[HiddenTerm]:
+def _worst_relaxation(relaxations: list[UndetectedTerm], found: float) -> list[UndetectedTerm]:
     """Return the relaxation that would cost most, and of another one the lag if that is larger.
 
     Neither is larger than is likely where one was found.
@@ -171,14 +187,16 @@ def _worst(relaxations: list[HiddenTerm], found: float) -> list[HiddenTerm]:
         ]
     worst = max(relaxations, key=lambda term: term.effect * term.carried)
     slower = _UNSEEN * found
-    latest = max((_by_excess(term) for term in relaxations), key=lambda term: term.lag * term.size)
+    latest = max(
+        (_lag_beyond_noise(term) for term in relaxations), key=lambda term: term.lag * term.size
+    )
     other = [latest] if latest.lag * latest.size > worst.lag * worst.carried else []
     if worst.above > 0 and worst.carried * worst.above < slower:
         worst = replace(worst, size=0.0, uncertainty=slower / worst.above)
     return [worst, *other]
 
 
-def _by_excess(term: HiddenTerm) -> HiddenTerm:
+def _lag_beyond_noise(term: UndetectedTerm) -> UndetectedTerm:
     """Return the lag alone of ``term``, in the size by which it exceeds what noise makes of none.
 
     Many relaxations lag, of each of which the noise would hide some; those that the data hint at
@@ -189,7 +207,7 @@ def _by_excess(term: HiddenTerm) -> HiddenTerm:
     return replace(term, size=excess, uncertainty=0.0, above=0.0, effect=effect)
 
 
-def relaxation_found(dynamics: TransferFunction) -> float:
+def fitted_relaxation(dynamics: TransferFunction) -> float:
     """Return the share of G(0) that comes with real poles slower than a structure's [1]."""
     poles = dynamics.poles()
     found = 0.0
@@ -201,32 +219,32 @@ def relaxation_found(dynamics: TransferFunction) -> float:
     return found
 
 
-def _excited(survey: Survey, judged: Judged) -> bool:
+def _excited(diagnostics: ResidualDiagnostics, judged: ScoreTest) -> bool:
     """Return False for a mode slower than the steps follow each other: they hardly excite it."""
-    return judged.term.family != MODE or judged.term.parameter * survey.plateau >= 1
+    return judged.term.family != MODE or judged.term.parameter * diagnostics.plateau >= 1
 
 
-def _hinted(judged: Judged) -> bool:
+def _hinted_by_data(judged: ScoreTest) -> bool:
     """Return whether chance alone makes such a mode in one test of twenty, or in fewer."""
     return judged.term.family == MODE and judged.log_p < np.log(_HINT)
 
 
-def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
-    fitted, term, score = survey.fitted, judged.term, judged.score
-    shift = omitted(survey, term.columns[:, 0])
-    frequency, rms = np.array(PAPER_SCAN).T
+def _undetected_terms(diagnostics: ResidualDiagnostics, judged: ScoreTest) -> UndetectedTerm:
+    fitted, term, score = diagnostics.fitted, judged.term, judged.score
+    shift = omission_shift(diagnostics, term.columns[:, 0])
+    frequency, rms = np.array(PAPER_SCAN_LINES).T
     imitated = _relative(fitted, frequency, shift)
-    remaining = imitated - _departure(term.family, term.parameter, term.damping, frequency)
+    remaining = imitated - _response_error(term.family, term.parameter, term.damping, frequency)
     # A light mode is tenfold at its own frequency, which no fitted coefficient imitates.
-    whole = term.family == CREEP or _hinted(judged)
+    whole = term.family == CREEP or _hinted_by_data(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
     lag = float(np.linalg.norm(remaining.imag * rms)) / _SCAN_RATE
-    return HiddenTerm(
+    return UndetectedTerm(
         term.family,
         term.parameter,
         float(score.size[0]),
         score.uncertainty,
-        _missed(judged),
+        _undetected_size(judged),
         np.zeros_like(shift) if whole else shift,
         gain,
         np.eye(len(gain))[-1],
@@ -236,14 +254,16 @@ def _hidden(survey: Survey, judged: Judged) -> HiddenTerm:
     )
 
 
-def _missed(judged: Judged) -> float:
+def _undetected_size(judged: ScoreTest) -> float:
     """Return the largest size that the test would have missed with 5 % probability."""
     degrees = max(judged.score.degrees, 1)
     limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, degrees))
     return float(limit + _POWER) * judged.score.uncertainty
 
 
-def _departure(family: str, parameter: float, damping: float, frequency: FloatArray) -> FloatArray:
+def _response_error(
+    family: str, parameter: float, damping: float, frequency: FloatArray
+) -> FloatArray:
     """Return the complex departure of G, relative, at ``frequency`` (k,) [Hz], per unit, (k,)."""
     s = 2j * np.pi * frequency
     if family == CREEP:
@@ -259,9 +279,9 @@ def _relative(fitted: Fit, frequency: FloatArray, shift: FloatArray) -> FloatArr
     return np.asarray(real + 1j * imaginary)
 
 
-def omitted(survey: Survey, column: FloatArray) -> FloatArray:
+def omission_shift(diagnostics: ResidualDiagnostics, column: FloatArray) -> FloatArray:
     """Return the shift (p,) of G's coefficients if a term that adds ``column`` (n,) is omitted."""
-    fitted, solved = survey.fitted, survey.space.imitating(column)
+    fitted, solved = diagnostics.fitted, diagnostics.space.collinear_parameters(column)
     jacobian = fitted.scaled.coefficient_jacobian(fitted.nonlinear)
     return np.asarray(jacobian @ solved[: fitted.structure.size])
 
@@ -289,7 +309,9 @@ _LITTLE = 0.02
 _DIRECTIONS = 1e-6
 
 
-def spread_of_modes(before: Survey, term: Term, fitted: Fit) -> FloatArray:
+def alternative_mode_covariance(
+    before: ResidualDiagnostics, term: ModelErrorTerm, fitted: Fit
+) -> FloatArray:
     """Return the covariance (p, p) of what other light modes than ``term`` would make of G.
 
     before: survey of the fit without the mode;  term: the mode as ``fitted`` has it
@@ -303,9 +325,9 @@ def spread_of_modes(before: Survey, term: Term, fitted: Fit) -> FloatArray:
         if term.parameter * np.exp(off) < highest
     ]
     before = before.thinned or before
-    modes = before.departures.modes(tried)
-    screened = before.screened(modes)
-    likely = np.exp(0.5 * (screened - np.max(screened)))
+    modes = before.model_errors.modes(tried)
+    screening_scores = before.screening_scores(modes)
+    likely = np.exp(0.5 * (screening_scores - np.max(screening_scores)))
     kept = np.flatnonzero(likely > _LEAST_LIKELY)
     lines = np.geomspace(_LOWEST_HZ, _HIGHEST * term.parameter, _LINES)
     lines = np.sort(np.append(lines, [frequency for frequency, _ in tried]))
@@ -314,10 +336,10 @@ def spread_of_modes(before: Survey, term: Term, fitted: Fit) -> FloatArray:
         np.sqrt(likely[i] / np.sum(likely[kept])) * (_change(before, modes.term(i), lines) - own)
         for i in kept.tolist()
     ]
-    return _imitating(fitted, lines, np.asarray(rows))
+    return _collinear_covariance(fitted, lines, np.asarray(rows))
 
 
-def _imitating(fitted: Fit, lines: FloatArray, rows: ComplexArray) -> FloatArray:
+def _collinear_covariance(fitted: Fit, lines: FloatArray, rows: ComplexArray) -> FloatArray:
     """Return the covariance (p, p) with which G varies at ``lines`` (k,) as by ``rows`` (m, k).
 
     Coefficients turn one mode into its neighbours, not into all of them: where ``rows`` are large
@@ -343,12 +365,12 @@ def _imitating(fitted: Fit, lines: FloatArray, rows: ComplexArray) -> FloatArray
     return np.asarray(factor**2 * covariance)
 
 
-def _change(before: Survey, term: Term, lines: FloatArray) -> ComplexArray:
+def _change(before: ResidualDiagnostics, term: ModelErrorTerm, lines: FloatArray) -> ComplexArray:
     """Return the relative change (k,) of G at ``lines`` [Hz] by a mode in its best size."""
     size = before.space.score(term.columns).size
     ratio = 1j * lines / term.parameter
     mode = 1 / (1 + 2 * term.damping * ratio + ratio**2)
-    real, imaginary = relative_response_jacobian(before.fitted.dynamics, lines) @ omitted(
+    real, imaginary = relative_response_jacobian(before.fitted.dynamics, lines) @ omission_shift(
         before, term.columns @ size
     )
     return np.asarray(size[0] * (mode - 1) + size[1] * ratio * mode - real - 1j * imaginary)
@@ -357,7 +379,7 @@ def _change(before: Survey, term: Term, lines: FloatArray) -> ComplexArray:
 # A relaxation, or a light mode, as poles of a response.
 
 
-def poles_of(term: Term) -> ComplexArray:
+def poles_of(term: ModelErrorTerm) -> ComplexArray:
     """Return the poles [rad/s] of a relaxation, (1,), or of a mode, (2,)."""
     if term.family == CREEP:
         return np.array([-1 / term.parameter], np.complex128)
@@ -366,7 +388,7 @@ def poles_of(term: Term) -> ComplexArray:
     return np.array([upper, np.conj(upper)], np.complex128)
 
 
-def as_fitted(term: Term, fitted: Fit) -> Term:
+def at_fitted_pole(term: ModelErrorTerm, fitted: Fit) -> ModelErrorTerm:
     """Return ``term`` with the time constant [s] or frequency [Hz] of the pole that it became."""
     poles = fitted.dynamics.poles()
     near = np.abs(np.log(poles / poles_of(term)[0]))
@@ -375,7 +397,7 @@ def as_fitted(term: Term, fitted: Fit) -> Term:
     return replace(term, parameter=float(parameter), damping=float(-pole.real / abs(pole)))
 
 
-def with_poles(
+def fit_with_added_poles(
     problem: Problem, base: Fit, new: ComplexArray, starts: Sequence[float]
 ) -> Fit | None:
     """Return the fit of ``base`` and ``new`` poles [rad/s], started at multiples of them.
@@ -386,7 +408,7 @@ def with_poles(
     larger = Structure(base.structure.poles + len(new), zeros, delay)
     if larger.poles > MAX_POLES:
         return None
-    scaled = Scaled(larger, problem.rate)
+    scaled = ScaledStructure(larger, problem.rate)
     late = float(base.nonlinear[-1]) if delay else 0.0
     own = base.dynamics.poles()
 

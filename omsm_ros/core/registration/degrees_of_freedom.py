@@ -15,12 +15,12 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.form_model import FormBasis
 from omsm_ros.core.registration.placement import (
-    FREEDOMS,
+    DEGREES_OF_FREEDOM,
     Aperture,
     Placed,
     Placement,
-    Portion,
-    freedom_columns,
+    PointBatch,
+    dof_columns,
     placed,
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -31,47 +31,47 @@ from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 AUTO = "auto"
 HELD = "freedoms held"
 """Name of the source of error that a freedom is which was held."""
-RIGID = FREEDOMS[:6]
+RIGID = DEGREES_OF_FREEDOM[:6]
 MOVES = ("x", "y", "clocking")
 """Freedoms that a chuck settles; piston, tip and tilt no part comes without."""
 # Odds that a part was moved, at which it is said to be: strong evidence. Less may be its form.
-_PLAINLY = 20.0
+_CLEARLY_DETERMINED = 20.0
 _LEAST_FORM_M = NANOMETRE_M
 
 
-def widest(freedom: str) -> float:
+def typical_range(dof: str) -> float:
     """Return how far a freedom may be off on a part that was put on its chuck by hand [m], [rad].
 
     One that a nanometre of form would move further than this is not determined by the surface.
     """
-    if freedom == "power":
+    if dof == "power":
         return 1.0
-    return MILLIMETRE_M if freedom in ("x", "y", "piston") else DEGREE_RAD
+    return MILLIMETRE_M if dof in ("x", "y", "piston") else DEGREE_RAD
 
 
-class Freedoms(NamedTuple):
+class DegreesOfFreedom(NamedTuple):
     """What is fitted, in the order of its columns, and why something else is not.
 
-    refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest`
+    refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest_dof`
     """
 
     fitted: tuple[str, ...]
     refused: dict[str, str]
     held: dict[str, str]
 
-    def without(self, name: str, reason: str) -> Freedoms:
+    def without(self, name: str, reason: str) -> DegreesOfFreedom:
         """Return the freedoms with one of them held."""
         left = tuple(n for n in self.fitted if n != name)
-        return Freedoms(left, self.refused, {**self.held, name: reason})
+        return DegreesOfFreedom(left, self.refused, {**self.held, name: reason})
 
 
-def parsed_freedoms(text: str) -> tuple[str, ...]:
+def parse_dofs(text: str) -> tuple[str, ...]:
     """Return the freedoms of 'auto' or of a list such as 'piston,tip,tilt'.
 
     Raises ConfigurationError for a name that is no freedom, or stands twice.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
-    known = [AUTO, *FREEDOMS]
+    known = [AUTO, *DEGREES_OF_FREEDOM]
     for name in names:
         if name not in known or names.count(name) > 1:
             why = "is unknown" if name not in known else "stands twice"
@@ -81,16 +81,16 @@ def parsed_freedoms(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def determined(asked: Sequence[str], gram: FloatArray, points: int) -> Freedoms:
+def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> DegreesOfFreedom:
     """Return which of the freedoms ``asked`` for are determined.
 
-    asked: of :data:`FREEDOMS`, or "auto", alone or beside "power": the rigid ones that are
+    asked: of :data:`DEGREES_OF_FREEDOM`, or "auto", alone or beside "power": the rigid ones that are
     gram: sums of products (7, 7) of the columns of all freedoms over ``points``
 
     Raises DataError for a freedom that was named and is not determined.
     """
     automatic = AUTO in asked
-    wanted = [n for n in FREEDOMS if n in asked or (automatic and n in RIGID)]
+    wanted = [n for n in DEGREES_OF_FREEDOM if n in asked or (automatic and n in RIGID)]
     fitted: list[str] = []
     refused: dict[str, str] = {}
     for name in wanted:
@@ -101,10 +101,10 @@ def determined(asked: Sequence[str], gram: FloatArray, points: int) -> Freedoms:
             refused[name] = reason
         else:
             raise DataError(f"{name} cannot be fitted: {reason}; leave it out of the fit")
-    return Freedoms(tuple(fitted), refused, {})
+    return DegreesOfFreedom(tuple(fitted), refused, {})
 
 
-def weakest(
+def weakest_dof(
     names: Sequence[str], values: FloatArray, covariance: FloatArray, gram: FloatArray
 ) -> tuple[str, str] | None:
     """Return which move had better be held at its nominal value, and why; None if none had.
@@ -122,11 +122,11 @@ def weakest(
     # The part of its column that no other freedom has.
     own = scale / np.sqrt(np.maximum(np.diag(inverse), 1.0))
     found = [
-        ((values[k] / spread[k]) ** 2 / 2 - np.log(widest(name) / spread[k]), k)
+        ((values[k] / spread[k]) ** 2 / 2 - np.log(typical_range(name) / spread[k]), k)
         for k, name in enumerate(names)
         if name in MOVES and own[k] * spread[k] > _LEAST_FORM_M
     ]
-    if not found or min(found)[0] > np.log(_PLAINLY):
+    if not found or min(found)[0] > np.log(_CLEARLY_DETERMINED):
         return None
     k = min(found)[1]
     unit = "rad" if names[k] == "clocking" else "m"
@@ -140,9 +140,9 @@ def weakest(
 
 def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> str:
     """Return why a freedom is not determined beside those ``before`` it, empty if it is."""
-    places, own = [FREEDOMS.index(n) for n in before], FREEDOMS.index(name)
+    places, own = [DEGREES_OF_FREEDOM.index(n) for n in before], DEGREES_OF_FREEDOM.index(name)
     alone = float(np.sqrt(gram[own, own]))
-    if alone * widest(name) < _LEAST_FORM_M:
+    if alone * typical_range(name) < _LEAST_FORM_M:
         return "the surface stays as it is when it is moved so"
     scale = np.sqrt(np.diag(gram))[places]
     shared = gram[places, own] / scale / alone
@@ -150,7 +150,7 @@ def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> str:
     share = np.linalg.lstsq(normal, shared, rcond=1e-14)[0] if places else shared
     left = alone * np.sqrt(max(1 - float(shared @ share), 0.0))
     # Beneath this share of the column the difference is rounding.
-    if left > 1e-6 * alone and left * widest(name) >= _LEAST_FORM_M:
+    if left > 1e-6 * alone and left * typical_range(name) >= _LEAST_FORM_M:
         return ""
     same = [n for n, s in zip(before, share, strict=True) if abs(s) > 0.05]
     return f"on this surface it does what {' and '.join(same)} do" if len(same) > 1 else (
@@ -165,7 +165,7 @@ def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> str:
 class Registration:
     """How the part sits, and how well that is known.
 
-    surface: the nominal;  placement: of the part;  freedoms: what was fitted, and what could not be
+    surface: the nominal;  placement: of the part;  dofs: what was fitted, and what could not be
     from_source: standard uncertainty of each (p,) by where it comes from
     pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
     taken: mean products of how much of each form is likely to have made (p, p), at most one
@@ -173,7 +173,7 @@ class Registration:
     moved: by how much each systematic source, off by its uncertainty, moves the freedoms, and
         then by how much what is held does (p, s + 2h)
     spread: standard uncertainty of each freedom that was asked for [m], [rad] or [1/m]
-    dragged: by freedom that no points determine: what it does to each of the fitted, in the first
+    correlated_moves: by freedom that no points determine: what it does to each of the fitted, in the first
         and second order (2,), where it is off by as much as it may be
     limit: deviation from the smooth form beyond which a point is an outlier [m]
     disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
@@ -182,14 +182,14 @@ class Registration:
 
     surface: Surface
     placement: Placement
-    freedoms: Freedoms
+    dofs: DegreesOfFreedom
     from_source: dict[str, FloatArray]
     pose_effects: FloatArray
     taken: FloatArray
     held_effects: FloatArray
     moved: FloatArray
     spread: dict[str, float]
-    dragged: dict[str, dict[str, FloatArray]]
+    correlated_moves: dict[str, dict[str, FloatArray]]
     limit: float
     disc: Aperture
     basis: FormBasis
@@ -197,9 +197,9 @@ class Registration:
     noise: float
     before: float
 
-    def uncertainty(self, freedom: str) -> float | None:
+    def uncertainty(self, dof: str) -> float | None:
         """Return the standard uncertainty of a freedom, None if nobody asked for it."""
-        return self.spread.get(freedom)
+        return self.spread.get(dof)
 
     def effects(self, points: Placed, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the pose (p, n) and the sources (s + 2h, n) may do to the deviations [m].
@@ -207,30 +207,32 @@ class Registration:
         systematic: effects on the heights (s, n), which the pose then follows. The last 2h of the
         sources are the freedoms that were held.
         """
-        columns = freedom_columns(self.placement, points, self.freedoms.fitted)
-        names = tuple(self.freedoms.held)
-        held = effects_of_held(self.surface, self.placement, points, names, self.held_effects)
+        columns = dof_columns(self.placement, points, self.dofs.fitted)
+        names = tuple(self.dofs.held)
+        held = held_dof_effects(self.surface, self.placement, points, names, self.held_effects)
         sources = np.concatenate([systematic * points.normal[2], held])
         return self.pose_effects @ columns, sources + self.moved.T @ columns
 
-    def glides(self, x: FloatArray, y: FloatArray) -> FloatArray:
+    def undetermined_displacements(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return how far (r, 2, n) [m] places x, y (n,) [m] of the part may lie beside where found.
 
         For each of r freedoms that no points determine, off by as much as it may be; the others
         follow, and the points stay on the surface.
         """
-        fitted = self.freedoms.fitted
+        fitted = self.dofs.fitted
         steps = [
-            [widest(name), *(others[n][0] for n in fitted)] for name, others in self.dragged.items()
+            [typical_range(name), *(others[n][0] for n in fitted)]
+            for name, others in self.correlated_moves.items()
         ]
         ways = [
-            self._moved((n, *fitted), s, x, y) for n, s in zip(self.dragged, steps, strict=True)
+            self._moved((n, *fitted), s, x, y)
+            for n, s in zip(self.correlated_moves, steps, strict=True)
         ]
         return np.array(ways).reshape(-1, 2, len(x))
 
     def displaced(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the same (e, 2, n) [m] for each row of :meth:`effects`, one below the other."""
-        fitted, held = self.freedoms.fitted, tuple(self.freedoms.held)
+        fitted, held = self.dofs.fitted, tuple(self.dofs.held)
         own = np.zeros((len(self.pose_effects) + self.moved.shape[1], len(fitted) + len(held)))
         own[:, : len(fitted)] = np.concatenate([self.pose_effects, self.moved.T])
         # Of what is held, the second order moves no place.
@@ -266,7 +268,7 @@ class Registration:
         return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
 
 
-def effects_of_held(
+def held_dof_effects(
     surface: Surface, at: Placement, points: Placed, names: Sequence[str], steps: FloatArray
 ) -> FloatArray:
     """Return what ``steps`` (h, h) of freedoms that were held do to the deviations (2h, n) [m].
@@ -274,7 +276,7 @@ def effects_of_held(
     Of each the first and the second order: what is held may be off by tenths of a millimetre.
     """
     there = points.from_origin + at.pose.origin[:, np.newaxis]
-    portion = Portion(there[0], there[1], there[2], np.empty((0, len(points.x))))
+    portion = PointBatch(there[0], there[1], there[2], np.empty((0, len(points.x))))
     rows = np.zeros((2 * len(steps), len(points.x)))
     for k, step in enumerate(steps):
         high, low = (
@@ -285,7 +287,7 @@ def effects_of_held(
     return np.nan_to_num(rows, copy=False)
 
 
-class Open(NamedTuple):
+class OpenUncertainty(NamedTuple):
     """What is not in the covariance of the fit.
 
     unknown: by freedom that no surface determines: what it does to each of the others, in first
@@ -297,7 +299,7 @@ class Open(NamedTuple):
     held: FloatArray
 
     @classmethod
-    def of(cls, unknown: dict[str, dict[str, FloatArray]]) -> Open:
+    def of(cls, unknown: dict[str, dict[str, FloatArray]]) -> OpenUncertainty:
         """Return what is open where nothing is held."""
         return cls(unknown, np.empty((0, 0)))
 
@@ -316,19 +318,19 @@ class Open(NamedTuple):
         found = {"noise and form": np.sqrt(np.diag(covariance))}
         for k, name in enumerate(sources):
             found[name] = np.hypot(found.get(name, 0.0), moved[:, k])
-        for name, dragged in self.unknown.items():
-            found[name] = np.array([np.linalg.norm(dragged[n]) for n in names])
+        for name, correlated_moves in self.unknown.items():
+            found[name] = np.array([np.linalg.norm(correlated_moves[n]) for n in names])
         return found
 
-    def spread(self, freedoms: Freedoms, by_source: dict[str, FloatArray]) -> dict[str, float]:
+    def spread(self, dofs: DegreesOfFreedom, by_source: dict[str, FloatArray]) -> dict[str, float]:
         """Return the standard uncertainty of each freedom that was asked for."""
         held = np.sqrt(np.diag(self.held))
         fitted = np.sqrt(np.sum([s**2 for s in by_source.values()], axis=0))
-        found = dict(zip(freedoms.fitted, map(float, fitted), strict=True))
-        for name, own in zip(freedoms.held, held, strict=True):
-            dragged = [np.linalg.norm(moves[name]) for moves in self.unknown.values()]
-            found[name] = float(np.linalg.norm([own, *dragged]))
-        return found | {name: widest(name) for name in freedoms.refused}
+        found = dict(zip(dofs.fitted, map(float, fitted), strict=True))
+        for name, own in zip(dofs.held, held, strict=True):
+            correlated_moves = [np.linalg.norm(moves[name]) for moves in self.unknown.values()]
+            found[name] = float(np.linalg.norm([own, *correlated_moves]))
+        return found | {name: typical_range(name) for name in dofs.refused}
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

@@ -26,7 +26,7 @@ import numpy as np
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.core.surface.zernike_terms import Term, rms_of, terms_up_to, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, rms_of, terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 
 HIGHEST_ORDER = 8
@@ -35,7 +35,7 @@ NOT_SETTLED = (
     "surface's parameters, the sign of its radii and the units of the cloud, or hold what need not "
     "be fitted, as --fit piston,tip,tilt"
 )
-_TERMS: tuple[Term, ...] = terms_up_to(HIGHEST_ORDER)
+_TERMS: tuple[ZernikeIndex, ...] = terms_up_to(HIGHEST_ORDER)
 _SCALE = np.array([1 / rms_of(term) for term in _TERMS])
 # Of its size: a term of which less is new on these points is left out.
 _LEAST_NEW = 1e-4
@@ -130,7 +130,7 @@ def _zernikes(disc: Aperture, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 @dataclass(eq=False)
-class NormalEquations:
+class FormNormalEquations:
     """Of columns with each other, with the deviation and with ``sources`` systematic effects.
 
     points: how many came;  square, total: sums of their squared residuals and deviations [m²]
@@ -203,44 +203,44 @@ def estimate(
     group: of each column of Z (k,): its order, or that of rings
     expected: where the freedoms stand, and standard deviation of where parts do, about zero (p,)
     """
-    freedoms = len(gram) - len(group)
+    dofs = len(gram) - len(group)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
-    scale[freedoms:] = 1.0
-    points = float(np.median(np.diag(gram)[freedoms:]))
+    scale[dofs:] = 1.0
+    points = float(np.median(np.diag(gram)[dofs:]))
     noise = max(variance, _LEAST_M**2, points * _BEST_KNOWN_M**2)
     normal, right = gram / np.outer(scale, scale) / noise, moments / scale / noise
-    value, spread = expected[0] * scale[:freedoms], expected[1] * scale[:freedoms]
-    normal[np.arange(freedoms), np.arange(freedoms)] += 1 / spread**2
-    right[:freedoms] -= value / spread**2
-    least = np.maximum(_LEAST_SHARE / np.diag(normal)[freedoms:], _LEAST_M**2)
+    value, spread = expected[0] * scale[:dofs], expected[1] * scale[:dofs]
+    normal[np.arange(dofs), np.arange(dofs)] += 1 / spread**2
+    right[:dofs] -= value / spread**2
+    least = np.maximum(_LEAST_SHARE / np.diag(normal)[dofs:], _LEAST_M**2)
     sizes = np.maximum(largest, least)
     for _ in range(_TURNS):
-        covariance = _inverse(normal, sizes, freedoms)
+        covariance = _inverse(normal, sizes, dofs)
         found = covariance @ right
-        unknown = np.diag(covariance)[freedoms:] / sizes
-        new = _sizes(found[freedoms:], unknown, least, group)
+        unknown = np.diag(covariance)[dofs:] / sizes
+        new = _sizes(found[dofs:], unknown, least, group)
         new = np.clip(new, least, np.maximum(_MOST_SHARE * largest, least))
         change = float(np.max(np.abs(np.log(new / sizes))))
         sizes = new
         if change < _SETTLED:
             break
-    likely = covariance[:freedoms, :freedoms]
-    sizes = sizes * _unlucky(np.diag(covariance)[freedoms:] / sizes, group)
-    covariance = _inverse(normal, sizes, freedoms)
+    likely = covariance[:dofs, :dofs]
+    sizes = sizes * _variance_upper_factor(np.diag(covariance)[dofs:] / sizes, group)
+    covariance = _inverse(normal, sizes, dofs)
     found = covariance @ right / scale
     return Estimate(
-        step=found[:freedoms],
-        form=found[freedoms:],
+        step=found[:dofs],
+        form=found[dofs:],
         covariance=covariance / np.outer(scale, scale),
         sizes=np.sqrt(sizes),
         noise=noise,
-        likely=likely / np.outer(scale, scale)[:freedoms, :freedoms],
+        likely=likely / np.outer(scale, scale)[:dofs, :dofs],
     )
 
 
-def _inverse(normal: FloatArray, sizes: FloatArray, freedoms: int) -> FloatArray:
+def _inverse(normal: FloatArray, sizes: FloatArray, dofs: int) -> FloatArray:
     full = normal.copy()
-    index: IntArray = np.arange(freedoms, len(full))
+    index: IntArray = np.arange(dofs, len(full))
     full[index, index] += 1 / sizes
     root = 1 / np.sqrt(np.diag(full))
     try:
@@ -253,7 +253,7 @@ def _inverse(normal: FloatArray, sizes: FloatArray, freedoms: int) -> FloatArray
     return np.asarray((inverse + inverse.T) / 2, np.float64)
 
 
-def _unlucky(unknown: FloatArray, group: IntArray) -> FloatArray:
+def _variance_upper_factor(unknown: FloatArray, group: IntArray) -> FloatArray:
     """Return by how much each variance (k,) may be larger than it was found, in one of seven parts.
 
     unknown: share of each term that the data leave open (k,). The factor is ν/χ²(ν, 15 %), by
@@ -282,10 +282,10 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
         if each != _RINGS:
             value = above = max(value, above)
         new[chosen] = value
-    return _falling(new, group)
+    return _monotone_variances(new, group)
 
 
-def _falling(sizes: FloatArray, group: IntArray) -> FloatArray:
+def _monotone_variances(sizes: FloatArray, group: IntArray) -> FloatArray:
     """Return the variances (k,), none falling steeper with order than parts do.
 
     A shift of an asphere is coma and nothing else: what coma there may be cannot be read off
@@ -301,7 +301,7 @@ def _falling(sizes: FloatArray, group: IntArray) -> FloatArray:
     return held
 
 
-def limit_of(residual: FloatArray) -> float:
+def outlier_limit(residual: FloatArray) -> float:
     """Return the distance [m] from the smooth form beyond which a point is dust.
 
     Dust is rare: what more than one point of twenty does, steps or a coarse reading, is the part.
@@ -310,7 +310,7 @@ def limit_of(residual: FloatArray) -> float:
     return max(OUTLIER_SIGMAS * statistics.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
 
 
-def most_like(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, float]:
+def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, float]:
     """Return the sum (q,) of ``columns`` (q, n) that is most like, and how far from it is dust [m].
 
     Without bounds on any column: what the pose leaves after a step that was not small, or a form
@@ -326,13 +326,13 @@ def most_like(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, f
         solve = np.linalg.pinv(near @ near.T, rcond=1e-12, hermitian=True)
         fitted = np.asarray(solve @ (near @ deviation[chosen]), np.float64)
         residual = deviation - fitted @ columns
-        limit = limit_of(residual)
+        limit = outlier_limit(residual)
         if np.array_equal(np.abs(residual) <= limit, chosen):
             break
     return fitted / scale, limit
 
 
-def relaxed(share: float, last: FloatArray, step: FloatArray) -> float:
+def relaxation_factor(share: float, last: FloatArray, step: FloatArray) -> float:
     """Return the share of a ``step`` (p,) to take, after ``share`` of the one before it.
 
     Where form and pose look alike, a whole step overshoots: what form there may be follows the

@@ -25,14 +25,14 @@ from omsm_ros.readable import quantity
 LEAST_POINTS = 200
 # Below a nanometre there are atoms, and no form.
 _LEAST_EXTENT_M = 1e-9
-FREEDOMS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
+DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
 """What a fit may move: a pose's six, and the curvature [1/m] by which the part is bent more."""
 
 _SHIFTS = {"x": 0, "y": 1, "piston": 2}
 _TURNS = {"tip": 0, "tilt": 1, "clocking": 2}
 
 
-class Portion(NamedTuple):
+class PointBatch(NamedTuple):
     """Successive points of a scan in the machine's frame, each (n,) [m].
 
     systematic: (k, n) [m]: by how much each of k sources of systematic error, off by its standard
@@ -45,7 +45,7 @@ class Portion(NamedTuple):
     systematic: FloatArray
 
 
-Portions: TypeAlias = Callable[[], Iterable[Portion]]
+PointBatches: TypeAlias = Callable[[], Iterable[PointBatch]]
 """Reads all points from the start, portion by portion; called once for each pass."""
 
 
@@ -75,12 +75,12 @@ class Placement:
     pose: Pose = field(default_factory=Pose)
     power: float = 0.0
 
-    def moved(self, freedoms: Sequence[str], step: FloatArray) -> Placement:
-        """Return the placement after a ``step`` (p,) of its ``freedoms``.
+    def moved(self, dofs: Sequence[str], step: FloatArray) -> Placement:
+        """Return the placement after a ``step`` (p,) of its ``dofs``.
 
         Raises DataError where no part of the machine could sit: a fit strayed.
         """
-        changes = dict(zip(freedoms, map(float, step), strict=True))
+        changes = dict(zip(dofs, map(float, step), strict=True))
         power = self.power + changes.pop("power", 0.0)
         try:
             pose = replace(self.pose, **{k: getattr(self.pose, k) + v for k, v in changes.items()})
@@ -91,9 +91,9 @@ class Placement:
             ) from err
         return Placement(pose, power)
 
-    def value(self, freedom: str) -> float:
+    def value(self, dof: str) -> float:
         """Return the value of one freedom [m], [rad] or [1/m]."""
-        return self.power if freedom == "power" else float(getattr(self.pose, freedom))
+        return self.power if dof == "power" else float(getattr(self.pose, dof))
 
 
 class Placed(NamedTuple):
@@ -114,7 +114,7 @@ class Placed(NamedTuple):
         return Placed(*(values[..., chosen] for values in self))
 
 
-def placed(surface: Surface, placement: Placement, portion: Portion) -> Placed:
+def placed(surface: Surface, placement: Placement, portion: PointBatch) -> Placed:
     """Return the points in the part's frame, NaN where the surface has no height.
 
     The foot of a point is first sought along the normal under it, then measured from its tangent
@@ -123,30 +123,30 @@ def placed(surface: Surface, placement: Placement, portion: Portion) -> Placed:
     pose = placement.pose
     away = np.stack([portion.x, portion.y, portion.height]) - pose.origin[:, np.newaxis]
     x, y, z = pose.rotation.T @ away
-    bent = placement.power / 2
-    slope_x, slope_y = _slopes(surface, bent, x, y)
-    above = z - surface.height(x, y) - bent * (x**2 + y**2)
+    half_power = placement.power / 2
+    slope_x, slope_y = _slopes(surface, half_power, x, y)
+    above = z - surface.height(x, y) - half_power * (x**2 + y**2)
     reach = above / (1 + slope_x**2 + slope_y**2)
     foot_x, foot_y = x + reach * slope_x, y + reach * slope_y
-    slope_x, slope_y = _slopes(surface, bent, foot_x, foot_y)
+    slope_x, slope_y = _slopes(surface, half_power, foot_x, foot_y)
     normal = unit_normal(slope_x, slope_y)
-    foot_z = surface.height(foot_x, foot_y) + bent * (foot_x**2 + foot_y**2)
+    foot_z = surface.height(foot_x, foot_y) + half_power * (foot_x**2 + foot_y**2)
     deviation = (x - foot_x) * normal[0] + (y - foot_y) * normal[1] + (z - foot_z) * normal[2]
     return Placed(x, y, np.asarray(deviation), normal, away)
 
 
 def _slopes(
-    surface: Surface, bent: float, x: FloatArray, y: FloatArray
+    surface: Surface, half_power: float, x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     slope_x, slope_y = gradient_of(surface, x, y)
-    return np.asarray(slope_x + 2 * bent * x), np.asarray(slope_y + 2 * bent * y)
+    return np.asarray(slope_x + 2 * half_power * x), np.asarray(slope_y + 2 * half_power * y)
 
 
-def freedom_columns(placement: Placement, points: Placed, freedoms: Sequence[str]) -> FloatArray:
+def dof_columns(placement: Placement, points: Placed, dofs: Sequence[str]) -> FloatArray:
     """Return the derivatives (p, n) of the deviation by each freedom."""
     rates, rotation = placement.pose.rotation_rates(), placement.pose.rotation
-    columns = np.empty((len(freedoms), len(points.x)))
-    for row, name in enumerate(freedoms):
+    columns = np.empty((len(dofs), len(points.x)))
+    for row, name in enumerate(dofs):
         if name in _SHIFTS:
             columns[row] = -rotation[_SHIFTS[name]] @ points.normal
         elif name in _TURNS:
@@ -157,7 +157,7 @@ def freedom_columns(placement: Placement, points: Placed, freedoms: Sequence[str
     return columns
 
 
-def selection(portions: Portions, most: int) -> Portion:
+def selection(portions: PointBatches, most: int) -> PointBatch:
     """Return ``most`` points evenly chosen from all, without their systematic effects."""
     kept, count = EvenSelection(most), 0
     for portion in portions():
@@ -166,10 +166,10 @@ def selection(portions: Portions, most: int) -> Portion:
     if not count:
         raise DataError("0 points: there is nothing to register; check the cloud")
     x, y, height = kept.rows().T
-    return Portion(x, y, height, np.empty((0, len(x))))
+    return PointBatch(x, y, height, np.empty((0, len(x))))
 
 
-def usable(points: Placed, aperture: Aperture | None) -> Placed:
+def inside_aperture(points: Placed, aperture: Aperture | None) -> Placed:
     """Return the points with a deviation that lie within the aperture.
 
     Raises DataError for too few of them, or for points closer together than any part is large.
@@ -191,7 +191,7 @@ def usable(points: Placed, aperture: Aperture | None) -> Placed:
     return points.part(good)
 
 
-def about_the_origin(points: Placed) -> Aperture:
+def centred_aperture(points: Placed) -> Aperture:
     """Return the disc about the part's origin that holds all points.
 
     About their middle where the origin lies outside of them.

@@ -18,39 +18,39 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.degrees_of_freedom import (
     AUTO,
     HELD,
-    Freedoms,
-    Open,
+    DegreesOfFreedom,
+    OpenUncertainty,
     Registration,
-    determined,
-    effects_of_held,
+    determined_dofs,
+    held_dof_effects,
     root_of,
     shares_of,
-    weakest,
-    widest,
+    typical_range,
+    weakest_dof,
 )
 from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
     NOT_SETTLED,
     Estimate,
     FormBasis,
-    NormalEquations,
+    FormNormalEquations,
+    best_matching_sum,
     estimate,
-    limit_of,
-    most_like,
-    relaxed,
+    outlier_limit,
+    relaxation_factor,
 )
 from omsm_ros.core.registration.placement import (
-    FREEDOMS,
+    DEGREES_OF_FREEDOM,
     LEAST_POINTS,
     Aperture,
     Placement,
-    Portion,
-    Portions,
-    about_the_origin,
-    freedom_columns,
+    PointBatch,
+    PointBatches,
+    centred_aperture,
+    dof_columns,
+    inside_aperture,
     placed,
     selection,
-    usable,
 )
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray
@@ -68,14 +68,14 @@ SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 
 def coarse_placement(
     surface: Surface,
-    chosen: Portion,
+    chosen: PointBatch,
     names: Sequence[str],
     aperture: Aperture | None,
     at: Placement,
 ) -> Placement:
     """Return the placement of least squares, points far from the others left out."""
     for turn in range(_MOST_TURNS):
-        points = usable(placed(surface, at, chosen), aperture)
+        points = inside_aperture(placed(surface, at, chosen), aperture)
         if turn and len(points.x):
             middle = points.deviation - np.median(points.deviation)
             # Generous: what is left here is still the pose.
@@ -84,14 +84,14 @@ def coarse_placement(
             )
         if len(points.x) < LEAST_POINTS:
             break
-        columns = -freedom_columns(at, points, names)
+        columns = -dof_columns(at, points, names)
         scale = np.sqrt(np.mean(columns**2, axis=1))
         columns /= scale[:, np.newaxis]
         step = _bounded_step(
             columns,
             points.deviation,
             np.array([at.value(n) for n in names]) * scale,
-            [widest(n) for n in names] * scale,
+            [typical_range(n) for n in names] * scale,
         )
         at = at.moved(names, step / scale)
         # The refinement that follows converges from far more.
@@ -137,7 +137,7 @@ _SHARE_OF_UNCERTAINTY = 0.1
 
 def register(
     surface: Surface,
-    portions: Portions,
+    portions: PointBatches,
     asked: Sequence[str],
     *,
     sources: Sequence[str] = (),
@@ -155,20 +155,20 @@ def register(
     """
     chosen = selection(portions, _MOST_SELECTED)
     start = Placement()
-    freedoms = _determined(surface, chosen, asked, aperture, start)
+    dofs = _determined(surface, chosen, asked, aperture, start)
     try:
-        at = coarse_placement(surface, chosen, freedoms.fitted, aperture, start)
+        at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     except DataError:
         # Where the part was left askew, a turn of half a degree may pass for one that shows.
-        seated = coarse_placement(surface, chosen, FREEDOMS[:3], aperture, start)
-        freedoms = _determined(surface, chosen, asked, aperture, seated)
-        at = coarse_placement(surface, chosen, freedoms.fitted, aperture, start)
-    points = usable(placed(surface, at, chosen), aperture)
-    disc = aperture or about_the_origin(points)
+        seated = coarse_placement(surface, chosen, DEGREES_OF_FREEDOM[:3], aperture, start)
+        dofs = _determined(surface, chosen, asked, aperture, seated)
+        at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
+    points = inside_aperture(placed(surface, at, chosen), aperture)
+    disc = aperture or centred_aperture(points)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
-    fit = _Fit(surface, freedoms, aperture, basis, at)
+    fit = _Fit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
-    open_ = Open.of(fit.unknown(stand.at, chosen))
+    open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
     if AUTO in asked:
         fit, stand, open_ = _useful(fit, stand, chosen, asked, open_)
     return _over_all(fit, stand, portions, sources, open_)
@@ -176,18 +176,18 @@ def register(
 
 def _determined(
     surface: Surface,
-    chosen: Portion,
+    chosen: PointBatch,
     asked: Sequence[str],
     aperture: Aperture | None,
     at: Placement,
-) -> Freedoms:
+) -> DegreesOfFreedom:
     """Return which freedoms the surface determines where the part is ``at``."""
-    points = usable(placed(surface, at, chosen), aperture)
-    columns = freedom_columns(at, points, FREEDOMS)
-    return determined(asked, columns @ columns.T, len(points.x))
+    points = inside_aperture(placed(surface, at, chosen), aperture)
+    columns = dof_columns(at, points, DEGREES_OF_FREEDOM)
+    return determined_dofs(asked, columns @ columns.T, len(points.x))
 
 
-class _Stand(NamedTuple):
+class _PlacementState(NamedTuple):
     """at: the placement that stands;  like: what sum of columns is most like there (q,)
     limit: of dust [m];  found, sums: by the selected points
     """
@@ -196,19 +196,23 @@ class _Stand(NamedTuple):
     like: FloatArray
     limit: float
     found: Estimate
-    sums: NormalEquations
+    sums: FormNormalEquations
 
 
 def _useful(
-    fit: _Fit, stand: _Stand, chosen: Portion, asked: Sequence[str], open_: Open
-) -> tuple[_Fit, _Stand, Open]:
+    fit: _Fit,
+    stand: _PlacementState,
+    chosen: PointBatch,
+    asked: Sequence[str],
+    open_: OpenUncertainty,
+) -> tuple[_Fit, _PlacementState, OpenUncertainty]:
     """Hold, of what nobody asked for by name, what the points do not determine well enough."""
     names, at = fit.names, stand.at
     values = np.array([at.value(name) for name in names])
     covariance = stand.found.covariance[: len(names), : len(names)]
     while True:
         free = len(fit.names)
-        weak = weakest(
+        weak = weakest_dof(
             tuple("" if n in asked else n for n in fit.names),
             np.array([stand.at.value(n) for n in fit.names]),
             stand.found.covariance[:free, :free],
@@ -216,12 +220,12 @@ def _useful(
         )
         if weak is None:
             break
-        fit = replace(fit, freedoms=fit.freedoms.without(*weak))
+        fit = replace(fit, dofs=fit.dofs.without(*weak))
         back = stand.at.moved([weak[0]], np.array([-stand.at.value(weak[0])]))
         stand = fit.refine(
             coarse_placement(fit.surface, chosen, fit.names, fit.aperture, back), chosen
         )
-    held = [names.index(n) for n in fit.freedoms.held]
+    held = [names.index(n) for n in fit.dofs.held]
     square = covariance[np.ix_(held, held)] + np.outer(values[held], values[held])
     return fit, stand, open_._replace(held=square)
 
@@ -234,19 +238,19 @@ class _Fit:
     """
 
     surface: Surface
-    freedoms: Freedoms
+    dofs: DegreesOfFreedom
     aperture: Aperture | None
     basis: FormBasis
     plain: Placement
 
     @property
     def names(self) -> tuple[str, ...]:
-        return self.freedoms.fitted
+        return self.dofs.fitted
 
-    def new_sums(self, sources: int) -> NormalEquations:
-        return NormalEquations(len(self.names) + len(self.basis), sources)
+    def new_sums(self, sources: int) -> FormNormalEquations:
+        return FormNormalEquations(len(self.names) + len(self.basis), sources)
 
-    def unknown(self, at: Placement, chosen: Portion) -> dict[str, dict[str, FloatArray]]:
+    def unknown(self, at: Placement, chosen: PointBatch) -> dict[str, dict[str, FloatArray]]:
         """Return what each freedom that the surface does not determine does to the others (2,).
 
         They follow it along a curve: a surface without errors, in the pose found, is fitted once
@@ -254,17 +258,17 @@ class _Fit:
         of the two, and their mean, are the first and second order.
         """
         every = max(len(chosen.x) // _ENOUGH_FOR_A_CURVE, 1)
-        few = Portion(*(v[..., ::every] for v in chosen))
+        few = PointBatch(*(v[..., ::every] for v in chosen))
         few = few._replace(height=PosedSurface(self.surface, at.pose).height(few.x, few.y))
-        few = Portion(*(v[..., np.isfinite(few.height)] for v in few))
+        few = PointBatch(*(v[..., np.isfinite(few.height)] for v in few))
         rigid = replace(at, power=0.0)
         found: dict[str, dict[str, FloatArray]] = {}
-        for name in self.freedoms.refused:
+        for name in self.dofs.refused:
             ends = [
                 coarse_placement(
                     self.surface, few, self.names, None, rigid.moved([name], np.array([off]))
                 )
-                for off in (widest(name), -widest(name))
+                for off in (typical_range(name), -typical_range(name))
             ]
             found[name] = {}
             for n in self.names:
@@ -274,30 +278,30 @@ class _Fit:
 
     def sums(
         self,
-        stand: _Stand,
-        portion: Portion,
+        stand: _PlacementState,
+        portion: PointBatch,
         held_effects: FloatArray,
-        sums: NormalEquations,
+        sums: FormNormalEquations,
     ) -> None:
         """Add a portion's points to ``sums``, residuals from what is most like them."""
         at, like, limit = stand.at, stand.like, stand.limit
         for begin in range(0, len(portion.x), CHUNK):
-            part = Portion(*(v[..., begin : begin + CHUNK] for v in portion))
+            part = PointBatch(*(v[..., begin : begin + CHUNK] for v in portion))
             whole = placed(self.surface, at, part)
             good = np.isfinite(whole.deviation)
             if self.aperture is not None:
                 good &= self.aperture.holds(whole.x, whole.y)
             points = whole.part(good)
-            names = tuple(self.freedoms.held)
-            held = effects_of_held(self.surface, at, points, names, held_effects)
+            names = tuple(self.dofs.held)
+            held = held_dof_effects(self.surface, at, points, names, held_effects)
             systematic = np.concatenate([part.systematic[:, good] * points.normal[2], held])
             z = self.basis.columns(points.x, points.y)
-            columns = np.concatenate([-freedom_columns(at, points, self.names), z])
+            columns = np.concatenate([-dof_columns(at, points, self.names), z])
             residual = points.deviation - like @ columns
             near = np.abs(residual) <= limit
             sums.add(columns[:, near], points.deviation[near], systematic[:, near], residual[near])
 
-    def solved(self, at: Placement, sums: NormalEquations) -> tuple[Estimate, float]:
+    def solved(self, at: Placement, sums: FormNormalEquations) -> tuple[Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
         free = len(self.names)
         variance = sums.square / max(sums.points - sums.columns, 1)
@@ -317,19 +321,19 @@ class _Fit:
         """
         first = [abs(self.plain.value(n)) for n in self.names]
         value = np.array([at.value(n) for n in self.names])
-        return value, np.maximum([widest(n) for n in self.names], first)
+        return value, np.maximum([typical_range(n) for n in self.names], first)
 
-    def refine(self, at: Placement, chosen: Portion) -> _Stand:
+    def refine(self, at: Placement, chosen: PointBatch) -> _PlacementState:
         """Return the placement that stands.
 
         Raises DataError if none does.
         """
         share, last = 1.0, np.zeros(len(self.names))
         for turn in range(_MOST_REFINED):
-            points = usable(placed(self.surface, at, chosen), self.aperture)
+            points = inside_aperture(placed(self.surface, at, chosen), self.aperture)
             z = self.basis.columns(points.x, points.y)
-            columns = np.concatenate([-freedom_columns(at, points, self.names), z])
-            like, limit = most_like(columns, points.deviation)
+            columns = np.concatenate([-dof_columns(at, points, self.names), z])
+            like, limit = best_matching_sum(columns, points.deviation)
             residual = points.deviation - like @ columns
             near = np.abs(residual) <= limit
             none = np.empty((0, int(near.sum())))
@@ -345,15 +349,19 @@ class _Fit:
             still = square < settled**2 or found.length < _SHARE_OF_UNCERTAINTY
             if turn > 3 and still:
                 smooth = np.concatenate([found.step, found.form]) @ columns
-                limit = limit_of(points.deviation - smooth)
-                return _Stand(at, like, limit, found, sums)
-            share, last = relaxed(share, last, step), step
+                limit = outlier_limit(points.deviation - smooth)
+                return _PlacementState(at, like, limit, found, sums)
+            share, last = relaxation_factor(share, last, step), step
             at = at.moved(self.names, share * found.step)
         raise DataError(NOT_SETTLED)
 
 
 def _over_all(
-    fit: _Fit, stand: _Stand, portions: Portions, sources: Sequence[str], open_: Open
+    fit: _Fit,
+    stand: _PlacementState,
+    portions: PointBatches,
+    sources: Sequence[str],
+    open_: OpenUncertainty,
 ) -> Registration:
     """Return the registration by all points, from one pass over them at a pose that stands."""
     free, held = len(fit.names), root_of(open_.held)
@@ -373,14 +381,14 @@ def _over_all(
     return Registration(
         surface=fit.surface,
         placement=stand.at.moved(fit.names, found.step),
-        freedoms=fit.freedoms,
+        dofs=fit.dofs,
         from_source=by_source,
         pose_effects=root_of(covariance),
         taken=shares_of(root_of(covariance), found.likely),
         held_effects=held,
         moved=moved,
-        spread=open_.spread(fit.freedoms, by_source),
-        dragged=open_.unknown,
+        spread=open_.spread(fit.dofs, by_source),
+        correlated_moves=open_.unknown,
         limit=stand.limit,
         disc=fit.basis.disc,
         basis=fit.basis,

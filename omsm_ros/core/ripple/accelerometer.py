@@ -22,7 +22,7 @@ _LEAST_SAMPLES = 256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FeltLine:
+class AccelerationLine:
     """A line of acceleration.
 
     axis: x, y or z;  frequency: [Hz], its standard uncertainty
@@ -42,14 +42,14 @@ class FeltLine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Felt:
+class AccelerationLines:
     """All lines of an accelerometer, and how far it reaches.
 
     highest: half its rate [Hz]: a line from beyond would be felt at its folded image
     duration: of the record [s]
     """
 
-    lines: tuple[FeltLine, ...]
+    lines: tuple[AccelerationLine, ...]
     highest: float
     duration: float
 
@@ -74,24 +74,24 @@ def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[s
     return min(periods), axes
 
 
-def felt(period: float, axes: dict[str, FloatArray]) -> Felt:
+def acceleration_lines(period: float, axes: dict[str, FloatArray]) -> AccelerationLines:
     """Return the lines of accelerations (n,) by axis, every ``period`` [s], NaN where lost.
 
     Of lines of one frequency on several axes the strongest is kept.
     """
-    found: list[FeltLine] = []
+    found: list[AccelerationLine] = []
     for axis, values in axes.items():
         found += _lines(period, axis, values)
     found.sort(key=lambda line: -line.acceleration)
-    kept: list[FeltLine] = []
+    kept: list[AccelerationLine] = []
     duration = period * max(map(len, axes.values()))
     for line in found:
         if all(abs(line.frequency - other.frequency) > 1.0 / duration for other in kept):
             kept.append(line)
-    return Felt(lines=tuple(kept), highest=0.5 / period, duration=duration)
+    return AccelerationLines(lines=tuple(kept), highest=0.5 / period, duration=duration)
 
 
-def _lines(period: float, axis: str, values: FloatArray) -> list[FeltLine]:
+def _lines(period: float, axis: str, values: FloatArray) -> list[AccelerationLine]:
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < _LEAST_SAMPLES or not np.ptp(values[known]):
         return []
@@ -101,7 +101,7 @@ def _lines(period: float, axis: str, values: FloatArray) -> list[FeltLine]:
         path=still, radius=still, turn=still,
     )  # fmt: skip
     return [
-        FeltLine(
+        AccelerationLine(
             axis=axis,
             frequency=line.frequency,
             frequency_uncertainty=line.frequency_uncertainty,
@@ -114,7 +114,7 @@ def _lines(period: float, axis: str, values: FloatArray) -> list[FeltLine]:
 
 # The spectrum of acceleration as it comes: levels by band and axis, and the height they move.
 
-PROBE, CARRIAGE = "probe", "carriage"
+PROBE, SLIDE = "probe", "carriage"
 """Where the accelerometer sits: what it feels the encoder does not see, or sees."""
 
 # A line is spread over ±4 resolutions by the window; four times as many make a band.
@@ -166,7 +166,7 @@ class MonitorOptions:
 
     edges: of the bands, rising [Hz];  window: length of a spectrum [s]
     averages: spectra over which levels are averaged
-    mount: ``probe`` or ``carriage``;  axis: along which a height is measured
+    mount: ``probe`` or ``slide``;  axis: along which a height is measured
     """
 
     edges: tuple[float, ...] = (5.0, 50.0, 150.0, 500.0, 2000.0)
@@ -183,10 +183,10 @@ class MonitorOptions:
                 f"bands {self.edges!r} Hz, expected two or more rising edges above zero, the "
                 f"first {least:g} Hz or more wide for a window of {self.window:g} s"
             )
-        if self.mount not in (PROBE, CARRIAGE) or self.axis not in AXES:
+        if self.mount not in (PROBE, SLIDE) or self.axis not in AXES:
             raise ConfigurationError(
                 f"accelerometer on {self.mount!r}, height along {self.axis!r}; expected "
-                f"{PROBE!r} or {CARRIAGE!r}, and one of {AXES!r}"
+                f"{PROBE!r} or {SLIDE!r}, and one of {AXES!r}"
             )
 
 
@@ -272,7 +272,7 @@ class RunningSpectrum:
         )
 
     def _height(self, response: TransferFunction | None) -> Density | None:
-        seen = self.options.mount == CARRIAGE
+        seen = self.options.mount == SLIDE
         if seen and response is None:
             return None
         spectrum = self._mean[self.options.axis]

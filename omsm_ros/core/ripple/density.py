@@ -181,13 +181,13 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
     power: of equally spaced frequencies from zero (m,);  oversampling: of them in a resolution
     """
     count = len(power)
-    narrow, wide = _NARROWEST * oversampling, _WIDEST * oversampling
+    narrow, broad = _NARROWEST * oversampling, _WIDEST * oversampling
     centres = np.unique(np.geomspace(1, count, _BANDS).astype(np.int64)) - 1
-    even = np.arange(0, count, max(wide // 2, 1))
+    even = np.arange(0, count, max(broad // 2, 1))
     centres = np.unique(np.r_[0, centres, even, count - 1])
     level = np.empty(len(centres))
     for place, centre in enumerate(centres):
-        half = int(np.clip(_RELATIVE_WIDTH * centre, narrow, wide))
+        half = int(np.clip(_RELATIVE_WIDTH * centre, narrow, broad))
         low, high = max(centre - half, 0), min(centre + half + 1, count)
         level[place] = np.median(power[low:high])
     # A band with many lines is the worse for its neighbours' sake; it must not hide them.
@@ -225,7 +225,7 @@ def ratio_at(sigma: float, tried: float) -> float:
 # Where a vibration beyond the Nyquist frequency turns up in sampled data.
 
 
-def folded_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:
+def aliased_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:
     """Return the apparent frequency [Hz] of ``frequency`` [Hz] sampled at ``sample_rate`` [Hz].
 
     ``|f - fs · NINT(f / fs)|`` with halves rounded up, as the paper has it; of the shape of

@@ -54,7 +54,7 @@ _LEAST_DETERMINED = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class SpindleOrder:
     """``cosine · cos(2π order · turn) + sine · sin(…)`` [m], alike at every radius.
 
     uncertainty: standard, of cosine and of sine [m]
@@ -72,7 +72,7 @@ class Order:
 
 
 @dataclass(frozen=True, eq=False)
-class Formless:
+class FormRemoved:
     """A scan without its form.
 
     residual: what is left (n,) [m];  degree: of the polynomials;  removed: rms of the form [m]
@@ -83,7 +83,7 @@ class Formless:
     residual: FloatArray
     degree: int
     removed: float
-    orders: tuple[Order, ...]
+    orders: tuple[SpindleOrder, ...]
     on_circle: bool
 
 
@@ -114,7 +114,7 @@ class FormFit:
             columns = basis.columns(self._signal, some)
             left = values[some] - columns[:, kept] @ _solved(gram, moment, kept)
             gram, moment = columns.T @ columns, columns.T @ left
-            degree = _beyond(basis, gram, moment, float(left @ left), worth, degree)
+            degree = _worthwhile_degree(basis, gram, moment, float(left @ left), worth, degree)
             if degree < top:
                 break
         return degree
@@ -129,7 +129,7 @@ class FormFit:
         bare = self._height - heights
         self._degree = max(self._degree, self._enough(bare, _WORTH_WITHOUT_LINES))
 
-    def without(self, waves: Waves | None = None) -> Formless:
+    def without(self, waves: Waves | None = None) -> FormRemoved:
         """Take form, drift and orders out, as they are beside ``waves``, which stay in."""
         basis, signal, chosen = self._basis, self._signal, self._chosen
         own = len(basis.names)
@@ -146,7 +146,7 @@ class FormFit:
             _, moment = _normal_equations(basis, signal, bare, chosen, waves)
         variance = float(np.mean(bare[chosen] ** 2))
         spread = np.sqrt(np.maximum(np.diag(inverse)[:own], 0.0) * variance)
-        return Formless(
+        return FormRemoved(
             residual=residual,
             degree=self._degree,
             removed=float(np.std(self._height - residual)),
@@ -166,7 +166,7 @@ class FormFit:
         return [(float(k), _OWNED + 0.5 * radial[k]) for k in range(1, highest + 1)]
 
 
-def without_form(signal: ScanSignal) -> Formless:
+def without_form(signal: ScanSignal) -> FormRemoved:
     """Take form, drift and what repeats with the spindle out of the heights of ``signal``."""
     return FormFit(signal).without()
 
@@ -288,7 +288,7 @@ def _enough(
     return kept
 
 
-def _beyond(
+def _worthwhile_degree(
     basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float, degree: int
 ) -> int:
     """Return a higher degree that is worth all those up to it, ``degree`` if none is.
@@ -327,7 +327,7 @@ def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> Float
 
 def _orders(
     basis: _Basis, solution: FloatArray, spread: FloatArray, mean: FloatArray
-) -> Iterator[Order]:
+) -> Iterator[SpindleOrder]:
     """Yield the orders that stand by themselves; ``mean``: of products of columns (p, p).
 
     Where the radius changes little, an order and a figure of the same harmonic may grow large
@@ -339,7 +339,7 @@ def _orders(
         if ("order", k, k) in found:
             cosine, sine = found["order", k, k], found["order", k, -k]
             worse = float(max(spread[cosine], spread[sine]))
-            own = Order(k, float(solution[cosine]), float(solution[sine]), worse)
+            own = SpindleOrder(k, float(solution[cosine]), float(solution[sine]), worse)
             alike = [i for i, (kind, _, m) in enumerate(basis.names) if abs(m) == k]
             part = solution[alike]
             together = float(part @ mean[np.ix_(alike, alike)] @ part)

@@ -25,7 +25,7 @@ from omsm_ros.core.ripple.density import ratio_at, significance
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.spectral_line import (
     CLOSEST,
-    Line,
+    SpectralLine,
     fitted,
     in_their_coordinates,
     start,
@@ -58,7 +58,7 @@ class LineSpectrum:
     amplitude_floor: σ of an amplitude over time at ``floor_frequency`` (m,) [Hz]
     """
 
-    lines: tuple[Line, ...]
+    lines: tuple[SpectralLine, ...]
     coordinates: dict[str, Coordinate]
     residual: FloatArray
     noise: float
@@ -73,7 +73,7 @@ class LineSpectrum:
 def find_lines(
     signal: ScanSignal,
     values: FloatArray,
-    known: Sequence[Line] = (),
+    known: Sequence[SpectralLine] = (),
     owned: Sequence[tuple[float, float]] = (),
 ) -> LineSpectrum:
     """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ.
@@ -108,11 +108,11 @@ def _strongest(
     signal: ScanSignal,
     residual: FloatArray,
     searched: Sequence[Coordinate],
-    known: Sequence[Line],
+    known: Sequence[SpectralLine],
     taken: Mapping[str, Sequence[tuple[float, float]]],
-) -> list[Line]:
+) -> list[SpectralLine]:
     """Return the strongest lines left, all of one coordinate."""
-    best: tuple[float, list[Line]] = (0.0, [])
+    best: tuple[float, list[SpectralLine]] = (0.0, [])
     for coordinate in searched:
         power, spacing = power_over(signal, residual, coordinate)
         tried = len(power) / OVERSAMPLING
@@ -156,7 +156,9 @@ def _reserved(
     return found
 
 
-def _is_shadow(new: Line, known: Sequence[Line], coordinates: dict[str, Coordinate]) -> bool:
+def _is_shadow(
+    new: SpectralLine, known: Sequence[SpectralLine], coordinates: dict[str, Coordinate]
+) -> bool:
     """Return True for the image of a known line in another coordinate.
 
     A fit of both would let them grow against each other.
@@ -174,10 +176,10 @@ def _is_shadow(new: Line, known: Sequence[Line], coordinates: dict[str, Coordina
 
 
 def _free(
-    lines: list[Line],
+    lines: list[SpectralLine],
     coordinates: dict[str, Coordinate],
     reserved: Mapping[str, Sequence[tuple[float, float]]],
-) -> list[Line]:
+) -> list[SpectralLine]:
     """Return ``lines`` without those that have moved to where form and orders are."""
     return [
         line
@@ -212,7 +214,7 @@ def _spaced(places: np.ndarray, most: int) -> list[int]:
 
 def _judged(
     signal: ScanSignal,
-    lines: list[Line],
+    lines: list[SpectralLine],
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
 ) -> LineSpectrum:
@@ -252,7 +254,9 @@ def _judged(
     )
 
 
-def _possible(line: Line, ratio: float, coordinates: dict[str, Coordinate]) -> dict[str, float]:
+def _possible(
+    line: SpectralLine, ratio: float, coordinates: dict[str, Coordinate]
+) -> dict[str, float]:
     """Return the coordinates in which the data allow it to be a line, with the frequency there."""
     own = coordinates[line.coordinate]
     found = {line.coordinate: line.frequency}

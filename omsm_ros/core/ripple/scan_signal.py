@@ -89,7 +89,7 @@ def scan_signal(
             f"on end, expected {_LEAST_POINTS} or more of each; record a longer scan"
         )
     count, x, y, c = (values[known] for values in (count, x, y, c))
-    turn = counted_on(count, c) / (2 * np.pi)
+    turn = unwrapped_angle(count, c) / (2 * np.pi)
     inside = (sample >= count[0]) & (sample <= count[-1])
     sample, height = sample[inside], height[inside]
     if len(sample) < _LEAST_POINTS:
@@ -112,7 +112,7 @@ def scan_signal(
     )
 
 
-def counted_on(count: IntArray, angle: FloatArray) -> FloatArray:
+def unwrapped_angle(count: IntArray, angle: FloatArray) -> FloatArray:
     """Return an encoder's angle (n,) [rad] counted on over its turns.
 
     An encoder that starts anew each turn is recognised by its range; over a gap of the trigger

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.ripple.accelerometer import Felt
+from omsm_ros.core.ripple.accelerometer import AccelerationLines
 from omsm_ros.core.ripple.coordinates import LEAST_WAVES, Coordinate
-from omsm_ros.core.ripple.density import folded_frequency
-from omsm_ros.core.ripple.form_removal import HIGHEST_ORDER, Formless
+from omsm_ros.core.ripple.density import aliased_frequency
+from omsm_ros.core.ripple.form_removal import HIGHEST_ORDER, FormRemoved
 from omsm_ros.core.ripple.lines import LineSpectrum
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
-from omsm_ros.core.ripple.spectral_line import Line
+from omsm_ros.core.ripple.spectral_line import SpectralLine
 
 PART, VIBRATION, SYNCHRONOUS = "on the part", "vibration", "synchronous spindle error"
 FOLDED, ARTEFACT, UNDECIDED = "folded vibration", "artefact of sampling", "undecided"
@@ -28,7 +28,7 @@ HIGHEST_SYNCHRONOUS = 500
 # With fewer turns everything is near a whole number of waves a turn.
 _LEAST_TURNS = 4.0
 # A vibration from 0 to so many times the sampling rate is looked for behind its image.
-_MOST_FOLDS = 5
+_MOST_ALIASES = 5
 # Mains keep their frequency to 2e-4 (ENTSO-E: ±10 mHz of 50 Hz most of the time); a feed and a
 # radius are known to 1e-4.
 _STEADY = {TIME: 2e-4, PATH: 1e-4, RADIUS: 1e-4, TURN: 1e-5}
@@ -37,7 +37,7 @@ _TIMES_UNCERTAINTY, _OWN_BIN, _OTHER_BIN = 4.0, 0.3, 0.1
 # A place so wide that some line is likely to lie in it by chance tells nothing.
 _GREATEST_CHANCE = 0.1
 # Expected amplitude over its σ, from which an absent line is really absent.
-_WOULD_BE_SEEN = 9.0
+_DETECTION_PROBABILITY_ = 9.0
 # The same line may be so many times as strong in another scan.
 _AMPLITUDES = 3.5
 
@@ -50,10 +50,10 @@ class StudiedScan:
     """
 
     signal: ScanSignal
-    formless: Formless
+    formless: FormRemoved
     spectrum: LineSpectrum
-    lines: tuple[Line, ...]
-    felt: Felt | None = None
+    lines: tuple[SpectralLine, ...]
+    acceleration_lines: AccelerationLines | None = None
 
     @property
     def coordinates(self) -> dict[str, Coordinate]:
@@ -70,38 +70,38 @@ class Hypothesis:
     """A line as one of a ``kind``, of a true ``frequency`` in ``coordinate``.
 
     uncertainty: of that frequency, with what the scan's length leaves open
-    folds: how often a vibration was folded before it was seen where it was
+    alias_count: how often a vibration was folded before it was seen where it was
     """
 
     kind: str
     coordinate: str
     frequency: float
     uncertainty: float
-    folds: int = 0
+    alias_count: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ExpectedLine:
     """Where a hypothesis puts its line in a scan: ``tolerance`` about ``frequency``.
 
-    folded: True if it is the image of something beyond half the rate
+    aliased: True if it is the image of something beyond half the rate
     """
 
     coordinate: str
     frequency: float
     tolerance: float
-    folded: bool
+    aliased: bool
 
 
-def hypotheses_of(scan: StudiedScan, line: Line) -> Iterator[Hypothesis]:
+def hypotheses_of(scan: StudiedScan, line: SpectralLine) -> Iterator[Hypothesis]:
     """Yield what ``line`` of ``scan`` may be; of a vibration also what folds to it."""
     if TIME in line.possible:
         seen, spread = line.possible[TIME], spread_of(scan, line, TIME)
         rate = scan.signal.rate
         yield Hypothesis(VIBRATION, TIME, seen, spread)
-        for folds in range(1, _MOST_FOLDS + 1):
-            for image in (folds * rate - seen, folds * rate + seen):
-                yield Hypothesis(VIBRATION, TIME, image, spread, folds)
+        for alias_count in range(1, _MOST_ALIASES + 1):
+            for image in (alias_count * rate - seen, alias_count * rate + seen):
+                yield Hypothesis(VIBRATION, TIME, image, spread, alias_count)
     for coordinate in (PATH, RADIUS):
         if coordinate in line.possible:
             spread = spread_of(scan, line, coordinate)
@@ -110,35 +110,35 @@ def hypotheses_of(scan: StudiedScan, line: Line) -> Iterator[Hypothesis]:
         yield Hypothesis(SYNCHRONOUS, TURN, float(order), 0.0)
 
 
-def whole_order(scan: StudiedScan, line: Line) -> int | None:
+def whole_order(scan: StudiedScan, line: SpectralLine) -> int | None:
     """Return how many waves a turn the line has, if it is a whole number."""
     if TURN not in line.possible or scan.signal.turns < _LEAST_TURNS:
         return None
     per_turn = line.possible[TURN]
     order = round(per_turn)
     own = scan.coordinates[TURN].resolution
-    allowed = _TIMES_UNCERTAINTY * _own_spread(scan, line, TURN) + _OWN_BIN * own
+    allowed = _TIMES_UNCERTAINTY * _own_uncertainty(scan, line, TURN) + _OWN_BIN * own
     if not 1 <= order <= HIGHEST_SYNCHRONOUS or abs(per_turn - order) > allowed:
         return None
     return order
 
 
-def spread_of(scan: StudiedScan, line: Line, coordinate: str) -> float:
+def spread_of(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
     """Return how far the true frequency in ``coordinate`` may be from where the line was seen."""
     return (
-        _TIMES_UNCERTAINTY * _own_spread(scan, line, coordinate)
+        _TIMES_UNCERTAINTY * _own_uncertainty(scan, line, coordinate)
         + _OTHER_BIN * scan.resolution(coordinate)
         + _STEADY[coordinate] * line.possible[coordinate]
     )
 
 
-def _own_spread(scan: StudiedScan, line: Line, coordinate: str) -> float:
+def _own_uncertainty(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
     """Return the standard uncertainty of its frequency in ``coordinate``."""
     share = scan.resolution(coordinate) / scan.resolution(line.coordinate)
     return line.frequency_uncertainty * share
 
 
-def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> Place | None:
+def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> ExpectedLine | None:
     """Return where the line would be in ``scan``; None if the scan cannot show it."""
     coordinate = scan.coordinates.get(hypothesis.coordinate)
     if coordinate is None:
@@ -146,46 +146,46 @@ def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> Place | None:
     if not coordinate.proportional_to_time:
         fine = hypothesis.frequency > coordinate.highest
         tolerance = hypothesis.uncertainty + _OWN_BIN * coordinate.resolution
-        return Place(coordinate.name, hypothesis.frequency, tolerance, fine)
+        return ExpectedLine(coordinate.name, hypothesis.frequency, tolerance, fine)
     in_time = hypothesis.frequency * coordinate.pace
     rate = scan.signal.rate
-    seen = float(folded_frequency(in_time, rate))
+    seen = float(aliased_frequency(in_time, rate))
     tolerance = hypothesis.uncertainty * coordinate.pace + _OWN_BIN * scan.resolution(TIME)
-    return Place(TIME, seen, tolerance, in_time > rate / 2)
+    return ExpectedLine(TIME, seen, tolerance, in_time > rate / 2)
 
 
-def apart(one: Place | None, other: Place | None) -> bool:
+def apart(one: ExpectedLine | None, other: ExpectedLine | None) -> bool:
     """Return True if a scan in which two hypotheses have these places separates them."""
     if one is None or other is None or one.coordinate != other.coordinate:
         return True
     return abs(one.frequency - other.frequency) > one.tolerance + other.tolerance
 
 
-def found_at(scan: StudiedScan, place: Place) -> Line | None:
+def lines_at(scan: StudiedScan, place: ExpectedLine) -> SpectralLine | None:
     """Return the line of ``scan`` at ``place``, the strongest if there are several."""
     near = [
         line
         for line in scan.lines
         if place.coordinate in line.possible
         and abs(line.possible[place.coordinate] - place.frequency)
-        <= place.tolerance + _TIMES_UNCERTAINTY * _own_spread(scan, line, place.coordinate)
+        <= place.tolerance + _TIMES_UNCERTAINTY * _own_uncertainty(scan, line, place.coordinate)
     ]
     return max(near, key=lambda line: line.amplitude, default=None)
 
 
-def by_chance(scan: StudiedScan, place: Place) -> float:
+def chance_probability(scan: StudiedScan, place: ExpectedLine) -> float:
     """Return how many lines of ``scan`` would lie at ``place`` if they lay anywhere."""
     band = scan.coordinates[place.coordinate].highest
     count = sum(place.coordinate in line.possible for line in scan.lines)
     return count * 2 * place.tolerance / band
 
 
-def shows(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
+def is_detected(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
     """Return whether a line of ``amplitude`` [m] elsewhere is in ``scan``; None: undecidable."""
     place = place_in(scan, hypothesis)
-    if place is None or by_chance(scan, place) > _GREATEST_CHANCE:
+    if place is None or chance_probability(scan, place) > _GREATEST_CHANCE:
         return None
-    line = found_at(scan, place)
+    line = lines_at(scan, place)
     if line is not None:
         ratio = line.amplitude / amplitude
         least = (
@@ -193,10 +193,12 @@ def shows(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool |
         )
         alike = hypothesis.kind == VIBRATION or least <= ratio <= _AMPLITUDES
         return True if alike else None
-    return None if _may_hide(scan, hypothesis, place, amplitude) else False
+    return None if _may_be_masked(scan, hypothesis, place, amplitude) else False
 
 
-def _may_hide(scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude: float) -> bool:
+def _may_be_masked(
+    scan: StudiedScan, hypothesis: Hypothesis, place: ExpectedLine, amplitude: float
+) -> bool:
     """Return True if the line could be there and not be found."""
     if hypothesis.kind == VIBRATION:
         return False  # the machine may stand still: absence is no proof, and is never used as one
@@ -204,14 +206,14 @@ def _may_hide(scan: StudiedScan, hypothesis: Hypothesis, place: Place, amplitude
         if place.frequency < (LEAST_WAVES + 1) * scan.resolution(TIME) or _near_form(scan, place):
             return True
         floor = scan.spectrum.sigma_at(place.frequency)
-    elif place.folded:
+    elif place.aliased:
         return True  # it is looked for only where another scan has found it
     else:
         floor = scan.spectrum.noise * np.sqrt(2 / len(scan.signal))
-    return amplitude * _least_share(scan, hypothesis) < _WOULD_BE_SEEN * floor
+    return amplitude * _least_share(scan, hypothesis) < _DETECTION_PROBABILITY_ * floor
 
 
-def _near_form(scan: StudiedScan, place: Place) -> bool:
+def _near_form(scan: StudiedScan, place: ExpectedLine) -> bool:
     """Return True where taking out the form takes a line out as well."""
     turn = scan.coordinates.get(TURN)
     if turn is None:
@@ -244,7 +246,7 @@ Key = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Claim:
+class SourceHypothesis:
     """A line is of this ``kind``; by its partners, and with none that is missing.
 
     texture: of an artefact, the line that another scan resolves
@@ -257,7 +259,7 @@ class Claim:
 
 
 @dataclass(frozen=True, eq=False)
-class Tested:
+class TestedHypothesis:
     """A hypothesis of a line: partners where it is there, scans in which it is missing."""
 
     hypothesis: Hypothesis
@@ -276,48 +278,48 @@ class Tested:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class LineEvidence:
     """Of one line: all hypotheses as tested, and the claims that follow."""
 
-    line: Line
-    tested: tuple[Tested, ...]
-    claims: tuple[Claim, ...]
+    line: SpectralLine
+    tested: tuple[TestedHypothesis, ...]
+    claims: tuple[SourceHypothesis, ...]
 
 
-def evidence_of(scans: Sequence[StudiedScan]) -> dict[Key, Evidence]:
+def attribution_evidence(scans: Sequence[StudiedScan]) -> dict[Key, LineEvidence]:
     """Return the evidence for every line of every scan."""
     keys = [(own, k) for own, scan in enumerate(scans) for k in range(len(scan.lines))]
     tested = {key: tuple(_tests(scans, key)) for key in keys}
     claims = {key: _claims(scans, tested[key]) for key in keys}
     images = _images(scans, claims)
     return {
-        key: Evidence(_line(scans, key), tested[key], (*claims[key], *images.get(key, ())))
+        key: LineEvidence(_line(scans, key), tested[key], (*claims[key], *images.get(key, ())))
         for key in keys
     }
 
 
-def _line(scans: Sequence[StudiedScan], key: Key) -> Line:
+def _line(scans: Sequence[StudiedScan], key: Key) -> SpectralLine:
     return scans[key[0]].lines[key[1]]
 
 
-def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[Tested]:
+def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[TestedHypothesis]:
     own, line = key[0], _line(scans, key)
     for hypothesis in hypotheses_of(scans[own], line):
         present, absent = [], []
         for other, scan in enumerate(scans):
             if other == own or (hypothesis.kind == PART and not _same_part(scans[own], scan)):
                 continue
-            shown = shows(scan, hypothesis, line.amplitude)
+            shown = is_detected(scan, hypothesis, line.amplitude)
             if shown:
                 place = place_in(scan, hypothesis)
                 present += [_key_at(other, scan, place)] if place is not None else []
             elif shown is not None:
                 absent.append(other)
-        yield Tested(hypothesis, tuple(present), tuple(absent))
+        yield TestedHypothesis(hypothesis, tuple(present), tuple(absent))
 
 
-def _key_at(own: int, scan: StudiedScan, place: Place) -> Key:
-    found = found_at(scan, place)
+def _key_at(own: int, scan: StudiedScan, place: ExpectedLine) -> Key:
+    found = lines_at(scan, place)
     return own, next(k for k, line in enumerate(scan.lines) if line is found)
 
 
@@ -328,7 +330,9 @@ def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
     return bool(high - low >= -0.02 * max(a.max(), b.max()))
 
 
-def _claims(scans: Sequence[StudiedScan], tested: Sequence[Tested]) -> tuple[Claim, ...]:
+def _claims(
+    scans: Sequence[StudiedScan], tested: Sequence[TestedHypothesis]
+) -> tuple[SourceHypothesis, ...]:
     """Return hypotheses that a scan separates from all other kinds, and that none contradicts."""
     alive = [t for t in tested if t.alive]
     found = []
@@ -336,23 +340,23 @@ def _claims(scans: Sequence[StudiedScan], tested: Sequence[Tested]) -> tuple[Cla
         rivals = [t for t in alive if _is_rival(one, t)]
         decisive = tuple(key for key in one.present if _decides(scans[key[0]], one, rivals))
         if decisive:
-            found.append(Claim(one.kind, one.hypothesis, decisive))
-    return tuple(_least_folded(found))
+            found.append(SourceHypothesis(one.kind, one.hypothesis, decisive))
+    return tuple(_least_aliased(found))
 
 
-def _is_rival(one: Tested, other: Tested) -> bool:
+def _is_rival(one: TestedHypothesis, other: TestedHypothesis) -> bool:
     """Return True for another kind, unless it folds: what folds is no rival of what does not."""
     if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
         return False  # on circles of one radius a figure of the part repeats just so
-    return one.kind != other.kind and not other.hypothesis.folds
+    return one.kind != other.kind and not other.hypothesis.alias_count
 
 
-def _decides(scan: StudiedScan, one: Tested, rivals: Sequence[Tested]) -> bool:
+def _decides(scan: StudiedScan, one: TestedHypothesis, rivals: Sequence[TestedHypothesis]) -> bool:
     place = place_in(scan, one.hypothesis)
     return all(apart(place, place_in(scan, rival.hypothesis)) for rival in rivals)
 
 
-def _least_folded(found: list[Claim]) -> list[Claim]:
+def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
     """Return the claims with one vibration: that in most scans, then the lowest frequency."""
     shaken = [c for c in found if c.kind == VIBRATION]
     if not shaken:
@@ -362,32 +366,32 @@ def _least_folded(found: list[Claim]) -> list[Claim]:
 
 
 def _images(
-    scans: Sequence[StudiedScan], claims: dict[Key, tuple[Claim, ...]]
-) -> dict[Key, list[Claim]]:
+    scans: Sequence[StudiedScan], claims: dict[Key, tuple[SourceHypothesis, ...]]
+) -> dict[Key, list[SourceHypothesis]]:
     """Return lines to which a texture that another scan resolves folds in a scan too coarse."""
-    found: dict[Key, list[Claim]] = {}
+    found: dict[Key, list[SourceHypothesis]] = {}
     for key, own in claims.items():
         for texture in own:
             if texture.kind != PART or texture.hypothesis.coordinate != PATH:
                 continue
             for partner in texture.partners:
                 place = place_in(scans[partner[0]], texture.hypothesis)
-                if place is not None and place.folded and place.coordinate == TIME:
-                    image = Claim(ARTEFACT, texture.hypothesis, (key,), key)
+                if place is not None and place.aliased and place.coordinate == TIME:
+                    image = SourceHypothesis(ARTEFACT, texture.hypothesis, (key,), key)
                     found.setdefault(partner, []).append(image)
     return found
 
 
 @dataclass
-class Settled:
+class Attribution:
     """What each line is, as far as it is decided; ``also`` what else it holds."""
 
     scans: Sequence[StudiedScan]
-    evidence: dict[Key, Evidence]
-    claim: dict[Key, Claim] = field(default_factory=dict)
-    also: dict[Key, Claim] = field(default_factory=dict)
+    evidence: dict[Key, LineEvidence]
+    claim: dict[Key, SourceHypothesis] = field(default_factory=dict)
+    also: dict[Key, SourceHypothesis] = field(default_factory=dict)
 
-    def open_claims(self, key: Key) -> list[Claim]:
+    def open_claims(self, key: Key) -> list[SourceHypothesis]:
         """Return the claims of a line whose partners are not all explained as something else.
 
         All of them if none is left: a line is something.
@@ -396,25 +400,25 @@ class Settled:
         left = [c for c in every if any(self._may_be(p, c) for p in c.partners)]
         return left or list(every)
 
-    def _may_be(self, partner: Key, claim: Claim) -> bool:
+    def _may_be(self, partner: Key, claim: SourceHypothesis) -> bool:
         settled = self.claim.get(partner)
         return settled is None or _family(settled.kind) == _family(claim.kind)
 
-    def settle(self, key: Key, claim: Claim) -> None:
+    def settle(self, key: Key, claim: SourceHypothesis) -> None:
         """Decide, and with it what partners of its size are."""
         self.claim[key] = claim
         size = self.evidence[key].line.amplitude
         for partner in claim.partners:
             ratio = self.evidence[partner].line.amplitude / size
-            theirs = self._as_theirs(partner, claim, key)
+            theirs = self._adopt_partner_claim(partner, claim, key)
             if partner in self.claim:
                 if _family(self.claim[partner].kind) != _family(claim.kind):
                     self.also.setdefault(partner, theirs or claim)
             elif theirs is not None and _EXPLAINED[0] <= ratio <= _EXPLAINED[1]:
                 self.claim[partner] = theirs
-                self._note_besides(partner, theirs)
+                self._note_secondary_sources(partner, theirs)
 
-    def _note_besides(self, key: Key, claim: Claim) -> None:
+    def _note_secondary_sources(self, key: Key, claim: SourceHypothesis) -> None:
         """Note what else a line holds by what was decided of its partners before it."""
         for other in self.evidence[key].claims:
             if _family(other.kind) != _family(claim.kind) and any(
@@ -425,7 +429,9 @@ class Settled:
             ):
                 self.also.setdefault(key, other)
 
-    def _as_theirs(self, partner: Key, claim: Claim, key: Key) -> Claim | None:
+    def _adopt_partner_claim(
+        self, partner: Key, claim: SourceHypothesis, key: Key
+    ) -> SourceHypothesis | None:
         """Return ``partner``'s own claim to be what ``key`` is by ``claim``; it names ``key``."""
         own = [
             c
@@ -435,9 +441,9 @@ class Settled:
         return max(own, key=lambda c: c.kind == ARTEFACT, default=None)
 
 
-def settled(scans: Sequence[StudiedScan], evidence: dict[Key, Evidence]) -> Settled:
+def attribute_lines(scans: Sequence[StudiedScan], evidence: dict[Key, LineEvidence]) -> Attribution:
     """Settle all claims: lines of one kind first, with most partners, then the largest."""
-    done = Settled(scans, evidence)
+    done = Attribution(scans, evidence)
     while True:
         waiting = [
             (_urgency(done, key, claims), key, claims)
@@ -450,26 +456,28 @@ def settled(scans: Sequence[StudiedScan], evidence: dict[Key, Evidence]) -> Sett
         done.settle(key, _largest(done, key, claims))
 
 
-def _urgency(done: Settled, key: Key, claims: Sequence[Claim]) -> tuple[bool, int, bool, float]:
+def _urgency(
+    done: Attribution, key: Key, claims: Sequence[SourceHypothesis]
+) -> tuple[bool, int, bool, float]:
     kinds = {_family(c.kind) for c in claims}
     most = max(claims, key=lambda c: len(c.partners))
     size = done.evidence[key].line.amplitude
     return len(kinds) == 1, len(most.partners), most.kind != VIBRATION, size
 
 
-def _largest(done: Settled, key: Key, claims: Sequence[Claim]) -> Claim:
+def _largest(done: Attribution, key: Key, claims: Sequence[SourceHypothesis]) -> SourceHypothesis:
     """Return, of several things at one frequency, the one that is strongest where it is alone."""
-    by_kind: dict[str, list[Claim]] = {}
+    by_kind: dict[str, list[SourceHypothesis]] = {}
     for claim in claims:
         by_kind.setdefault(_family(claim.kind), []).append(claim)
-    sizes = {kind: size_elsewhere(done, own) for kind, own in by_kind.items()}
+    sizes = {kind: unexplained_partner_amplitude(done, own) for kind, own in by_kind.items()}
     order = sorted(by_kind, key=lambda kind: -sizes[kind])
     if len(order) > 1:
         done.also[key] = by_kind[order[1]][0]
     return max(by_kind[order[0]], key=lambda c: (c.kind == ARTEFACT, len(c.partners)))
 
 
-def size_elsewhere(done: Settled, claims: Sequence[Claim]) -> float:
+def unexplained_partner_amplitude(done: Attribution, claims: Sequence[SourceHypothesis]) -> float:
     """Return the greatest amplitude of the partners that nothing else explains [m]."""
     found = [
         done.evidence[p].line.amplitude
@@ -485,7 +493,7 @@ def _family(kind: str) -> str:
     return PART if kind == ARTEFACT else kind
 
 
-def radius_or_turn(tested: Sequence[Tested]) -> bool:
+def is_ring_or_spindle(tested: Sequence[TestedHypothesis]) -> bool:
     """Return True if a line may be rings on the part as well as the spindle, both with partners."""
     kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.present}
     return (PART, RADIUS) in kinds and any(kind == SYNCHRONOUS for kind, _ in kinds)

@@ -26,7 +26,7 @@ _LIKE = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line:
+class SpectralLine:
     """``cosine · cos(2π f u) + sine · sin(2π f u)``, u one coordinate of the scan.
 
     coordinate: in which it is sharpest;  frequency: there [1/unit], its standard uncertainty
@@ -50,7 +50,9 @@ class Line:
         return float(np.hypot(self.cosine, self.sine))
 
 
-def texture(signal: ScanSignal, values: FloatArray, frequency: float, spread: float) -> Line:
+def texture(
+    signal: ScanSignal, values: FloatArray, frequency: float, spread: float
+) -> SpectralLine:
     """Return the strongest line along the path within ``spread`` of ``frequency`` [1/m]."""
     place = signal.path - float(np.mean(signal.path))
     step = 0.5 / float(np.ptp(place))
@@ -63,17 +65,23 @@ def texture(signal: ScanSignal, values: FloatArray, frequency: float, spread: fl
     for k in range(len(tried)):
         power[k] = abs(np.sum(turning))
         turning = turning * turn
-    return Line(coordinate=PATH, frequency=float(tried[np.argmax(power)]), cosine=0.0, sine=0.0)
+    return SpectralLine(
+        coordinate=PATH, frequency=float(tried[np.argmax(power)]), cosine=0.0, sine=0.0
+    )
 
 
-def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> Line:
+def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> SpectralLine:
     """Return a line to start a fit with: the Fourier sum of ``values`` (n,) at ``frequency``."""
     phase = np.exp(-2j * np.pi * frequency * coordinate.values)
     mean = 2 * complex(values @ phase) / len(values)
-    return Line(coordinate=coordinate.name, frequency=frequency, cosine=mean.real, sine=-mean.imag)
+    return SpectralLine(
+        coordinate=coordinate.name, frequency=frequency, cosine=mean.real, sine=-mean.imag
+    )
 
 
-def fitted(lines: list[Line], coordinates: dict[str, Coordinate], values: FloatArray) -> list[Line]:
+def fitted(
+    lines: list[SpectralLine], coordinates: dict[str, Coordinate], values: FloatArray
+) -> list[SpectralLine]:
     """Fit all ``lines`` at once to ``values`` (n,): amplitudes first, then frequencies as well."""
     lines = _stepped(lines, coordinates, values, turning=False)
     for _ in range(_FITTING_STEPS):
@@ -82,11 +90,11 @@ def fitted(lines: list[Line], coordinates: dict[str, Coordinate], values: FloatA
 
 
 def in_their_coordinates(
-    lines: list[Line],
-    new: Sequence[Line],
+    lines: list[SpectralLine],
+    new: Sequence[SpectralLine],
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
-) -> list[Line]:
+) -> list[SpectralLine]:
     """Return all lines, each ``new`` one in the coordinate that takes most of its power.
 
     Where the pace hardly changes, a spectrum's grid alone may make the wrong one look better.
@@ -101,11 +109,13 @@ def in_their_coordinates(
     return chosen
 
 
-def _bin(line: Line, coordinates: dict[str, Coordinate]) -> float:
+def _bin(line: SpectralLine, coordinates: dict[str, Coordinate]) -> float:
     return 4 * coordinates[line.coordinate].resolution
 
 
-def _best_version(line: Line, coordinates: dict[str, Coordinate], values: FloatArray) -> Line:
+def _best_version(
+    line: SpectralLine, coordinates: dict[str, Coordinate], values: FloatArray
+) -> SpectralLine:
     own = coordinates[line.coordinate]
     versions = [line]
     for name, other in coordinates.items():
@@ -119,7 +129,7 @@ def _best_version(line: Line, coordinates: dict[str, Coordinate], values: FloatA
 
 
 def waves_of(
-    lines: Sequence[Line], coordinates: dict[str, Coordinate]
+    lines: Sequence[SpectralLine], coordinates: dict[str, Coordinate]
 ) -> Callable[[np.ndarray], FloatArray]:
     """Return a function: cosine and sine of every line at given samples, to fit beside the form."""
 
@@ -133,9 +143,9 @@ def waves_of(
     return waves
 
 
-def _apart(lines: list[Line], coordinates: dict[str, Coordinate]) -> list[Line]:
+def _apart(lines: list[SpectralLine], coordinates: dict[str, Coordinate]) -> list[SpectralLine]:
     """Return ``lines`` without the weaker of any two that are one."""
-    kept: list[Line] = []
+    kept: list[SpectralLine] = []
     for line in sorted(lines, key=lambda one: -one.amplitude):
         bin_ = coordinates[line.coordinate].resolution
         if all(
@@ -146,7 +156,9 @@ def _apart(lines: list[Line], coordinates: dict[str, Coordinate]) -> list[Line]:
     return kept
 
 
-def _columns(line: Line, place: FloatArray, middle: float, turning: bool) -> list[FloatArray]:
+def _columns(
+    line: SpectralLine, place: FloatArray, middle: float, turning: bool
+) -> list[FloatArray]:
     phase = 2 * np.pi * line.frequency * place
     cosine, sine = np.cos(phase), np.sin(phase)
     if not turning:
@@ -156,8 +168,12 @@ def _columns(line: Line, place: FloatArray, middle: float, turning: bool) -> lis
 
 
 def _stepped(
-    lines: list[Line], coordinates: dict[str, Coordinate], values: FloatArray, *, turning: bool
-) -> list[Line]:
+    lines: list[SpectralLine],
+    coordinates: dict[str, Coordinate],
+    values: FloatArray,
+    *,
+    turning: bool,
+) -> list[SpectralLine]:
     """Return one Gauss-Newton step of cosines, sines and, if ``turning``, frequencies."""
     per = 3 if turning else 2
     gram, moment = np.zeros((per * len(lines),) * 2), np.zeros(per * len(lines))
@@ -181,7 +197,7 @@ def _stepped(
     ]
 
 
-def _moved(line: Line, step: FloatArray, coordinate: Coordinate) -> Line:
+def _moved(line: SpectralLine, step: FloatArray, coordinate: Coordinate) -> SpectralLine:
     """Return ``line`` moved by ``step``, half a resolution at most: beyond is another line.
 
     The derivative is taken about the middle of the scan, the phase at the coordinate's zero.
@@ -196,7 +212,9 @@ def _moved(line: Line, step: FloatArray, coordinate: Coordinate) -> Line:
     return replace(line, frequency=frequency, cosine=turned.real, sine=-turned.imag)
 
 
-def sum_of(lines: Sequence[Line], coordinates: dict[str, Coordinate], count: int) -> FloatArray:
+def sum_of(
+    lines: Sequence[SpectralLine], coordinates: dict[str, Coordinate], count: int
+) -> FloatArray:
     """Return the heights of all ``lines`` together [m], (count,)."""
     total = np.zeros(count)
     for line in lines:

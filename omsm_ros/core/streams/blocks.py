@@ -37,7 +37,7 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 MAX_BLOCK_SAMPLES = 4_000_000
 
 # Of fewer steps the median may be the jump itself.
-_STEPS_TOLD = 5
+_STEPS_REPORTED = 5
 
 SAME_PERIOD = 1e-6
 """Sample periods are written, not measured: alike to this part, six digits, they are one."""
@@ -59,7 +59,7 @@ class Status(IntEnum):
     LOST = 4
 
 
-def no_parts() -> IntArray:
+def empty_parts() -> IntArray:
     """Return the parts of a block of one message, (0, 2)."""
     return np.empty((0, 2), np.int64)
 
@@ -85,7 +85,7 @@ class Block:
     stamp_ns: int
     first_sample: int
     sample_period: float
-    parts: IntArray = field(default_factory=no_parts)
+    parts: IntArray = field(default_factory=empty_parts)
 
     def __len__(self) -> int:
         """Samples in the block."""
@@ -123,7 +123,7 @@ class Block:
         COUNTER.checked(self.first_sample, DataError, f"{name}: first_sample")
         STAMP.checked(self.stamp_ns, DataError, f"{name}: stamp")
         for channel, quantity in channels.items():
-            object.__setattr__(self, channel, quantity.or_lost(getattr(self, channel)))
+            object.__setattr__(self, channel, quantity.nan_if_implausible(getattr(self, channel)))
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -190,7 +190,7 @@ class AccelerationBlock(Block):
         return len(self.z)
 
 
-class CountingOn:
+class AngleUnwrapper:
     """An angle that counts on, of one that may begin anew on every turn [rad].
 
     Whatever delays or interpolates C would take such a jump for a turn back. A jump is told from a
@@ -206,14 +206,14 @@ class CountingOn:
         before = np.concatenate([self._last, angle])
         steps = np.diff(before)
         known = np.concatenate([self._steps, steps])
-        if len(known) >= _STEPS_TOLD:
+        if len(known) >= _STEPS_REPORTED:
             turns = np.round((steps - np.median(known)) / (2 * np.pi))
             if np.any(turns):
                 steps = steps - 2 * np.pi * turns
                 before[1:] -= 2 * np.pi * np.cumsum(turns)
                 angle = before[len(self._last) :]
         self._last = before[-1:]
-        self._steps = np.concatenate([self._steps, steps])[-_STEPS_TOLD:]
+        self._steps = np.concatenate([self._steps, steps])[-_STEPS_REPORTED:]
         return angle
 
 
@@ -223,7 +223,7 @@ class CountingOn:
 # never came is none of these: trigger counts that a session left out are ``missing``.
 
 
-class Reason(IntEnum):
+class RejectionReason(IntEnum):
     """Why a sample gave no surface point; 0 means that it did.
 
     INVALID: not finite, or the probe gave no usable reading, on either side of a pair
@@ -280,11 +280,11 @@ class Tally:
         self.received = 0
         self.missing = 0
         self.corrected = 0
-        self._counted: Counter[Reason] = Counter()
+        self._counted: Counter[RejectionReason] = Counter()
 
-    def count(self, reason: Reason, samples: int) -> None:
+    def count(self, reason: RejectionReason, samples: int) -> None:
         """Enter ``samples`` under ``reason``; NONE means corrected."""
-        if reason is Reason.NONE:
+        if reason is RejectionReason.NONE:
             self.corrected += samples
         else:
             self._counted[reason] += samples
@@ -292,7 +292,7 @@ class Tally:
     def count_each(self, reasons: NDArray[np.uint8]) -> None:
         """Enter one sample under each of ``reasons`` (n,)."""
         for value, samples in enumerate(np.bincount(reasons)):
-            self.count(Reason(value), int(samples))
+            self.count(RejectionReason(value), int(samples))
 
     def snapshot(self, pending: int) -> StreamAccount:
         """Return the account as it stands with ``pending`` samples waiting."""
@@ -312,7 +312,7 @@ MOST_TOGETHER = 100
 
 # Stamps within one block are those of its first sample and the period; they are moved no further.
 _STAMP_TOLERANCE_S = 1e-3
-_NO_CHANNELS = ("stamp_ns", "first_sample", "sample_period", "parts")
+_NOT_CHANNELS = ("stamp_ns", "first_sample", "sample_period", "parts")
 
 
 def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:
@@ -350,16 +350,18 @@ def _continues(first: B, length: int, block: B) -> bool:
     if block.first_sample != first.first_sample + length or block.sample_period != period:
         return False
     off_ns = block.stamp_ns - first.stamp_ns - length * period * NANOSECONDS_PER_S
-    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _given(first) == _given(block)
+    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _nonempty_channels(
+        first
+    ) == _nonempty_channels(block)
 
 
-def _given(block: B) -> tuple[str, ...]:
+def _nonempty_channels(block: B) -> tuple[str, ...]:
     """Return names of the channels that have samples: an empty one means something of its own."""
     return tuple(name for name in _channels(block) if len(getattr(block, name)))
 
 
 def _channels(block: B) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(block) if f.name not in _NO_CHANNELS)
+    return tuple(f.name for f in fields(block) if f.name not in _NOT_CHANNELS)
 
 
 def joined(run: Sequence[B]) -> B:
@@ -375,7 +377,7 @@ def joined(run: Sequence[B]) -> B:
     )
 
 
-def without_first(block: B, messages: int) -> B:
+def without_first_message(block: B, messages: int) -> B:
     """Return a block that was joined of several messages without the first of them."""
     if not messages:
         return block

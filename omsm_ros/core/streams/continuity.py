@@ -21,7 +21,7 @@ from omsm_ros.units import MILLISECOND_S, NANOSECOND_S, NANOSECONDS_PER_S
 
 # Messages are not delivered this late; time that falls back further has been set back.
 TIME_JUMP_S = 2.0
-_GAPS_REMEMBERED = 256
+_GAPS_KEPT = 256
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class TriggerCount:
         self._next = 0
         self._newest_first = 0
         self._newest_stamp_ns: int | None = None
-        self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS_REMEMBERED)
+        self._gaps: deque[tuple[int, int]] = deque(maxlen=_GAPS_KEPT)
 
     def place(self, block: Block, length: int) -> Arrival:
         """Place ``block`` of ``length`` samples after what came before."""
         first, missing = block.first_sample, 0
-        if self._begins_anew(first, block):
+        if self._starts_new_session(first, block):
             self._session += 1
             self._next = first
             self._gaps.clear()
@@ -79,14 +79,14 @@ class TriggerCount:
             else:
                 left.append((a, b))
         if late:
-            self._gaps = deque(left, maxlen=_GAPS_REMEMBERED)
+            self._gaps = deque(left, maxlen=_GAPS_KEPT)
         return late
 
     def end(self) -> None:
         """Begin a session with whatever comes next."""
         self._newest_stamp_ns = None
 
-    def _begins_anew(self, first: int, block: Block) -> bool:
+    def _starts_new_session(self, first: int, block: Block) -> bool:
         if self._newest_stamp_ns is None:
             return True
         elapsed_ns = block.stamp_ns - self._newest_stamp_ns
@@ -167,7 +167,7 @@ class StampLine:
         counts, stamps = self._counts[place], self._stamps[place]
         return np.concatenate([[count], counts]), np.concatenate([[stamp], stamps])
 
-    def leaps(self, session: int, count: int, period_ns: float) -> bool:
+    def follows_gap(self, session: int, count: int, period_ns: float) -> bool:
         """Return whether the block that begins at ``count``, if one does, comes after a pause."""
         if self._current is None or not len(self) or self._next() != (session, count):
             return False
@@ -187,7 +187,7 @@ class StampLine:
             return None
         return self._current[2] + (count - self._current[1]) * period_ns
 
-    def later_than(
+    def stamp_difference(
         self, other: StampLine, sessions: tuple[int, int], period_ns: float
     ) -> float | None:
         """Return by how much later a count is stamped here than there [ns], None where unknown.
@@ -207,7 +207,7 @@ class StampLine:
         return self._sessions[at], self._counts[at], self._stamps[at]
 
 
-def stamps_ahead(
+def upcoming_stamps(
     lines: Sequence[StampLine], sessions: tuple[int, int], end: int, period_ns: float
 ) -> tuple[FloatArray, BoolArray] | None:
     """Return what the next blocks of two streams say where one begins, as :class:`StampHistory` has
@@ -285,7 +285,7 @@ class StampHistory:
         begin = int(np.searchsorted(rows[:, 0], since))
         return rows[min(begin, *(int(s[-least]) for s in starts)) :]
 
-    def in_real_time(self, period_ns: float) -> bool:
+    def stamps_follow_counts(self, period_ns: float) -> bool:
         """Return whether stamps advance about as the counts do."""
         (first, *_, began), (last, *_, ended) = self.rows[0], self.rows[-1]
         elapsed, passed = (last - first) * period_ns, ended - began

@@ -14,11 +14,18 @@ from omsm_ros.core.streams.blocks import (
     FloatArray,
     IntArray,
     Status,
-    no_parts,
+    empty_parts,
 )
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, INTENSITY_READING, SAMPLE_PERIOD, STAMP, TIME
-from omsm_ros.units import DATE, NANOSECONDS_PER_S, SINCE_1970, check_share, check_turns, is_other
+from omsm_ros.units import (
+    DATE,
+    NANOSECONDS_PER_S,
+    SINCE_1970,
+    check_share,
+    check_turns,
+    contradicts_unit,
+)
 
 AXES = ("x", "y", "z", "b", "c")
 PROBE = ("distance", "intensity")
@@ -57,7 +64,7 @@ class Column:
 
     def contradicts(self, stated: str, channel: str) -> bool:
         """Return whether ``stated``, a file's own word on the unit, means another one."""
-        return is_other(stated, self.unit, channel)
+        return contradicts_unit(stated, self.unit, channel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +120,7 @@ class ColumnMap:
         return channel in self.columns and self.columns[channel].name != ""
 
 
-def in_step(starts: Sequence[float], periods: Sequence[float]) -> bool:
+def share_trigger(starts: Sequence[float], periods: Sequence[float]) -> bool:
     """Return whether streams that begin at ``starts`` [s] share one trigger, by their times.
 
     They do if their ``periods`` [s] agree to 0.1 %, and their samples fall on one grid.
@@ -229,7 +236,7 @@ def counter_of_triggers(values: FloatArray, before: int) -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class TableRows:
     """Where some rows stand in their recording.
 
     counter: trigger number of each (n,);  elapsed: time of each (n,) [s] after ``start`` [s, Unix]
@@ -254,7 +261,7 @@ class Rows:
 
 
 def axis_blocks(
-    table: Mapping[str, FloatArray], mapped: ColumnMap, rows: Rows
+    table: Mapping[str, FloatArray], mapped: ColumnMap, rows: TableRows
 ) -> Iterator[AxisBlock]:
     """Yield the axes of ``rows`` of ``table`` (column name → (n,)), cut at gaps of their count."""
     for axis in ("b", "c"):
@@ -266,13 +273,13 @@ def axis_blocks(
             stamp_ns=stamp_ns,
             first_sample=first,
             sample_period=rows.period,
-            parts=no_parts(),
+            parts=empty_parts(),
             **{c: values[part] for c, values in channels.items()},
         )
 
 
 def distance_blocks(
-    table: Mapping[str, FloatArray], mapped: ColumnMap, rows: Rows
+    table: Mapping[str, FloatArray], mapped: ColumnMap, rows: TableRows
 ) -> Iterator[DistanceBlock]:
     """Yield the probe's readings of ``rows``; NaN and ``invalid`` ones as no target."""
     count = len(rows.counter)
@@ -286,7 +293,7 @@ def distance_blocks(
     if mapped.has("intensity"):
         read = _channel(table, mapped.columns["intensity"], count)
         check_share(read, mapped.columns["intensity"].unit)
-        intensity = INTENSITY_READING.or_lost(read).astype(np.float32)
+        intensity = INTENSITY_READING.nan_if_implausible(read).astype(np.float32)
     for part, stamp_ns, first in rows.parts():
         yield DistanceBlock(
             stamp_ns=stamp_ns,

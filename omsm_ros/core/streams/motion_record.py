@@ -22,13 +22,13 @@ from omsm_ros.core.streams.blocks import (
     BoolArray,
     DistanceBlock,
     FloatArray,
-    Reason,
+    RejectionReason,
     StreamAccount,
     consecutive,
     joined,
 )
 from omsm_ros.core.streams.continuity import TIME_JUMP_S
-from omsm_ros.core.streams.pairing import STAMP_TOLERANCE_S, Intake, Pairing, Run
+from omsm_ros.core.streams.pairing import STAMP_TOLERANCE_S, Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.stamps import axes_at_probe
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import DataError
@@ -150,13 +150,13 @@ def _ordered(blocks: Iterable[B]) -> list[B]:
     return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
 
 
-def _runs(blocks: Iterable[Block], values: Values, intake: Intake) -> Iterator[Run]:
+def _runs(blocks: Iterable[Block], values: Values, intake: StreamInput) -> Iterator[SampleRun]:
     """Yield what is new of each block; ``values`` gives its channel (n,) and where it is usable."""
     for block in _ordered(blocks):
         if (arrival := intake.new(block)) is not None:
             value, ok = values(block)
-            reasons = np.where(ok, Reason.NONE, Reason.INVALID).astype(np.uint8)
-            yield Run.of(block, arrival, reasons, np.asarray(value, np.float64)[np.newaxis])
+            reasons = np.where(ok, RejectionReason.NONE, RejectionReason.INVALID).astype(np.uint8)
+            yield SampleRun.of(block, arrival, reasons, np.asarray(value, np.float64)[np.newaxis])
 
 
 def _position(block: Any) -> tuple[FloatArray, BoolArray]:
@@ -171,7 +171,7 @@ def _reading(block: Any) -> tuple[FloatArray, BoolArray]:
 class _Grid:
     """The axis on the counts ``first`` … of one session, (n,), NaN and not ``known`` in gaps."""
 
-    runs: list[Run]
+    runs: list[SampleRun]
     first: int
     z: FloatArray
     known: BoolArray
@@ -179,7 +179,7 @@ class _Grid:
 
     @classmethod
     def of(cls, axes: Sequence[AxisBlock]) -> _Grid:
-        intake = Intake()
+        intake = StreamInput()
         runs = list(_runs(axes, _position, intake))
         sessions = len({run.session for run in runs})
         first, samples = runs[0].first, runs[-1].end - runs[0].first
@@ -192,7 +192,7 @@ class _Grid:
         z, known = np.full(samples, np.nan), np.zeros(samples, np.bool_)
         for run in runs:
             place = slice(run.first - first, run.end - first)
-            z[place], known[place] = run.values[0], run.reasons == Reason.NONE
+            z[place], known[place] = run.values[0], run.reasons == RejectionReason.NONE
         return cls(runs, first, z, known, intake.tally.snapshot(0))
 
     def matched(
@@ -202,7 +202,7 @@ class _Grid:
 
         Raises DataError where their counter slipped against that of the axes.
         """
-        axes, intake = Intake(), Intake(trigger.counter_offset)
+        axes, intake = StreamInput(), StreamInput(trigger.counter_offset)
         pairing = Pairing(axes, intake, trigger)
         for run in self.runs:
             axes.stamps.add(run.session, run.first, run.stamp_ns)
@@ -212,7 +212,7 @@ class _Grid:
         seen, ok = np.full(len(self.z), np.nan), np.zeros(len(self.z), np.bool_)
         for axis, reading in chain(pairing.pairs(), pairing.end()):
             place = slice(axis.first - self.first, axis.end - self.first)
-            usable = reading.reasons == Reason.NONE
+            usable = reading.reasons == RejectionReason.NONE
             seen[place], ok[place] = np.where(usable, reading.values[0], np.nan), usable
         pairing.distance.clear()
         if pairing.watch.found is not None:

@@ -21,9 +21,9 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import Block, FloatArray, Reason, Tally
+from omsm_ros.core.streams.blocks import Block, FloatArray, RejectionReason, Tally
 from omsm_ros.core.streams.continuity import Arrival, StampLine, TriggerCount
-from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, SlipWatch
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, TriggerSlipDetector
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
@@ -33,7 +33,7 @@ _MISSES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class SampleRun:
     """Consecutive samples of one stream.
 
     session, first: of the first sample;  stamp_ns, period_ns: its time and the step [ns]
@@ -51,7 +51,7 @@ class Run:
     @classmethod
     def of(
         cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
-    ) -> Run:
+    ) -> SampleRun:
         """Return what is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
         period_ns = _period_ns(block)
         whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
@@ -69,9 +69,9 @@ class Run:
         """Return the time of the sample ``count`` [ns]."""
         return self.stamp_ns + (count - self.first) * self.period_ns
 
-    def part(self, start: int, stop: int) -> Run:
+    def part(self, start: int, stop: int) -> SampleRun:
         """Return the samples from index ``start`` up to ``stop``."""
-        return Run(
+        return SampleRun(
             self.session,
             self.first + start,
             self.stamp_ns + round(start * self.period_ns),
@@ -81,7 +81,7 @@ class Run:
         )
 
 
-class Intake:
+class StreamInput:
     """One stream's blocks on their way to a partner: what is new of each, what is counted.
 
     offset: added to the stream's trigger counts;  stamps: of its blocks
@@ -101,8 +101,8 @@ class Intake:
         arrival = self._count.place(block, len(block))
         self.tally.received += len(block)
         self.tally.missing = max(self.tally.missing + arrival.missing - arrival.late, 0)
-        self.tally.count(Reason.LATE, arrival.late)
-        self.tally.count(Reason.DUPLICATE, arrival.skip - arrival.late)
+        self.tally.count(RejectionReason.LATE, arrival.late)
+        self.tally.count(RejectionReason.DUPLICATE, arrival.skip - arrival.late)
         if arrival.skip == len(block):
             return None
         arrival = replace(arrival, first=arrival.first + self._offset)
@@ -132,7 +132,7 @@ class Intake:
         self._count.end()
 
 
-class Queue:
+class RunQueue:
     """Runs of one stream that wait for a partner.
 
     pending: samples without one;  held: in pairs that are not settled yet
@@ -143,57 +143,59 @@ class Queue:
     def __init__(self, tally: Tally, stamps: StampLine) -> None:
         self.stamps = stamps
         self.pending = self.held = 0
-        self.given_up: Run | None = None
-        self._runs: deque[Run] = deque()
+        self.given_up: SampleRun | None = None
+        self._runs: deque[SampleRun] = deque()
         self._tally = tally
 
     @property
-    def head(self) -> Run | None:
+    def head(self) -> SampleRun | None:
         """The oldest run."""
         return self._runs[0] if self._runs else None
 
-    def push(self, run: Run) -> None:
+    def push(self, run: SampleRun) -> None:
         """Append the newest run."""
         self._runs.append(run)
         self.pending += len(run)
 
-    def drop(self, samples: int, reason: Reason = Reason.UNMATCHED) -> Run:
+    def drop(self, samples: int, reason: RejectionReason = RejectionReason.UNMATCHED) -> SampleRun:
         """Take the oldest ``samples`` of the head, which have no partner for ``reason``."""
         run = self._cut(samples)
         self.stamps.advance(run.session, run.end - 1)
         self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(reason)))
         return run
 
-    def hold(self, samples: int) -> Run:
+    def hold(self, samples: int) -> SampleRun:
         """Take the oldest ``samples`` of the head, which have partners; settle or refuse them."""
         self.held += samples
         return self._cut(samples)
 
-    def settle(self, run: Run, partner_reasons: NDArray[np.uint8]) -> None:
+    def settle(self, run: SampleRun, partner_reasons: NDArray[np.uint8]) -> None:
         """Enter a run that was held, whose partners have these reasons."""
         self.held -= len(run)
         if run.reasons.any() or partner_reasons.any():
             self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
         else:
-            self._tally.count(Reason.NONE, len(run))
+            self._tally.count(RejectionReason.NONE, len(run))
 
-    def refuse(self, run: Run) -> None:
+    def refuse(self, run: SampleRun) -> None:
         """Enter a run that was held, and whose partners are of other triggers."""
         self.held -= len(run)
-        self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(Reason.SLIPPED)))
+        self._tally.count_each(
+            np.where(run.reasons, run.reasons, np.uint8(RejectionReason.SLIPPED))
+        )
 
     def limit(self, samples: int) -> None:
         """Give the oldest up until no more than ``samples`` wait."""
         while self.pending > samples:
             excess = min(self.pending - samples, len(self._runs[0]))
-            self.given_up = self.drop(excess, Reason.OVERDUE)
+            self.given_up = self.drop(excess, RejectionReason.OVERDUE)
 
     def clear(self) -> None:
         """Drop all that waits, which will find no partner."""
         while self._runs:
             self.drop(len(self._runs[0]))
 
-    def strays(self, other: Run) -> int:
+    def misplaced_runs(self, other: SampleRun) -> int:
         """Return how many runs come before the newest ones of ``other``'s time; 0 without such."""
         first = misses = 0
         for place in range(len(self._runs) - 1, 0, -1):
@@ -203,7 +205,7 @@ class Queue:
             first = first if misses else place
         return first
 
-    def _cut(self, samples: int) -> Run:
+    def _cut(self, samples: int) -> SampleRun:
         run = self._runs[0]
         self.pending -= samples
         if samples == len(run):
@@ -227,36 +229,36 @@ class Pairing:
     """
 
     def __init__(
-        self, axes: Intake, distance: Intake, trigger: CommonTrigger = EQUAL_COUNTS
+        self, axes: StreamInput, distance: StreamInput, trigger: CommonTrigger = EQUAL_COUNTS
     ) -> None:
-        self.axes = Queue(axes.tally, axes.stamps)
-        self.distance = Queue(distance.tally, distance.stamps)
+        self.axes = RunQueue(axes.tally, axes.stamps)
+        self.distance = RunQueue(distance.tally, distance.stamps)
         self.stamp_skew: float | None = None
-        self.watch = SlipWatch(axes.stamps, distance.stamps, trigger)
+        self.watch = TriggerSlipDetector(axes.stamps, distance.stamps, trigger)
         self._link = _Link(-1, -1)
-        self._held: deque[tuple[Run, Run]] = deque()
+        self._held: deque[tuple[SampleRun, SampleRun]] = deque()
 
-    def pairs(self) -> Iterator[tuple[Run, Run]]:
+    def pairs(self) -> Iterator[tuple[SampleRun, SampleRun]]:
         """Yield complete runs of axes and distance, of equal count and length."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
             order = self._order(a, d)
             if order == 0:
                 yield from self._joined(a, d)
-            elif not self._linked(a, d) and _apart(a, d) and self._passes_strays(a, d):
+            elif not self._linked(a, d) and _apart(a, d) and self._drop_misplaced(a, d):
                 continue
             elif order < 0:
-                samples = self._leading(a, d.first, a, d)
+                samples = self._samples_before(a, d.first, a, d)
                 self.axes.drop(samples, _missing(a, self.distance))
             else:
-                samples = self._leading(d, a.first, a, d)
+                samples = self._samples_before(d, a.first, a, d)
                 self.distance.drop(samples, _missing(d, self.axes))
 
-    def end(self) -> Iterator[tuple[Run, Run]]:
+    def end(self) -> Iterator[tuple[SampleRun, SampleRun]]:
         """Yield the pairs that still wait to be settled, as far as stamps can tell; none follow."""
         if self._held:
             yield from self._settle(self._held[-1][0].end, self.watch.end())
 
-    def _joined(self, a: Run, d: Run) -> Iterator[tuple[Run, Run]]:
+    def _joined(self, a: SampleRun, d: SampleRun) -> Iterator[tuple[SampleRun, SampleRun]]:
         """Yield the pairs that two heads of equal count settle; theirs may have to wait."""
         self.stamp_skew = (a.stamp_ns - d.stamp_ns) / NANOSECONDS_PER_S
         sessions, first, samples = (a.session, d.session), a.first, min(len(a), len(d))
@@ -268,7 +270,7 @@ class Pairing:
         for slipped, alike in groupby(verdicts, key=itemgetter(1)):
             yield from self._settle(max(until for until, _ in alike), slipped)
 
-    def _settle(self, until: int, slipped: bool) -> Iterator[tuple[Run, Run]]:
+    def _settle(self, until: int, slipped: bool) -> Iterator[tuple[SampleRun, SampleRun]]:
         """Yield the pairs that waited before the count ``until``, but for those that slipped."""
         while self._held and (first := self._held[0][0].first) < until:
             a, d = self._held.popleft()
@@ -284,13 +286,13 @@ class Pairing:
                 self.distance.settle(d, a.reasons)
                 yield a, d
 
-    def _passes_strays(self, a: Run, d: Run) -> bool:
+    def _drop_misplaced(self, a: SampleRun, d: SampleRun) -> bool:
         """Drop heads of a wrong time, where the other stream's goes with what comes after them.
 
         Of a block whose stamp was wrong alone, nothing says so but the blocks that follow it: one
         head would be taken for older, and the other stream dropped from then on.
         """
-        axes, distance = self.axes.strays(d), self.distance.strays(a)
+        axes, distance = self.axes.misplaced_runs(d), self.distance.misplaced_runs(a)
         if bool(axes) == bool(distance):
             return False
         stream = self.axes if axes else self.distance
@@ -299,25 +301,25 @@ class Pairing:
             stream.drop(len(stream.head))
         return True
 
-    def _leading(self, run: Run, other_first: int, a: Run, d: Run) -> int:
+    def _samples_before(self, run: SampleRun, other_first: int, a: SampleRun, d: SampleRun) -> int:
         """Return samples of ``run`` before the other head, all of them if the sessions differ."""
         if not self._linked(a, d):
             return len(run)
         return min(other_first - run.first, len(run))
 
-    def _linked(self, a: Run, d: Run) -> bool:
+    def _linked(self, a: SampleRun, d: SampleRun) -> bool:
         return (a.session, d.session) == (self._link.axes, self._link.distance)
 
-    def _order(self, a: Run, d: Run) -> int:
+    def _order(self, a: SampleRun, d: SampleRun) -> int:
         """Return -1 if the axes' head has no partner, 1 if the distance's, 0 for a pair."""
         if not self._linked(a, d):
             if _apart(a, d):
-                return self._older(a, d)
+                return self._earlier_session(a, d)
             if max(a.first, d.first) < min(a.end, d.end):
                 self._link = _Link(a.session, d.session)
         return _sign(a.first - d.first)
 
-    def _older(self, a: Run, d: Run) -> int:
+    def _earlier_session(self, a: SampleRun, d: SampleRun) -> int:
         """Return which of two heads that cannot be of one session is left over from before."""
         if a.session == self._link.axes:
             return -1
@@ -326,17 +328,17 @@ class Pairing:
         return _sign(a.stamp_ns - d.stamp_ns) or -1
 
 
-def _apart(a: Run, d: Run) -> bool:
+def _apart(a: SampleRun, d: SampleRun) -> bool:
     """Return True if one trigger count would have had two different times."""
     count = max(a.first, d.first)
     return abs(a.stamp_of(count) - d.stamp_of(count)) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
 
 
-def _missing(run: Run, other: Queue) -> Reason:
+def _missing(run: SampleRun, other: RunQueue) -> RejectionReason:
     """Return why the other stream has no partner for the first sample of ``run``."""
     lost = other.given_up
     overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
-    return Reason.OVERDUE if overdue else Reason.UNMATCHED
+    return RejectionReason.OVERDUE if overdue else RejectionReason.UNMATCHED
 
 
 def _period_ns(block: Block) -> float:

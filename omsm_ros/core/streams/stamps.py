@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from omsm_ros.core.streams.blocks import (
+    AngleUnwrapper,
     AxisBlock,
     Block,
-    CountingOn,
     DistanceBlock,
     FloatArray,
     uninterrupted,
-    without_first,
+    without_first_message,
 )
 from omsm_ros.core.streams.continuity import TriggerCount
 from omsm_ros.errors import ConfigurationError, DataError
@@ -48,7 +48,7 @@ B = TypeVar("B", AxisBlock, DistanceBlock)
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class StampClock:
     """Time of the sample ``count``: ``start + (count - first) · period``.
 
     first, start_ns: a sample and its time, whole and below [ns];  period_ns: [ns]
@@ -68,7 +68,7 @@ class Clock:
         return np.asarray((whole + fine) / NANOSECONDS_PER_S, np.float64)
 
 
-def fit_clock(blocks: Sequence[Block]) -> Clock:
+def fit_clock(blocks: Sequence[Block]) -> StampClock:
     """Return the line through the stamps of one session's blocks, its first sample the reference.
 
     Raises DataError if the stamps contradict the blocks' sample period.
@@ -79,7 +79,7 @@ def fit_clock(blocks: Sequence[Block]) -> Clock:
     count, since = (stamps - stamps[0]).T.astype(np.float64)
     late = since - count * nominal
     if np.ptp(count) == 0:
-        return Clock(first, start, float(late.mean()), nominal, 0.0)
+        return StampClock(first, start, float(late.mean()), nominal, 0.0)
     centred = count - count.mean()
     drift = float(centred @ late / (centred @ centred))
     offset = float(late.mean() - drift * count.mean())
@@ -93,7 +93,7 @@ def fit_clock(blocks: Sequence[Block]) -> Clock:
     if abs(drift) > _MAX_RATE_ERROR * nominal:
         # Few blocks with jitter say little about the rate: the stated one stands.
         offset, drift = float(late.mean()), 0.0
-    return Clock(first, start, offset, nominal + drift, jitter)
+    return StampClock(first, start, offset, nominal + drift, jitter)
 
 
 def axes_at_probe(
@@ -140,7 +140,7 @@ class _Track:
     spline: BSpline | None
 
     @classmethod
-    def of(cls, run: Sequence[AxisBlock], clock: Clock) -> _Track:
+    def of(cls, run: Sequence[AxisBlock], clock: StampClock) -> _Track:
         values = np.stack([np.concatenate([getattr(b, name) for b in run]) for name in _AXES], 1)
         count = run[0].first_sample + np.arange(len(values), dtype=np.float64)
         time = clock.since(count, run[0].stamp_ns)
@@ -149,14 +149,14 @@ class _Track:
 
         usable = len(values) > _SPLINE_DEGREE and bool(np.all(np.isfinite(values)))
         if usable:
-            values[:, _C] = CountingOn().of(values[:, _C])
+            values[:, _C] = AngleUnwrapper().of(values[:, _C])
         spline = make_interp_spline(time, values, _SPLINE_DEGREE) if usable else None
         return cls(run[0].stamp_ns, float(time[0]), float(time[-1]), spline)
 
 
 def _at(
     block: DistanceBlock,
-    clock: Clock,
+    clock: StampClock,
     tracks: Sequence[_Track],
     nodes: FloatArray,
     weights: FloatArray,
@@ -189,13 +189,13 @@ def _sessions(blocks: Iterable[B]) -> list[list[B]]:
         arrival = count.place(block, len(block))
         again = int(np.searchsorted(block.stamps[:, 0], arrival.first + arrival.skip))
         if again < len(block.stamps):
-            placed.append((arrival.session, without_first(block, again)))
+            placed.append((arrival.session, without_first_message(block, again)))
     return [[b for _, b in group] for _, group in groupby(placed, key=lambda item: item[0])]
 
 
-def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], Clock]]:
+def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], StampClock]]:
     """Return uninterrupted runs of blocks, each with the clock of its session."""
-    runs: list[tuple[list[AxisBlock], Clock]] = []
+    runs: list[tuple[list[AxisBlock], StampClock]] = []
     for session in _sessions(blocks):
         clock = fit_clock(session)
         runs += [(run, clock) for run in uninterrupted(session)]
@@ -323,7 +323,7 @@ class RecentIncrease:
         return {name: rise for name, rise in rises.items() if rise > 0}
 
 
-class Flow:
+class SampleFlow:
     """Samples that come: how many a second, and since when none."""
 
     def __init__(self, window: float = WINDOW_S) -> None:

@@ -37,9 +37,9 @@ _LEAST_HELD, _LONGER = 100, 50.0
 # often on the average, many may lie there.
 _LEAST_PILED, _PILED, _COARSE = 20, 10.0, 5.0
 # Samples of the axes in which steps are looked for, and how many steps tell.
-_STEPS_LOOKED_FOR, _STEPS_TOLD = 1_000_000, 20
+_STEPS_LOOKED_FOR, _STEPS_REPORTED = 1_000_000, 20
 # Half a probe's noise, and what a slope of a per cent makes it: less is in no figure.
-_STEP_OF_HEIGHT_M, _STEP_SIDEWAYS_M = 5e-9, 1e-6
+_STEP_OF_HEIGHT_M, _LATERAL_STEP_M = 5e-9, 1e-6
 
 
 class StreamWatch:
@@ -133,8 +133,8 @@ class StreamWatch:
                 f"height open by {quantity(left, 'm')} (rms): record it at each trigger and with "
                 "all its digits, or state encoder_resolution"
             )
-        for axis, unit, size, sideways in (("X", "m", x, x), ("C", "rad", c, c * self._widest)):
-            if (left := sideways / np.sqrt(12)) > max(_STEP_SIDEWAYS_M, 1.5 * lateral):
+        for axis, unit, size, lateral_step in (("X", "m", x, x), ("C", "rad", c, c * self._widest)):
+            if (left := lateral_step / np.sqrt(12)) > max(_LATERAL_STEP_M, 1.5 * lateral):
                 yield (
                     f"{axis} stands still and goes on in steps of {quantity(size, unit)}, which "
                     f"leaves places open by {quantity(left, 'm')} (rms): record it at each trigger "
@@ -178,7 +178,7 @@ class _Readings:
         self._run, self._last = 0, np.nan
         self._longest, self._value = 0, np.nan
         # The least are the greatest with their sign turned.
-        self._ends = {"greatest": (1, _End()), "least": (-1, _End())}
+        self._ends = {"greatest": (1, _EndValues()), "least": (-1, _EndValues())}
 
     def add(self, readings: FloatArray) -> None:
         """Take the next readings (n,), finite."""
@@ -240,12 +240,12 @@ class _Steps:
     @property
     def size(self) -> float:
         """Of a step, rms; 0 where most steps follow on another one."""
-        if self._alone < max(_STEPS_TOLD, self._moves / 2):
+        if self._alone < max(_STEPS_REPORTED, self._moves / 2):
             return 0.0
         return float(np.sqrt(self._squares / self._alone))
 
 
-class _End:
+class _EndValues:
     """The greatest of all values and how often it came, and the same of the next."""
 
     def __init__(self) -> None:

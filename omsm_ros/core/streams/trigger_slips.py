@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.streams.continuity import StampHistory, StampLine, stamps_ahead
+from omsm_ros.core.streams.continuity import StampHistory, StampLine, upcoming_stamps
 from omsm_ros.core.streams.statistics import median, spread_about_median
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
@@ -82,7 +82,7 @@ EQUAL_COUNTS = CommonTrigger()
 
 
 @dataclass(frozen=True, slots=True)
-class Slip:
+class TriggerSlip:
     """What the stamps say of two counters.
 
     samples: periods by which axes are stamped later at equal counts, 0 as long as they agree
@@ -101,7 +101,7 @@ class Slip:
         )
 
 
-class SlipWatch:
+class TriggerSlipDetector:
     """Judges pairs of two streams by the stamps of their blocks.
 
     sessions: of axes and distance, whose pairs are watched
@@ -111,12 +111,12 @@ class SlipWatch:
     def __init__(self, axes: StampLine, distance: StampLine, trigger: CommonTrigger) -> None:
         self._lines = (axes, distance)
         self._trigger = trigger
-        self.found: Slip | None = None
+        self.found: TriggerSlip | None = None
         self._restart((-1, -1), 0)
 
     def _restart(self, sessions: tuple[int, int], first: int) -> None:
         self.sessions, self._start = sessions, first
-        self._state = Slip()
+        self._state = TriggerSlip()
         self._judged, self._since, self._period_ns = -1, 0.0, 1.0
         # Nothing was judged yet; whether one driver stamps both, once any stamp was seen.
         self._starting, self._common = True, False
@@ -131,17 +131,21 @@ class SlipWatch:
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
 
     @property
-    def one_driver(self) -> bool:
+    def same_stamps(self) -> bool:
         """Whether both streams carry the same stamps: then one device latches both."""
         return self._common
 
     @property
-    def state(self) -> Slip:
+    def state(self) -> TriggerSlip:
         """What the stamps said last."""
         if self._state.samples:
             return self._state
         window = self._window()
-        return Slip() if window is None else Slip(seen_from=math.ceil(self._limit(window)))
+        return (
+            TriggerSlip()
+            if window is None
+            else TriggerSlip(seen_from=math.ceil(self._limit(window)))
+        )
 
     def settled(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
@@ -155,11 +159,11 @@ class SlipWatch:
         for line, session in zip(self._lines, sessions, strict=True):
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
-            if (last := self._quiet(end, period_ns)) is not None:
-                yield self._agreed(last, period_ns), False
+            if (last := self._skip_unremarkable(end, period_ns)) is not None:
+                yield self._agreed_until(last, period_ns), False
                 continue
             pairs = zip(self._lines, sessions, strict=True)
-            if self._common or any(line.leaps(s, count, period_ns) for line, s in pairs):
+            if self._common or any(line.follows_gap(s, count, period_ns) for line, s in pairs):
                 yield count, self.end()
             before = self._state.samples
             self._observe(count, period_ns)
@@ -167,13 +171,13 @@ class SlipWatch:
                 yield count, True
                 self._shown = [count, count]
             else:
-                yield self._agreed(count, period_ns), False
+                yield self._agreed_until(count, period_ns), False
         pairs = zip(self._lines, sessions, strict=True)
         stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in pairs)
         if self._common or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
 
-    def _quiet(self, end: int, period_ns: float) -> int | None:
+    def _skip_unremarkable(self, end: int, period_ns: float) -> int | None:
         """Take the next stamps up to the first that stands out, as :meth:`_observe` takes each.
 
         Return the last one's count; None if that one has to be looked at by itself. Of a bag
@@ -181,7 +185,7 @@ class SlipWatch:
         """
         if self._starting or self._odd or self._state.samples or sum(map(len, self._lines)) < _MANY:
             return None
-        ahead = stamps_ahead(self._lines, self.sessions, end, period_ns)
+        ahead = upcoming_stamps(self._lines, self.sessions, end, period_ns)
         if ahead is None:
             return None
         self._period_ns = period_ns
@@ -214,7 +218,7 @@ class SlipWatch:
             self._state.samples
             or self._odd_at <= since
             or few
-            or not self._seen.in_real_time(self._period_ns)
+            or not self._seen.stamps_follow_counts(self._period_ns)
         ):
             return bool(self._state.samples)
         rows = self._seen.after(since)
@@ -223,7 +227,7 @@ class SlipWatch:
             self._state = self.found = found
         return bool(found.samples)
 
-    def _agreed(self, count: int, period_ns: float) -> int:
+    def _agreed_until(self, count: int, period_ns: float) -> int:
         """Return up to where stamps have shown that there is no slip."""
         per_s = NANOSECONDS_PER_S / period_ns
         if self._starting and count - self._start <= _MOST_WAIT_S * per_s:
@@ -240,7 +244,7 @@ class SlipWatch:
         """Take the skew where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self.sessions
         begun = axes.advance(a, count), distance.advance(d, count)
-        skew = axes.later_than(distance, self.sessions, period_ns)
+        skew = axes.stamp_difference(distance, self.sessions, period_ns)
         if skew is None:
             self._common = False
             return
@@ -286,8 +290,8 @@ class SlipWatch:
         if not (self._odd or self._state.samples or self._starting):
             return
         rows = self._recent()
-        if rows is None or not self._seen.in_real_time(self._period_ns):
-            self._state, self._odd = Slip(), True
+        if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
+            self._state, self._odd = TriggerSlip(), True
             if rows is not None:
                 self._starting, self._judged_to = False, count  # stamps tell nothing
         else:
@@ -307,7 +311,7 @@ class SlipWatch:
         rows = self._recent()
         return (
             None
-            if rows is None or not self._seen.in_real_time(self._period_ns)
+            if rows is None or not self._seen.stamps_follow_counts(self._period_ns)
             else rows[:, 1] / self._period_ns
         )
 
@@ -319,17 +323,17 @@ class SlipWatch:
         """Return the skew that is a slip [samples]."""
         wander = np.array(self._wander) / self._period_ns
         scatter = max(
-            spread_about_median(window), spread_about_median(wander), _to_be_learnt(wander)
+            spread_about_median(window), spread_about_median(wander), _clock_uncertainty(wander)
         )
         return self._steady(self._period_ns) + _SEVERAL_TIMES * scatter
 
-    def _verdict(self, window: FloatArray) -> Slip:
+    def _verdict(self, window: FloatArray) -> TriggerSlip:
         skew, limit = median(window), self._limit(window)
         slipped = abs(skew) >= (self._steady(self._period_ns) if self._state.samples else limit)
         if not slipped:
-            return Slip()
+            return TriggerSlip()
         samples = round(skew) or int(math.copysign(1, skew))
-        return Slip(samples, math.ceil(limit), self._remedy(skew, self._period_ns))
+        return TriggerSlip(samples, math.ceil(limit), self._remedy(skew, self._period_ns))
 
     def _remedy(self, skew: float, period_ns: float) -> str:
         later = skew * period_ns / NANOSECONDS_PER_S / MILLISECOND_S
@@ -342,7 +346,7 @@ class SlipWatch:
         )
 
 
-def _to_be_learnt(wander: FloatArray) -> float:
+def _clock_uncertainty(wander: FloatArray) -> float:
     """Return by how much clocks that moved as in ``wander`` (n,) may still be wrong."""
     if len(wander) <= 2:
         return 0.0

@@ -156,13 +156,13 @@ class Biconic:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the conics have ended."""
-        bent, root, _, _ = self._parts(x, y)
-        return np.asarray(bent / (1 + root), np.float64)
+        curvature_term, root, _, _ = self._parts(x, y)
+        return np.asarray(curvature_term / (1 + root), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
-        bent, root, p, q = self._parts(x, y)
-        share = bent / ((1 + root) ** 2 * root)
+        curvature_term, root, p, q = self._parts(x, y)
+        share = curvature_term / ((1 + root) ** 2 * root)
         cx, cy = curvature_of(self.radius_x), curvature_of(self.radius_y)
         return (
             np.asarray(2 * cx * x / (1 + root) + share * p * x),

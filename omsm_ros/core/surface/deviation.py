@@ -101,7 +101,7 @@ def level(
     return np.asarray(deviation - design @ fitted, np.float64)
 
 
-def unlike(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> list[str]:
+def mismatch_text(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> list[str]:
     """Return what says that points are not of ``nominal``, in words for people, or nothing.
 
     x, y, height: [m], each (n,), in the frame of the surface

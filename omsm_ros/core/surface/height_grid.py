@@ -108,7 +108,7 @@ class GridSurface:
             raise DataError(f"map of shape {grid.height.shape!r}, expected 4 rows and columns")
         self._grid, self._known = grid, np.isfinite(grid.height)
         # Only cells whose places are all known are used; the others must not bend these.
-        filled = np.where(self._known, grid.height, _beside(grid.height))
+        filled = np.where(self._known, grid.height, _filled_from_neighbours(grid.height))
         self._spline = RectBivariateSpline(grid.y, grid.x, filled)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -143,7 +143,7 @@ class GridSurface:
         return np.asarray(inside & whole[low, left])
 
 
-def _beside(height: FloatArray) -> FloatArray:
+def _filled_from_neighbours(height: FloatArray) -> FloatArray:
     """Return the map with each missing place as the nearest known one of its row, else the mean."""
     made = np.full_like(height, np.nanmean(height))
     index = np.arange(height.shape[1])

@@ -94,7 +94,7 @@ def measured(
     )
 
 
-def each_once(points: MeasuredPoints) -> MeasuredPoints:
+def without_duplicates(points: MeasuredPoints) -> MeasuredPoints:
     """Return the points without those that stand there again in every digit; a note tells them.
 
     What a program has written twice is no second measurement.

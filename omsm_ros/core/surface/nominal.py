@@ -34,7 +34,7 @@ from omsm_ros.core.surface.zernike_terms import (
     NUMBERING,
     Indexing,
     Norm,
-    Term,
+    ZernikeIndex,
     first_terms,
     rms_of,
     zernike_slopes,
@@ -159,7 +159,7 @@ class ZernikeSurface:
         u, v = np.broadcast_arrays(x, y)
         return u / self.radius, v / self.radius
 
-    def _terms(self) -> tuple[list[Term], FloatArray]:
+    def _terms(self) -> tuple[list[ZernikeIndex], FloatArray]:
         """Return the terms that are there, and their sizes at the rim [m]."""
         numbered = first_terms(len(self.coefficients), self.indexing)
         used = [(t, c) for t, c in zip(numbered, self.coefficients, strict=True) if c]
@@ -296,19 +296,21 @@ class QFreeform:
         """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
         square, c = np.square(x) + np.square(y), curvature_of(self.radius)
         root = root_of(1 - c**2 * square)
-        departure, _, _ = self._departure(x, y)
+        departure, _, _ = self._departure_from_sphere(x, y)
         return np.asarray(c * square / (1 + root) + departure / root, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         c = curvature_of(self.radius)
         root = root_of(1 - c**2 * (np.square(x) + np.square(y)))
-        departure, along_x, along_y = self._departure(x, y)
+        departure, along_x, along_y = self._departure_from_sphere(x, y)
         # Of the sphere, and of 1/root, divided by x or y.
         rate = c / root + departure * c**2 / root**3
         return np.asarray(along_x / root + rate * x), np.asarray(along_y / root + rate * y)
 
-    def _departure(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _departure_from_sphere(
+        self, x: FloatArray, y: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return δ [m] and its slopes [1]; u^m exp(imθ) is a power of (x + iy)/aperture_radius."""
         w: ComplexArray = np.asarray(np.add(x, np.multiply(1j, y)) / self.aperture_radius)
         s = np.square(w.real) + np.square(w.imag)

@@ -27,41 +27,41 @@ Indexing: TypeAlias = Literal["noll", "fringe", "ansi"]
 MOST_FRINGE = 37
 
 
-class Term(NamedTuple):
+class ZernikeIndex(NamedTuple):
     """One polynomial: ``n`` radial order, ``m`` angular order, negative for sines."""
 
     n: int
     m: int
 
 
-def noll(j: int) -> Term:
+def noll(j: int) -> ZernikeIndex:
     """Return the term of Noll's number j = 1, 2, … (J. Opt. Soc. Am. 66, 207)."""
     n = int((np.sqrt(8 * j - 7) - 1) // 2)
     place = j - n * (n + 1) // 2 - 1
     m = 2 * ((place + 1) // 2) if n % 2 == 0 else 2 * (place // 2) + 1
-    return Term(n, m if j % 2 == 0 else -m)
+    return ZernikeIndex(n, m if j % 2 == 0 else -m)
 
 
-def fringe(j: int) -> Term:
+def fringe(j: int) -> ZernikeIndex:
     """Return the term of the Fringe number j = 1 to 37 (University of Arizona; ISO 14999-2).
 
     Its last is the symmetric one of order twelve, out of turn, and there are no others.
     """
     if j == MOST_FRINGE:
-        return Term(12, 0)
+        return ZernikeIndex(12, 0)
     half = int(np.ceil(np.sqrt(j))) - 1
     place = j - half**2 - 1
     m = half - place // 2
-    return Term(2 * half - m, m if place % 2 == 0 else -m)
+    return ZernikeIndex(2 * half - m, m if place % 2 == 0 else -m)
 
 
-def ansi(j: int) -> Term:
+def ansi(j: int) -> ZernikeIndex:
     """Return the term of the ANSI Z80.28 number j = 0, 1, …"""
     n = int((np.sqrt(8 * j + 1) - 1) // 2)
-    return Term(n, 2 * j - n * (n + 2))
+    return ZernikeIndex(n, 2 * j - n * (n + 2))
 
 
-NUMBERING: dict[str, tuple[Callable[[int], Term], int]] = {
+NUMBERING: dict[str, tuple[Callable[[int], ZernikeIndex], int]] = {
     "noll": (noll, 1),
     "fringe": (fringe, 1),
     "ansi": (ansi, 0),
@@ -69,18 +69,18 @@ NUMBERING: dict[str, tuple[Callable[[int], Term], int]] = {
 """Each numbering with the number that it begins with."""
 
 
-def first_terms(count: int, indexing: Indexing = "fringe") -> tuple[Term, ...]:
+def first_terms(count: int, indexing: Indexing = "fringe") -> tuple[ZernikeIndex, ...]:
     """Return the first ``count`` terms of a numbering."""
     term_of, first = NUMBERING[indexing]
     return tuple(term_of(j) for j in range(first, first + count))
 
 
-def terms_up_to(order: int, least: int = 0) -> tuple[Term, ...]:
+def terms_up_to(order: int, least: int = 0) -> tuple[ZernikeIndex, ...]:
     """Return all terms of radial orders ``least`` to ``order``."""
-    return tuple(Term(n, m) for n in range(least, order + 1) for m in range(-n, n + 1, 2))
+    return tuple(ZernikeIndex(n, m) for n in range(least, order + 1) for m in range(-n, n + 1, 2))
 
 
-def rms_of(term: Term) -> float:
+def rms_of(term: ZernikeIndex) -> float:
     """Return the root mean square over the disc of a term that is one at the rim."""
     return float(1 / np.sqrt((1 if term.m == 0 else 2) * (term.n + 1)))
 
@@ -107,7 +107,7 @@ def _jacobi(
         yield value, slope
 
 
-def _by_angle(terms: Sequence[Term]) -> dict[int, list[tuple[int, int, bool]]]:
+def _by_angle(terms: Sequence[ZernikeIndex]) -> dict[int, list[tuple[int, int, bool]]]:
     """Return, by |m|, the place of each term, its k, and whether it is a sine."""
     found: dict[int, list[tuple[int, int, bool]]] = {}
     for place, (n, m) in enumerate(terms):
@@ -115,7 +115,7 @@ def _by_angle(terms: Sequence[Term]) -> dict[int, list[tuple[int, int, bool]]]:
     return found
 
 
-def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[Term]) -> FloatArray:
+def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[ZernikeIndex]) -> FloatArray:
     """Return the terms (k, n), one at the rim, at x, y (n,) of the unit disc."""
     made = np.empty((len(terms), *np.shape(x)))
     t = 2 * (x**2 + y**2) - 1
@@ -133,7 +133,7 @@ def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[Term]) -> Float
 
 
 def zernike_slopes(
-    x: FloatArray, y: FloatArray, terms: Sequence[Term]
+    x: FloatArray, y: FloatArray, terms: Sequence[ZernikeIndex]
 ) -> tuple[FloatArray, FloatArray]:
     """Return ∂Z/∂x and ∂Z/∂y, each (k, n), of the terms at x, y (n,) of the unit disc."""
     along_x, along_y = (np.empty((len(terms), *np.shape(x))) for _ in range(2))

@@ -228,7 +228,7 @@ class Chrocodile(StreamDevice):
             self._read(name)
         if not intact:
             self._try(TRIGGERS[wanted.trigger])  # some of them start the counter anew
-            self._tracker.begin_anew()
+            self._tracker.restart_count()
         self._ever_set_up = True
         self._finish()
         self._asked = self._monotonic()
@@ -258,9 +258,9 @@ class Chrocodile(StreamDevice):
 
     def _set_rate(self) -> None:
         """SHZ counts exposures: as many to a sample, or to a trigger, as are averaged into it."""
-        told = _value(self._identity.get("AVD", "1"))
-        averaged = isinstance(told, float) and told > 1 and self._slowed_by_averaging
-        self._exposures = round(told) if averaged and isinstance(told, float) else 1
+        averaging = _value(self._identity.get("AVD", "1"))
+        averaged = isinstance(averaging, float) and averaging > 1 and self._slowed_by_averaging
+        self._exposures = round(averaging) if averaged and isinstance(averaging, float) else 1
         rate = self._exposures / self._wanted.sample_period
         free = self._wanted.trigger == "free_run"
         self._ask("SHZ", rate if free else float(round(rate * _ABOVE_TRIGGER)))
@@ -472,8 +472,8 @@ class ChrocodileDevice(Chrocodile):
         now = self._monotonic()
         previous = self._raw_time if self._raw_time is not None else int(raw[0])
         steps = np.diff(raw, prepend=previous) % _TIME_RANGE
-        hidden = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
-        steps[0] += max(0, round(hidden / _TIME_RANGE)) * _TIME_RANGE
+        missing_samples = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
+        steps[0] += max(0, round(missing_samples / _TIME_RANGE)) * _TIME_RANGE
         times: IntArray = self._device_ns + np.cumsum(steps)
         self._raw_time, self._device_ns, self._time_at = int(raw[-1]), int(times[-1]), now
         return times

@@ -23,8 +23,8 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
     FORMATS,
     TIME_OFFSET,
     UPDATE,
-    Command,
     DataFormat,
+    PacketCommand,
     PacketDecoder,
     Value,
     encode_command,
@@ -53,7 +53,7 @@ from omsm_ros.instruments.chrocodile.telegram import (
     ProbeReading,
     Records,
 )
-from omsm_ros.instruments.emulator import AXES, Instrument, Line, Measured, Source
+from omsm_ros.instruments.emulator import AXES, Instrument, InstrumentLink, Measured, Source
 from omsm_ros.instruments.six_channel.protocol import AxisScaling
 from omsm_ros.units import MICROMETRE_M
 
@@ -74,7 +74,7 @@ class ChrocodileEmulator(Instrument):
 
     def __init__(
         self,
-        line: Line,
+        line: InstrumentLink,
         source: Source | None = None,
         *,
         triggered: bool = False,
@@ -228,17 +228,17 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
         self._packets.reset()
         for name in ("SHZ", "LAI", "AVD", "SODX"):
             values = tuple(map(_number, self._values[name].split()))
-            self.say(encode_command(Command(name, values, UPDATE)))
+            self.say(encode_command(PacketCommand(name, values, UPDATE)))
         self.say(encode_format(self._format))
-        self.say(encode_command(Command(CONFIGURED, (), UPDATE)))
+        self.say(encode_command(PacketCommand(CONFIGURED, (), UPDATE)))
 
     def receive(self, data: bytes) -> None:
         """Take commands, in any portions."""
         for message in self._packets.feed(data):
-            if isinstance(message, Command):
+            if isinstance(message, PacketCommand):
                 self._obey(message)
 
-    def _obey(self, asked: Command) -> None:
+    def _obey(self, asked: PacketCommand) -> None:
         words = (ASK,) if asked.flags & CHROCODILE_PACKET_QUERY else tuple(map(_text, asked.values))
         text = self._answer(Request(b"", asked.name, words))
         flags = ERROR if text == _REFUSED else 0
@@ -246,7 +246,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
             values: tuple[Value, ...] = (text,)
         else:
             values = tuple(map(_number, text.split())) if text else asked.values
-        self.say(encode_command(Command(asked.name, values, flags, asked.ticket)))
+        self.say(encode_command(PacketCommand(asked.name, values, flags, asked.ticket)))
         if asked.name in ("SODX", "SHZ") and not asked.flags & CHROCODILE_PACKET_QUERY:
             self._describe()
             self.say(encode_format(self._format))

@@ -18,9 +18,9 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
     HEADER,
     QUERY,
     UPDATE,
-    Command,
     Data,
     Message,
+    PacketCommand,
     PacketDecoder,
     Value,
     encode_command,
@@ -48,7 +48,7 @@ class ChrocodilePacketDevice(Chrocodile):
         self._decoder = PacketDecoder()
         self._ticket, self._sample_bytes = 0, 1
         self._early: list[Data] = []
-        self._commands: list[Command] = []
+        self._commands: list[PacketCommand] = []
         self._said = b""
 
     def counts(self) -> dict[str, float]:
@@ -66,11 +66,11 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def _await_configuration(self) -> None:
         """The device tells it to every new client; one that has not is asked for it once."""
-        told = self._wanted.patience / 2
+        answer_patience = self._wanted.patience / 2
         try:
-            self._await("CONF", lambda c: c.name == CONFIGURED, told)
+            self._await("CONF", lambda c: c.name == CONFIGURED, answer_patience)
         except DeviceTimeoutError:
-            self._transport.write(encode_command(Command(CONFIGURED, (), 0, 0)))
+            self._transport.write(encode_command(PacketCommand(CONFIGURED, (), 0, 0)))
             self._await("CONF", lambda c: c.name == CONFIGURED, self._wanted.patience)
 
     def _finish(self) -> None:
@@ -81,7 +81,7 @@ class ChrocodilePacketDevice(Chrocodile):
         self._ticket = (self._ticket + 1) % _TICKETS
         query = arguments == ("?",)
         values = () if query else tuple(map(_value, arguments))
-        asked = Command(name, values, QUERY if query else 0, self._ticket)
+        asked = PacketCommand(name, values, QUERY if query else 0, self._ticket)
         self._commands.clear()
         self._transport.write(encode_command(asked))
         answer = self._await(
@@ -102,7 +102,9 @@ class ChrocodilePacketDevice(Chrocodile):
             )
         return Answer(encode_command(asked), text)
 
-    def _await(self, what: str, wanted: Callable[[Command], bool], patience: float) -> Command:
+    def _await(
+        self, what: str, wanted: Callable[[PacketCommand], bool], patience: float
+    ) -> PacketCommand:
         deadline = self._monotonic() + patience
         while True:
             data = self._read_answer(self._said, partial(self._unanswered, what))
@@ -123,7 +125,7 @@ class ChrocodilePacketDevice(Chrocodile):
     def _sorted(self, messages: Sequence[Message]) -> list[Data]:
         found = []
         for message in messages:
-            if isinstance(message, Command):
+            if isinstance(message, PacketCommand):
                 self._commands.append(message)
             elif isinstance(message, Data):
                 found.append(message)

@@ -53,7 +53,7 @@ def name_code(name: str) -> int:
     return int.from_bytes(name.encode(), "little")
 
 
-class Command(NamedTuple):
+class PacketCommand(NamedTuple):
     """A command, its answer, or an update.  ticket: of the command that is answered."""
 
     name: str
@@ -94,7 +94,7 @@ class Data(NamedTuple):
     times_ns: NDArray[np.int64]
 
 
-Message: TypeAlias = Command | DataFormat | Data
+Message: TypeAlias = PacketCommand | DataFormat | Data
 
 
 # Encoding.
@@ -113,7 +113,7 @@ def _argument(value: Value) -> bytes:
     return struct.pack("<II", kind, len(raw)) + raw + bytes(-len(raw) % 4)
 
 
-def encode_command(command: Command) -> bytes:
+def encode_command(command: PacketCommand) -> bytes:
     """Wire bytes of a command, an answer or an update."""
     arguments = b"".join(map(_argument, command.values))
     head = _COMMAND.pack(
@@ -145,7 +145,7 @@ def encode_data(form: DataFormat, records: Records, time_ns: int) -> bytes:
 # Decoding.
 
 
-def decode_command(body: bytes) -> Command:
+def decode_command(body: bytes) -> PacketCommand:
     """Return the command in a packet's body; ProtocolError or struct.error if it is none."""
     code, _, _, flags, _, ticket, count = _COMMAND.unpack_from(body)
     name = code.to_bytes(4, "little").rstrip(b"\0").decode("latin-1")
@@ -156,7 +156,7 @@ def decode_command(body: bytes) -> Command:
         value, size = _decode_argument(kind, body, place + NUMBER.size)
         values.append(value)
         place += NUMBER.size + size
-    return Command(name, tuple(values), flags, ticket)
+    return PacketCommand(name, tuple(values), flags, ticket)
 
 
 def _decode_argument(kind: int, body: bytes, place: int) -> tuple[Value, int]:

@@ -25,7 +25,7 @@ from omsm_ros.instruments.micro_epsilon.protocol import (
     INTENSITY_FULL,
     INTENSITY_MASK,
     VALUE_BITS,
-    Believed,
+    PlausibleValueFilter,
     SerialDecoder,
     channel_dtype,
     confocal_dtype,
@@ -39,7 +39,7 @@ from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
 
 SERIAL_VALUES = ("distance", "intensity", "counter")
 # A value of the frame that is passed over.
-PASSED_OVER = "-"
+SKIPPED_VALUES = "-"
 # Of every answer to GETINFO; a controller that does not know it says so.
 _INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
@@ -66,12 +66,12 @@ class ConfocalDtSettings(BlockSettings):
 
     def __post_init__(self) -> None:
         BlockSettings.__post_init__(self)
-        named = [value for value in self.values if value != PASSED_OVER]
+        named = [value for value in self.values if value != SKIPPED_VALUES]
         unknown, doubled = set(named) - set(SERIAL_VALUES), len(set(named)) < len(named)
         if "distance" not in named or unknown or doubled:
             raise ConfigurationError(
                 f"values {self.values!r}, expected 'distance' and more of {SERIAL_VALUES!r}, each "
-                f"once, in the order of the frame; {PASSED_OVER!r} for another value"
+                f"once, in the order of the frame; {SKIPPED_VALUES!r} for another value"
             )
         if len(set(self.wired)) < len(self.wired) or set(self.wired) - set(range(len(AXES))):
             raise ConfigurationError(f"wired {self.wired!r}, expected axes 0 to 4, each once")
@@ -106,7 +106,7 @@ class ConfocalDtDevice(StreamDevice):
         super().__init__(transport, base, Channels(timed=False), counting, now_ns, monotonic)
         self._wanted = settings
         self._decoder = SerialDecoder(len(settings.values))
-        self._believed = Believed(len(settings.values))
+        self._believed = PlausibleValueFilter(len(settings.values))
         self._counted = self._unread = 0
 
     def counts(self) -> dict[str, float]:
@@ -119,7 +119,7 @@ class ConfocalDtDevice(StreamDevice):
         self._believed.reset()
         self._unread = 0
         if "counter" not in self._wanted.values:
-            self._tracker.begin_anew()
+            self._tracker.restart_count()
 
     def _decode(self, data: bytes) -> Samples:
         values, spoilt = self._believed.feed(*self._decoder.feed(data))
@@ -141,9 +141,9 @@ class ConfocalDtDevice(StreamDevice):
 
     def _listen_in(self, silent: float) -> None:
         if "counter" not in self._wanted.values:
-            self._tracker.begin_anew()
+            self._tracker.restart_count()
         self._check_understood(silent, self._unread)
-        _must_talk(self._transport.name, self._wanted, silent)
+        _check_not_silent(self._transport.name, self._wanted, silent)
 
 
 class ConfocalDtEthernetDevice(BlockStreamDevice):
@@ -201,16 +201,18 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
                 f"{self._transport.name} refused {wanted:.4g} kHz: {error[0]!r}; choose another"
             )
         said = port.ask("MEASRATE", "\n")
-        told = [float(number) for number in re.findall(r"\d+(?:\.\d*)?", said) if float(number) > 0]
-        if not told:
+        answered = [
+            float(number) for number in re.findall(r"\d+(?:\.\d*)?", said) if float(number) > 0
+        ]
+        if not answered:
             raise DeviceError(
                 f"{self._transport.name} did not tell its measuring rate ({said[-64:]!r}); check "
                 "that command_port is this controller's, or set it to 0"
             )
-        if abs(told[-1] / wanted - 1) > RATE_TOLERANCE:
+        if abs(answered[-1] / wanted - 1) > RATE_TOLERANCE:
             raise DeviceError(
                 f"{self._transport.name}: {wanted:.4g} kHz was asked for, the controller measures "
-                f"at {told[-1]:g} kHz; set sample_period to {1e-3 / told[-1]:.9g} s"
+                f"at {answered[-1]:g} kHz; set sample_period to {1e-3 / answered[-1]:.9g} s"
             )
 
     def _samples_of(
@@ -242,9 +244,9 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         if "intensity 1" not in (frames.dtype.names or ()):
             return distance, None
         words = np.stack([distance, frames["intensity 1"].astype(np.int32)], axis=1)
-        told = intensity_leads(words, self._wanted.probe.full_scale / NANOMETRE_M)
-        if told is not None:
-            self._intensity_leads = told
+        answered = intensity_leads(words, self._wanted.probe.full_scale / NANOMETRE_M)
+        if answered is not None:
+            self._intensity_leads = answered
         first, second = words.T
         return (second, first) if self._intensity_leads else (first, second)
 
@@ -259,10 +261,10 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
 
     def _listen_in(self, silent: float) -> None:
         super()._listen_in(silent)
-        _must_talk(self._transport.name, self._wanted, silent)
+        _check_not_silent(self._transport.name, self._wanted, silent)
 
 
-def _must_talk(name: str, settings: ConfocalDtSettings, silent: float) -> None:
+def _check_not_silent(name: str, settings: ConfocalDtSettings, silent: float) -> None:
     if settings.period and silent > settings.patience:
         raise NoSamplesError(
             f"{name} sent nothing that could be read for {silent:.1f} s; check power, output "

@@ -17,10 +17,10 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.instruments.chrocodile.telegram import ProbeReading
-from omsm_ros.instruments.emulator import AXES, Instrument, Line, Measured, Source
+from omsm_ros.instruments.emulator import AXES, Instrument, InstrumentLink, Measured, Source
 from omsm_ros.instruments.micro_epsilon.protocol import (
     VALUE_BITS,
-    Block,
+    MeasurementBlock,
     confocal_dtype,
     encode_block,
     encode_frames,
@@ -46,14 +46,14 @@ class Controller(Instrument):
 
     def __init__(
         self,
-        line: Line,
+        line: InstrumentLink,
         source: Source | None = None,
         *,
         triggered: bool = False,
         clock: Callable[[], float] = time.monotonic,
         seed: int = 1,
         probe: ProbeReading | None = None,
-        commands: Line | None = None,
+        commands: InstrumentLink | None = None,
     ) -> None:
         self._probe = probe or ProbeReading()
         self._commands = commands
@@ -185,6 +185,6 @@ def _blocks(
     anew = np.flatnonzero(np.diff(counters) != 1) + 1
     starts = sorted({*range(0, len(frames), _FRAMES), *anew.tolist()})
     for start, end in zip(starts, [*starts[1:], len(frames)], strict=True):
-        block = Block(_ORDER, _SERIAL, kind, int(counters[start]), raw[start:end])
+        block = MeasurementBlock(_ORDER, _SERIAL, kind, int(counters[start]), raw[start:end])
         pieces[start] = encode_block(form, block)
     return pieces

@@ -61,7 +61,7 @@ FIRST_ERROR = 0x7FFFFF00
 _SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
 
 
-class Block(NamedTuple):
+class MeasurementBlock(NamedTuple):
     """One block.  kind: what its frames hold, in the header's own coding;  frames: (n, bytes)."""
 
     order: int
@@ -119,7 +119,7 @@ def channel_dtype(field: int) -> np.dtype[np.void]:
     return np.dtype([(name, "<i4") for name in present])
 
 
-def encode_block(form: str, block: Block, preamble: bytes = PREAMBLES[0]) -> bytes:
+def encode_block(form: str, block: MeasurementBlock, preamble: bytes = PREAMBLES[0]) -> bytes:
     """Wire bytes of a block; form: of HEADERS."""
     head = HEADERS[form].pack(
         preamble, block.order, block.serial, *block.kind, *block.frames.shape, block.counter
@@ -162,11 +162,11 @@ class BlockDecoder:
         """Forget an unfinished block, as after connecting anew."""
         self._buffer = b""
 
-    def feed(self, data: bytes) -> list[Block]:
+    def feed(self, data: bytes) -> list[MeasurementBlock]:
         """Return the blocks completed by ``data``, in order."""
         self._received += len(data)
         self._buffer += data
-        found: list[Block] = []
+        found: list[MeasurementBlock] = []
         start = 0
         while (place := self._find(start)) >= 0:
             size = self._size(place)
@@ -184,7 +184,7 @@ class BlockDecoder:
         self._buffer = self._buffer[start:]
         return found
 
-    def settle(self) -> list[Block]:
+    def settle(self) -> list[MeasurementBlock]:
         """Return the block that waited for what follows it, now that nothing does."""
         size = len(self._buffer)
         if self._find(0) != 0 or self._size(0, last=True) != size:
@@ -248,7 +248,7 @@ class BlockDecoder:
             inside = self._find(inside + 1)
         return False
 
-    def _block(self, place: int, size: int) -> Block:
+    def _block(self, place: int, size: int) -> MeasurementBlock:
         fields = self._header.unpack_from(self._buffer, place)
         shape = self._shape(fields)
         assert shape is not None  # it was asked before
@@ -256,7 +256,9 @@ class BlockDecoder:
         raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self._header.size)
         self._packets += 1
         self._understood += size
-        return Block(fields[1], fields[2], (fields[3], fields[4]), fields[-1], raw.reshape(shape))
+        return MeasurementBlock(
+            fields[1], fields[2], (fields[3], fields[4]), fields[-1], raw.reshape(shape)
+        )
 
 
 # Measured values of a Micro-Epsilon confocalDT over RS-422: three bytes a value.
@@ -273,7 +275,7 @@ NO_PEAK, BEFORE_RANGE, BEHIND_RANGE, NO_VALUE = 262_076, 262_077, 262_078, 262_0
 VALUE_BITS = 18
 _VALUE_BYTES = 3
 # So many values in a row have their marks by chance once in 64⁵ places, 10⁹ bytes.
-_VALUES_BELIEVED = 5
+_PLAUSIBLE_VALUES = 5
 
 
 def encode_frames(values: IntArray) -> bytes:
@@ -384,7 +386,7 @@ class SerialDecoder:
         return np.flatnonzero((windows == self._marks).all(axis=1))
 
 
-class Believed:
+class PlausibleValueFilter:
     """Frames that are more than chance: enough of them came one after the other at once.
 
     Nothing but the marks vouches for a value, and in noise, or at another baud rate, every 64th
@@ -396,7 +398,7 @@ class Believed:
     def __init__(self, width: int) -> None:
         """width: values in a frame."""
         self._width = width
-        self._needed = -(-_VALUES_BELIEVED // width)
+        self._needed = -(-_PLAUSIBLE_VALUES // width)
         self.unconfirmed = 0
         self.reset()
 

@@ -1,7 +1,7 @@
 """The device's side of the generic six-channel stream, fed by the twin.
 
 Imitated: quantisation to counts and whole nanometres, the probe's verdict, the device's own
-sequence and clock, and, on request, the faults of ``Faults``.
+sequence and clock, and, on request, the faults of ``StreamFaults``.
 
 Not imitated: jitter, drift and resolution of the device's clock, latency of the link, baud
 rate and UART overrun (a reader that is too slow is waited for), commands to the device.
@@ -47,7 +47,7 @@ _NOISE_BYTES = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Faults:
+class StreamFaults:
     """What goes wrong; the first five are probabilities per frame, repeatable by ``seed``.
 
     noise: random bytes on the line before the frame (which they spoil)
@@ -81,7 +81,7 @@ class Faults:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Played:
+class PlayedCounts:
     """What became of the samples played.
 
     ``samples + duplicated = intact + spoilt + dropped + unread``, where
@@ -98,12 +98,12 @@ class Played:
     duplicated: int = 0
     unread: int = 0
 
-    def __add__(self, other: Played) -> Played:
-        names = [f.name for f in fields(Played)]
-        return Played(**{n: getattr(self, n) + getattr(other, n) for n in names})
+    def __add__(self, other: PlayedCounts) -> PlayedCounts:
+        names = [f.name for f in fields(PlayedCounts)]
+        return PlayedCounts(**{n: getattr(self, n) + getattr(other, n) for n in names})
 
 
-class Line(Protocol):
+class StreamLink(Protocol):
     """What carries the bytes away, a ``Pty`` as a rule."""
 
     @property
@@ -122,15 +122,15 @@ class GenericStreamEmulator:
 
     def __init__(
         self,
-        line: Line,
+        line: StreamLink,
         scaling: StreamScaling | None = None,
-        faults: Faults | None = None,
+        faults: StreamFaults | None = None,
         first_sequence: int = 0,
         first_device_time_ns: int = 0,
     ) -> None:
         self._line = line
         self._scaling = scaling or StreamScaling()
-        self._faults = faults or Faults()
+        self._faults = faults or StreamFaults()
         self._faulty = FaultyLine(self._faults)
         self._sequence = first_sequence
         self._device_time = first_device_time_ns
@@ -141,7 +141,7 @@ class GenericStreamEmulator:
         time_lapse: float = 1.0,
         stop: threading.Event | None = None,
         progress: Callable[[int], None] | None = None,
-    ) -> Played:
+    ) -> PlayedCounts:
         """Send every sample of ``recording``, paced, and return what became of them.
 
         time_lapse: seconds of the device's clock per second of ours; inf does not wait
@@ -155,7 +155,7 @@ class GenericStreamEmulator:
         period = recording.axes.sample_period
         size = int(min(max(1.0, time_lapse * WRITE_INTERVAL_S / period), MAX_CHUNK_FRAMES))
         started, origin = time.monotonic(), int(frames["device_time"][0])
-        total = Played()
+        total = PlayedCounts()
         for chunk in _chunks(frames, size):
             elapsed = (int(chunk["device_time"][-1]) - origin) / NANOSECONDS_PER_S
             if _wait_until(started + elapsed / time_lapse, stop):
@@ -166,7 +166,7 @@ class GenericStreamEmulator:
         self._go_on_after(frames[: total.samples], period)
         return total
 
-    def _send(self, chunk: FrameArray, stop: threading.Event) -> Played:
+    def _send(self, chunk: FrameArray, stop: threading.Event) -> PlayedCounts:
         ran_on = self._faulty.runs_on
         pieces, intact, plan = self._faulty.transmit(chunk)
         wire = b"".join(pieces)
@@ -213,20 +213,20 @@ class FaultyLine:
     runs_on: what was last sent lacks its terminator, so it will spoil the next frame
     """
 
-    def __init__(self, faults: Faults) -> None:
+    def __init__(self, faults: StreamFaults) -> None:
         self._faults = faults
         self._random = np.random.default_rng(faults.seed)
         self.runs_on = False
 
-    def transmit(self, frames: FrameArray) -> tuple[list[bytes], BoolArray, Played]:
+    def transmit(self, frames: FrameArray) -> tuple[list[bytes], BoolArray, PlayedCounts]:
         """Return pieces of wire, True where one decodes to its frame, and the samples' account."""
-        copies = 1 - self._strike(self._faults.drop, len(frames)).astype(int)
-        copies += copies * self._strike(self._faults.duplicate, len(frames))
+        copies = 1 - self._hit_frames(self._faults.drop, len(frames)).astype(int)
+        copies += copies * self._hit_frames(self._faults.duplicate, len(frames))
         sent = int(copies.sum())
         wire = np.frombuffer(encode_frames(np.repeat(frames, copies)), np.uint8)
         wire = wire.reshape(sent, ENCODED_SIZE).copy()
         noisy, flipped, cut = (
-            self._strike(rate, sent)
+            self._hit_frames(rate, sent)
             for rate in (self._faults.noise, self._faults.flip, self._faults.truncate)
         )
         self._flip(wire, flipped)
@@ -237,14 +237,14 @@ class FaultyLine:
         runs_on = np.r_[self.runs_on, [not piece.endswith(TERMINATOR) for piece in pieces]]
         self.runs_on = bool(runs_on[-1])
         intact = ~(noisy | flipped | cut | runs_on[:-1].astype(np.bool_))
-        plan = Played(
+        plan = PlayedCounts(
             samples=len(frames),
             dropped=int(np.sum(copies == 0)),
             duplicated=int(np.sum(copies == 2)),
         )
         return pieces, intact, plan
 
-    def _strike(self, rate: float, count: int) -> BoolArray:
+    def _hit_frames(self, rate: float, count: int) -> BoolArray:
         # No draw without a fault: faultless play is then fast, and each fault repeatable.
         return self._random.random(count) < rate if rate else np.zeros(count, np.bool_)
 

@@ -17,7 +17,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import open_regular, read_text, whole_file
+from omsm_ros.io.files import atomic_file, open_regular, read_text
 from omsm_ros.io.table_file import rows_in
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.units import LengthUnits, metres_in, name_and_unit, needed, refuse_other
@@ -130,14 +130,14 @@ def _columns(
             continue
         if role in stated:
             scales[role] = stated[role]
-            _agreed(units, role, stated[role], what)
+            _agreed_until(units, role, stated[role], what)
         else:
             given = needed(units, what)
             scales[role] = given.lateral if role in "xy" else given.height
     return places, scales, count
 
 
-def _agreed(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
+def _agreed_until(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
     """Refuse a column whose name states another unit than was given."""
     if units is None:
         return
@@ -227,7 +227,7 @@ def _notes(names: Mapping[str, int], count: int) -> tuple[str, ...]:
 def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv: bool) -> None:
     """Write columns (n,) of one length by their names, as CSV or, for xyz, after a ``#`` line."""
     mark = "," if csv else " "
-    with whole_file(path, "w") as stream:
+    with atomic_file(path, "w") as stream:
         stream.write(("" if csv else "# ") + mark.join(columns) + "\n")
         for portion in _portions(columns):
             np.savetxt(stream, portion, fmt=_formats(columns), delimiter=mark)
@@ -275,11 +275,11 @@ class DabamProfile:
 
 def has_dabam_header(path: Path) -> bool:
     """Tell whether a text beside ``path`` describes it as a profile of DABAM."""
-    beside = path.with_suffix(".txt")
-    if path.suffix.lower() != ".dat" or beside == path or not beside.is_file():
+    header_path = path.with_suffix(".txt")
+    if path.suffix.lower() != ".dat" or header_path == path or not header_path.is_file():
         return False
     try:
-        return "FILE_FORMAT" in _header(beside)
+        return "FILE_FORMAT" in _header(header_path)
     except FileError:
         return False
 

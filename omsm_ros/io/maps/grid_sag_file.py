@@ -15,7 +15,7 @@ import numpy as np
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, whole_file
+from omsm_ros.io.files import atomic_file, open_regular
 from omsm_ros.io.table_file import rows_in
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.units import LengthUnits, refuse_other
@@ -131,7 +131,7 @@ def write_grid_sag(path: Path, grid: HeightGrid) -> None:
     table = np.column_stack([np.flipud(part).ravel() for part in parts])
     centre = (grid.x0 + grid.dx * (columns - 1) / 2, grid.y0 + grid.dy * (rows - 1) / 2)
     head = (columns, rows, *(f"{v:.17g}" for v in (grid.dx, grid.dy)), _METRES)
-    with whole_file(path, "w") as stream:
+    with atomic_file(path, "w") as stream:
         stream.write(" ".join(map(str, (*head, *(f"{v:.17g}" for v in centre)))) + "\n")
         np.savetxt(stream, table, fmt=["%.17g", "%.9g", "%.9g", "%.9g", "%d"])
 

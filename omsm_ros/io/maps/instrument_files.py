@@ -17,8 +17,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, said, whole_file
-from omsm_ros.io.optional_libraries import library, walked
+from omsm_ros.io.files import atomic_file, exception_text, open_regular
+from omsm_ros.io.optional_libraries import import_optional, walk_in_subprocess
 from omsm_ros.quantities import MAP_POINTS, shown
 from omsm_ros.units import LengthUnits, metres_in, needed, refuse_other
 
@@ -34,9 +34,9 @@ def read_hdf5(path: Path) -> MeasuredPoints:
     Raises FileError for other HDF5 files, and for those that are damaged.
     """
     what = f"HDF5 file {str(path)!r}"
-    h5py = library("h5py", what)
+    h5py = import_optional("h5py", what)
     with open_regular(path, FileError, "HDF5 file") as stream:
-        walked(path, what)
+        walk_in_subprocess(path, what)
         try:
             with h5py.File(stream, "r") as content:
                 if content.attrs.get("schema") == SCHEMA:
@@ -46,7 +46,9 @@ def read_hdf5(path: Path) -> MeasuredPoints:
         except FileError:
             raise
         except Exception as err:  # whatever the library makes of a damaged file
-            raise FileError(f"{what} cannot be read: {said(err)}; write it again") from err
+            raise FileError(
+                f"{what} cannot be read: {exception_text(err)}; write it again"
+            ) from err
     raise FileError(f"{what} is neither a table of ours nor a .datx of Zygo; convert it to xyz")
 
 
@@ -118,8 +120,8 @@ def _pixel(surface: Any, key: str, what: str) -> float:
 
 def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: str) -> None:
     """Write columns (n,) as datasets with their ``units``, lengths in metres."""
-    h5py = library("h5py", f"writing {str(path)!r}")
-    with whole_file(path, "w+b") as stream, h5py.File(stream, "w") as content:
+    h5py = import_optional("h5py", f"writing {str(path)!r}")
+    with atomic_file(path, "w+b") as stream, h5py.File(stream, "w") as content:
         content.attrs["schema"] = SCHEMA
         content.attrs["comment"] = comment
         for name, values in columns.items():
@@ -203,7 +205,7 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     open_regular(path, FileError, "map").close()
     if path.stat().st_size > MAX_FOREIGN_BYTES:
         raise FileError(f"{what} has more than {MAX_FOREIGN_BYTES} bytes; convert it to xyz")
-    topography = library("SurfaceTopography", what)
+    topography = import_optional("SurfaceTopography", what)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what the file lacks; we ask for it ourselves
@@ -211,7 +213,9 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
                 found = reader.topography()
             height = np.ma.filled(np.ma.asarray(found.heights(), np.float64), np.nan)
     except Exception as err:  # a reader of forty formats fails in as many ways
-        raise FileError(f"{what} is of no known format, convert it to xyz: {said(err)}") from err
+        raise FileError(
+            f"{what} is of no known format, convert it to xyz: {exception_text(err)}"
+        ) from err
     if height.ndim != 2 or found.physical_sizes is None:
         raise FileError(f"{what} is no map with its size; convert it to xyz")
     metres = metres_in(str(found.unit)) if found.unit else None

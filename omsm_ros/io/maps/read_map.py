@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError, FileError
-from omsm_ros.io.files import CLOUD, open_regular, said
+from omsm_ros.io.files import CLOUD, exception_text, open_regular
 from omsm_ros.io.maps import instrument_files
 from omsm_ros.io.maps.columns_file import has_dabam_header, read_columns, read_dabam
 from omsm_ros.io.maps.grid_sag_file import is_grid_sag, read_grid_sag
@@ -37,7 +37,9 @@ def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
     except DataError as err:
         raise FileError(f"map {str(file)!r}: {err}") from err
     except OSError as err:
-        raise FileError(f"map {str(file)!r} cannot be read: {said(err)}; check the path") from err
+        raise FileError(
+            f"map {str(file)!r} cannot be read: {exception_text(err)}; check the path"
+        ) from err
 
 
 def _head(path: Path) -> bytes:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, said, whole_file
+from omsm_ros.io.files import atomic_file, exception_text, open_regular
 from omsm_ros.io.table_file import rows_in
 from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.units import NOT_USED, LengthUnits, needed
@@ -103,7 +103,9 @@ def _pcd_points(entries: Mapping[str, Sequence[str]], what: str) -> tuple[np.dty
             for name, size, kind in zip(names, sizes, kinds, strict=True)
         ]
     except (KeyError, ValueError) as err:
-        raise FileError(f"{what} has fields of unknown type: {said(err)}; write numbers") from err
+        raise FileError(
+            f"{what} has fields of unknown type: {exception_text(err)}; write numbers"
+        ) from err
     return _dtype(fields, what), _count(entries.get("POINTS", []), what)
 
 
@@ -112,7 +114,7 @@ def _dtype(fields: list[tuple[str, str]], what: str) -> np.dtype[np.void]:
         dtype = np.dtype(fields)
     except (TypeError, ValueError) as err:
         raise FileError(
-            f"{what} has fields that cannot be read: {said(err)}; name each once"
+            f"{what} has fields that cannot be read: {exception_text(err)}; name each once"
         ) from err
     if not {"x", "y"} <= set(dtype.names or ()) or not {"z", "height"} & set(dtype.names or ()):
         raise FileError(f"{what} has the fields {shown(dtype.names)}, expected x, y and z")
@@ -158,18 +160,18 @@ def _points(
     metres = LengthUnits(1.0, 1.0)
     scale = metres if ours else needed(units, what)
     height = "height" if "height" in names else "z"
-    spread = _quiet(table["uncertainty"]) if ours and "uncertainty" in names else None
+    spread = _skip_unremarkable(table["uncertainty"]) if ours and "uncertainty" in names else None
     return measured(
-        _quiet(table["x"], scale.lateral),
-        _quiet(table["y"], scale.lateral),
-        _quiet(table[height], scale.height),
+        _skip_unremarkable(table["x"], scale.lateral),
+        _skip_unremarkable(table["y"], scale.lateral),
+        _skip_unremarkable(table[height], scale.height),
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
         notes=(NOT_USED,) if ours and units not in (None, metres) else (),
         sample=table["sample"] if ours and "sample" in names else None,
     )
 
 
-def _quiet(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
+def _skip_unremarkable(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
     """Return ``scale`` times values (n,), without NaN of the signalling kind.
 
     Damaged bytes may be such.
@@ -204,6 +206,6 @@ def write_pcd(path: Path, table: NDArray[np.void]) -> None:
 
 
 def _write(path: Path, lines: Sequence[str], table: NDArray[np.void]) -> None:
-    with whole_file(path) as stream:
+    with atomic_file(path) as stream:
         stream.write(("\n".join(lines) + "\n").encode("ascii"))
         stream.write(np.ascontiguousarray(table).data)

@@ -17,8 +17,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, said, whole_file
-from omsm_ros.io.optional_libraries import library
+from omsm_ros.io.files import atomic_file, exception_text, open_regular
+from omsm_ros.io.optional_libraries import import_optional
 from omsm_ros.quantities import MAP_POINTS
 
 # All points that are read, in eight bytes each, and what describes them.
@@ -43,7 +43,7 @@ def read_x3p(path: Path) -> MeasuredPoints:
     Raises FileError for a file that is none, is damaged, or unpacks to more than is read.
     """
     what = f"x3p file {str(path)!r}"
-    x3pio = library("x3pio", what)
+    x3pio = import_optional("x3pio", what)
     with open_regular(path, FileError, "x3p file") as stream:
         try:
             with zipfile.ZipFile(stream) as archive:
@@ -60,7 +60,7 @@ def read_x3p(path: Path) -> MeasuredPoints:
         except FileError:
             raise
         except Exception as err:  # whatever zip, XML and heights make of a damaged file
-            raise FileError(f"{what} cannot be read: {said(err)}; save it again") from err
+            raise FileError(f"{what} cannot be read: {exception_text(err)}; save it again") from err
     layers = len(content.layers)
     notes = (f"the first of its {layers} layers",) if layers > 1 else ()
     return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
@@ -114,7 +114,7 @@ def _places(x3pio: Any, content: Any) -> FloatArray:
 
 def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:
     """Write a map [m] with its place as x3p of the revision that all readers take."""
-    x3pio = library("x3pio", f"writing {str(path)!r}")
+    x3pio = import_optional("x3pio", f"writing {str(path)!r}")
     surface = x3pio.Surface.from_array(
         grid.height,
         x_scale=grid.dx,
@@ -124,5 +124,5 @@ def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:
         revision=x3pio.Revision.ISO5436_2000,
     )
     named = surface.with_metadata(manufacturer="omsm_ros", model="omsm_ros", comment=comment)
-    with whole_file(path) as stream:
+    with atomic_file(path) as stream:
         named.save(stream)

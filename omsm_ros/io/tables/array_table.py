@@ -26,15 +26,15 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import open_regular, said
-from omsm_ros.io.optional_libraries import walked
+from omsm_ros.io.files import exception_text, open_regular
+from omsm_ros.io.optional_libraries import walk_in_subprocess
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Does a library live through a file? Some trust it so far that a damaged one ends the process.
 
 
-def survives(read: Callable[[], object]) -> bool:
+def probe_in_subprocess(read: Callable[[], object]) -> bool:
     """Return whether a process that calls ``read`` lives on; what it raises is no matter.
 
     It is a copy of this one, so that nothing is loaded anew, as a process of its own would for a
@@ -82,7 +82,7 @@ class ArrayTable(ForeignTable):
             raise
         except Exception as err:  # whatever a library says of a damaged file
             raise FileError(
-                f"{self} cannot be read: {said(err)}; write it again, or as CSV"
+                f"{self} cannot be read: {exception_text(err)}; write it again, or as CSV"
             ) from err
         for name, array in self._arrays.items():
             self._name(name, array)
@@ -127,7 +127,7 @@ class ArrayTable(ForeignTable):
                 loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
             return loaded
 
-        if not survives(load):
+        if not probe_in_subprocess(load):
             raise FileError(
                 f"{self} cannot be read: what it holds does not fit together; write it again, or "
                 "as CSV"
@@ -148,7 +148,7 @@ class ArrayTable(ForeignTable):
             import h5py
         except ImportError as err:
             raise FileError(f"{self} needs h5py; pip install h5py, or give CSV") from err
-        walked(self.path, str(self))
+        walk_in_subprocess(self.path, str(self))
         found: dict[str, Any] = {}
         file = self._opened.enter_context(h5py.File(self.path, "r"))
 
@@ -284,8 +284,8 @@ class TdmsTable(ForeignTable):
         if file.file_status.incomplete_final_segment:
             raise ValueError("it was cut short")
         for group in file.groups():
-            for told in (file, group, *group.channels()):
-                _check_scales(told.properties)
+            for known_properties in (file, group, *group.channels()):
+                _check_scales(known_properties.properties)
         self._channels = {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
         self.names = [n for n, c in self._channels.items() if _kind(c) in "fiuM"]
         properties = {name: self._channels[name].properties for name in self.names}
@@ -294,9 +294,9 @@ class TdmsTable(ForeignTable):
 
     def used(self, names: Sequence[str]) -> None:
         """Take the period of the channels ``names``; FileError where they are not side by side."""
-        told = {name: self._properties[name] for name in names}
+        known_properties = {name: self._properties[name] for name in names}
         for key in (_PERIOD, *_BEGINS):
-            values = {p[key]: name for name, p in told.items() if p.get(key)}
+            values = {p[key]: name for name, p in known_properties.items() if p.get(key)}
             if len(values) > 1:
                 one, other = list(values.items())[:2]
                 raise FileError(
@@ -313,7 +313,7 @@ class TdmsTable(ForeignTable):
             raise self._damaged(err) from err
 
     def _damaged(self, err: Exception) -> FileError:
-        return FileError(f"{self} cannot be read: {said(err)}; write it again, or as CSV")
+        return FileError(f"{self} cannot be read: {exception_text(err)}; write it again, or as CSV")
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]

@@ -124,7 +124,7 @@ def stated_unit(table: ForeignTable, name: str) -> str:
 # ``MAP.yaml``: which column of a foreign recording is which channel, in which unit.
 
 _MAX_BYTES = 100_000
-_BY_PLACE = re.compile(r"\[\d{1,4}\]")
+_BY_POSITION = re.compile(r"\[\d{1,4}\]")
 
 _TEXT = {"type": "string", "minLength": 1}
 _LINES = {"type": "integer", "minimum": 0, "maximum": 1000}
@@ -183,7 +183,7 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
 def _is_named(mapped: ColumnMap) -> bool:
     """Return whether columns have names; where all are [0], [1], … a text has no line of them."""
     names = mapped.names(CHANNELS)
-    return not names or not all(_BY_PLACE.fullmatch(name) for name in names)
+    return not names or not all(_BY_POSITION.fullmatch(name) for name in names)
 
 
 def _column(channel: str, given: Mapping[str, Any]) -> Column:

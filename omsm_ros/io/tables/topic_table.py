@@ -26,11 +26,11 @@ from rosbags.typesys.store import Typestore
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import BagError, FileError
 from omsm_ros.io.bag_checks import (
+    bag_errors,
     check_checksums,
     check_files,
     check_index,
     check_length_of_definitions,
-    translated,
 )
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -51,7 +51,7 @@ class ForeignBag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with translated(path, _REMEDY), ExitStack() as opening:
+        with bag_errors(path, _REMEDY), ExitStack() as opening:
             check_files(path)
             self.reader = AnyReader([path], default_typestore=_standard())
             if self.reader.is2:
@@ -114,7 +114,7 @@ class TopicTable(ForeignTable):
 
     def _messages(self) -> Iterator[tuple[int, Any]]:
         reader = self._bag.reader
-        with translated(self.path, _REMEDY):
+        with bag_errors(self.path, _REMEDY):
             for _, stamp_ns, raw in reader.messages(self._connections):
                 yield stamp_ns, reader.deserialize(raw, self._kind)
 
@@ -128,7 +128,7 @@ class TopicTable(ForeignTable):
         for number, (logged_ns, message) in enumerate(self._messages()):
             found = [self._taken(get, message, logged_ns) for get in take]
             absent = [n for n, value in zip(names, found, strict=True) if value is None]
-            if absent and self._is_of_others(found, fields):
+            if absent and self._is_foreign_message(found, fields):
                 self.passed_over += 1
                 continue
             if absent:
@@ -160,7 +160,7 @@ class TopicTable(ForeignTable):
             return None
 
     @staticmethod
-    def _is_of_others(found: Sequence[float | None], fields: Sequence[str]) -> bool:
+    def _is_foreign_message(found: Sequence[float | None], fields: Sequence[str]) -> bool:
         """Return whether a message holds nothing of what is wanted but its time."""
         pairs = zip(found, fields, strict=True)
         return not any(v is not None for v, f in pairs if f != LOG_TIME and not f.endswith("stamp"))

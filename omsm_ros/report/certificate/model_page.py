@@ -17,7 +17,7 @@ from omsm_ros.report.certificate import figures as drawn
 from omsm_ros.report.certificate.tables import known_rows, texts
 from omsm_ros.report.page_parts import Headline, IssuedPage, Section, fill, picture, present
 from omsm_ros.report.tables import Table, mapping_table, part
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 
 BAND, RECORD, CORRELATION = "band", "record", "correlation"
 CAPTIONS = {
@@ -74,15 +74,17 @@ def render_model(page: ModelPage) -> str:
     )
 
 
-def verdict_on_model(model: SampledModel) -> Verdict:
+def verdict_on_model(model: SampledModel) -> PageVerdict:
     """Return the model's own verdict, and why."""
     stated = str(model.certificate.get("verdict", ""))
     reasons, warnings = (texts(model.certificate, name) for name in ("reasons", "warnings"))
     if stated == REJECTED:
-        return Verdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
+        return PageVerdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
     if not stated:
-        return Verdict("unknown", "Not judged", ("the model has no certificate",))
-    return Verdict("care" if warnings else "good", stated[:1].upper() + stated[1:], tuple(warnings))
+        return PageVerdict("unknown", "Not judged", ("the model has no certificate",))
+    return PageVerdict(
+        "care" if warnings else "good", stated[:1].upper() + stated[1:], tuple(warnings)
+    )
 
 
 def _headlines(page: ModelPage) -> list[Headline]:

@@ -22,7 +22,7 @@ from omsm_ros.report.certificate.tables import CertificateEntries, known_rows, l
 from omsm_ros.report.page_parts import Headline, IssuedPage, Section, fill, picture, present
 from omsm_ros.report.response_figures import step_response
 from omsm_ros.report.tables import Table, latency_text, mapping_table, part
-from omsm_ros.report.verdict import Verdict
+from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, PPM
 
 # What the response says of the machine, and what could hide in it: modes, masses, shape.
@@ -96,7 +96,7 @@ def shape_table(calibration: Calibration) -> Table:
     """Return what stands out in the identified response, and whether the band reaches it."""
     certificate, trusted = calibration.certificate, calibration.valid_up_to
     rows = [
-        (name, _point(certificate, place, gain), _reached(certificate, place, trusted))
+        (name, _point(certificate, place, gain), _response_up_to(certificate, place, trusted))
         for name, place, gain in _SHAPE_ROWS
     ]
     left = number(certificate.get("modal_remainder"))
@@ -106,7 +106,7 @@ def shape_table(calibration: Calibration) -> Table:
     return Table("Shape of the response", columns, known_rows(rows, 1))
 
 
-def _reached(certificate: CertificateEntries, place: str, trusted: float) -> str:
+def _response_up_to(certificate: CertificateEntries, place: str, trusted: float) -> str:
     at = number(part(certificate, "shape", place))
     return "" if at is None else "yes" if at <= trusted else "no"
 
@@ -118,10 +118,10 @@ def _point(certificate: CertificateEntries, place: str, gain: str | None) -> str
     return f"{plain(part(certificate, 'shape', gain), 4)} at {at}"
 
 
-def _size(hidden: Mapping[str, Any]) -> str:
+def _size(delay_bound: Mapping[str, Any]) -> str:
     """Return the largest size that was missed, in the unit of its family."""
-    missed = number(hidden.get("missed"))
-    if missed is None or hidden.get("family") not in (CREEP, MODE):
+    missed = number(delay_bound.get("missed"))
+    if missed is None or delay_bound.get("family") not in (CREEP, MODE):
         return quantity(missed, "m")
     return f"{percent(missed)} of the motion"
 
@@ -134,7 +134,7 @@ def _family(entry: Mapping[str, Any]) -> str:
     return f"{family} at {quantity(parameter, 'Hz', 2)}" if family == MODE else family
 
 
-def hidden_table(certificate: CertificateEntries) -> Table:
+def undetected_error_table(certificate: CertificateEntries) -> Table:
     """Return what this very test would have missed, and what that costs on a scan."""
     rows = [
         (
@@ -240,20 +240,20 @@ def render(certificate: CertificatePage) -> str:
     )
 
 
-def verdict_on_calibration(calibration: Calibration) -> Verdict:
+def verdict_on_calibration(calibration: Calibration) -> PageVerdict:
     """Return the certificate's own verdict, and why."""
     stated, reasons = verdict_of(calibration)
     if stated == REJECTED:
-        return Verdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
+        return PageVerdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
     if not stated:
-        return Verdict("unknown", "Not judged", ("the calibration has no certificate",))
+        return PageVerdict("unknown", "Not judged", ("the calibration has no certificate",))
     kept = tables.texts(calibration.certificate, "reservations")
     level = "good" if stated.startswith("accepted") else "unknown"
-    grounds = (*reasons, *kept, *_grounds(calibration))
-    return Verdict("care" if kept else level, stated[:1].upper() + stated[1:], grounds)
+    grounds = (*reasons, *kept, *_verdict_reasons(calibration))
+    return PageVerdict("care" if kept else level, stated[:1].upper() + stated[1:], grounds)
 
 
-def _grounds(calibration: Calibration) -> list[str]:
+def _verdict_reasons(calibration: Calibration) -> list[str]:
     certificate, found = calibration.certificate, []
     if number(certificate.get("chi_square")) is not None:
         found.append(
@@ -262,11 +262,11 @@ def _grounds(calibration: Calibration) -> list[str]:
     if np.any(calibration.covariance):
         top = quantity(calibration.valid_up_to, "Hz")
         found.append(f"up to {top} the 95 % band is within {_band_text(calibration)}")
-    hidden = number(certificate.get("inter_sample_delay_bound_s"))
-    if hidden is not None:
+    delay_bound = number(certificate.get("inter_sample_delay_bound_s"))
+    if delay_bound is not None:
         found.append(
-            f"motion between samples hides a lag of {quantity(hidden, 's', 2)} at most"
-            if hidden
+            f"motion between samples hides a lag of {quantity(delay_bound, 's', 2)} at most"
+            if delay_bound
             else "no motion is hidden between samples"
         )
     return found
@@ -340,14 +340,14 @@ def _order_headline(calibration: Calibration) -> Headline:
     return Headline("Structure", tables.structure_text(known), "")
 
 
-def _departures(entries: tables.CertificateEntries) -> Section:
+def _model_error_texts(entries: tables.CertificateEntries) -> Section:
     return Section(
         "What departs, and what could hide",
         (),
         (
-            tables.departure_table(entries),
+            tables.model_error_table(entries),
             tables.consistency_table(entries),
-            hidden_table(entries),
+            undetected_error_table(entries),
         ),
         "Anything larger than the largest size missed, this very test would have shown with a "
         "probability of 95 %; the band carries what it cannot exclude. The rms is that of heights "
@@ -398,7 +398,7 @@ def sections(certificate: CertificatePage) -> list[Section]:
             (),
             (tables.gain_table(calibration), tables.background_table(entries)),
         ),
-        _departures(entries),
+        _model_error_texts(entries),
         Section(
             "Records",
             (),

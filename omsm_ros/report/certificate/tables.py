@@ -14,13 +14,13 @@ from omsm_ros.core.calibration.calibration import RECORDED, SCHEMA, Calibration
 from omsm_ros.readable import (
     NOTHING,
     count,
+    date_text_of_stamp,
     measured,
-    moment_of,
     number,
     plain,
     probability,
     quantity,
-    raised,
+    superscript,
 )
 from omsm_ros.report.tables import Table, mapping_table, part
 from omsm_ros.units import PPM
@@ -200,7 +200,7 @@ def _or_none(value: object, unit: str) -> str:
     return "none found" if number(value) == 0 else quantity(value, unit)
 
 
-def departure_table(certificate: CertificateEntries) -> Table:
+def model_error_table(certificate: CertificateEntries) -> Table:
     """Return what departs from a linear, steady response, and was modelled."""
     rows = [
         (
@@ -258,7 +258,7 @@ def coefficient_table(calibration: Calibration) -> Table:
 
 
 def _power(letter: str, k: int) -> str:
-    unit = f"s{raised(k)}" if k > 1 else "s" if k else "1"
+    unit = f"s{superscript(k)}" if k > 1 else "s" if k else "1"
     return f"{letter}{k} [{unit}]"
 
 
@@ -303,7 +303,7 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
         ("identity", calibration.id),
         ("schema", SCHEMA),
         ("recording", source or NOTHING),
-        ("recorded", moment_of(calibration.certificate.get(RECORDED))),
+        ("recorded", date_text_of_stamp(calibration.certificate.get(RECORDED))),
         ("sample period", quantity(calibration.sample_period, "s", 4)),
         ("half the sampling rate", quantity(0.5 / calibration.sample_period, "Hz", 4)),
         ("omsm_ros", version or NOTHING),

@@ -20,7 +20,7 @@ _AREAL_UNIT = NANOMETRE_M**2 * MILLIMETRE_M**2
 _LEAST_SHARE = 1e-9
 # A band of uncertainty that reaches zero ends so far below the least value of a logarithmic axis.
 _BELOW = 0.2
-_WIDE, _HIGH = 6.1, 3.7
+_FULL_WIDTH, _HIGH = 6.1, 3.7
 _BELOW_BARS = 0.2
 _AREAL_PLACE, _BAR_PLACE = (0.17, 0.125, 0.6, 0.78), (0.8, 0.125, 0.025, 0.78)
 _LINES = {"x": "along x", "y": "along y", "diagonal": "along x = y"}
@@ -45,7 +45,7 @@ def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str
 def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw ``terms``, each {n, m, value, uncertainty (k = 1)} [m], without piston and tilts."""
     shown = [t for t in terms if t["n"] > 1 and t["value"] is not None]
-    made, axes = style.figure(_WIDE, _HIGH)
+    made, axes = style.figure(_FULL_WIDTH, _HIGH)
     ax = axes[0, 0]
     # Numbers on their side take more room than those of other axes.
     box = ax.get_position()
@@ -65,7 +65,7 @@ def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
 
 def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw deviations [nm] over the place [mm] on each line, with ±2u; one panel a line."""
-    made, axes = style.figure(_WIDE, 1.9 * len(lines) + 0.4, rows=len(lines), sharex=True)
+    made, axes = style.figure(_FULL_WIDTH, 1.9 * len(lines) + 0.4, rows=len(lines), sharex=True)
     for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
         _draw(ax, curve, MILLIMETRE_M, NANOMETRE_M)
         style.label(ax, y="[nm]", title=f"Registered deviation {_LINES[name]}")
@@ -75,7 +75,7 @@ def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw deviations [nm] over the radius [mm], the mean of a ring, and around [°], with ±2u."""
-    made, axes = style.figure(_WIDE, 2.7 * len(rings) + 0.4, rows=len(rings))
+    made, axes = style.figure(_FULL_WIDTH, 2.7 * len(rings) + 0.4, rows=len(rings))
     kinds = {
         "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
         "angle": (DEGREE_RAD, "angle from x [°]", "Around, outer third of the radius"),
@@ -89,7 +89,7 @@ def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 def radial_density(curve: Mapping[str, Any]) -> Figure:
     """Draw the density [nm² mm²] over radial frequency [1/mm], logarithmic, with ±2u."""
-    made, axes = style.figure(_WIDE, _HIGH)
+    made, axes = style.figure(_FULL_WIDTH, _HIGH)
     ax = axes[0, 0]
     values = np.array(curve["value"], np.float64)
     floor = max(_BELOW * float(values.min()), _LEAST_SHARE * float(values.max()))
@@ -107,7 +107,7 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
 
 def direction_density(curve: Mapping[str, Any]) -> Figure:
     """Draw the mean square [nm²] per radian over the direction of waves [°], with ±2u."""
-    made, axes = style.figure(_WIDE, _HIGH)
+    made, axes = style.figure(_FULL_WIDTH, _HIGH)
     ax = axes[0, 0]
     _draw(ax, curve, DEGREE_RAD, NANOMETRE_M**2, floor=0.0)
     ax.set_xlim(0, 180)
@@ -124,7 +124,7 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     high = float(value.max()) or 1.0
     # Nine tenths of the blocks in different colours.
     low = max(float(np.quantile(value, 0.1)), high * _LEAST_SHARE)
-    made, axes = style.figure(_WIDE, _HIGH)
+    made, axes = style.figure(_FULL_WIDTH, _HIGH)
     ax = axes[0, 0]
     ax.grid(False)
     shown = ax.pcolormesh(

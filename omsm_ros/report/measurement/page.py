@@ -8,12 +8,21 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.readable import NOTHING, days, expanded, figure, measured, moment_of, plain, quantity
+from omsm_ros.readable import (
+    NOTHING,
+    date_text_of_stamp,
+    days,
+    expanded,
+    figure,
+    measured,
+    plain,
+    quantity,
+)
 from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
 from omsm_ros.report.page_parts import Headline, check_places, fill, picture
 from omsm_ros.report.tables import Table, part
-from omsm_ros.report.verdict import Verdict, verdict_on_measurement
+from omsm_ros.report.verdict import PageVerdict, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
 # What the page says of the part, of what was taken out, of limits, and of where it is from.
@@ -38,7 +47,7 @@ _POSE_UNITS = {
 }  # fmt: skip
 
 
-def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verdict | None:
+def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> PageVerdict | None:
     """Return the part's deviation, and whether it holds its tolerance; None without a nominal."""
     deviation = part(form, "deviation")
     if deviation:
@@ -59,13 +68,15 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Verd
     held = part(form, "conformity") or part(summary, "form", "conformity")
     if not held:
         words.append("no tolerance was given (--tolerance), so it is for you to say")
-        return Verdict("unknown", "Deviation from nominal", tuple(words))
+        return PageVerdict("unknown", "Deviation from nominal", tuple(words))
     level, word = _CONFORMITY[held["verdict"]]
     if level == "good" and part(summary, "light", "level") != "green":
         # The uncertainty of what nobody looked at is not in it.
         level, word = "care", f"By what was evaluated, {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
-    return Verdict(level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(words))
+    return PageVerdict(
+        level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(words)
+    )
 
 
 def _expanded(figure: Mapping[str, Any]) -> str:
@@ -75,14 +86,16 @@ def _expanded(figure: Mapping[str, Any]) -> str:
     return text + larger if text.startswith("at most") else text
 
 
-def verdict_on_points(form: Mapping[str, Any]) -> Verdict:
+def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
     """Say how far a form is to be trusted of whose points nothing but themselves is known."""
     missing = tuple(part(form, "removed", "not_evaluated") or ())
     if missing:
-        return Verdict(
+        return PageVerdict(
             "unknown", "By the points alone", (*(f"not evaluated: {m}" for m in missing),)
         )
-    return Verdict("care", "By the points and their systematic fields", ("no summary lay beside",))
+    return PageVerdict(
+        "care", "By the points and their systematic fields", ("no summary lay beside",)
+    )
 
 
 def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -128,7 +141,7 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
     # Each says in words how well the points determine it.
     reasons = {name: f"held: {why}" for name, why in held.items()}
-    reasons |= {name: f"{why}{dragged(form, name)}" for name, why in refused.items()}
+    reasons |= {name: f"{why}{correlated_moves(form, name)}" for name, why in refused.items()}
     if not reasons:
         return Table(title, columns, fitted)
     rows = [(*row, "") for row in fitted]
@@ -139,7 +152,7 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
 def settled(form: Mapping[str, Any], name: str) -> float | None:
     """Return the standard uncertainty of a freedom, were those that no points determine held.
 
-    What they would drag along changes no form; :func:`dragged` names it.
+    What they would drag along changes no form; :func:`correlated_moves` names it.
     """
     shares: Mapping[str, Mapping[str, float]] = part(form, "removed", "pose_uncertainty") or {}
     refused = part(form, "removed", "not_determined") or ()
@@ -148,16 +161,16 @@ def settled(form: Mapping[str, Any], name: str) -> float | None:
     return math.hypot(*(share[name] for source, share in shares.items() if source not in refused))
 
 
-def dragged(form: Mapping[str, Any], name: str) -> str:
+def correlated_moves(form: Mapping[str, Any], name: str) -> str:
     """Return what moves with a freedom that the points do not determine, at the same form."""
     shares: Mapping[str, float] = part(form, "removed", "pose_uncertainty", name) or {}
     if not shares:
         return ""
     sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
-    told = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v]
-    if len(told) < 2:
+    stated = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v]
+    if len(stated) < 2:
         return ""
-    own, *others = told
+    own, *others = stated
     return f"; {own} would go with {', '.join(others)}, at the same form"
 
 
@@ -195,10 +208,13 @@ def _size_of(value: Any, unit: str) -> str:
     return quantity(value, unit) if unit else plain(value)
 
 
-def _temperature(told: Mapping[str, Any]) -> str:
-    if not told:
+def _temperature(stated: Mapping[str, Any]) -> str:
+    if not stated:
         return NOTHING
-    mean, change = quantity(told.get("mean"), "°C", 4), quantity(told.get("change"), "K", 2, True)
+    mean, change = (
+        quantity(stated.get("mean"), "°C", 4),
+        quantity(stated.get("change"), "K", 2, True),
+    )
     return f"{mean}, {change} from the beginning to the end"
 
 
@@ -207,7 +223,7 @@ def provenance_table(summary: Mapping[str, Any]) -> Table:
     admission = part(summary, "admission")
     rows = [
         ("recording", str(part(summary, "bag") or NOTHING)),
-        ("recorded", moment_of(part(summary, "conditions", "recorded_ns"))),
+        ("recorded", date_text_of_stamp(part(summary, "conditions", "recorded_ns"))),
         ("temperature", _temperature(part(summary, "conditions", "temperature") or {})),
         ("calibration", str(part(summary, "calibration") or NOTHING)),
         ("its age then", days(part(summary, "conditions", "calibration_age"))),
@@ -314,7 +330,7 @@ def render(report: Report) -> str:
         "report.html",
         report=report,
         on_part=verdict_on_part(report.summary, report.form),
-        verdict=_trust(report),
+        verdict=_trust_section(report),
         removed=removed_table(report.summary, report.form),
         script=drawing,
         script_policy=policy_of(drawing),
@@ -326,7 +342,7 @@ def render(report: Report) -> str:
     )
 
 
-def _trust(report: Report) -> Verdict:
+def _trust_section(report: Report) -> PageVerdict:
     if report.form and not report.summary:
         return verdict_on_points(report.form)
     return verdict_on_measurement(report.summary, report.calibration)
@@ -380,7 +396,7 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
 
 def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
-    verdict = _trust(report)
+    verdict = _trust_section(report)
     found = [
         form_table(report.form, report.curves),
         tables.error_table(summary),

@@ -110,10 +110,10 @@ def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
     after = np.minimum.accumulate(np.where(filled, row, _FAR)[::-1], axis=0)[::-1]
     along = np.minimum(row - before, after - row).astype(np.float64) ** 2
     nearest = along.copy()
-    for aside in range(1, min(within + 1, columns)):
-        left, right = slice(None, -aside), slice(aside, None)
-        nearest[:, left] = np.minimum(nearest[:, left], along[:, right] + aside**2)
-        nearest[:, right] = np.minimum(nearest[:, right], along[:, left] + aside**2)
+    for shift in range(1, min(within + 1, columns)):
+        left, right = slice(None, -shift), slice(shift, None)
+        nearest[:, left] = np.minimum(nearest[:, left], along[:, right] + shift**2)
+        nearest[:, right] = np.minimum(nearest[:, right], along[:, left] + shift**2)
     return np.sqrt(nearest)
 
 

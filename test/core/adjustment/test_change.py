@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.repeatability import compare
+from omsm_ros.core.calibration.repeatability import compare_calibrations
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -29,13 +29,13 @@ def calibrated(seed, later=0.0, count=10):
 
 @pytest.mark.parametrize("seed", [2, 3, 4])
 def test_an_unchanged_machine_is_the_same(seed):
-    change = compare(calibrated(1), calibrated(seed, count=3))
+    change = compare_calibrations(calibrated(1), calibrated(seed, count=3))
     assert not change.changed
     assert change.text().startswith("the same")
 
 
 def test_a_probe_that_got_later_is_seen_in_a_short_test():
-    change = compare(calibrated(1), calibrated(5, later=20e-6, count=3))
+    change = compare_calibrations(calibrated(1), calibrated(5, later=20e-6, count=3))
     assert change.changed
     assert change.delay == pytest.approx(20e-6, abs=8e-6)
     assert change.delay_sigmas > 4
@@ -55,13 +55,13 @@ def with_gain(calibration, gain):
 
 def test_a_changed_scale_is_a_change():
     old = calibrated(1)
-    change = compare(old, with_gain(old, old.static_gain * 1.001))
+    change = compare_calibrations(old, with_gain(old, old.static_gain * 1.001))
     assert change.changed
     assert change.static_gain == pytest.approx(1e-3)
 
 
 def test_a_calibration_equals_itself():
-    change = compare(calibrated(1), calibrated(1))
+    change = compare_calibrations(calibrated(1), calibrated(1))
     assert change.p_value == pytest.approx(1.0)
     assert change.delay == 0
 
@@ -76,4 +76,4 @@ def test_without_a_common_band_there_is_nothing_to_compare():
         covariance=np.asarray(old.covariance),
     )
     with pytest.raises(CalibrationError, match="no common band"):
-        compare(old, silent)
+        compare_calibrations(old, silent)

@@ -15,7 +15,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.repeatability import (
     Spread,
     common_lines,
-    compare,
+    compare_calibrations,
     mahalanobis,
     repeatability,
     response_covariance,
@@ -46,7 +46,7 @@ def late(delay: float = LAG, gain: float = 1.0, **other: object) -> Calibration:
 def test_chance_is_that_of_two_independent_differences(sigmas: float, gains: float) -> None:
     """One direction of the response, the delay, and one gain: χ² with two degrees of freedom."""
     delay_u, gain_u = LAG_U * math.sqrt(2), GAIN_U * math.sqrt(2)
-    found = compare(late(), late(LAG + sigmas * delay_u, 1.0 + gains * gain_u))
+    found = compare_calibrations(late(), late(LAG + sigmas * delay_u, 1.0 + gains * gain_u))
     assert found.delay_sigmas == pytest.approx(sigmas, abs=1e-9)
     assert found.static_gain_sigmas == pytest.approx(gains, abs=1e-9)
     expected = stats.chi2.sf(sigmas**2 + gains**2, 2)
@@ -56,7 +56,7 @@ def test_chance_is_that_of_two_independent_differences(sigmas: float, gains: flo
 
 def test_the_other_way_round_the_signs_turn() -> None:
     old, new = late(), late(LAG + 9e-6, 1.00001)
-    there, back = compare(old, new), compare(new, old)
+    there, back = compare_calibrations(old, new), compare_calibrations(new, old)
     assert back.p_value == pytest.approx(there.p_value, rel=1e-9)
     assert (back.delay, back.phase_at) == pytest.approx((-there.delay, -there.phase_at))
     assert back.static_gain == pytest.approx(-there.static_gain, rel=1e-4)
@@ -69,8 +69,10 @@ def test_the_other_way_round_the_signs_turn() -> None:
 @pytest.mark.parametrize("unit", [1e-3, 4.0, 1e3])
 def test_the_unit_of_the_probe_does_not_matter(unit: float) -> None:
     """A gain in µm per volt changes by as many parts, and as many sigmas, as one near 1."""
-    told = {"static_gain_uncertainty": unit * GAIN_U}
-    found = compare(late(gain=unit, certificate=told), late(gain=unit * 1.00001, certificate=told))
+    reported = {"static_gain_uncertainty": unit * GAIN_U}
+    found = compare_calibrations(
+        late(gain=unit, certificate=reported), late(gain=unit * 1.00001, certificate=reported)
+    )
     assert found.static_gain == pytest.approx(1e-5)
     assert found.static_gain_sigmas == pytest.approx(1e-5 / GAIN_U / math.sqrt(2))
 
@@ -79,7 +81,7 @@ def test_a_phase_that_has_turned_round_is_near() -> None:
     """A delay of 0.1 s more: at 10 Hz the phase has turned once, and is the same again."""
     old = late(valid_up_to=30.0, covariance=np.diag([0.0, 1.0]))
     new = replace(old, dynamics=TransferFunction(np.ones(1), np.ones(1), LAG + 0.1))
-    found = compare(old, new)
+    found = compare_calibrations(old, new)
     assert abs(found.phase_at) <= np.pi
     lines = common_lines([old, new])
     wrapped = np.angle(np.exp(-2j * np.pi * lines * 0.1))
@@ -89,7 +91,7 @@ def test_a_phase_that_has_turned_round_is_near() -> None:
 
 def test_without_a_stated_uncertainty_nothing_is_known_of_the_gain() -> None:
     silent = [late(gain=g, certificate={}) for g in (1.0, 1.5)]
-    found = compare(*silent)
+    found = compare_calibrations(*silent)
     assert found.static_gain == pytest.approx(0.5)
     assert found.static_gain_sigmas == 0.0
     assert not found.changed
@@ -97,27 +99,27 @@ def test_without_a_stated_uncertainty_nothing_is_known_of_the_gain() -> None:
 
 
 def test_one_stated_uncertainty_is_enough_to_judge_the_gain() -> None:
-    found = compare(late(certificate={}), late(gain=1.0 + 3 * GAIN_U))
+    found = compare_calibrations(late(certificate={}), late(gain=1.0 + 3 * GAIN_U))
     assert found.static_gain_sigmas == pytest.approx(3.0)
 
 
 def test_a_delay_that_is_known_exactly_changes_beyond_all_sigmas() -> None:
     exact = [late(d, covariance=np.zeros((2, 2))) for d in (LAG, LAG + 1e-9)]
-    assert compare(*exact).delay_sigmas == float("inf")
+    assert compare_calibrations(*exact).delay_sigmas == float("inf")
 
 
-def test_what_could_hide_in_both_alike_does_not_excuse_a_change() -> None:
+def test_undetected_error_in_both_alike_does_not_excuse_a_change() -> None:
     """Ten times the noise is stated besides; repeated tests of one machine do not scatter so."""
     noise = [0.0, 0.0, 0.0, LAG_U**2]
-    told = {"static_gain_uncertainty": GAIN_U, "noise_covariance": noise}
-    wide = {"covariance": np.diag([0.0, (10 * LAG_U) ** 2]), "certificate": told}
-    found = compare(late(**wide), late(LAG + 6 * LAG_U, **wide))  # type: ignore[arg-type]
+    reported = {"static_gain_uncertainty": GAIN_U, "noise_covariance": noise}
+    broad = {"covariance": np.diag([0.0, (10 * LAG_U) ** 2]), "certificate": reported}
+    found = compare_calibrations(late(**broad), late(LAG + 6 * LAG_U, **broad))  # type: ignore[arg-type]
     assert found.delay_sigmas == pytest.approx(6 / math.sqrt(2))
     assert found.changed
 
 
-def test_a_change_is_told_with_sign_and_sigmas() -> None:
-    text = compare(late(), late(LAG - 20e-6, 1.0001)).text()
+def test_a_change_is_reported_with_sign_and_sigmas() -> None:
+    text = compare_calibrations(late(), late(LAG - 20e-6, 1.0001)).text()
     assert text.startswith("changed: lag by -20.0 µs (7.1 sigma), static gain by +100 ppm (17.7")
 
 

@@ -8,10 +8,10 @@ import pytest
 from omsm_ros.core.adjustment.scan_model import (
     DYNAMIC,
     GAIN,
-    Place,
+    IntervalRows,
     PolarBasis,
-    Portion,
     ScanModel,
+    ScanPlacement,
     normal_equations,
     portions,
 )
@@ -30,7 +30,7 @@ INTERVAL = BASIS.interval(RADIUS)
 ORDER = np.lexsort((np.arange(COUNT), INTERVAL))
 
 
-def parts(kept: FloatArray | None = None) -> list[Portion]:
+def parts(kept: FloatArray | None = None) -> list[IntervalRows]:
     order = ORDER if kept is None else ORDER[kept[ORDER]]
     return list(portions(BASIS, order, INTERVAL, RADIUS, ANGLE))
 
@@ -48,7 +48,7 @@ TRUTH = np.array([0.3, -2.0, 1.1])
 Y = B @ SURFACE + X @ TRUTH + RANDOM.normal(0, 0.5, COUNT)
 
 
-def columns(part: Portion) -> tuple[FloatArray, FloatArray]:
+def columns(part: IntervalRows) -> tuple[FloatArray, FloatArray]:
     return X[part.points], Y[part.points]
 
 
@@ -86,11 +86,11 @@ def test_misfit_is_that_of_the_best_surface_for_any_parameters(parameters: Float
 def test_any_surface_may_be_added_to_the_heights() -> None:
     plain = normal_equations(BASIS, iter(parts()), columns)
     other = B @ RANDOM.normal(size=BASIS.size)
-    bent = normal_equations(
+    curved = normal_equations(
         BASIS, iter(parts()), lambda part: (X[part.points], Y[part.points] + other[part.points])
     )
-    assert bent.right == pytest.approx(plain.right, rel=1e-8)
-    assert bent.square == pytest.approx(plain.square, rel=1e-8)
+    assert curved.right == pytest.approx(plain.right, rel=1e-8)
+    assert curved.square == pytest.approx(plain.square, rel=1e-8)
 
 
 def test_a_ring_that_nobody_saw_has_no_shape_and_harms_nothing() -> None:
@@ -108,7 +108,7 @@ def test_a_column_that_is_a_surface_has_no_say() -> None:
     """What the surface can do is eliminated: nothing of it is left to be asked for."""
     wave = B @ SURFACE
 
-    def with_wave(part: Portion) -> tuple[FloatArray, FloatArray]:
+    def with_wave(part: IntervalRows) -> tuple[FloatArray, FloatArray]:
         return np.column_stack([X[part.points], wave[part.points]]), Y[part.points]
 
     found = normal_equations(BASIS, iter(parts()), with_wave)
@@ -120,10 +120,10 @@ def test_a_column_that_is_a_surface_has_no_say() -> None:
 MODEL = ScanModel(
     [scanned(30.0, followed=coma, seed=1), scanned(60.0, followed=coma, seed=2)], harmonics=3
 )
-PLACE = Place(1e-4, np.zeros(2))
+PLACE = ScanPlacement(1e-4, np.zeros(2))
 
 
-def of_model() -> tuple[list[Portion], FloatArray, FloatArray, FloatArray]:
+def of_model() -> tuple[list[IntervalRows], FloatArray, FloatArray, FloatArray]:
     """Portions, and of all points in their order the terms, columns and heights."""
     came = list(MODEL.portions(PLACE, 1))
     rows = np.zeros((len(MODEL), MODEL.basis.size))
@@ -163,13 +163,15 @@ def test_scores_are_sums_over_whole_rings() -> None:
         radius[part.points] = MODEL.radius(part)
     count = int(min(MODEL.turns))
     assert 15 <= count <= 16
-    ring, meat = rings(radius, count), np.zeros((MODEL.size, MODEL.size))
+    ring, score_covariance = rings(radius, count), np.zeros((MODEL.size, MODEL.size))
     for k in range(count):
         score = noise[ring == k] @ COLUMNS[ring == k]
-        meat += np.outer(score, score) * count / (count - 1)
-    scale = np.sqrt(np.maximum(np.diag(meat), 1e-300))
-    found = seen.meat()
-    assert np.allclose(found / np.outer(scale, scale), meat / np.outer(scale, scale), atol=1e-9)
+        score_covariance += np.outer(score, score) * count / (count - 1)
+    scale = np.sqrt(np.maximum(np.diag(score_covariance), 1e-300))
+    found = seen.score_covariance()
+    assert np.allclose(
+        found / np.outer(scale, scale), score_covariance / np.outer(scale, scale), atol=1e-9
+    )
     assert seen.square == pytest.approx(float(noise @ noise), rel=1e-12, abs=0)
 
 
@@ -185,7 +187,7 @@ def test_a_ring_that_is_high_as_a_whole_counts_more_than_scattered_points() -> N
     scattered = size * np.random.default_rng(6).choice([-1.0, 1.0], len(MODEL))
     column = COLUMNS[:, 0]
     alike = size * np.sign(column)
-    chance, ordered = (gathered(h).meat()[0, 0] for h in (scattered, alike))
+    chance, ordered = (gathered(h).score_covariance()[0, 0] for h in (scattered, alike))
     assert ordered > 100 * chance
 
 

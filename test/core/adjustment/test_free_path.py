@@ -89,7 +89,7 @@ def test_a_line_is_in_the_band_of_its_own_hertz(samples: int) -> None:
     assert excited_bands(np.sin(2 * np.pi * 7.5 * time), PERIOD) == ((7.0, 8.0),)
 
 
-def test_a_weak_line_beside_a_strong_one_is_no_excitation() -> None:
+def test_a_weak_line_next_to_a_strong_one_is_no_excitation() -> None:
     strong = np.sin(2 * np.pi * 3.5 * TIME)
     weak, equal = (a * np.sin(2 * np.pi * 40.5 * TIME) for a in (0.1, 0.9))
     assert excited_bands(strong + weak, PERIOD) == ((3.0, 4.0),)

@@ -59,11 +59,11 @@ def test_a_counter_that_begins_anew_has_to_be_established_anew() -> None:
     assert watch.established is None
 
 
-def test_it_is_told_within_two_seconds_of_motion() -> None:
+def test_the_slip_is_reported_within_two_seconds_of_motion() -> None:
     assert watched(blocks(motion("steps"), 1)[:42]).established is not None
 
 
-def test_nothing_is_told_of_counts_that_only_one_stream_has() -> None:
+def test_nothing_is_reported_of_counts_that_only_one_stream_has() -> None:
     """The probe starts late, in a gap of the axes, which have gone on since."""
     came = blocks(motion("chirp"), 0)
     counted = [axes.first_sample for axes, _ in came]

@@ -17,7 +17,7 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     without_step_test,
 )
 from omsm_ros.core.adjustment.scan_model import CURVATURE, GAIN, LAG, LATENCY
-from omsm_ros.core.adjustment.self_calibration import Agreement, SelfCalibration
+from omsm_ros.core.adjustment.self_calibration import ScanConsistency, SelfCalibration
 from omsm_ros.core.calibration.calibration import REVERSAL, SPEEDS, Calibration, latency_of
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
@@ -38,7 +38,7 @@ def found_by(values: FloatArray = VALUES, **other: object) -> SelfCalibration:
         "speeds": (np.pi, 2 * np.pi),
         "residual": 10e-9,
         "followed": 1e-9,
-        "agreement": Agreement(ratio=1.0, disagreement=0.1e-9, noise=10e-9),
+        "agreement": ScanConsistency(ratio=1.0, disagreement=0.1e-9, noise=10e-9),
         "surprise": 1.0,
         "own": np.array([[1e-7, 2e-7, 3e-7, 4e-7, 5e-7]]),
         "own_uncertainty": np.array([[1e-8, 2e-8, 3e-8, 4e-8, 5e-8]]),
@@ -152,19 +152,19 @@ def test_the_unit_calibration_corrects_nothing() -> None:
 
 
 def test_without_a_step_test_next_to_nothing_is_known() -> None:
-    wide, told = without_step_test().covariance, without_step_test(2e-4).covariance
-    assert told[GAIN, GAIN] == pytest.approx(4e-8, abs=0)
+    broad, reported = without_step_test().covariance, without_step_test(2e-4).covariance
+    assert reported[GAIN, GAIN] == pytest.approx(4e-8, abs=0)
     others = [LAG, CURVATURE, LATENCY]
-    assert np.array_equal(wide[np.ix_(others, others)], told[np.ix_(others, others)])
-    assert np.count_nonzero(wide - np.diag(np.diag(wide))) == 0
+    assert np.array_equal(broad[np.ix_(others, others)], reported[np.ix_(others, others)])
+    assert np.count_nonzero(broad - np.diag(np.diag(broad))) == 0
     # Longer than the lag of any structure: the paper's is 0.34 ms.
-    assert wide[LAG, LAG] ** 0.5 > 1e-3 < wide[LATENCY, LATENCY] ** 0.5
+    assert broad[LAG, LAG] ** 0.5 > 1e-3 < broad[LATENCY, LATENCY] ** 0.5
 
 
 def test_after_a_step_test_lag_and_gain_are_known_as_it_says() -> None:
     covariance = np.diag([0.0, 4e-12, 9e-12])
-    told = {"static_gain_uncertainty": 4.9e-5}
-    prior = after_step_test(calibration([1.0], [1.0, 3e-4], 1e-4, covariance, told)).covariance
+    reported = {"static_gain_uncertainty": 4.9e-5}
+    prior = after_step_test(calibration([1.0], [1.0, 3e-4], 1e-4, covariance, reported)).covariance
     assert prior[LAG, LAG] == pytest.approx(13e-12, abs=0)
     # ln(1/(1 + d s)) = -d s + d² s²/2 - …: the curvature moves by d for a unit of d.
     assert prior[CURVATURE, CURVATURE] == pytest.approx((3e-4) ** 2 * 4e-12, abs=0)
@@ -188,7 +188,7 @@ def slow_part(dynamics: TransferFunction, covariance: FloatArray) -> FloatArray:
     return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
-def told(left: FloatArray, values: tuple[float, float] = (0.0, 0.0)) -> SelfCalibration:
+def reported(left: FloatArray, values: tuple[float, float] = (0.0, 0.0)) -> SelfCalibration:
     covariance = np.zeros((4, 4))
     covariance[:GAIN, :GAIN] = left
     covariance[LATENCY, LATENCY] = 1e-12
@@ -197,7 +197,7 @@ def told(left: FloatArray, values: tuple[float, float] = (0.0, 0.0)) -> SelfCali
 
 def test_scans_that_say_nothing_new_leave_the_covariance() -> None:
     before = calibration(*G2, covariance=SIGMA)
-    after = resolved(before, told(slow_part(before.dynamics, SIGMA)))
+    after = resolved(before, reported(slow_part(before.dynamics, SIGMA)))
     assert np.allclose(after.covariance, SIGMA, rtol=1e-9, atol=1e-9 * np.max(SIGMA))
     assert after.dynamics.response(np.array([3.0]))[0] == pytest.approx(
         before.dynamics.response(np.array([3.0]))[0], rel=1e-12
@@ -208,7 +208,7 @@ def test_scans_that_say_nothing_new_leave_the_covariance() -> None:
 def test_slow_motion_is_known_afterwards_as_the_scans_say(share: float) -> None:
     before = calibration(*G2, covariance=SIGMA)
     prior = slow_part(before.dynamics, SIGMA)
-    after = resolved(before, told(share * prior))
+    after = resolved(before, reported(share * prior))
     left = slow_part(after.dynamics, after.covariance)
     assert np.allclose(left, share * prior, rtol=1e-6, atol=1e-9 * np.max(np.abs(prior)))
     # Nothing is known worse than before, and no combination better than possible.
@@ -221,7 +221,7 @@ def test_slow_motion_is_known_afterwards_as_the_scans_say(share: float) -> None:
 
 def test_the_lag_found_is_added_to_that_of_the_step_test() -> None:
     before = calibration(*G2, covariance=SIGMA)
-    after = resolved(before, told(1e-3 * slow_part(before.dynamics, SIGMA), (2e-6, 3e-10)))
+    after = resolved(before, reported(1e-3 * slow_part(before.dynamics, SIGMA), (2e-6, 3e-10)))
     lag, curvature = slow_series(before.dynamics)
     # (1 - L s + κ s²)(1 - δ s + k s²)
     expected = lag + 2e-6, curvature + 2e-6 * lag + 3e-10
@@ -233,7 +233,7 @@ def test_the_lag_found_is_added_to_that_of_the_step_test() -> None:
 
 def test_a_numerator_that_is_none_grows_to_hold_the_lag() -> None:
     before = calibration([1.0], [1.0, 3e-4], 1e-4, np.diag([0.0, 4e-12, 9e-12]))
-    after = resolved(before, told(np.diag([1e-14, 1e-22]), (5e-6, 0.0)))
+    after = resolved(before, reported(np.diag([1e-14, 1e-22]), (5e-6, 0.0)))
     assert len(after.dynamics.numerator) == 2
     assert after.covariance.shape == (4, 4)
     assert after.dynamics.low_frequency_delay == pytest.approx(4.05e-4)
@@ -245,7 +245,7 @@ def test_a_numerator_that_is_none_grows_to_hold_the_lag() -> None:
 @pytest.mark.parametrize(("found", "left"), [(5e-6, 1.05e-4), (-2e-5, 8e-5), (-3e-4, 0.0)])
 def test_a_pure_delay_takes_the_lag_and_ends_at_none(found: float, left: float) -> None:
     before = calibration([1.0], [1.0], 1e-4, np.diag([0.0, 9e-12]))
-    after = resolved(before, told(np.diag([1e-14, 0.0]), (found, 0.0)))
+    after = resolved(before, reported(np.diag([1e-14, 0.0]), (found, 0.0)))
     assert after.dynamics.delay == pytest.approx(left)
     assert len(after.dynamics.numerator) == 1
 
@@ -253,8 +253,10 @@ def test_a_pure_delay_takes_the_lag_and_ends_at_none(found: float, left: float) 
 def test_a_curvature_that_has_no_room_counts_as_doubt() -> None:
     """A numerator of the first degree stays one: what it cannot hold widens what is stated."""
     before = calibration([1.0, -1e-4], [1.0, 3e-4, 6e-8], 1e-4, np.diag([0, 4e-12, 4e-12, 0, 0]))
-    quiet, bent = (resolved(before, told(np.diag([1e-14, 1e-22]), (0.0, k))) for k in (0.0, 4e-10))
-    without, withal = (slow_part(c.dynamics, c.covariance)[1, 1] for c in (quiet, bent))
+    quiet, curved = (
+        resolved(before, reported(np.diag([1e-14, 1e-22]), (0.0, k))) for k in (0.0, 4e-10)
+    )
+    without, withal = (slow_part(c.dynamics, c.covariance)[1, 1] for c in (quiet, curved))
     assert withal - without == pytest.approx((4e-10) ** 2, rel=1e-6, abs=0)
 
 
@@ -310,7 +312,7 @@ def test_what_was_fitted_besides_is_in_the_certificate() -> None:
     assert entry["agreement"]["noise"] == 10e-9
 
 
-BAD_AGREEMENT = Agreement(ratio=9.0, disagreement=31e-9, noise=10e-9)
+BAD_AGREEMENT = ScanConsistency(ratio=9.0, disagreement=31e-9, noise=10e-9)
 
 
 @pytest.mark.parametrize(
@@ -332,10 +334,10 @@ def test_contradictions_reject_with_their_reason(wrong: dict[str, object], said:
     assert before.certificate["verdict"] == "accepted"
 
 
-def test_all_contradictions_are_told_at_once() -> None:
+def test_all_contradictions_are_reported_at_once() -> None:
     before = calibration(*G2, covariance=SIGMA)
     early = np.array([0.0, 0.0, 0.0, -1e-4])
-    after = resolved(before, found_by(early, agreement=BAD_AGREEMENT, surprise=40.0))
+    after = resolved(before, found_by(early, agreement=BAD_AGREEMENT, prior_conflict=40.0))
     assert len(after.certificate["reasons"]) == 3  # type: ignore[arg-type]
 
 

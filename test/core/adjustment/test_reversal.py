@@ -76,7 +76,7 @@ def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[ScanColu
     assert found.residual == pytest.approx(10.5e-9, rel=0.05)
 
 
-def test_a_mechanical_lag_is_not_sideways() -> None:
+def test_a_mechanical_lag_is_not_probe_latency() -> None:
     scans = [scan(30.0, 1, MECHANICAL, Cell()), scan(-30.0, 2, MECHANICAL, Cell())]
     found = reversal(scans, MECHANICAL)
     assert abs(found.lag) < 3 * found.uncertainty
@@ -84,7 +84,7 @@ def test_a_mechanical_lag_is_not_sideways() -> None:
     assert found.lag_of_z == pytest.approx(0.3397e-3, abs=1e-7)
 
 
-def test_latency_is_told_when_it_is_all_of_the_lag(late_scans: list[ScanColumns]) -> None:
+def test_latency_is_reported_when_it_is_the_whole_lag(late_scans: list[ScanColumns]) -> None:
     total = LATE.dynamics.low_frequency_delay
     known = replace(LATE, covariance=calibration(LATE.dynamics, (20e-6) ** 2).covariance)
     found = reversal(late_scans, known)

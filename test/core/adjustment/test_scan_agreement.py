@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.adjustment.self_calibration import HARMONICS, RINGS, AgreementSums
+from omsm_ros.core.adjustment.self_calibration import HARMONICS, RINGS, ScanConsistencySums
 
 TURNS, POINTS = 40, 2000
 ANGLE = np.linspace(0.0, 2 * np.pi * TURNS, TURNS * POINTS, endpoint=False)
@@ -12,7 +12,7 @@ NOISE = 2e-9
 
 
 def judged(wave, seed=1):
-    sums = AgreementSums(2, 1e-3, 10e-3)
+    sums = ScanConsistencySums(2, 1e-3, 10e-3)
     random = np.random.default_rng(seed)
     for scan, sign in ((0, 1.0), (1, -1.0)):
         left = sign * wave + random.normal(0.0, NOISE, len(ANGLE))

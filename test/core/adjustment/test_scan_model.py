@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.adjustment.scan_model import Place, ScanModel
+from omsm_ros.core.adjustment.scan_model import ScanModel, ScanPlacement
 from omsm_ros.core.adjustment.scan_reader import ScanColumns
 from omsm_ros.errors import DataError
 
@@ -71,7 +71,7 @@ def test_each_scan_but_the_first_has_parameters_of_its_own() -> None:
 
 def test_every_so_many_of_the_points_are_portioned_and_each_once() -> None:
     model = ScanModel([spiral(), spiral()], 3)
-    place = Place(0.0, np.zeros(2))
+    place = ScanPlacement(0.0, np.zeros(2))
     for every in (1, 3):
         points = np.concatenate([part.points for part in model.portions(place, every)])
         assert len(np.unique(points)) == len(points) == -(-len(model) // every)
@@ -79,7 +79,7 @@ def test_every_so_many_of_the_points_are_portioned_and_each_once() -> None:
 
 def test_before_a_surface_is_known_nothing_is_said_of_what_needs_its_slope() -> None:
     model = ScanModel([spiral(), spiral()], 3)
-    place = Place(1e-4, np.array([0.0, 1e-5]))
+    place = ScanPlacement(1e-4, np.array([0.0, 1e-5]))
     for part in model.portions(place, 1):
         x, y = model.columns(part, place, None)
         assert not np.any(x[:, [3, *range(4, 7)]])

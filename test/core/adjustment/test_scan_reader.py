@@ -43,7 +43,7 @@ def test_rates_are_those_of_the_motion(recording: Recording, whole: ScanColumns)
     omega = 2 * np.pi
     np.testing.assert_allclose(whole.angular_rate[outside], -omega, rtol=1e-6)
     np.testing.assert_allclose(whole.radial_rate[outside], -2e-3, rtol=1e-6)
-    z = recording.truth.carriage  # type: ignore[union-attr]
+    z = recording.truth.slide  # type: ignore[union-attr]
     velocity = np.gradient(z, 1e-3)[np.round(whole.time / 1e-3).astype(int)]
     assert np.max(abs(whole.motion_rate - velocity)) < 2e-3 * np.max(abs(velocity))
 

@@ -194,7 +194,7 @@ def test_scans_of_different_parts_contradict_each_other() -> None:
     assert "contradict each other by" in str(result.certificate["reasons"])
 
 
-def test_a_step_test_that_the_scans_contradict_is_told() -> None:
+def test_a_step_test_that_the_scans_contradict_is_reported() -> None:
     # The probe is prompt; the step test was made with a slower structure. What it has too much
     # passes for latency, but for the following error, which shows that it is none.
     slow = step_test(0.0, off=300e-6)
@@ -205,7 +205,7 @@ def test_a_step_test_that_the_scans_contradict_is_told() -> None:
     assert "scans and step test contradict each other" in str(result.certificate["reasons"])
 
 
-def test_a_probe_that_would_be_early_is_told() -> None:
+def test_a_probe_that_would_be_early_is_reported() -> None:
     stiff = step_test(0.0, off=-30e-6)
     pair = [scanned(made(rpm, s, disturbed()), stiff) for s, rpm in ((1, 30.0), (2, 60.0))]
     result = resolved(stiff, self_calibrate(pair, after_step_test(stiff)))

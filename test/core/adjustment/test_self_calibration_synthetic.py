@@ -184,7 +184,7 @@ def test_what_the_step_test_knows_exactly_stays() -> None:
     assert found.values[LAG] == pytest.approx(0.0, abs=1e-9)
     assert found.values[CURVATURE] == pytest.approx(0.0, abs=1e-12)
     assert abs(found.values[LATENCY] - LATENCY_S) < 4 * spread(found, LATENCY)
-    assert found.surprise < 10.0
+    assert found.prior_conflict < 10.0
 
 
 def test_an_uncertain_gain_is_not_estimated_but_counts(late: SelfCalibration) -> None:
@@ -247,10 +247,10 @@ def test_the_same_there_and_back_contradicts_no_step_test() -> None:
         for seed in range(5)
     ]
     assert max(abs(f.values[LAG]) for f in found) < 1e-6
-    assert max(f.surprise for f in found) < 6.0
+    assert max(f.prior_conflict for f in found) < 6.0
 
 
 def test_a_lag_far_beyond_the_step_test_contradicts_it() -> None:
     prior = replace(PRIOR, covariance=np.diag([1e-6, 1e-7, 0.0, 1e-2]) ** 2)
-    assert fitted(pair(latency=LATENCY_S), prior).surprise < 14.0
-    assert fitted(pair(latency=LATENCY_S, lag=100e-6), prior).surprise > 100.0
+    assert fitted(pair(latency=LATENCY_S), prior).prior_conflict < 14.0
+    assert fitted(pair(latency=LATENCY_S, lag=100e-6), prior).prior_conflict > 100.0

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from two_counters import CALIBRATION, blocks, motion, watched
 
 from omsm_ros.core.adjustment.scan_reader import ScanReader, read_scan
-from omsm_ros.core.adjustment.self_calibration import Agreement, AgreementSums
+from omsm_ros.core.adjustment.self_calibration import ScanConsistency, ScanConsistencySums
 from omsm_ros.core.correction.counter_offset import CounterOffset, LiveOffset, counter_offset
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
@@ -125,9 +125,9 @@ def recut(sizes: list[int]) -> list[AxisBlock | DistanceBlock]:
     while begin < len(z):
         size = sizes[k % len(sizes)]
         cut, still = slice(begin, begin + size), np.zeros(len(z[begin : begin + size]))
-        told = {"first_sample": first + begin, "sample_period": 1e-3, "stamp_ns": 0}
-        made.append(AxisBlock(x=still, y=still, z=z[cut], b=still, c=still, **told))
-        made.append(DistanceBlock(distance=d[cut], **told))
+        reported = {"first_sample": first + begin, "sample_period": 1e-3, "stamp_ns": 0}
+        made.append(AxisBlock(x=still, y=still, z=z[cut], b=still, c=still, **reported))
+        made.append(DistanceBlock(distance=d[cut], **reported))
         begin, k = begin + size, k + 1
     return made
 
@@ -159,7 +159,7 @@ def test_one_finding_is_none() -> None:
     assert watch.established is not None
 
 
-def test_before_any_block_nothing_is_told() -> None:
+def test_before_any_block_nothing_is_reported() -> None:
     watch = LiveOffset(CALIBRATION, 0)
     watch.judge()
     assert watch.established is None
@@ -173,8 +173,10 @@ RADIUS = np.linspace(1e-3, 10e-3, len(ANGLE))
 LEFT = [RANDOM.normal(0, 2e-9, len(ANGLE)) + s * 20e-9 * np.cos(3 * ANGLE) for s in (1, -1)]
 
 
-def agreement(left: list[FloatArray], turn: float = 0.0, every: int = len(ANGLE)) -> Agreement:
-    sums = AgreementSums(len(left), 1e-3, 10e-3)
+def agreement(
+    left: list[FloatArray], turn: float = 0.0, every: int = len(ANGLE)
+) -> ScanConsistency:
+    sums = ScanConsistencySums(len(left), 1e-3, 10e-3)
     for scan, residual in enumerate(left):
         for begin in range(0, len(ANGLE), every):
             part = slice(begin, begin + every)
@@ -182,7 +184,9 @@ def agreement(left: list[FloatArray], turn: float = 0.0, every: int = len(ANGLE)
     return sums.result()
 
 
-def alike(found: Agreement, expected: Agreement, unit: float = 1.0, rel: float = 1e-9) -> None:
+def alike(
+    found: ScanConsistency, expected: ScanConsistency, unit: float = 1.0, rel: float = 1e-9
+) -> None:
     assert found.ratio == pytest.approx(expected.ratio, rel=rel)
     assert found.disagreement == pytest.approx(unit * expected.disagreement, rel=rel)
     assert found.noise == pytest.approx(unit * expected.noise, rel=rel)
@@ -205,7 +209,7 @@ def test_portions_cost_the_agreement_one_difference_each() -> None:
 
 
 def test_a_ring_or_a_scan_that_nobody_saw_says_nothing() -> None:
-    sums = AgreementSums(3, 1e-3, 20e-3)  # the outer rings, and the third scan, are empty
+    sums = ScanConsistencySums(3, 1e-3, 20e-3)  # the outer rings, and the third scan, are empty
     for scan, residual in enumerate(LEFT):
         sums.add(scan, RADIUS, ANGLE, residual)
     found = sums.result()
@@ -226,7 +230,7 @@ def test_scans_without_noise_agree() -> None:
 def test_only_what_is_beyond_noise_and_visible_is_a_contradiction(
     ratio: float, disagreement: float, holds: bool
 ) -> None:
-    assert Agreement(ratio, disagreement, 1e-9).holds is holds
+    assert ScanConsistency(ratio, disagreement, 1e-9).holds is holds
 
 
 # -- a scan as it is read

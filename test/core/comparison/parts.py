@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from omsm_ros.core.comparison.stated_errors import Measurement
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 
 RADIUS = 5e-3
@@ -42,7 +42,7 @@ def scan(seed, feed=1.5e-4, rpm=30, added=None, walk=0.0, noise=10e-9, stated=No
         uncertainty=None if stated is None else np.full(len(x), stated),
         sample=np.arange(len(x)),
     )
-    return Measurement(name=name, points=points, **known)
+    return ComparedMeasurement(name=name, points=points, **known)
 
 
 def mapped(shift=(0.0, 0.0), turn=0.0, noise=0.5e-9, stated=None, seed=9, side=81, added=None,
@@ -60,4 +60,4 @@ def mapped(shift=(0.0, 0.0), turn=0.0, noise=0.5e-9, stated=None, seed=9, side=8
         height += added(u, v)
     spread = None if stated is None else np.full(len(x), stated)
     points = MeasuredPoints(x=x, y=y, height=height, uncertainty=spread)
-    return Measurement(name="map", points=points, **known)
+    return ComparedMeasurement(name="map", points=points, **known)

@@ -11,7 +11,7 @@ from scipy import stats
 from omsm_ros.core.comparison.agreement import (
     COVERAGE_FACTOR,
     TERMS,
-    Errors,
+    MeasurementErrors,
     figures_of,
     judge,
     peak_to_valley,
@@ -45,13 +45,13 @@ def matched(a, b=None, columns=SEATED):
     return Matched(
         grid=HeightGrid(height=flat.reshape(SIDE, SIDE), x0=-RADIUS, y0=-RADIUS, dx=step, dy=step),
         filled=INSIDE, x=X, y=Y, a=a, b=b, columns=np.stack(list(columns.values())),
-        freedoms=tuple(columns), moved=dict.fromkeys(columns, 0.0), refused={},
+        dofs=tuple(columns), moved=dict.fromkeys(columns, 0.0), refused={},
         from_a=nothing, from_b=nothing, b_x=X, b_y=Y,
     )  # fmt: skip
 
 
 def noisy(size, **shapes):
-    return Errors(shapes, np.full(COUNT, size), np.full(COUNT, size))
+    return MeasurementErrors(shapes, np.full(COUNT, size), np.full(COUNT, size))
 
 
 def levelled(values, columns=SEATED):
@@ -232,8 +232,8 @@ def test_the_place_that_is_farthest_off_is_named_in_uncertainties():
     difference[117] = -40e-9
     errors = noisy(1e-9)
     # Twice as uncertain, twice as far off there would count no more.
-    wide = replace(errors, single=np.where(np.arange(COUNT) == 117, 4e-9, 1e-9))
-    found = judge(matched(difference), (errors, wide))
+    broad = replace(errors, single=np.where(np.arange(COUNT) == 117, 4e-9, 1e-9))
+    found = judge(matched(difference), (errors, broad))
     assert found.at == (X[117], Y[117])
     assert found.farthest == pytest.approx(40 / np.sqrt(17))
     assert found.farthest > found.allowed
@@ -250,12 +250,12 @@ def test_figures_that_differ_by_noise_alone_agree():
     form = 100e-9 * VALUES[2]
     a, b = form + RNG.normal(0, 20e-9, COUNT), form + RNG.normal(0, 1e-9, COUNT)
     found = judge(matched(a, b), (noisy(20e-9), noisy(1e-9)))
-    wide = found.figures["peak_to_valley"]
-    assert wide.a - wide.b > 30e-9
+    broad = found.figures["peak_to_valley"]
+    assert broad.a - broad.b > 30e-9
     assert all(abs(number.e_n) < 1 for number in found.figures.values())
 
 
-def test_a_part_twice_as_bent_differs_in_each_of_its_figures():
+def test_a_part_of_twice_the_form_error_differs_in_every_figure():
     form = 100e-9 * VALUES[2]
     noise = RNG.normal(0, 1e-9, (2, COUNT))
     found = judge(matched(2 * form + noise[0], form + noise[1]), (noisy(1e-9), noisy(1e-9)))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.matching import FREEDOMS, SEATED, freedoms_named, match
+from omsm_ros.core.comparison.matching import DEGREES_OF_FREEDOM, SEATED, match, ordered_dofs
 from omsm_ros.core.comparison.resampling import (
     TREND_DEGREE,
     LocalQuadratic,
-    Trend,
+    SurfaceTrend,
     averaged,
     cell_side,
     on_grid,
@@ -51,7 +51,7 @@ def wavy(x, y):
 
 
 def test_a_trend_is_the_polynomial_and_its_slopes_are_its_derivatives():
-    trend = Trend(points(polynomial(X, Y)))
+    trend = SurfaceTrend(points(polynomial(X, Y)))
     np.testing.assert_allclose(trend.at(AT_X, AT_Y), polynomial(AT_X, AT_Y), atol=1e-15)
     step = 1e-6
     along_x, along_y = trend.slopes(AT_X, AT_Y)
@@ -63,9 +63,9 @@ def test_a_trend_is_the_polynomial_and_its_slopes_are_its_derivatives():
 
 def test_of_few_points_the_trend_is_their_plane():
     few = points(3e-6 + 2e-3 * X[:200] - 1e-3 * Y[:200], X[:200], Y[:200])
-    trend = Trend(few)
+    trend = SurfaceTrend(few)
     np.testing.assert_allclose(trend.at(AT_X, AT_Y), 3e-6 + 2e-3 * AT_X - 1e-3 * AT_Y, atol=1e-15)
-    bowl = Trend(points(X[:200] ** 2, X[:200], Y[:200]))
+    bowl = SurfaceTrend(points(X[:200] ** 2, X[:200], Y[:200]))
     assert np.ptp(bowl.slopes(AT_X, AT_Y)[0]) < 1e-9
 
 
@@ -199,10 +199,10 @@ def seat(x, y):
     return 2e-6 + 3e-6 * y - (-4e-6) * x + 5e-3 * (x**2 + y**2) / 2
 
 
-@pytest.mark.parametrize("freedoms", [(*SEATED, "power"), ("power", "tilt", "tip", "piston")])
-def test_what_a_seat_makes_is_taken_off_with_its_signs(freedoms):
-    found = match(*two(points(wavy(X, Y) - seat(X, Y))), freedoms)
-    assert found.freedoms == (*SEATED, "power")
+@pytest.mark.parametrize("dofs", [(*SEATED, "power"), ("power", "tilt", "tip", "piston")])
+def test_what_a_seat_makes_is_taken_off_with_its_signs(dofs):
+    found = match(*two(points(wavy(X, Y) - seat(X, Y))), dofs)
+    assert found.dofs == (*SEATED, "power")
     assert found.moved == pytest.approx(
         {"piston": 2e-6, "tip": 3e-6, "tilt": -4e-6, "power": 5e-3}, rel=1e-4
     )
@@ -232,14 +232,14 @@ def test_less_the_fit_nothing_is_left_of_its_columns_and_once_is_enough():
 
 
 def test_freedoms_come_in_one_order_and_each_once():
-    assert freedoms_named(FREEDOMS[::-1]) == FREEDOMS
-    assert freedoms_named(("tilt", "piston", "tilt")) == ("piston", "tilt")
-    assert freedoms_named(()) == ()
+    assert ordered_dofs(DEGREES_OF_FREEDOM[::-1]) == DEGREES_OF_FREEDOM
+    assert ordered_dofs(("tilt", "piston", "tilt")) == ("piston", "tilt")
+    assert ordered_dofs(()) == ()
     with pytest.raises(ConfigurationError, match=r"'roll' is unknown, expected one of \['piston'"):
-        freedoms_named(("piston", "roll"))
+        ordered_dofs(("piston", "roll"))
 
 
-def test_a_surface_that_is_not_there_is_told_with_the_number_of_places():
-    beside = points(wavy(X, Y), X + 1.7 * RADIUS, Y)
+def test_a_surface_that_is_not_there_is_reported_with_the_number_of_places():
+    adjacent = points(wavy(X, Y), X + 1.7 * RADIUS, Y)
     with pytest.raises(DataError, match=r"share \d+ places of 333 µm, expected 100 or more"):
-        match(*two(beside), SEATED)
+        match(*two(adjacent), SEATED)

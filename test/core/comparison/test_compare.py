@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.interpolate import RectBivariateSpline
 
-from omsm_ros.core.comparison.compare import AGREE, CANNOT_TELL, DIFFER, compare
+from omsm_ros.core.comparison.compare import (
+    AGREE,
+    CANNOT_TELL,
+    DIFFER,
+    compare_measurements_of_part,
+)
 from omsm_ros.core.comparison.matching import SEATED
-from omsm_ros.core.comparison.stated_errors import ESTIMATED, Measurement
+from omsm_ros.core.comparison.stated_errors import ESTIMATED, ComparedMeasurement
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import ConfigurationError, DataError
@@ -28,7 +33,7 @@ def pair(seed, added=None, **known):
 def test_two_scans_with_drift_agree_and_with_astigmatism_differ():
     for seed in (5, 6):
         first, second = pair(seed)
-        found = compare(first, second)
+        found = compare_measurements_of_part(first, second)
         assert found.verdict.verdict == AGREE
         assert abs(found.agreement.largest.e_n) < 1
         assert all(abs(n.e_n) < 1 for n in found.agreement.figures.values())
@@ -37,7 +42,7 @@ def test_two_scans_with_drift_agree_and_with_astigmatism_differ():
         assert "nobody states the drift" in found.verdict.reservations[0]
         assert {side.drift_from for side in found.sides} == {ESTIMATED}
 
-        other = compare(first, pair(seed, astigmatism)[1])
+        other = compare_measurements_of_part(first, pair(seed, astigmatism)[1])
         assert other.verdict.verdict == DIFFER
         largest = other.agreement.largest
         assert (largest.n, largest.m) == (2, 2)
@@ -50,20 +55,22 @@ def test_the_size_of_the_drift_is_found():
     """Within the factor that one realisation of a random walk leaves open."""
     sizes = []
     for seed in range(3):
-        found = compare(*pair(seed))
+        found = compare_measurements_of_part(*pair(seed))
         sizes.append(found.sides[0].drift / (WALK * np.sqrt(67)))
     assert 0.4 < float(np.exp(np.mean(np.log(sizes)))) < 2.0
 
 
 def test_drift_that_is_stated_and_too_small_is_a_difference():
     first, second = pair(3, drift=0.2e-9)
-    found = compare(first, second)
+    found = compare_measurements_of_part(first, second)
     assert found.verdict.verdict == DIFFER
     assert found.verdict.reservations == ()
 
 
 def test_stated_drift_widens_what_a_spiral_turns_it_into_and_nothing_else():
-    calm, windy = (compare(*pair(0, drift=size)).agreement for size in (1e-12, 20e-9))
+    calm, windy = (
+        compare_measurements_of_part(*pair(0, drift=size)).agreement for size in (1e-12, 20e-9)
+    )
     spread = [{(t.n, t.m): t.uncertainty for t in found.terms} for found in (calm, windy)]
     assert spread[1][2, 0] > 5 * spread[0][2, 0]
     assert spread[1][2, 2] == pytest.approx(spread[0][2, 2], rel=0.1)
@@ -75,7 +82,7 @@ def test_stated_uncertainties_hold_over_repetitions():
     for seed in range(8):
         first = scan(seed, common=0.0, drift=0.0)
         second = scan(seed + 100, feed=2e-4, rpm=45, common=0.0, drift=0.0)
-        found = compare(first, second, spacing=0.35e-3).agreement
+        found = compare_measurements_of_part(first, second, spacing=0.35e-3).agreement
         scores += [term.difference / term.uncertainty for term in found.terms]
         probabilities.append(found.probability)
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1, abs=0.2)
@@ -95,13 +102,15 @@ def test_form_like_errors_scatter_as_stated():
         error = (root @ np.random.default_rng(seed).normal(size=len(nodes))).reshape(25, 25)
         spline = RectBivariateSpline(at, at, size * error.T)
         second = mapped(common=size, added=spline.ev, side=51)
-        found = compare(mapped(common=0.0, seed=1, side=51), second, length=length)
+        found = compare_measurements_of_part(
+            mapped(common=0.0, seed=1, side=51), second, length=length
+        )
         scores += [t.difference / t.uncertainty for t in found.agreement.terms if t.n < 5]
     assert np.sqrt(np.mean(np.square(scores))) == pytest.approx(1, abs=0.25)
 
 
 def test_without_an_uncertainty_nothing_is_evaluated():
-    found = compare(scan(0, stated=3e-9, name="ours"), mapped())
+    found = compare_measurements_of_part(scan(0, stated=3e-9, name="ours"), mapped())
     assert found.verdict.verdict == CANNOT_TELL
     assert found.verdict.reasons == ("map carries no uncertainty; state it, as --uncertainty 5e-9",)
     assert found.agreement is None
@@ -109,31 +118,33 @@ def test_without_an_uncertainty_nothing_is_evaluated():
 
 
 def test_an_uncertainty_larger_than_the_part_tells_nothing():
-    found = compare(scan(0, common=5e-6, drift=0.0), mapped(common=5e-6))
+    found = compare_measurements_of_part(scan(0, common=5e-6, drift=0.0), mapped(common=5e-6))
     assert found.verdict.verdict == CANNOT_TELL
     assert "more than all that is compared" in found.verdict.reasons[0]
 
 
 def test_an_uncertainty_in_a_wrong_unit_is_larger_than_the_part():
     """Five metres for five nanometres: terms beside them have no covariance but rounding."""
-    found = compare(mapped(common=5.0), mapped(common=5.0, seed=3))
+    found = compare_measurements_of_part(mapped(common=5.0), mapped(common=5.0, seed=3))
     assert found.verdict.verdict == CANNOT_TELL
     assert "more than all that is compared" in found.verdict.reasons[0]
 
 
-@pytest.mark.parametrize("freedom", ["x", "clocking"])
-def test_a_shift_alone_is_fitted(freedom):
-    moved = mapped(**({"shift": (80e-6, 0.0)} if freedom == "x" else {"turn": 7e-3}), common=1e-9)
-    found = compare(mapped(common=1e-9), moved, (freedom,))
-    size = {"x": -80e-6, "clocking": -7e-3}[freedom]
-    assert found.matched.moved[freedom] == pytest.approx(size, abs=0.1 * abs(size))
+@pytest.mark.parametrize("dof", ["x", "clocking"])
+def test_a_shift_alone_is_fitted(dof):
+    moved = mapped(**({"shift": (80e-6, 0.0)} if dof == "x" else {"turn": 7e-3}), common=1e-9)
+    found = compare_measurements_of_part(mapped(common=1e-9), moved, (dof,))
+    size = {"x": -80e-6, "clocking": -7e-3}[dof]
+    assert found.matched.moved[dof] == pytest.approx(size, abs=0.1 * abs(size))
 
 
 def test_a_scratch_that_no_zernike_term_sees_is_found():
     def scratch(x, y):
         return 60e-9 * np.exp(-((x - 1e-3) ** 2 + (y + 2e-3) ** 2) / (2 * (0.25e-3) ** 2))
 
-    found = compare(scan(0, common=1e-9, drift=0.0), mapped(common=1e-9, added=scratch))
+    found = compare_measurements_of_part(
+        scan(0, common=1e-9, drift=0.0), mapped(common=1e-9, added=scratch)
+    )
     assert found.verdict.verdict == DIFFER
     place = next(reason for reason in found.verdict.reasons if "at x" in reason)
     assert "x = 1.0" in place or "x = 9" in place
@@ -162,19 +173,21 @@ def test_each_direction_of_a_calibration_is_one_error_in_both():
 
     def explained(*of_both):
         sides = [
-            Measurement(name=m.name, points=m.points, fields=f, drift=0.0, calibration="one")
+            ComparedMeasurement(
+                name=m.name, points=m.points, fields=f, drift=0.0, calibration="one"
+            )
             for m, f in zip((first, second), of_both, strict=True)
         ]
-        found = compare(*sides)
+        found = compare_measurements_of_part(*sides)
         return next(t.uncertainty for t in found.agreement.terms if (t.n, t.m) == (2, 2))
 
-    wide = explained(known(first, 2e-3, 3e-3), known(second, 2e-3))
+    broad = explained(known(first, 2e-3, 3e-3), known(second, 2e-3))
     cancelled = explained(known(first, 2e-3, 3e-3), known(second, 2e-3, 3e-3))
     turned = explained(known(first, 2e-3, 3e-3), known(second, -2e-3, -3e-3))
-    assert cancelled < 0.1 * wide
+    assert cancelled < 0.1 * broad
     # What is of opposite signs in both adds up; of independent errors only the squares would.
     assert turned == pytest.approx(
-        wide * 2 * np.hypot(2, 3) / np.sqrt(2**2 + 3**2 + 2**2), rel=0.05
+        broad * 2 * np.hypot(2, 3) / np.sqrt(2**2 + 3**2 + 2**2), rel=0.05
     )
 
 
@@ -184,13 +197,13 @@ def test_an_error_that_both_share_is_subtracted():
     spread = {}
     for ids in (("one", "one"), ("one", "two"), ("", "")):
         sides = [
-            Measurement(
+            ComparedMeasurement(
                 name=m.name, points=m.points, fields=turned_field(m, size), drift=0.0,
                 calibration=own,
             )
             for m, own in zip((first, second), ids, strict=True)
         ]  # fmt: skip
-        found = compare(*sides)
+        found = compare_measurements_of_part(*sides)
         spread[ids] = {(t.n, t.m): t.uncertainty for t in found.agreement.terms}
         assert found.common == (("lateral_lag",) if ids == ("one", "one") else ())
         assert found.sides[0].sources["lateral_lag"] > 1e-9
@@ -205,11 +218,11 @@ def test_an_error_that_both_share_is_subtracted():
 # Matching.
 
 
-def test_piston_tip_tilt_and_power_are_taken_off_and_told():
+def test_piston_tip_tilt_and_power_are_taken_off_and_reported():
     def seat(x, y):
         return 4e-6 + 30e-6 * x - 20e-6 * y + 1e-3 * (x**2 + y**2)
 
-    found = compare(
+    found = compare_measurements_of_part(
         mapped(common=1e-9), mapped(common=1e-9, added=seat, seed=3), (*SEATED, "power")
     )
     assert found.verdict.verdict == AGREE
@@ -225,8 +238,8 @@ def test_piston_tip_tilt_and_power_are_taken_off_and_told():
 def test_shift_and_clocking_are_found():
     moved = mapped(shift=(80e-6, -50e-6), turn=7e-3, common=1e-9, seed=4)
     here = mapped(common=1e-9)
-    assert compare(here, moved).verdict.verdict == DIFFER
-    found = compare(here, moved, (*SEATED, "x", "y", "clocking"))
+    assert compare_measurements_of_part(here, moved).verdict.verdict == DIFFER
+    found = compare_measurements_of_part(here, moved, (*SEATED, "x", "y", "clocking"))
     assert found.verdict.verdict == AGREE
     assert "x, y, clocking were fitted" in found.verdict.reservations[0]
     # The second goes back: turned about the origin, then shifted.
@@ -240,8 +253,8 @@ def test_a_turn_that_a_surface_of_revolution_does_not_show_is_refused():
     at = np.linspace(-RADIUS, RADIUS, 61)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     bowl = MeasuredPoints(x=x, y=y, height=(x**2 + y**2) / 0.2)
-    sides = [Measurement(name=n, points=bowl, common=1e-9) for n in "ab"]
-    found = compare(*sides, freedoms=(*SEATED, "x", "y", "clocking"))
+    sides = [ComparedMeasurement(name=n, points=bowl, common=1e-9) for n in "ab"]
+    found = compare_measurements_of_part(*sides, dofs=(*SEATED, "x", "y", "clocking"))
     assert set(found.matched.refused) == {"x", "y", "clocking"}
     assert any("clocking was not fitted" in text for text in found.verdict.reservations)
 
@@ -251,26 +264,30 @@ def test_slopes_that_are_noise_alone_tell_no_turn():
     at, random = np.linspace(-RADIUS, RADIUS, 81), np.random.default_rng(2)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     sides = [
-        Measurement(name=n, common=1e-9, points=MeasuredPoints(
+        ComparedMeasurement(name=n, common=1e-9, points=MeasuredPoints(
             x=x, y=y, height=(x**2 + y**2) / 0.2 + random.normal(0, 10e-9, len(x))))
         for n in "ab"
     ]  # fmt: skip
-    found = compare(*sides, freedoms=(*SEATED, "x", "y", "clocking"))
+    found = compare_measurements_of_part(*sides, dofs=(*SEATED, "x", "y", "clocking"))
     assert "clocking" in found.matched.refused
     assert found.verdict.verdict != DIFFER
 
 
-def test_steep_heights_that_were_compared_whole_are_told():
+def test_steep_heights_that_were_compared_whole_are_reported():
     """Of a cylinder: moved beside its axis by a micrometre, it is higher by the micrometre's slope,
     which a tilt takes up; a saddle of fourth order keeps it."""
     at = np.linspace(-RADIUS, RADIUS, 61)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     steep = MeasuredPoints(x=x, y=y, height=1e-3 * (x / RADIUS) ** 4)
-    found = compare(*(Measurement(name=n, points=steep, common=1e-9) for n in "ab"))
-    told = [text for text in found.verdict.reservations if "whole heights" in text]
-    assert "--nominal SURFACE.yaml" in told[0]
+    found = compare_measurements_of_part(
+        *(ComparedMeasurement(name=n, points=steep, common=1e-9) for n in "ab")
+    )
+    reported = [text for text in found.verdict.reservations if "whole heights" in text]
+    assert "--nominal SURFACE.yaml" in reported[0]
     flat = MeasuredPoints(x=x, y=y, height=1e-9 * (x / RADIUS) ** 4)
-    found = compare(*(Measurement(name=n, points=flat, common=1e-9) for n in "ab"))
+    found = compare_measurements_of_part(
+        *(ComparedMeasurement(name=n, points=flat, common=1e-9) for n in "ab")
+    )
     assert not any("whole heights" in text for text in found.verdict.reservations)
 
 
@@ -278,31 +295,35 @@ def test_what_does_not_lie_together_is_refused():
     first = mapped(common=1e-9)
     away = MeasuredPoints(x=first.points.x + 1.0, y=first.points.y, height=first.points.height)
     with pytest.raises(DataError, match="do not overlap; do they lie in one frame"):
-        compare(first, Measurement(name="b", points=away, common=1e-9))
+        compare_measurements_of_part(first, ComparedMeasurement(name="b", points=away, common=1e-9))
     apart = MeasuredPoints(
         x=first.points.x + 1.88 * RADIUS, y=first.points.y, height=first.points.height
     )
     with pytest.raises(DataError, match=r"share \d+ places"):
-        compare(first, Measurement(name="b", points=apart, common=1e-9))
+        compare_measurements_of_part(
+            first, ComparedMeasurement(name="b", points=apart, common=1e-9)
+        )
 
 
 def test_a_small_overlap_cannot_tell():
     first = mapped(common=1e-9)
-    aside = MeasuredPoints(
+    shifted = MeasuredPoints(
         x=first.points.x + 1.2 * RADIUS, y=first.points.y, height=first.points.height
     )
-    found = compare(first, Measurement(name="b", points=aside, common=1e-9))
+    found = compare_measurements_of_part(
+        first, ComparedMeasurement(name="b", points=shifted, common=1e-9)
+    )
     assert found.verdict.verdict == CANNOT_TELL
     assert "% of the smaller area" in found.verdict.reasons[0]
 
 
 def test_an_unknown_freedom_is_refused():
     with pytest.raises(ConfigurationError, match="freedom 'z' is unknown"):
-        compare(mapped(), mapped(), ("piston", "z"))
+        compare_measurements_of_part(mapped(), mapped(), ("piston", "z"))
 
 
 def test_heights_of_so_few_digits_that_they_do_not_scatter_are_compared():
     first, second = mapped(stated=1e-9), mapped(stated=1e-9, seed=3)
     coarse = replace(second.points, height=np.round(second.points.height, 4))
-    found = compare(first, replace(second, points=coarse))
+    found = compare_measurements_of_part(first, replace(second, points=coarse))
     assert found.verdict.verdict == DIFFER

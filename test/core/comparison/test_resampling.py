@@ -105,7 +105,7 @@ def test_the_whole_aperture_has_heights():
     assert np.max(np.abs(error)) < 1e-10
 
 
-def test_the_cells_of_a_spiral_are_about_as_wide_as_its_feed():
+def test_cells_of_a_spiral_are_about_one_feed_across():
     side = cell_side(*_spiral(feed=0.1e-3), 1000)
     assert 0.08e-3 < side < 0.25e-3
 

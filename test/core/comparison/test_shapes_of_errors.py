@@ -9,8 +9,8 @@ from omsm_ros.core.comparison.stated_errors import (
     AT_ONCE,
     ESTIMATED,
     STATED,
-    Errors,
-    Measurement,
+    ComparedMeasurement,
+    MeasurementErrors,
     drift,
     drift_size,
     likely_drift,
@@ -147,18 +147,20 @@ def test_what_another_error_explains_is_no_drift():
     walk = 40e-9 * shapes[0]
     noise = np.full(101, 1e-9)
     alone = likely_drift(walk, np.empty((0, 101)), noise, shapes)
-    beside = likely_drift(walk, 40e-9 * shapes[:1], noise, shapes)
-    assert beside < 0.2 * alone
+    adjacent = likely_drift(walk, 40e-9 * shapes[:1], noise, shapes)
+    assert adjacent < 0.2 * alone
 
 
 def test_the_largest_of_a_drift_is_where_its_shapes_add_up_to_most():
     rows = np.array([[1e-9, 3e-9, 0.0], [2e-9, 4e-9, 0.0]])
     shapes = {"drift": rows[:1], "drift of the probe": rows[1:], "other": 1e-6 * np.ones((1, 3))}
-    errors = Errors(shapes, np.zeros(3), np.zeros(3))
+    errors = MeasurementErrors(shapes, np.zeros(3), np.zeros(3))
     assert drift_size(errors) == pytest.approx(5e-9)
     assert drift_size(None) == 0.0
-    assert drift_size(Errors({"other": rows}, np.zeros(3), np.zeros(3))) == 0.0
-    assert drift_size(Errors({"drift": np.empty((0, 3))}, np.zeros(3), np.zeros(3))) == 0.0
+    assert drift_size(MeasurementErrors({"other": rows}, np.zeros(3), np.zeros(3))) == 0.0
+    assert (
+        drift_size(MeasurementErrors({"drift": np.empty((0, 3))}, np.zeros(3), np.zeros(3))) == 0.0
+    )
 
 
 # Who knows it.
@@ -175,7 +177,7 @@ class Known:
 
 def measurement(sample, **known):
     points = MeasuredPoints(x=X, y=Y, height=0 * X, sample=sample)
-    return Measurement(name="a", points=points, **known)
+    return ComparedMeasurement(name="a", points=points, **known)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.agreement import TERMS, Agreement, Number, TermNumber
+from omsm_ros.core.comparison.agreement import (
+    TERMS,
+    ComparedFigure,
+    ComparedTerm,
+    ComparisonAgreement,
+)
 from omsm_ros.core.comparison.compare import AGREE, CANNOT_TELL, DIFFER, verdict_of
 
 COMPARED_M = 100e-9
@@ -28,7 +33,7 @@ def terms(scores=None, expanded=5e-9):
     """All terms of one expanded uncertainty, E_n zero but for the ``scores``."""
     scores = scores or {}
     return tuple(
-        TermNumber(
+        ComparedTerm(
             n=n, m=m, difference=scores.get((n, m), 0.0) * expanded, uncertainty=expanded / 3,
             expanded=expanded, e_n=scores.get((n, m), 0.0),
         )
@@ -36,8 +41,8 @@ def terms(scores=None, expanded=5e-9):
     )  # fmt: skip
 
 
-AGREED = Agreement(
-    figures={name: Number(1e-7, 1e-7, 1e-8, 0.1) for name in ("peak_to_valley", "rms")},
+AGREED = ComparisonAgreement(
+    figures={name: ComparedFigure(1e-7, 1e-7, 1e-8, 0.1) for name in ("peak_to_valley", "rms")},
     terms=terms({(2, 0): 0.4, (3, -1): -0.7}),
     probability=0.5,
     within=0.96,
@@ -54,7 +59,7 @@ def judged(shared=1.0, unknown=(), reservations=(), **changes):
     return verdict_of(Compared(), agreement, unknown, shared, reservations)
 
 
-def test_within_all_they_state_they_agree_and_the_largest_term_is_told():
+def test_within_all_they_state_they_agree_and_the_largest_term_is_reported():
     found = judged(reservations=("one thing",))
     assert found.verdict == AGREE
     assert found.reservations == ("one thing",)
@@ -65,9 +70,9 @@ def test_within_all_they_state_they_agree_and_the_largest_term_is_told():
     assert "96.0 % of the area" in found.reasons[2]
 
 
-def test_the_terms_that_are_least_known_are_told_with_what_may_hide_there():
-    wide = [replace(t, expanded=9e-9) if (t.n, t.m) == (2, 0) else t for t in AGREED.terms]
-    found = judged(terms=tuple(wide))
+def test_the_most_uncertain_terms_are_reported_with_the_error_they_may_mask():
+    broad = [replace(t, expanded=9e-9) if (t.n, t.m) == (2, 0) else t for t in AGREED.terms]
+    found = judged(terms=tuple(broad))
     assert "up to 9.00 nm of power Z(2, 0)" in found.reasons[3]
 
 
@@ -99,7 +104,7 @@ def test_the_term_that_differs_is_named_with_its_size_and_what_explains_it():
     assert found.reasons[0].startswith("Z(5, -3) differs by -15.0 nm")
 
 
-def test_all_terms_together_are_told_where_they_are_what_tells():
+def test_the_joint_test_is_reported_where_it_decides():
     found = judged(probability=1e-3)
     assert found.verdict == DIFFER
     assert len(found.reasons) == 1
@@ -116,7 +121,7 @@ def test_a_place_plainly_beyond_the_most_to_expect_differs_and_is_named(farthest
 
 
 def test_a_figure_alone_makes_no_difference_but_a_doubt():
-    figures = {**AGREED.figures, "rms": Number(2e-7, 1e-7, 5e-8, 2.0)}
+    figures = {**AGREED.figures, "rms": ComparedFigure(2e-7, 1e-7, 5e-8, 2.0)}
     found = judged(figures=figures)
     assert found.verdict == CANNOT_TELL
     assert "E_n = 2.00, too little beyond 1 to tell" in found.reasons[0]
@@ -127,7 +132,7 @@ def test_a_figure_alone_makes_no_difference_but_a_doubt():
 
 
 def test_a_figure_that_was_not_evaluated_says_nothing():
-    found = judged(figures={"rms": Number(1e-7, 2e-7, None, None)})
+    found = judged(figures={"rms": ComparedFigure(1e-7, 2e-7, None, None)})
     assert found.verdict == AGREE
 
 
@@ -139,9 +144,9 @@ def test_terms_less_known_than_all_that_is_compared_tell_nothing(expanded, verdi
         assert "101 nm or more, more than all that is compared, 100 nm rms" in found.reasons[0]
 
 
-def test_a_few_terms_that_are_hardly_known_do_not_hide_the_others():
-    wide = [replace(t, expanded=1e-5) if t.n == 2 else t for t in AGREED.terms]
-    assert judged(terms=tuple(wide)).verdict == AGREE
+def test_a_few_uncertain_terms_do_not_mask_the_others():
+    broad = [replace(t, expanded=1e-5) if t.n == 2 else t for t in AGREED.terms]
+    assert judged(terms=tuple(broad)).verdict == AGREE
 
 
 @pytest.mark.parametrize(("shared", "verdict"), [(0.5, AGREE), (0.49, CANNOT_TELL)])
@@ -152,11 +157,11 @@ def test_of_half_the_smaller_area_and_more_there_is_a_verdict(shared, verdict):
         assert found.reasons == ("they share 49 % of the smaller area, expected 50 % or more",)
 
 
-def test_little_overlap_hides_a_difference():
+def test_little_overlap_masks_a_difference():
     assert judged(shared=0.2, terms=terms({(2, 2): 9.0})).verdict == CANNOT_TELL
 
 
-def test_without_an_uncertainty_nothing_is_told_but_why():
+def test_without_an_uncertainty_nothing_is_reported_but_why():
     found = verdict_of(Compared(), None, ("map carries none",), 0.3, ("kept",))
     assert found.verdict == CANNOT_TELL
     assert found.reasons[0] == "map carries none"

@@ -32,7 +32,7 @@ PROBE = {"probe.averaging": 4.0, "probe.model": "A"}
 
 
 @pytest.mark.parametrize(
-    ("told", "reasons"),
+    ("reported", "reasons"),
     [
         ([], ()),
         ([PROBE], ()),
@@ -45,10 +45,10 @@ PROBE = {"probe.averaging": 4.0, "probe.model": "A"}
         ),
     ],
 )
-def test_what_the_probe_tells_is_compared_where_both_know(told, reasons):
+def test_what_the_probe_tells_is_compared_where_both_know(reported, reasons):
     known = replace(calibration(), settings=SETTINGS | PROBE)
-    assert objections(known, probe=told) == reasons
-    assert objections(known, settings=SETTINGS, probe=told) == reasons
+    assert objections(known, probe=reported) == reasons
+    assert objections(known, settings=SETTINGS, probe=reported) == reasons
 
 
 def test_a_calibration_belongs_to_one_setting_of_the_probe():
@@ -82,13 +82,13 @@ def test_a_calibration_that_nobody_judged_is_objected_to() -> None:
         ("triggered", 1.5, "triggered is 1.5, calibrated with True"),
     ],
 )
-def test_a_setting_that_differs_is_told_with_both_values(
+def test_a_setting_that_differs_is_reported_with_both_values(
     name: str, value: object, text: str
 ) -> None:
     assert objections(calibration(), settings=SETTINGS | {name: value}) == (text,)
 
 
-def test_a_setting_that_is_no_longer_known_is_told() -> None:
+def test_a_setting_that_is_no_longer_known_is_reported() -> None:
     now = {k: v for k, v in SETTINGS.items() if k != "averaging"}
     assert objections(calibration(), settings=now) == ("averaging is not known, calibrated with 1",)
 
@@ -98,7 +98,7 @@ def test_numbers_are_compared_as_numbers() -> None:
     assert objections(calibration(), settings=SETTINGS | {"exposure_s": 0.5000000001e-3}) == ()
 
 
-def test_another_rate_is_told() -> None:
+def test_another_rate_is_reported() -> None:
     found = objections(calibration(), sample_period=0.5e-3)
     assert found == ("sample period is 0.0005 s, calibrated at 0.001 s",)
 
@@ -109,7 +109,7 @@ def test_a_failed_certificate_tells_its_reasons() -> None:
     assert text == "its certificate says 'rejected' (too noisy; too few edges)"
 
 
-def test_a_probe_turned_round_since_is_told() -> None:
+def test_a_probe_turned_round_since_is_reported() -> None:
     (text,) = objections(calibration(polarity=1), polarity=-1)
     assert text.startswith("polarity is -1, calibrated with 1 (the distance falls as z rises)")
     assert text.endswith("state polarity 1 (--polarity 1)")

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.machine_sources import (
@@ -107,7 +107,7 @@ def test_what_a_step_test_could_not_show_is_a_row_of_its_own(
     trace = replace(
         spiral_points(),
         dynamics=np.stack([spiral_points().x, spiral_points().y]) * 1e-6,
-        hidden=np.array([False, True]),
+        undetected=np.array([False, True]),
     )
     found = scan_budget(known, NO_ERRORS, {}, Geometry(), NOTHING_STATED, trace, len(trace))
     assert found.heights == pytest.approx({"could_hide": 1e-6 * np.std(trace.y)})
@@ -121,7 +121,7 @@ def test_an_open_lag_is_an_upper_bound_and_one_that_was_measured_is_not(
     said = MachineSources((stated("lateral_lag", 1e-6),))
     assert budget(true_calibration, said).bounds == ("could_hide",)
     lag = true_calibration.dynamics.low_frequency_delay
-    known = with_latency(true_calibration, declared(lag, 0.0, 1e-6, "light switch"))
+    known = with_latency(true_calibration, declared_latency(lag, 0.0, 1e-6, "light switch"))
     assert budget(known).bounds == ("could_hide",)
 
 
@@ -171,8 +171,8 @@ def test_a_source_of_points_is_stated_once() -> None:
 
 def test_sizes_alone_are_declared() -> None:
     said = declared_sources({"encoder_noise": 4e-10, "tilt": 1e-6})
-    assert said.of_points() == {"encoder_noise": 4e-10}
-    assert [source.name for source in said.of_the_scan()] == ["tilt"]
+    assert said.point_uncertainties() == {"encoder_noise": 4e-10}
+    assert [source.name for source in said.scan_sources()] == ["tilt"]
     with pytest.raises(ConfigurationError, match="'tlit' is unknown"):
         declared_sources({"tlit": 1e-6})
     with pytest.raises(ConfigurationError, match="needs per_turn"):
@@ -224,7 +224,7 @@ def test_a_declared_tilt_is_in_the_uncertainty_of_each_point(
 ) -> None:
     said = MachineSources((stated("tilt", 1e-5), stated("decentre", 1e-6)))
     noise = ErrorSources(probe_noise=1.2e-8)
-    options = CorrectionOptions(sources=noise, systematic=said.of_the_scan())
+    options = CorrectionOptions(sources=noise, systematic=said.scan_sources())
     _, without = corrected(true_calibration, small_scan, CorrectionOptions(sources=noise))
     corrector, tilted = corrected(true_calibration, small_scan, options)
     radius = 1e-5 * np.hypot(*(getattr(corrector.trace.points(), name) for name in "xy"))

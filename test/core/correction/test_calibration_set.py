@@ -7,7 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.calibration import Calibration, declared, latency_of, with_latency
+from omsm_ros.core.calibration.calibration import (
+    Calibration,
+    declared_latency,
+    latency_of,
+    with_latency,
+)
 from omsm_ros.core.calibration.calibration_set import CalibrationSet, calibration_set
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
@@ -149,7 +154,7 @@ def test_the_worst_of_the_members_is_said_of_the_set(true_calibration: Calibrati
     assert made.certificate["noise_m"] == 2e-8
     assert not latency_of(made).resolved
     known = [
-        with_latency(true_calibration, declared(3e-4, delay, 1e-6, "maker"))
+        with_latency(true_calibration, declared_latency(3e-4, delay, 1e-6, "maker"))
         for delay in (1e-4, 1.2e-4)
     ]
     latency = latency_of(calibration_set("z", list(zip((0.0, 1e-3), known, strict=True))))

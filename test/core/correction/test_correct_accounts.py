@@ -147,7 +147,7 @@ def test_what_waits_in_vain_is_bounded(scan: Recording) -> None:
     assert corrector.account.distance.corrected == 1000
 
 
-def test_stamps_that_disagree_about_a_trigger_are_told(scan: Recording) -> None:
+def test_stamps_that_disagree_about_a_trigger_are_reported(scan: Recording) -> None:
     corrector = Corrector(CALIBRATION)
     assert corrector.stamp_skew is None
     corrector.push_axes(scan.axes)

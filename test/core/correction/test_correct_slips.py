@@ -114,7 +114,7 @@ def test_blocks_that_a_bag_joins_are_judged_by_the_stamps_of_all(
     assert account == expected
     assert same_points(replace(found, stamp_ns=0), replace(each, stamp_ns=0))
     assert ("slipped" in account.distance.counted) is (drivers != "one")
-    assert corrector.slips.one_driver is (drivers == "one")
+    assert corrector.slips.same_stamps is (drivers == "one")
 
 
 def test_diagnostics_say_what_slipped_and_what_to_do(

@@ -6,8 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.calibration.calibration import Calibration, declared, with_latency
-from omsm_ros.core.correction.budget import AMBER, GREEN, RED, Light, Reason, light_of, noisier
+from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
+from omsm_ros.core.correction.budget import (
+    AMBER,
+    GREEN,
+    RED,
+    TrafficLight,
+    TrafficLightReason,
+    excess_noise_reasons,
+    traffic_light_of,
+)
 from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
 
 LOOKED_AT = {
@@ -39,14 +47,14 @@ def all_but(*left_out: str) -> MachineSources:
 
 @pytest.fixture
 def settled(true_calibration: Calibration) -> Calibration:
-    return with_latency(true_calibration, declared(3e-4, 0.0, 1e-7, "trigger of the maker"))
+    return with_latency(true_calibration, declared_latency(3e-4, 0.0, 1e-7, "trigger of the maker"))
 
 
 HEIGHTS = {"dynamics": 3e-9, "lateral_lag": 4e-9}
 
 
-def light(calibration: Calibration, sources: MachineSources, **more: object) -> Light:
-    return light_of(calibration, HEIGHTS, sources, **more)  # type: ignore[arg-type]
+def light(calibration: Calibration, sources: MachineSources, **more: object) -> TrafficLight:
+    return traffic_light_of(calibration, HEIGHTS, sources, **more)  # type: ignore[arg-type]
 
 
 def test_green_when_all_is_settled_for_what_is_asked_for(settled: Calibration) -> None:
@@ -106,21 +114,21 @@ def test_red_for_a_rejected_calibration_and_amber_without_a_certificate(
     refused = {**settled.certificate, "verdict": "rejected", "reasons": ["not linear"]}
     found = light(replace(settled, certificate=refused), all_but())
     assert found.level == RED
-    assert Reason("not linear") in found.reasons
+    assert TrafficLightReason("not linear") in found.reasons
     silent = {k: v for k, v in settled.certificate.items() if k != "verdict"}
     assert light(replace(settled, certificate=silent), all_but()).level == AMBER
 
 
 def test_other_doubts_make_it_amber(settled: Calibration) -> None:
-    doubt = Reason("half of the points are lost", "run slower")
+    doubt = TrafficLightReason("half of the points are lost", "run slower")
     assert light(settled, all_but(), doubts=[doubt]).reasons == (doubt,)
     assert str(doubt) == "half of the points are lost: run slower"
 
 
-def test_scatter_beyond_what_is_stated_is_told_with_both() -> None:
+def test_scatter_beyond_what_is_stated_is_reported_with_both() -> None:
     """3 and 4 nm stated are 5, with 12 beyond they are 13; what all heights share is no scatter."""
     budget = {"probe_noise": 3e-9, "vibration": 4e-9, "scan_scatter": 12e-9, "dynamics": 1e-6}
-    (reason,) = noisier(budget)
+    (reason,) = excess_noise_reasons(budget)
     assert reason.what == (
         "heights of this scan scatter by 13.0 nm, 5.00 nm by what is stated of single readings"
     )
@@ -129,33 +137,33 @@ def test_scatter_beyond_what_is_stated_is_told_with_both() -> None:
 
 @pytest.mark.parametrize("beyond", [0.0, 1e-9, 2e-9])
 def test_a_little_more_scatter_is_light_and_texture(beyond: float) -> None:
-    assert not [*noisier({"probe_noise": 5e-9, "scan_scatter": beyond})]
+    assert not [*excess_noise_reasons({"probe_noise": 5e-9, "scan_scatter": beyond})]
 
 
 def test_the_unit_of_the_scatter_does_not_matter() -> None:
     for size in (1e-12, 1e-9, 1e-3):
-        assert [*noisier({"probe_noise": size, "scan_scatter": size})]
-        assert not [*noisier({"probe_noise": size, "scan_scatter": 0.3 * size})]
+        assert [*excess_noise_reasons({"probe_noise": size, "scan_scatter": size})]
+        assert not [*excess_noise_reasons({"probe_noise": size, "scan_scatter": 0.3 * size})]
 
 
 def test_where_nothing_is_stated_nothing_is_exceeded() -> None:
-    assert not [*noisier({"scan_scatter": 1e-6})]
-    assert not [*noisier({})]
+    assert not [*excess_noise_reasons({"scan_scatter": 1e-6})]
+    assert not [*excess_noise_reasons({})]
 
 
 def test_what_all_heights_share_adds_in_squares(settled: Calibration) -> None:
     heights = {"dynamics": 2e-9, "tilt": 6e-9, "drift": 9e-9}
-    found = light_of(settled, heights, all_but(), accuracy=30e-9)
+    found = traffic_light_of(settled, heights, all_but(), accuracy=30e-9)
     assert found.uncertainty == pytest.approx(22e-9)
     # Where none is asked for, the accuracy is what is stated.
-    assert light_of(settled, heights, all_but()).accuracy == found.uncertainty
-    nothing = light_of(settled, {}, all_but(), accuracy=1e-9)
+    assert traffic_light_of(settled, heights, all_but()).accuracy == found.uncertainty
+    nothing = traffic_light_of(settled, {}, all_but(), accuracy=1e-9)
     assert (nothing.uncertainty, nothing.level) == (0.0, GREEN)
 
 
 def test_what_is_too_large_stands_before_what_nobody_looked_at(settled: Calibration) -> None:
-    doubt = Reason("half of the points are lost")
-    found = light_of(settled, HEIGHTS, all_but("vibration"), accuracy=9e-9, doubts=[doubt])
+    doubt = TrafficLightReason("half of the points are lost")
+    found = traffic_light_of(settled, HEIGHTS, all_but("vibration"), accuracy=9e-9, doubts=[doubt])
     what = [reason.what for reason in found.reasons]
     assert found.level == RED
     assert "exceeds the accuracy" in what[0]

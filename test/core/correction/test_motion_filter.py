@@ -13,11 +13,11 @@ from omsm_ros.core.correction.motion_filter import (
     SETTLED,
     MotionFilter,
     MotionFilters,
-    forgotten_after,
+    forgetting_samples,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.blocks import Reason
-from omsm_ros.core.streams.pairing import Run
+from omsm_ros.core.streams.blocks import RejectionReason
+from omsm_ros.core.streams.pairing import SampleRun
 from omsm_ros.twin.plant import Plant
 
 G = Plant().dynamics
@@ -32,11 +32,11 @@ X, Y, B, C, ERROR, MOVED, RATE, SENSITIVITIES = range(8)
 SPEED = np.array([2e-3, -1e-3, 3e-3, 0.01, 3.0])
 
 
-def uniform(first: int, length: int, session: int = 0) -> Run:
+def uniform(first: int, length: int, session: int = 0) -> SampleRun:
     """Axes x, y, z, b, c, each at a constant speed."""
     time = (first + np.arange(length)) * 1e-3
     values = SPEED[:, np.newaxis] * time
-    return Run(session, first, 0, 1e6, np.zeros(length, np.uint8), values)
+    return SampleRun(session, first, 0, 1e6, np.zeros(length, np.uint8), values)
 
 
 def new(**lags: float) -> MotionFilter:
@@ -52,7 +52,7 @@ def test_a_uniform_motion_comes_out_late_by_the_lag_from_the_first_sample() -> N
     lag = SPEED[2] * G.low_frequency_delay
     # The settling samples too: uniform motion is what the start assumes.
     assert np.allclose(run.values[ERROR], lag, rtol=1e-6)
-    assert np.array_equal(run.reasons[: settling()], np.full(settling(), Reason.SETTLING))
+    assert np.array_equal(run.reasons[: settling()], np.full(settling(), RejectionReason.SETTLING))
     assert not run.reasons[settling() :].any()
 
 
@@ -74,7 +74,7 @@ def test_a_spindle_that_begins_anew_on_every_turn_is_delayed_alike(
     """Also one that makes a whole turn from sample to sample, where nothing begins anew."""
     once = speed > 1000
     counting, anew = new(lateral_lag=0.4e-3), new(lateral_lag=0.4e-3)
-    both: list[list[Run]] = [[], []]
+    both: list[list[SampleRun]] = [[], []]
     for first in range(0, 400, length):
         run = uniform(first + 10, length)
         turned = replace(run, values=run.values.copy())
@@ -104,7 +104,7 @@ def test_too_few_samples_wait_and_are_settling_at_the_end() -> None:
     assert motion.pending == 5
     (run,) = motion.end()
     assert motion.pending == 0
-    assert np.all(run.reasons == Reason.SETTLING)
+    assert np.all(run.reasons == RejectionReason.SETTLING)
 
 
 @pytest.mark.parametrize(
@@ -114,7 +114,7 @@ def test_an_interruption_settles_again(first: int, session: int) -> None:
     motion = new()
     motion.push(uniform(0, 100))
     (run,) = motion.push(uniform(first, 100, session))
-    assert np.count_nonzero(run.reasons == Reason.SETTLING) == settling()
+    assert np.count_nonzero(run.reasons == RejectionReason.SETTLING) == settling()
 
 
 def test_an_axis_that_is_no_number_splits_the_run() -> None:
@@ -122,8 +122,8 @@ def test_an_axis_that_is_no_number_splits_the_run() -> None:
     broken.values[4, 100:103] = np.nan
     runs = new().push(broken)
     assert [(r.first, len(r)) for r in runs] == [(0, 100), (100, 3), (103, 197)]
-    assert np.all(runs[1].reasons == Reason.INVALID)
-    assert np.count_nonzero(runs[2].reasons == Reason.SETTLING) == settling()
+    assert np.all(runs[1].reasons == RejectionReason.INVALID)
+    assert np.count_nonzero(runs[2].reasons == RejectionReason.SETTLING) == settling()
     assert np.all(np.isfinite(runs[2].values))
 
 
@@ -169,7 +169,7 @@ def test_a_slow_pole_of_small_share_is_forgotten_before_its_decay_ends():
         [1.0, slow * (1 - size)], [1.0, slow + fast, slow * fast]
     )
     expected = slow * np.log(2 * size / SETTLED) / 1e-3
-    assert forgotten_after(dynamics, 1e-3) == pytest.approx(expected, rel=0.01)
+    assert forgetting_samples(dynamics, 1e-3) == pytest.approx(expected, rel=0.01)
     known = replace(CALIBRATION, dynamics=dynamics, covariance=np.zeros((5, 5)))
     shares = MotionFilters.of(known, 1e-3)
     assert shares.settling_samples() < 0.5 * shares.height.settling_samples(SETTLED)

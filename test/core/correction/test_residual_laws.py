@@ -92,14 +92,14 @@ def test_what_does_not_follow_linearly_is_left_at_rest_too() -> None:
     assert Residual(EXACT, PERIOD).largest(np.zeros(COUNT)) == 0.0
 
 
-def test_noise_and_what_could_hide_are_left_apart() -> None:
+def test_noise_and_undetected_error_are_kept_separate() -> None:
     """Of a variance of which a quarter is noise, three quarters could hide."""
     noise = np.diag([0.0, LAG_U**2 / 4, 0.0])
-    told = calibration(certificate={"noise_covariance": [float(v) for v in noise.ravel()]})
-    known, hidden = Residual(told, PERIOD).variances(sine(5.0))
-    np.testing.assert_allclose(hidden[1000:-1000], 3 * known[1000:-1000], rtol=1e-3, atol=1e-24)
+    reported = calibration(certificate={"noise_covariance": [float(v) for v in noise.ravel()]})
+    known, undetected = Residual(reported, PERIOD).variances(sine(5.0))
+    np.testing.assert_allclose(undetected[1000:-1000], 3 * known[1000:-1000], rtol=1e-3, atol=1e-24)
     both = Residual(calibration(), PERIOD).variances(sine(5.0))
-    np.testing.assert_allclose(known + hidden, both[0] + both[1], rtol=1e-6, atol=1e-24)
+    np.testing.assert_allclose(known + undetected, both[0] + both[1], rtol=1e-6, atol=1e-24)
     assert not np.any(both[1])
 
 

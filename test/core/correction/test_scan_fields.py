@@ -10,7 +10,7 @@ import pytest
 from omsm_ros.core.correction.source_kinds import source_of
 from omsm_ros.core.correction.systematic import (
     DECLARED,
-    resolves_turns,
+    resolves_per_turn_waves,
     scan_fields,
     standard_fields,
 )
@@ -80,9 +80,9 @@ def test_without_sources_there_are_no_fields() -> None:
 
 def test_turns_that_the_points_leap_over_are_seen() -> None:
     points = spiral_points(3000)
-    assert resolves_turns(points)
-    assert resolves_turns(replace(points, c=points.c % (2 * np.pi)))
-    assert not resolves_turns(spiral_points(150))
+    assert resolves_per_turn_waves(points)
+    assert resolves_per_turn_waves(replace(points, c=points.c % (2 * np.pi)))
+    assert not resolves_per_turn_waves(spiral_points(150))
 
 
 def waves(*sizes: float) -> np.ndarray:
@@ -103,11 +103,11 @@ def test_only_what_counts_among_all_is_left_of_a_source() -> None:
 
 def test_a_calibration_of_which_nothing_counts_is_left_out_as_a_whole() -> None:
     small, large = {"dynamics": waves(1e-4, 1e-5)}, {"dynamics": waves(1.0, 1e-5)}
-    beside = {"drift": waves(1.0)}
-    assert scan_fields(beside | small, 1).aligned == ()
-    assert scan_fields(beside | small, 1).names == ("drift",)
+    adjacent = {"drift": waves(1.0)}
+    assert scan_fields(adjacent | small, 1).aligned == ()
+    assert scan_fields(adjacent | small, 1).names == ("drift",)
     # But with one that counts the others stay, in their order.
-    found = scan_fields(large | beside, 1)
+    found = scan_fields(large | adjacent, 1)
     assert found.names == ("dynamics", "dynamics", "drift")
     assert found.aligned == ("dynamics",)
     np.testing.assert_array_equal(found.fields[:2], large["dynamics"])

@@ -35,7 +35,7 @@ def added(trace: ScanTrace, part: slice, session: int = 1, late: float = 0.0) ->
 
 def whole(most: int = COUNT) -> ScanTrace:
     trace = ScanTrace(most)
-    trace.hidden = np.array([False, True])
+    trace.undetected = np.array([False, True])
     added(trace, slice(None))
     return trace
 
@@ -53,7 +53,7 @@ def test_all_is_kept_where_there_is_room_counted_from_the_first_point() -> None:
     for name in NAMES:
         assert np.array_equal(column(points, name), COLUMNS[name])
     assert np.array_equal(points.dynamics, MOTION[2:])
-    assert points.hidden.tolist() == [False, True]
+    assert points.undetected.tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("most", "every"), [(500, 1), (499, 2), (250, 2), (249, 4), (16, 32)])
@@ -70,7 +70,7 @@ def test_of_a_longer_scan_every_so_many_th_point_is_kept(most: int, every: int) 
 @given(cuts=st.lists(st.integers(0, COUNT), max_size=8), most=st.sampled_from([7, 100, COUNT]))
 def test_a_scan_in_any_pieces_leaves_the_same_points(cuts: list[int], most: int) -> None:
     trace = ScanTrace(most)
-    trace.hidden = np.array([False, True])
+    trace.undetected = np.array([False, True])
     seen = [added(trace, slice(begin, end)) for begin, end in pairwise([0, *sorted(cuts), COUNT])]
     expected, found = whole(most).points(), trace.points()
     for name in ("time", "z", *NAMES, "dynamics"):

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.calibration.calibration import (
     Calibration,
-    declared,
+    declared_latency,
     latency_of,
-    unresolved,
+    unresolved_latency,
     with_latency,
 )
 from omsm_ros.core.calibration.calibration_set import (
@@ -129,7 +129,7 @@ def test_one_that_may_not_be_used_spoils_the_set(
     assert together(*each).certificate.get("verdict") == expected
 
 
-def test_each_reason_is_told_once() -> None:
+def test_each_reason_is_reported_once() -> None:
     made = together(certified(reasons=["a", "b"]), certified(reasons=["b", "c"]), certified())
     assert made.certificate["reasons"] == ["a", "b", "c"]
 
@@ -139,11 +139,11 @@ def test_an_open_latency_may_be_any_part_of_the_largest_lag(lags: tuple[float, f
     """Of a lead too: what counts is how far the probe may be from the slides."""
     latency = latency_of(together(*map(member, lags)))
     assert not latency.resolved
-    assert latency.beside_z_s == pytest.approx(unresolved(3e-4).beside_z_s)
+    assert latency.beside_z_s == pytest.approx(unresolved_latency(3e-4).beside_z_s)
 
 
 def test_one_open_latency_leaves_that_of_the_set_open() -> None:
-    known = with_latency(member(), declared(3e-4, 1e-4, 1e-6, "maker"))
+    known = with_latency(member(), declared_latency(3e-4, 1e-4, 1e-6, "maker"))
     assert latency_of(together(known, known)).resolved
     assert not latency_of(together(known, member())).resolved
 
@@ -152,7 +152,7 @@ def test_latencies_that_differ_are_uncertain_by_as_much() -> None:
     delays, own = (1.0e-4, 1.3e-4, 1.1e-4), (1e-6, 4e-6, 2e-6)
     made = together(
         *(
-            with_latency(member(), declared(3e-4, delay, u, f"test {k % 2}"))
+            with_latency(member(), declared_latency(3e-4, delay, u, f"test {k % 2}"))
             for k, (delay, u) in enumerate(zip(delays, own, strict=True))
         )
     )

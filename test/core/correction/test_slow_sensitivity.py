@@ -54,7 +54,7 @@ def corrected(known: Calibration, z: np.ndarray) -> Corrector:
     return corrector
 
 
-def test_noise_and_what_could_hide_are_two_terms_of_the_budget():
+def test_noise_and_undetected_error_are_two_terms_of_the_budget():
     z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
     budget = corrected(with_noise(), z).budget
     assert budget["dynamics"] == pytest.approx(
@@ -71,11 +71,11 @@ def test_noise_and_what_could_hide_are_two_terms_of_the_budget():
 def test_noise_that_exceeds_the_covariance_divides_nothing():
     """A certificate whose parts contradict the whole is not believed."""
     known = with_noise(scale=4.0)
-    assert not np.any(known.hidden_covariance)
-    assert np.any(with_noise().hidden_covariance)
+    assert not np.any(known.undetected_error_covariance)
+    assert np.any(with_noise().undetected_error_covariance)
 
 
-def test_the_prediction_names_what_could_hide_and_the_rest_that_would_tell_it():
+def test_the_prediction_states_the_undetected_error_and_the_dwell_that_would_reveal_it():
     z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
     unlimited = MachineLimits(
         servo_frequency=None, probe_range=None, spindle_speed_rpm=None, motion_frequency=None

@@ -18,7 +18,7 @@ from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.machine_errors import Harmonic, SpindleError
-from omsm_ros.twin.part import PartPose, PosedSurface
+from omsm_ros.twin.part import MountedSurface, PartPose
 
 from .systematic_scan import spiral_points
 
@@ -75,7 +75,7 @@ POSES = {
 @pytest.mark.parametrize("name", POSES)
 def test_pose_is_what_the_posed_surface_says(name: str, points: ScanPoints) -> None:
     for field, pose in zip(fields(name, points), POSES[name], strict=True):
-        moved = PosedSurface(PAPER_MIRROR, pose).height(points.x, points.y)
+        moved = MountedSurface(PAPER_MIRROR, pose).height(points.x, points.y)
         # A tilted point goes sideways by its height, which is left out: a hundredth here.
         limit = 2e-2 if name == "tilt" else 2e-3
         difference(name, field, (moved - points.height) / SMALL, limit)
@@ -163,7 +163,7 @@ def test_sources_of_one_name_are_one_source(points: ScanPoints) -> None:
     assert standard_fields(twice, points)["spindle_axial"].shape == (4, len(points))
 
 
-def test_a_flat_has_no_sideways_errors() -> None:
+def test_a_flat_has_no_lateral_errors() -> None:
     flat = spiral_points(100).with_slopes(Flat())
     for name in ("decentre", "clocking", "centre_x", "spindle_radial", "probe_slope"):
         assert not np.any(fields(name, flat)), name

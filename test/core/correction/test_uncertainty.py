@@ -16,7 +16,7 @@ from omsm_ros.core.correction.uncertainty import (
     ErrorSources,
     contributions,
     sensitivity_filters,
-    with_lateral,
+    with_lateral_uncertainty,
 )
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -237,7 +237,7 @@ def test_contributions_by_hand() -> None:
     assert found["lateral_lag"] == pytest.approx([81e-6, 100e-6])
 
 
-def test_a_sideways_lag_costs_its_uncertainty_times_the_speed() -> None:
+def test_probe_latency_adds_its_uncertainty_times_the_speed() -> None:
     lag = 5e-6
     known = calibration(np.zeros((7, 7)))
     points = correct(known, Z, DISTANCE, ErrorSources(lateral_lag=lag))
@@ -251,11 +251,13 @@ def test_a_sideways_lag_costs_its_uncertainty_times_the_speed() -> None:
 def test_lateral_uncertainty_counts_by_the_slope() -> None:
     points = correct(calibration(np.zeros((7, 7))), Z, DISTANCE, ErrorSources(probe_noise=3e-9))
     points = replace(points, x=np.full(len(points), 6e-3), y=np.full(len(points), 8e-3))
-    bowl = with_lateral(points, Sphere(0.1), 1e-6)
+    bowl = with_lateral_uncertainty(points, Sphere(0.1), 1e-6)
     # tan of the angle whose sine is 10 mm / 100 mm.
     slope = 0.1 / np.sqrt(0.99)
     assert np.allclose(bowl.uncertainty, np.hypot(3e-9 / GAIN, slope * 1e-6), rtol=1e-5)
-    assert np.all(with_lateral(points, PAPER_MIRROR, 0.0).uncertainty == points.uncertainty)
+    assert np.all(
+        with_lateral_uncertainty(points, PAPER_MIRROR, 0.0).uncertainty == points.uncertainty
+    )
 
 
 def test_the_certificate_tells_noise_and_gain() -> None:

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import optimize
 
-from omsm_ros.core.estimation.optimisation import Effort, Projection, descend
+from omsm_ros.core.estimation.optimisation import EvaluationBudget, Projection, descend
 from omsm_ros.core.streams.blocks import FloatArray
 
 Function = Callable[[FloatArray], FloatArray]
-WIDE = 1e3
+BROAD = 1e3
 
 
 class Watched:
@@ -36,7 +36,7 @@ class Watched:
 
 
 def open_box(size: int) -> tuple[FloatArray, FloatArray]:
-    return np.full(size, -WIDE), np.full(size, WIDE)
+    return np.full(size, -BROAD), np.full(size, BROAD)
 
 
 def cost(at: Projection) -> float:
@@ -172,10 +172,10 @@ def test_more_tries_are_never_worse() -> None:
 
 def test_a_step_that_makes_it_worse_is_not_taken() -> None:
     """Newton's method on an arcus tangent goes from 3 to -9 and on, ever further out."""
-    bent = Watched(
+    curved = Watched(
         lambda p: np.arctan(10 * p), lambda p: np.array([10 / (1 + (10 * p) ** 2)]).reshape(1, 1)
     )
-    left = [cost(bent.down([0.3], *open_box(1), k)) for k in range(15)]
+    left = [cost(curved.down([0.3], *open_box(1), k)) for k in range(15)]
     assert all(later <= before for before, later in pairwise(left))
     assert left[-1] < 1e-6 * left[0]
 
@@ -236,27 +236,27 @@ def test_half_the_slope_and_the_curvature_are_those_of_the_sum_of_squares() -> N
 
 
 def test_effort_is_spent_at_some_time() -> None:
-    effort = Effort()
+    effort = EvaluationBudget()
     assert not effort.spent
     effort.comparisons += 100_000
     assert effort.spent
 
 
-def compared(samples: int, times: int, effort: Effort) -> Effort:
+def compared(samples: int, times: int, effort: EvaluationBudget) -> EvaluationBudget:
     for _ in range(times):
         effort.count(samples)
     return effort
 
 
 def test_a_record_of_ten_seconds_is_compared_1500_times() -> None:
-    effort = compared(10_000, 1500, Effort())
+    effort = compared(10_000, 1500, EvaluationBudget())
     assert not effort.spent
     assert compared(10_000, 1, effort).spent
 
 
 def test_comparisons_with_fewer_samples_cost_what_they_take() -> None:
     """Those of a long record: hundreds with all of it, thousands with a tenth."""
-    effort = compared(200_000, 200, Effort())
+    effort = compared(200_000, 200, EvaluationBudget())
     assert not compared(20_000, 2000, effort).spent
     assert effort.comparisons == 200
     assert compared(20_000, 1000, effort).spent
@@ -265,7 +265,7 @@ def test_comparisons_with_fewer_samples_cost_what_they_take() -> None:
 def test_ever_longer_records_are_compared_less_often() -> None:
     most = []
     for samples in (20_000, 40_000, 400_000):
-        effort = Effort()
+        effort = EvaluationBudget()
         while not effort.spent:
             effort.count(samples)
         most.append(effort.comparisons)

@@ -6,7 +6,7 @@ from scipy import signal
 
 from omsm_ros.core.estimation.model_order import StartingPoints
 from omsm_ros.core.estimation.model_structure import Structure
-from omsm_ros.core.estimation.noise import smoothed, without_unfollowed
+from omsm_ros.core.estimation.noise import correct_errors_in_variables, smoothed
 from omsm_ros.core.estimation.output_error import evaluated, fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Edge, find_steps
@@ -59,7 +59,7 @@ def cleaned(record):
     problem = prepare(record, "encoder").problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     two = Structure(2, 0, True)
-    return problem, without_unfollowed(
+    return problem, correct_errors_in_variables(
         problem, fit(problem, two, StartingPoints(problem, lag).of(two, [lag]))
     )
 
@@ -112,7 +112,7 @@ def test_noise_of_the_encoder_is_taken_out():
     assert quiet is not None
     added = problem.input - (z - np.mean(z))
     rests = np.abs(np.gradient(z)) == 0
-    taken = quiet.unfollowed[rests]
+    taken = quiet.errors_in_variables[rests]
     assert taken @ added[rests] / (taken @ taken) == pytest.approx(1.0, abs=0.03)
     assert np.std(quiet.input[rests] - (z - np.mean(z))[rests]) < 0.5e-9
 
@@ -121,7 +121,7 @@ def test_what_the_probe_follows_stays():
     """Jitter of the axis itself, some of it too slow to tell from a rest, and hardly any noise."""
     z = staircase(500)
     _, quiet = cleaned(record_of(z + jitter(len(z), 3e-9, 120.0), 0.05e-9))
-    assert quiet is None or np.std(quiet.unfollowed) < 0.3e-9
+    assert quiet is None or np.std(quiet.errors_in_variables) < 0.3e-9
 
 
 def test_half_followed_is_half_taken_out():
@@ -131,40 +131,40 @@ def test_half_followed_is_half_taken_out():
     problem, quiet = cleaned(record_of(shaken, 3e-9))
     assert quiet is not None
     rests = np.abs(np.gradient(z)) == 0
-    shown, taken = (problem.input - (z - np.mean(z)))[rests], quiet.unfollowed[rests]
+    shown, taken = (problem.input - (z - np.mean(z)))[rests], quiet.errors_in_variables[rests]
     assert shown @ taken / (shown @ shown) == pytest.approx(0.5, abs=0.12)
 
 
-def test_a_hum_that_is_followed_stays_beside_noise_that_is_not():
+def test_real_hum_is_kept_while_encoder_noise_is_removed():
     z = staircase(500)
     time = np.arange(len(z)) * PERIOD
     hum = 3e-9 * np.sin(2 * np.pi * 48.0 * time)
     _, quiet = cleaned(record_of(z + hum, 2e-9))
     assert quiet is not None
-    lines = np.abs(np.fft.rfft(quiet.unfollowed)) ** 2
+    lines = np.abs(np.fft.rfft(quiet.errors_in_variables)) ** 2
     near = np.abs(np.fft.rfftfreq(len(z), PERIOD) - 48.0) < 0.2
     there = np.sum(np.abs(np.fft.rfft(hum)[near]) ** 2)
     assert np.sum(lines[near]) < 0.02 * there
-    assert np.std(quiet.unfollowed) > 1.5e-9
+    assert np.std(quiet.errors_in_variables) > 1.5e-9
 
 
 def test_it_is_taken_out_once():
     _, quiet = cleaned(record_of(staircase(500), 3e-9))
     again = evaluated(quiet, Structure(0, 0, True), np.array([0.1]))
-    assert without_unfollowed(quiet, again) is None
+    assert correct_errors_in_variables(quiet, again) is None
 
 
 @pytest.mark.parametrize("rest", [500, 2000])
 @pytest.mark.parametrize("noise", [1e-9, 4e-9])
-def test_a_light_mode_is_known_beside_it(rest, noise):
+def test_a_lightly_damped_mode_is_known_in_addition(rest, noise):
     """Without a word of backlash, other modes or errors of the scale, which swallow noise too."""
     found = identify(record_of(staircase(rest), noise)).calibration
     certificate = found.certificate
     assert str(certificate["verdict"]).startswith("accepted,")
     assert certificate["reservations"] == []
     assert certificate["encoder_noise_m"] == pytest.approx(noise, rel=0.1)
-    told = any("did not follow" in warning for warning in certificate["warnings"])
-    assert told == (noise > READING / 3)
+    reported = any("did not follow" in warning for warning in certificate["warnings"])
+    assert reported == (noise > READING / 3)
     poles = found.dynamics.poles()
     mode = poles[np.argmin(np.abs(np.abs(poles) - OMEGA))]
     assert abs(mode) == pytest.approx(OMEGA, rel=1e-3)

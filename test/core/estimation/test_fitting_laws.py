@@ -12,7 +12,7 @@ from scipy import linalg, signal
 
 from omsm_ros.core.estimation.covariance import (
     autoregression,
-    hidden_motion_covariance,
+    inter_sample_motion_covariance,
     noise_spectrum,
     parameter_covariance,
 )
@@ -116,7 +116,7 @@ CURVE = np.sin(2 * np.pi * np.arange(5000) / 900)
 
 
 @pytest.mark.parametrize("noise", [1e-9, 3e-8])
-def test_noise_on_a_smooth_motion_is_told_from_it(noise: float) -> None:
+def test_noise_on_a_smooth_motion_is_distinguished_from_it(noise: float) -> None:
     z = 50e-6 * CURVE + np.random.default_rng(1).normal(0, noise, 5000)
     assert sample_noise(z) == pytest.approx(noise, rel=0.05)
 
@@ -311,11 +311,11 @@ def test_a_process_of_known_poles_is_whitened_by_them(poles: list[complex]) -> N
     assert noise_spectrum(noise, 256) == pytest.approx(4.0 * np.abs(response) ** 2, rel=0.3)
 
 
-def test_motion_hidden_between_samples_moves_lag_and_curvature_by_its_bound() -> None:
+def test_motion_unseen_between_samples_moves_lag_and_curvature_by_its_bound() -> None:
     g = TransferFunction(np.array([1.0, -1e-4]), np.array([1.0, 3e-4, 6e-8]), 1e-4)
-    found = hidden_motion_covariance(g, 2e-6, PERIOD)
+    found = inter_sample_motion_covariance(g, 2e-6, PERIOD)
     bend = 2e-6 * PERIOD / (2 * np.pi * 0.1)
     expected = np.diag([0.0, 0.0, (2e-6) ** 2 / 3, bend**2 / 3, 0.0])
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=0)
-    pure = hidden_motion_covariance(TransferFunction(np.ones(1), np.ones(1)), 2e-6, PERIOD)
+    pure = inter_sample_motion_covariance(TransferFunction(np.ones(1), np.ones(1)), 2e-6, PERIOD)
     np.testing.assert_allclose(pure, np.diag([0.0, (2e-6) ** 2 / 3]), rtol=1e-12, atol=0)

@@ -11,7 +11,7 @@ from omsm_ros.core.estimation.sampled_model import (
     Discrete,
     SampledModel,
     free_run,
-    resting_output,
+    stationary_output,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import IdentificationError
@@ -96,7 +96,7 @@ def test_what_does_not_count_changes_nothing():
 
 def test_the_output_that_rests_where_the_input_has_its_mean():
     u, y = moving()
-    found = resting_output(held().discrete, u, y, np.ones(2000, bool))
+    found = stationary_output(held().discrete, u, y, np.ones(2000, bool))
     assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 4.0), abs=2e-2)
 
 
@@ -120,7 +120,7 @@ def test_the_resting_output_of_a_single_step():
     u = np.where(np.arange(2000) < 400, 3.0, 5.0)
     discrete = held().discrete
     y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, u - 3.0)
-    found = resting_output(discrete, u, y, np.ones(2000, bool))
+    found = stationary_output(discrete, u, y, np.ones(2000, bool))
     assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 3.0), abs=1e-6)
 
 

@@ -64,7 +64,7 @@ def test_the_order_is_chosen_near_the_truth():
     assert np.std((output_of(found, y, used) - y)[~used]) < 0.03
 
 
-def test_an_order_asked_for_is_given_beside_the_free_choice():
+def test_a_requested_order_is_reported_with_the_free_choice():
     u, y = held_system(noise=0.02)
     found = choose_sampled(u, y, first_half(600), 0.1, order=7)
     assert found.chosen.order == 7
@@ -119,8 +119,8 @@ def test_a_pole_more_is_taken_for_half_a_standard_error(gain, order):
     small, large = (
         SampledCandidate(None, None, n, False, 10.0 + more) for n, more in ((1, 0.0), (2, differs))
     )
-    small = replace(small, hidden=np.full(7, 10.0))
-    assert sampled_choice.plainest([small, large]).order == order
+    small = replace(small, held_out=np.full(7, 10.0))
+    assert sampled_choice.simplest_undominated([small, large]).order == order
 
 
 def test_what_no_model_predicts_is_given_none():

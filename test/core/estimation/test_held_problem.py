@@ -8,14 +8,18 @@ from scipy import signal
 
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
-from omsm_ros.core.estimation.sampled_fit import DiscreteScaled, HeldProblem, coefficients
+from omsm_ros.core.estimation.sampled_fit import (
+    ScaledDiscreteStructure,
+    ZeroOrderHoldProblem,
+    coefficients,
+)
 
 PERIOD, SAMPLES = 0.1, 300
 POLES = np.array([0.9 * np.exp(0.4j), 0.9 * np.exp(-0.4j), 0.7])
 A = np.poly(POLES).real
 B = np.array([0.1, 0.5, -0.2, 0.05])
 STRUCTURE = Structure(3, 3, False)
-SCALED = DiscreteScaled(STRUCTURE, 0.5 / PERIOD)
+SCALED = ScaledDiscreteStructure(STRUCTURE, 0.5 / PERIOD)
 
 
 def problem(noise=0.0, seed=1, start=(0.3, -1.0, 2.0)):
@@ -23,7 +27,7 @@ def problem(noise=0.0, seed=1, start=(0.3, -1.0, 2.0)):
     u = np.repeat(rng.choice([-1.0, 1.0], SAMPLES // 4), 4)
     y, _ = signal.lfilter(B, A, u, zi=np.array(start))
     y = y + rng.normal(0.0, noise, SAMPLES) if noise else y
-    return HeldProblem(
+    return ZeroOrderHoldProblem(
         u - u.mean(), y, np.ones(SAMPLES, bool), PERIOD, np.ones((SAMPLES, 1)), 0.5 / PERIOD
     )
 
@@ -99,7 +103,7 @@ def test_the_columns_are_the_derivatives_of_the_output():
 def test_twenty_poles_stay_finite():
     """Powers of w up to the twentieth would overflow at half the sampling rate."""
     structure = Structure(20, 20, False)
-    scaled = DiscreteScaled(structure, 0.5 / PERIOD)
+    scaled = ScaledDiscreteStructure(structure, 0.5 / PERIOD)
     poles = 0.95 * np.exp(1j * np.linspace(0.2, 3.0, 10))
     of = problem(0.01)
     at = of.project(scaled, scaled.of_discrete(np.concatenate([poles, poles.conj()])))
@@ -107,7 +111,7 @@ def test_twenty_poles_stay_finite():
     assert np.all(np.isfinite(at.jacobian))
 
 
-def test_a_run_behind_a_gap_does_not_look_at_what_is_hidden():
+def test_a_run_after_a_gap_ignores_held_out_samples():
     of = problem(0.01)
     used = np.arange(SAMPLES) < 200
     spoiled = replace(of, output=np.where(used, of.output, 1e6), used=used)

@@ -9,14 +9,14 @@ from scipy import signal
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.sampled_choice import SampledCandidate
-from omsm_ros.core.estimation.sampled_fit import HeldProblem
+from omsm_ros.core.estimation.sampled_fit import ZeroOrderHoldProblem
 from omsm_ros.core.estimation.sampled_model import Discrete
 from omsm_ros.core.identification.sampled_identification import (
     HOLDS,
     _Known,
     identify_samples,
-    longest_range,
     sampled_certificate,
+    widest_valid_range,
 )
 from omsm_ros.core.lti.frequency_response import Band, ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -63,7 +63,9 @@ def test_stated_uncertainties_hold_over_many_records():
     for seed in range(60):
         u, y = recorded("zero-order", seed=seed, samples=400)
         used = np.ones(400, bool)
-        problem = HeldProblem(u - u.mean(), y, used, PERIOD, np.ones((400, 1)), 0.5 / PERIOD)
+        problem = ZeroOrderHoldProblem(
+            u - u.mean(), y, used, PERIOD, np.ones((400, 1)), 0.5 / PERIOD
+        )
         start = problem.parametrised(structure).of_discrete(np.roots(a))
         found = fit(problem, structure, [start])
         known = _Known.of(SampledCandidate(problem, found, 2, False, np.empty(0)), 0, PERIOD)
@@ -188,8 +190,8 @@ class TestVerdict:
         frequency = np.array([1.0, 2.0, 3.0, 4.0, 8.0, 16.0, 32.0])
         gain = np.array([0.01, 0.01, 1.0, 0.01, 0.01, 0.01, 1.0])
         band = Band(frequency, gain, np.zeros(7))
-        assert longest_range(band, self.LIMITS) == (4.0, 16.0)
-        assert longest_range(replace(band, phase=np.ones(7)), self.LIMITS) == (1.0, 1.0)
+        assert widest_valid_range(band, self.LIMITS) == (4.0, 16.0)
+        assert widest_valid_range(replace(band, phase=np.ones(7)), self.LIMITS) == (1.0, 1.0)
 
 
 def sines(frequencies, samples=4000):

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import Problem, fit
-from omsm_ros.core.identification.model_choice import starts_ringing
+from omsm_ros.core.identification.model_choice import has_initial_response
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
 PERIOD, RATE, SAMPLES, SKIPPED = 1e-3, 2 * np.pi * 50, 4000, 50
@@ -40,7 +40,7 @@ def problem(amplitude, seed=1):
 
 
 def fitted(of):
-    start = Scaled(MODE, RATE).nonlinear_of(TRUTH.poles() / RATE, 0.0)
+    start = ScaledStructure(MODE, RATE).nonlinear_of(TRUTH.poles() / RATE, 0.0)
     return fit(of, MODE, [start])
 
 
@@ -57,17 +57,19 @@ def test_free_decays_are_those_of_the_differential_equation():
 @pytest.mark.parametrize("amplitude", [0.0, 100e-9, 3e-6])
 def test_ringing_is_seen_where_it_is(amplitude):
     of = problem(amplitude)
-    assert starts_ringing(of, fitted(of)) is (amplitude > 0)
+    assert has_initial_response(of, fitted(of)) is (amplitude > 0)
 
 
 def test_a_record_that_starts_moving_is_not_asked():
     """What moved before is unknown; a little of it would bias long before it showed."""
     of = problem(0.0)
-    assert starts_ringing(of, fitted(of), at_rest=False)
+    assert has_initial_response(of, fitted(of), at_rest=False)
 
 
 def test_a_chance_is_rarely_taken_for_ringing():
-    assert not any(starts_ringing(of, fitted(of)) for of in (problem(0.0, s) for s in range(40)))
+    assert not any(
+        has_initial_response(of, fitted(of)) for of in (problem(0.0, s) for s in range(40))
+    )
 
 
 def test_with_free_decays_only_noise_is_left():
@@ -106,8 +108,11 @@ def test_fast_poles_are_over_before_the_first_sample_that_counts():
     """Then nothing is looked for, whatever the residual holds."""
     fast = Structure(1, 0, False)
     of = problem(3e-6)
-    found = fit(of, fast, [Scaled(fast, RATE).nonlinear_of(np.array([-4000 / RATE + 0j]), 0.0)])
-    quick = replace(
-        found, nonlinear=Scaled(fast, RATE).nonlinear_of(np.array([-4000 / RATE + 0j]), 0.0)
+    found = fit(
+        of, fast, [ScaledStructure(fast, RATE).nonlinear_of(np.array([-4000 / RATE + 0j]), 0.0)]
     )
-    assert not starts_ringing(of, quick)
+    quick = replace(
+        found,
+        nonlinear=ScaledStructure(fast, RATE).nonlinear_of(np.array([-4000 / RATE + 0j]), 0.0),
+    )
+    assert not has_initial_response(of, quick)

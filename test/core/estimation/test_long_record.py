@@ -5,8 +5,12 @@ import pytest
 from scipy import signal
 
 from omsm_ros.core.estimation import sampled_choice
-from omsm_ros.core.estimation.sampled_choice import CHOSEN_ON, choose_of_any_length, telling_part
-from omsm_ros.core.estimation.sampled_fit import HeldProblem
+from omsm_ros.core.estimation.sampled_choice import (
+    CHOSEN_ON,
+    choose_sampled_long,
+    most_exciting_part,
+)
+from omsm_ros.core.estimation.sampled_fit import ZeroOrderHoldProblem
 from omsm_ros.core.identification.sampled_identification import identify_samples
 from omsm_ros.errors import IdentificationError
 
@@ -55,7 +59,7 @@ def test_a_plant_slower_than_the_part_is_found_on_the_whole():
 def test_an_order_that_is_asked_for_is_kept():
     u = telegraph(MANY)
     y = signal.lfilter([0.0, 0.3], [1.0, -0.7], u) + np.random.default_rng(5).normal(0, 0.1, MANY)
-    choice = choose_of_any_length(u, y, np.ones(MANY, bool), 1.0, order=3)
+    choice = choose_sampled_long(u, y, np.ones(MANY, bool), 1.0, order=3)
     assert choice.chosen.order == 3
     assert choice.free.order == 1
     assert len(choice.chosen.fit.residual) == MANY
@@ -65,11 +69,11 @@ def test_the_part_is_one_in_which_the_input_moves():
     u = np.zeros(5 * CHOSEN_ON)
     u[-CHOSEN_ON:] = telegraph(CHOSEN_ON)
     used = np.ones(len(u), bool)
-    part = telling_part(u, used)
+    part = most_exciting_part(u, used)
     assert part.start <= 4 * CHOSEN_ON
     assert part.stop > 4 * CHOSEN_ON
     used[::3] = False
-    part = telling_part(u, used)
+    part = most_exciting_part(u, used)
     assert np.sum(used[part]) == CHOSEN_ON
     assert np.ptp(u[part]) > 0
 
@@ -94,24 +98,24 @@ def test_long_records_are_refused_as_short_ones_are(change, says):
     u = telegraph(MANY)
     u, y = change(u, u.copy())
     with pytest.raises(IdentificationError, match=says):
-        choose_of_any_length(u, y, np.ones(MANY, bool), 1.0, order=4)
+        choose_sampled_long(u, y, np.ones(MANY, bool), 1.0, order=4)
 
 
 def test_five_times_as_long_costs_no_more_than_so_many_times_as_much(monkeypatch):
     """In numbers computed; all orders on all parts would be five times as much and more."""
     spent = [0]
-    plain = HeldProblem.project
+    plain = ZeroOrderHoldProblem.project
 
     def counted(self, scaled, nonlinear):
         spent[0] += int(np.sum(self.used)) * (2 * scaled.structure.poles + 3)
         return plain(self, scaled, nonlinear)
 
-    monkeypatch.setattr(HeldProblem, "project", counted)
+    monkeypatch.setattr(ZeroOrderHoldProblem, "project", counted)
     costs = []
     monkeypatch.setattr(sampled_choice, "CHOSEN_ON", 1000)  # else it takes ten seconds
     for samples in (1000, 5000):
         u, spent[0] = telegraph(samples), 0
         y = np.tanh(2 * signal.lfilter([0.0, 0.142, 0.135], [1.0, -1.584, 0.861], u))
-        choose_of_any_length(u, y, np.ones(samples, bool), 1.0)
+        choose_sampled_long(u, y, np.ones(samples, bool), 1.0)
         costs.append(spent[0])
     assert costs[1] < 3 * costs[0]

@@ -10,18 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from omsm_ros.core.estimation.sampled_fit import FIRST_ORDER, ZERO_ORDER, held_equivalent
+from omsm_ros.core.estimation.sampled_fit import FIRST_ORDER, ZERO_ORDER, zero_order_hold_equivalent
 from omsm_ros.core.estimation.sampled_model import (
     BAND_LIMITED,
     Discrete,
     SampledModel,
     free_run,
-    resting_output,
+    stationary_output,
 )
 from omsm_ros.core.identification.sampled_identification import (
     identify_samples,
-    longest_range,
     sampled_certificate,
+    widest_valid_range,
 )
 from omsm_ros.core.lti.frequency_response import Band, ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -107,7 +107,7 @@ def test_a_pole_alone_by_hand() -> None:
 def test_a_lag_behind_a_zero_order_hold_by_hand(gain: float) -> None:
     """x[k+1] = p x[k] + (1 - p) g u[k], p = exp(-T/τ)."""
     numerator = np.array([0.0, gain * (1 - POLE)])
-    found = held_equivalent(numerator, np.array([1.0, -POLE]), PERIOD, ZERO_ORDER)
+    found = zero_order_hold_equivalent(numerator, np.array([1.0, -POLE]), PERIOD, ZERO_ORDER)
     assert found is not None
     assert found.denominator == pytest.approx([1.0, -PERIOD / np.log(POLE)])
     assert found.numerator[0] == pytest.approx(gain)
@@ -119,7 +119,9 @@ def test_a_lag_behind_a_first_order_hold_by_hand() -> None:
     tau = -PERIOD / np.log(POLE)
     b0 = 1 - tau / PERIOD * (1 - POLE)
     b1 = tau / PERIOD * (1 - POLE) - POLE
-    found = held_equivalent(np.array([b0, b1]), np.array([1.0, -POLE]), PERIOD, FIRST_ORDER)
+    found = zero_order_hold_equivalent(
+        np.array([b0, b1]), np.array([1.0, -POLE]), PERIOD, FIRST_ORDER
+    )
     assert found is not None
     lag = TransferFunction(np.ones(1), np.array([1.0, tau]))
     np.testing.assert_allclose(found.response(LINES), lag.response(LINES), rtol=1e-9)
@@ -139,19 +141,23 @@ def test_any_modes_come_back_through_either_hold(
         down = np.polymul([omega**-2, 2 * damping / omega, 1.0], down)
     up, sampled, _ = signal.cont2discrete(([0.01, 1.0], down), PERIOD, hold)
     name = ZERO_ORDER if hold == "zoh" else FIRST_ORDER
-    found = held_equivalent(np.ravel(up), sampled, PERIOD, name)
+    found = zero_order_hold_equivalent(np.ravel(up), sampled, PERIOD, name)
     assert found is not None
     truth = TransferFunction.from_ascending([1.0, 0.01], down[::-1])
     np.testing.assert_allclose(found.response(LINES[:4]), truth.response(LINES[:4]), rtol=1e-4)
 
 
 def test_a_numerator_longer_than_the_denominator_has_no_equivalent() -> None:
-    assert held_equivalent(np.ones(3), np.array([1.0, -POLE]), PERIOD, ZERO_ORDER) is None
+    assert (
+        zero_order_hold_equivalent(np.ones(3), np.array([1.0, -POLE]), PERIOD, ZERO_ORDER) is None
+    )
 
 
 def test_the_scale_of_both_polynomials_does_not_matter() -> None:
     b, a = np.array([0.0, 0.3, 0.1]), np.array([1.0, -1.2, 0.5])
-    plain, scaled = (held_equivalent(f * b, f * a, PERIOD, ZERO_ORDER) for f in (1.0, -2.5))
+    plain, scaled = (
+        zero_order_hold_equivalent(f * b, f * a, PERIOD, ZERO_ORDER) for f in (1.0, -2.5)
+    )
     assert plain is not None
     assert scaled is not None
     np.testing.assert_allclose(scaled.response(LINES), plain.response(LINES), rtol=1e-12)
@@ -168,16 +174,16 @@ def band(gain: FloatArray | float, phase: FloatArray | float = 0.0) -> Band:
 
 
 def test_all_of_a_band_within_the_limits_is_the_range() -> None:
-    assert longest_range(band(0.01, 0.01), LIMITS) == (GRID[0], GRID[-1])
-    assert longest_range(band(0.2), LIMITS) == (GRID[0], GRID[0])
-    assert longest_range(band(0.0, 0.2), LIMITS) == (GRID[0], GRID[0])
+    assert widest_valid_range(band(0.01, 0.01), LIMITS) == (GRID[0], GRID[-1])
+    assert widest_valid_range(band(0.2), LIMITS) == (GRID[0], GRID[0])
+    assert widest_valid_range(band(0.0, 0.2), LIMITS) == (GRID[0], GRID[0])
 
 
 @settings(max_examples=40)
 @given(inside=st.lists(st.booleans(), min_size=31, max_size=31), by=st.sampled_from("gps"))
 def test_the_range_is_the_widest_run_however_it_ends(inside: list[bool], by: str) -> None:
     size = np.where(inside, 0.01, 0.2)
-    found = longest_range(
+    found = widest_valid_range(
         band(size if by == "g" else 0.0, size if by == "p" else 0.0),
         LIMITS,
         np.array(inside) if by == "s" else None,
@@ -190,8 +196,8 @@ def test_the_range_is_the_widest_run_however_it_ends(inside: list[bool], by: str
 
 def test_half_a_width_of_95_percent_is_what_counts() -> None:
     just = 0.1 / 1.96
-    assert longest_range(band(0.999 * just), LIMITS)[1] == GRID[-1]
-    assert longest_range(band(1.001 * just), LIMITS)[1] == GRID[0]
+    assert widest_valid_range(band(0.999 * just), LIMITS)[1] == GRID[-1]
+    assert widest_valid_range(band(1.001 * just), LIMITS)[1] == GRID[0]
 
 
 def certificate(**changes: object) -> dict[str, object]:
@@ -305,9 +311,9 @@ def test_the_resting_output_is_that_of_the_mean_input() -> None:
     used = np.ones(len(U), np.bool_)
     gain = np.sum(MODE.numerator) / np.sum(MODE.denominator)
     expected = 30.0 + gain * (np.mean(U) - 4.0)
-    assert resting_output(MODE, U, Y, used) == pytest.approx(expected, abs=1e-9)
+    assert stationary_output(MODE, U, Y, used) == pytest.approx(expected, abs=1e-9)
     spoiled = np.where(np.arange(len(U)) % 50 == 7, 1e3, Y)
-    assert resting_output(MODE, U, spoiled, spoiled < 1e2) == pytest.approx(expected, abs=1e-9)
+    assert stationary_output(MODE, U, spoiled, spoiled < 1e2) == pytest.approx(expected, abs=1e-9)
 
 
 def test_a_band_limited_model_runs_by_its_continuous_half() -> None:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 
 EVERY = [Structure(n, m, d) for n in range(1, 6) for m in range(n) for d in (False, True)]
 
@@ -20,7 +20,7 @@ def random_shape(scaled, seed):
 @settings(max_examples=60)
 @given(structure=st.sampled_from(EVERY), seed=st.integers(0, 10_000))
 def test_every_shape_is_stable(structure, seed):
-    scaled = Scaled(structure, 300.0)
+    scaled = ScaledStructure(structure, 300.0)
     numerator = np.ones(structure.zeros + 1)
     assert scaled.transfer_function(random_shape(scaled, seed), numerator).is_stable
 
@@ -28,7 +28,7 @@ def test_every_shape_is_stable(structure, seed):
 @settings(max_examples=60)
 @given(structure=st.sampled_from(EVERY), seed=st.integers(0, 10_000))
 def test_the_lag_is_the_response_without_its_numerator(structure, seed):
-    scaled = Scaled(structure, 300.0)
+    scaled = ScaledStructure(structure, 300.0)
     shape = random_shape(scaled, seed)
     numerator = np.concatenate([[1.0], np.random.default_rng(seed).normal(size=structure.zeros)])
     frequency = np.geomspace(0.1, 500, 20)
@@ -40,7 +40,7 @@ def test_the_lag_is_the_response_without_its_numerator(structure, seed):
 
 @pytest.mark.parametrize("structure", EVERY, ids=Structure.label)
 def test_the_gradient_is_that_of_finite_differences(structure):
-    scaled = Scaled(structure, 300.0)
+    scaled = ScaledStructure(structure, 300.0)
     shape = random_shape(scaled, 7)
     s = 1j * np.geomspace(0.01, 10, 15)
     lag, relative = scaled.lag(shape, s), scaled.lag_slopes(shape, s)
@@ -53,7 +53,7 @@ def test_the_gradient_is_that_of_finite_differences(structure):
 
 @pytest.mark.parametrize("structure", EVERY, ids=Structure.label)
 def test_the_jacobian_of_the_coefficients_is_that_of_finite_differences(structure):
-    scaled = Scaled(structure, 300.0)
+    scaled = ScaledStructure(structure, 300.0)
     shape = random_shape(scaled, 5)
     numerator = np.concatenate([[1.0], np.arange(1.0, structure.zeros + 1)])
 
@@ -74,7 +74,7 @@ def test_the_jacobian_of_the_coefficients_is_that_of_finite_differences(structur
 
 def test_a_nonlinear_of_poles_has_those_poles():
     poles = np.array([-1 + 3j, -1 - 3j, -0.5, -4.0, -9.0], complex)
-    scaled = Scaled(Structure(5, 0, True), 200.0)
+    scaled = ScaledStructure(Structure(5, 0, True), 200.0)
     g = scaled.transfer_function(scaled.nonlinear_of(poles, 0.25), np.ones(1))
     np.testing.assert_allclose(
         np.sort_complex(g.poles() / 200.0), np.sort_complex(poles), rtol=1e-6

@@ -19,7 +19,7 @@ from omsm_ros.core.estimation.model_order import (
     structures,
 )
 from omsm_ros.core.estimation.model_structure import Structure
-from omsm_ros.core.estimation.optimisation import Effort
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -41,7 +41,7 @@ def problem_of(dynamics, seed=1):
     moved = respond(Plant(dynamics), motion, round(motion.duration / 1e-3), 1e-3)
     n = len(moved.probe)
     seen = moved.probe + np.random.default_rng(seed).normal(0.0, NOISE, n)
-    return Problem(moved.carriage, seen, np.ones(n, bool), 1e-3, np.ones((n, 1)), 300.0)
+    return Problem(moved.slide, seen, np.ones(n, bool), 1e-3, np.ones((n, 1)), 300.0)
 
 
 def fitter(problem):
@@ -83,7 +83,7 @@ def test_a_structure_has_one_or_two_zeros_fewer_and_a_delay_or_none_the_smallest
 
 
 def test_no_order_is_begun_once_enough_was_tried():
-    spent = Effort(comparisons=10**6)
+    spent = EvaluationBudget(comparisons=10**6)
     to = [
         max(c.fit.structure.poles for c in explore(fitter(problem_of(PAIR)), order, effort=spent))
         for order in (0, 3)
@@ -118,7 +118,7 @@ def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
 
 
 @pytest.mark.parametrize(
-    ("frequency", "damping", "told"),
+    ("frequency", "damping", "reported"),
     [
         (50.0, 0.01, True),
         (50.0, 1e-4, False),  # decays to 1/e in 32 s, the record takes ten
@@ -127,10 +127,10 @@ def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
         (7e6, 1.0, True),  # too fast to be seen, and harmless
     ],
 )
-def test_a_pole_is_told_by_samples_it_shows_in(frequency, damping, told):
+def test_a_pole_is_identified_from_samples_in_which_it_is_visible(frequency, damping, reported):
     omega = 2 * np.pi * frequency
     pair = TransferFunction.from_ascending([1.0], [1.0, 2 * damping / omega, omega**-2])
-    assert identifiable(pair, 1e-3, 10.0) is told
+    assert identifiable(pair, 1e-3, 10.0) is reported
 
 
 @pytest.mark.parametrize(("truth", "poles"), [(FIRST_ORDER, 1), (PAIR, 2), (PAIR_AND_POLE, 3)])

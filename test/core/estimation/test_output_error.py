@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import Problem, close_period, fit
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
@@ -45,7 +45,7 @@ def resonance(frequency, damping):
 
 
 def start(structure, poles, delay=0.1):
-    return Scaled(structure, RATE).nonlinear_of(np.asarray(poles, complex), delay)
+    return ScaledStructure(structure, RATE).nonlinear_of(np.asarray(poles, complex), delay)
 
 
 def test_a_resonance_is_found_exactly_without_noise():
@@ -93,7 +93,7 @@ def test_the_best_of_several_starts_wins():
 def test_the_jacobian_after_elimination_points_downhill():
     structure = Structure(2, 1, True)
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
-    scaled = Scaled(structure, RATE)
+    scaled = ScaledStructure(structure, RATE)
     shape = start(structure, [-1 + 1.5j, -1 - 1.5j])
     at = problem.project(scaled, shape)
     gradient = at.jacobian.T @ at.residual
@@ -122,11 +122,11 @@ def test_a_response_bends_by_gain_lag_and_curvature():
     structure = Structure(2, 1, True)
     problem = problem_of(resonance(60.0, 0.2), noise=1e-8)
     found = fit(problem, structure, [start(structure, [-1 + 1.5j, -1 - 1.5j])])
-    columns = problem.bent(found)
+    columns = problem.low_order_sensitivity(found)
     closed = close_period(problem.input, PERIOD)
     frequency = np.fft.rfftfreq(len(closed), PERIOD)
     moved = np.fft.rfft(closed) * found.dynamics.response(frequency)
     for power in range(3):
-        bent = moved * (2j * np.pi * frequency / RATE) ** power
-        expected = np.fft.irfft(bent, len(closed))[: len(problem.input)]
+        low_order_sensitivity = moved * (2j * np.pi * frequency / RATE) ** power
+        expected = np.fft.irfft(low_order_sensitivity, len(closed))[: len(problem.input)]
         np.testing.assert_allclose(columns[:, power], expected, atol=1e-9 * np.ptp(expected))

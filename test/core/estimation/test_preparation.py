@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.estimation.output_error import close_period
-from omsm_ros.core.estimation.preparation import from_rest_to_rest, input_bandwidth, prepare
+from omsm_ros.core.estimation.preparation import faded_to_stationary, input_bandwidth, prepare
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError, StepTestError
@@ -76,8 +76,8 @@ def test_after_a_gap_of_the_encoder_the_response_settles_first():
 
 
 def test_only_offset_and_drift_are_fitted_before_any_model():
-    bent = prepare(record_of(1e-7 * (TIME / TIME[-1]) ** 2), "encoder")
-    assert bent.problem.background.shape[1] == 2
+    curved = prepare(record_of(1e-7 * (TIME / TIME[-1]) ** 2), "encoder")
+    assert curved.problem.background.shape[1] == 2
 
 
 @pytest.mark.parametrize(("share", "expected"), [(0.03, 20.0), (0.003, 2.0)])
@@ -143,7 +143,7 @@ def test_what_rests_at_both_ends_is_left_as_it_is():
 def test_a_fade_shorter_than_a_sample_changes_nothing(samples: int, period: float) -> None:
     motion = np.arange(samples, dtype=np.float64)
     moving = np.ones(samples, np.bool_)
-    assert np.array_equal(from_rest_to_rest(motion, moving, period), motion)
+    assert np.array_equal(faded_to_stationary(motion, moving, period), motion)
 
 
 def test_a_motion_too_small_to_square_has_the_lowest_content() -> None:
@@ -151,7 +151,7 @@ def test_a_motion_too_small_to_square_has_the_lowest_content() -> None:
     assert input_bandwidth(motion, 1e-3) == pytest.approx(1 / (100 * 1e-3))
 
 
-def test_a_distance_that_stands_still_beside_a_sweep_is_refused():
+def test_a_distance_that_stands_still_next_to_a_sweep_is_refused():
     z = Chirp().positions(np.arange(8000) * 1e-3).z
     with pytest.raises(IdentificationError, match=r"does not change .* probe is connected"):
         prepare(MotionRecord.from_arrays(1e-3, z, np.full(8000, 3e-6)), "encoder")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
@@ -35,7 +35,7 @@ def resonance(frequency, damping):
 
 
 def frequencies_of(points, structure, shapes):
-    scaled = Scaled(structure, points.problem.rate)
+    scaled = ScaledStructure(structure, points.problem.rate)
     return [scaled.transfer_function(s, np.ones(1)).modes()[0].frequency for s in shapes]
 
 
@@ -60,7 +60,7 @@ def test_a_richer_structure_never_fits_worse_than_the_one_it_contains():
 def test_every_start_has_the_nonlinear_of_its_structure_and_is_stable():
     points = points_for(resonance(60.0, 0.1))
     for structure in (Structure(4, 3, True), Structure(3, 2, False), Structure(0, 0, True)):
-        scaled = Scaled(structure, points.problem.rate)
+        scaled = ScaledStructure(structure, points.problem.rate)
         for shape in points.of(structure, []):
             assert len(shape) == scaled.nonlinear_size
             assert scaled.transfer_function(shape, np.ones(1)).is_stable
@@ -90,7 +90,9 @@ def test_a_coarser_problem_has_the_same_response(every):
     assert coarse.period == pytest.approx(every * problem.period)
     assert len(coarse.input) == len(coarse.output) == len(coarse.used) == len(coarse.background)
     structure = Structure(2, 1, True)
-    start = Scaled(structure, problem.rate).nonlinear_of(np.array([-1.0, -2.0], complex), 0.3)
+    start = ScaledStructure(structure, problem.rate).nonlinear_of(
+        np.array([-1.0, -2.0], complex), 0.3
+    )
     found = fit(coarse, structure, [start]).dynamics
     lines = np.geomspace(1.0, 60.0, 8)
     np.testing.assert_allclose(found.response(lines), truth.response(lines), rtol=1e-3)

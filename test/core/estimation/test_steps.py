@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.estimation.steps import (
     backlash_columns,
+    extended,
     find_steps,
     held_out,
-    lasting,
     sample_noise,
     segments,
 )
@@ -164,4 +164,4 @@ def test_backlash_of_an_edge_begins_with_it():
 @given(flags=st.lists(st.booleans(), max_size=40), samples=st.integers(0, 50))
 def test_what_lasts_is_what_was_within_so_many_samples(flags, samples):
     expected = [any(flags[max(k - samples, 0) : k + 1]) for k in range(len(flags))]
-    assert lasting(np.array(flags, bool), samples).tolist() == expected
+    assert extended(np.array(flags, bool), samples).tolist() == expected

@@ -15,7 +15,7 @@ TIME = np.arange(0.0, TEST.duration, PERIOD)
 RATE = np.gradient(TEST.positions(TIME).z, PERIOD)
 
 
-def test_the_scatter_is_told_from_noise():
+def test_the_scatter_is_distinguished_from_noise():
     rng = np.random.default_rng(1)
     noise = rng.normal(0, 10e-9, len(TIME))
     late = noise + RATE * rng.normal(0, SCATTER_S, len(TIME))
@@ -45,7 +45,7 @@ def test_a_lag_that_the_model_misses_is_no_scatter():
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_probe_that_scatters_is_accepted_and_told_so(seed):
+def test_a_probe_that_scatters_is_accepted_with_a_warning(seed):
     rng = np.random.default_rng(seed)
     z = TEST.positions(TIME).z + rng.normal(0, 0.3e-9, len(TIME))
     when = TIME - LAG_S + rng.normal(0, SCATTER_S, len(TIME))
@@ -53,8 +53,8 @@ def test_a_probe_that_scatters_is_accepted_and_told_so(seed):
     certificate = identify(MotionRecord.from_arrays(PERIOD, z, -seen)).calibration.certificate
     assert str(certificate["verdict"]).startswith("accepted with reservations")
     assert certificate["timing_scatter_s"] == pytest.approx(SCATTER_S, rel=0.2)
-    (told,) = certificate["reservations"]
-    assert "scatter in time by" in told
+    (reported,) = certificate["reservations"]
+    assert "scatter in time by" in reported
     assert certificate["chi_square"] < 1.2
 
 
@@ -83,6 +83,6 @@ def test_an_axis_that_scatters_is_named_as_the_cause():
     record = MotionRecord.from_arrays(PERIOD, z, -seen + rng.normal(0, 10e-9, len(TIME)))
     certificate = identify(record).calibration.certificate
     assert certificate["axis_timing_scatter_s"] == pytest.approx(SCATTER_S, rel=0.2)
-    told = [*certificate["reasons"], *certificate["reservations"]]
-    assert any("readings of the axis scatter in time" in text for text in told)
+    reported = [*certificate["reasons"], *certificate["reservations"]]
+    assert any("readings of the axis scatter in time" in text for text in reported)
     assert not any("loose" in text for text in certificate["reasons"])

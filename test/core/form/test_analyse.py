@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import Aperture, Portion
+from omsm_ros.core.registration.placement import Aperture, PointBatch
 from omsm_ros.core.surface.nominal import Flat, Sphere
 from omsm_ros.errors import DataError
 
@@ -12,7 +12,7 @@ RNG = np.random.default_rng(6)
 
 
 def form(x, y, height, *asked, **options):
-    portion = Portion(x, y, height, np.empty((0, len(x))))
+    portion = PointBatch(x, y, height, np.empty((0, len(x))))
     return analyse_form(Flat(), lambda: [portion], asked or ("auto",), **options)
 
 
@@ -50,7 +50,7 @@ def test_every_point_is_accounted_for():
     height = np.nan_to_num(Sphere(0.019).height(x, y)) + RNG.normal(0, 1e-8, 5000)
     height[:7] = np.nan
     height[100:120] += 1e-5
-    portion = Portion(x, y, height, np.empty((0, 5000)))
+    portion = PointBatch(x, y, height, np.empty((0, 5000)))
     found = analyse_form(Sphere(0.019), lambda: [portion], ("piston",), aperture=Aperture(0.015))
     counts = dict(found.counts)
     assert counts.pop("read") == 5000 == sum(counts.values())
@@ -61,7 +61,7 @@ def test_every_point_is_accounted_for():
     assert counts["outliers"] == pytest.approx(int(inside.sum()), abs=1)
 
 
-def test_an_aperture_beside_the_points_is_refused():
+def test_an_aperture_without_points_is_refused():
     x, y = RNG.uniform(-0.02, 0.02, (2, 5000))
     with pytest.raises(DataError, match="0 points lie on the nominal surface"):
         form(x, y, 0 * x, aperture=Aperture(0.001, 0.5, 0.0))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.deviation_map import Cells, DeviationMap
+from omsm_ros.core.form.deviation_map import DeviationMap, GridCells
 from omsm_ros.core.form.texture import bands_of, power_density, texture
 from omsm_ros.errors import DataError
 
@@ -28,7 +28,7 @@ def wave(length, size=10e-9, angle=0.0):
 
 
 def test_a_cell_is_the_mean_of_its_points():
-    cells = Cells.of(square(lambda x, y: 1e-6 * x + 2e-6 * y, noise=0.0))
+    cells = GridCells.of(square(lambda x, y: 1e-6 * x + 2e-6 * y, noise=0.0))
     assert np.all(cells.present)
     steps = np.diff(cells.mean, axis=1)
     assert np.median(steps) == pytest.approx(1e-6 * cells.pitch, rel=0.1)
@@ -38,21 +38,21 @@ def test_a_cell_is_the_mean_of_its_points():
 @pytest.mark.parametrize("length", [1.5e-3, 4e-3])
 def test_half_of_a_wave_passes_at_the_cutoff(length):
     """ISO 16610-21: the transmission at the cutoff is one half."""
-    cells = Cells.of(square(wave(length)))
+    cells = GridCells.of(square(wave(length)))
     passed = cells.smoothed(cells.mean, length)
     inner = (slice(None), slice(40, -40))
     assert np.std(passed[inner]) / np.std(cells.mean[inner]) == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_filter_does_not_drag_the_edge_down():
-    cells = Cells.of(square(lambda x, y: 1e-6 + 0 * x))
+    cells = GridCells.of(square(lambda x, y: 1e-6 + 0 * x))
     np.testing.assert_allclose(cells.smoothed(cells.mean, 3e-3), 1e-6, rtol=1e-12)
 
 
 def test_parameters_of_a_sine_are_those_of_the_textbook():
     """Sq = a/√2, Sa = 2a/π, Ssk = 0, Sku = 1.5, slope 2π a/λ/√2."""
     length, size = 3e-3, 10e-9
-    cells = Cells.of(square(wave(length, size)))
+    cells = GridCells.of(square(wave(length, size)))
     found = texture(cells, cells, bands_of(cells, None, 15e-3))
     # An S-filter of a seventh of the wavelength takes 1.4 % of it.
     assert found["Sq"].value == pytest.approx(size / np.sqrt(2), rel=0.03)
@@ -72,18 +72,19 @@ def test_noise_is_in_the_uncertainty_and_an_effect_too():
     noisy = square(wave(2e-3, 1e-9), noise=2e-8, effects=[wave(2e-3, 5e-10)])
     for name in ("Sq", "Sa", "Sz", "slope_rms"):
         true, found = (
-            texture(Cells.of(m), Cells.of(m), bands_of(Cells.of(m)))[name] for m in (quiet, noisy)
+            texture(GridCells.of(m), GridCells.of(m), bands_of(GridCells.of(m)))[name]
+            for m in (quiet, noisy)
         )
         assert abs(found.value - true.value) < 2 * found.uncertainty
         assert found.uncertainty > 0.2 * abs(found.value - true.value)
     bare = square(wave(2e-3, 1e-9), effects=[wave(2e-3, 5e-10)])
-    cells = Cells.of(bare)
+    cells = GridCells.of(bare)
     found = texture(cells, cells, bands_of(cells))["Sq"]
     assert found.uncertainty == pytest.approx(0.5 * found.value, rel=0.02)
 
 
 def test_bands_are_what_was_asked_for_where_the_cells_allow_it():
-    cells = Cells.of(square(wave(2e-3)))
+    cells = GridCells.of(square(wave(2e-3)))
     assert bands_of(cells, 1e-3, 8e-3).l_filter == 8e-3
     assert bands_of(cells, 1e-3, 8e-3).s_filter == 1e-3
     assert bands_of(cells, 1e-9).s_filter == 3 * cells.pitch
@@ -97,13 +98,13 @@ def test_bands_are_what_was_asked_for_where_the_cells_allow_it():
 @pytest.mark.parametrize("angle", [0.0, 0.6, 2.0])
 def test_the_density_holds_the_mean_square_and_where_it_is(angle):
     """Parseval in the plane, over radial frequency and over direction; the wave's own place."""
-    cells = Cells.of(square(wave(1.25e-3, angle=angle)))
+    cells = GridCells.of(square(wave(1.25e-3, angle=angle)))
     found = power_density(cells)
     step_x, step_y = found.x[1], found.y[1]
     assert found.areal.sum() * step_x * step_y == pytest.approx(found.mean_square, rel=1e-12, abs=0)
     # A cell holds the mean of its points.
-    wide = cells.pitch / 1.25e-3 * np.array([np.cos(angle), np.sin(angle)])
-    expected = 0.5e-16 * np.prod(np.sinc(wide)) ** 2
+    broad = cells.pitch / 1.25e-3 * np.array([np.cos(angle), np.sin(angle)])
+    expected = 0.5e-16 * np.prod(np.sinc(broad)) ** 2
     assert found.mean_square == pytest.approx(expected, rel=0.01, abs=0)
     turn = found.azimuthal
     assert turn.value.sum() * np.pi / len(turn.value) == pytest.approx(
@@ -123,7 +124,7 @@ def test_the_density_holds_the_mean_square_and_where_it_is(angle):
 def test_the_density_of_noise_is_flat_and_of_the_known_height():
     """White noise of variance σ² on cells of pitch d has the density σ² d² everywhere."""
     map_ = square(lambda x, y: 0 * x, noise=1e-8)
-    cells = Cells.of(map_)
+    cells = GridCells.of(map_)
     found = power_density(cells).radial
     height = np.mean(cells.noise**2) * cells.pitch**2
     middle = found.value[5:-5]
@@ -136,7 +137,7 @@ def test_the_density_of_noise_is_flat_and_of_the_known_height():
 
 
 def test_blocks_of_the_density_hold_what_their_cells_do():
-    found = power_density(Cells.of(square(wave(1.25e-3, angle=0.4))))
+    found = power_density(GridCells.of(square(wave(1.25e-3, angle=0.4))))
     x, y, areal = found.coarse(48)
     assert areal.shape == (len(y), len(x))
     assert max(areal.shape) <= 48
@@ -152,7 +153,7 @@ def test_a_strip_and_a_disc_have_cells_too():
         n = int(chosen.sum())
         map_ = DeviationMap(x=x[chosen], y=y[chosen], deviation=1e-9 * x[chosen],
                             area=np.ones(n), effects=np.empty((0, n)), noise=0.0)  # fmt: skip
-        cells = Cells.of(map_)
+        cells = GridCells.of(map_)
         assert cells.present.mean() > 0.6
         assert np.isfinite(texture(cells, cells, bands_of(cells))["Sq"].value)
         assert power_density(cells).mean_square >= 0
@@ -160,7 +161,7 @@ def test_a_strip_and_a_disc_have_cells_too():
 
 def test_a_wave_does_not_leak_into_other_frequencies():
     """Beyond two lines a raised cosine lets through -31 dB at most."""
-    found = power_density(Cells.of(square(wave(4e-3))))
+    found = power_density(GridCells.of(square(wave(4e-3))))
     along = found.areal[0]
     away = np.abs(np.abs(found.x) - 250.0)
     assert np.max(along[away > 2.1 * found.x[1]]) < 1e-3 * np.max(along)
@@ -171,7 +172,7 @@ def test_what_is_in_the_band_of_a_narrow_strip_is_no_less_than_nothing(rows):
     """A transform of two cells has zero and a negative frequency alone."""
     mean = np.random.default_rng(3).normal(0.0, 1e-9, (rows, 40))
     present = np.ones(mean.shape, bool)
-    cells = replace(Cells.of(square(wave(4e-3))), mean=mean, present=present, noise=0.0 * mean)
+    cells = replace(GridCells.of(square(wave(4e-3))), mean=mean, present=present, noise=0.0 * mean)
     for strip in (cells, replace(cells, mean=mean.T, present=present.T, noise=0.0 * mean.T)):
         found = power_density(strip)
         assert found.mean_square_in_band >= 0

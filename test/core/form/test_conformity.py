@@ -2,7 +2,7 @@
 
 import pytest
 
-from omsm_ros.core.form.deviation_map import FAILS, HOLDS, OPEN, Figure, conformity
+from omsm_ros.core.form.deviation_map import FAILS, HOLDS, OPEN, UncertainValue, conformity
 
 
 @pytest.mark.parametrize(
@@ -20,11 +20,11 @@ from omsm_ros.core.form.deviation_map import FAILS, HOLDS, OPEN, Figure, conform
     ],
 )
 def test_with_its_expanded_uncertainty(value, uncertainty, verdict):
-    found = conformity(Figure(value, uncertainty), 100e-9)
+    found = conformity(UncertainValue(value, uncertainty), 100e-9)
     assert found.verdict == verdict
     assert found.entry()["tolerance"] == 100e-9
     assert found.expanded == (None if uncertainty is None else 2 * uncertainty)
 
 
 def test_nothing_is_said_of_a_figure_without_a_value():
-    assert conformity(Figure(None, None), 100e-9) is None
+    assert conformity(UncertainValue(None, None), 100e-9) is None

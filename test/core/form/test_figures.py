@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.form.deviation_map import (
     DeviationMap,
-    noise_beside,
+    neighbour_noise,
     root_mean_square,
     weighted_quantiles,
 )
@@ -116,8 +116,8 @@ def test_an_upper_bound_widens_but_is_not_subtracted(there):
     deviation = FORM + there * bound
     seen = figures(map_of(deviation))
     known = figures(map_of(deviation, effects=EFFECTS / 20))
-    told = figures(map_of(deviation, effects=effects, bounds=[len(EFFECTS)]))
-    for name, figure in told.items():
+    reported = figures(map_of(deviation, effects=effects, bounds=[len(EFFECTS)]))
+    for name, figure in reported.items():
         assert figure.value == pytest.approx(seen[name].value, rel=0.05), name
         assert figure.value == pytest.approx(known[name].value, rel=0.02), name
         assert abs(figure.value - TRUE[name]) <= 2 * figure.uncertainty, name
@@ -128,8 +128,8 @@ def test_a_bound_beyond_the_map_leaves_the_figure_open():
     """Nothing but noise was seen; of 200 nm that could be there anything may be."""
     bound = 100e-9 * X / 1e-2
     rng = np.random.default_rng(4)
-    told = map_of(rng.normal(0.0, 1e-9, POINTS), 1e-9, bound[np.newaxis], bounds=[0])
-    for figure in figures(told).values():
+    reported = map_of(rng.normal(0.0, 1e-9, POINTS), 1e-9, bound[np.newaxis], bounds=[0])
+    for figure in figures(reported).values():
         assert figure.value < 3e-9
         assert figure.uncertainty > 0.5 * np.sqrt(np.mean(bound**2))
 
@@ -138,17 +138,17 @@ def test_the_rms_under_a_bound_is_that_of_draws():
     """Closed form against errors drawn from the bound, about the value that is stated."""
     rng = np.random.default_rng(8)
     bounds = EFFECTS[:2]
-    told = rms_of_part(map_of(FORM, effects=bounds, bounds=[0, 1]))
+    reported = rms_of_part(map_of(FORM, effects=bounds, bounds=[0, 1]))
     drawn = rng.normal(size=(4000, 2))
     # Of FORM - drawn @ bounds, the mean square less that of FORM, written out.
     products = bounds @ bounds.T / POINTS
     more = np.sum(drawn @ products * drawn, axis=1) - 2 * drawn @ (bounds @ FORM / POINTS)
     spread = np.sqrt(np.mean(more**2))
-    assert told.value == pytest.approx(np.sqrt(np.mean(FORM**2)), rel=1e-9)
-    low = np.sqrt(max(told.value**2 - 2 * spread, 0.0))
-    high = np.sqrt(told.value**2 + 2 * spread)
-    expected = max(told.value - low, high - told.value) / 2
-    assert told.uncertainty == pytest.approx(expected, rel=0.05)
+    assert reported.value == pytest.approx(np.sqrt(np.mean(FORM**2)), rel=1e-9)
+    low = np.sqrt(max(reported.value**2 - 2 * spread, 0.0))
+    high = np.sqrt(reported.value**2 + 2 * spread)
+    expected = max(reported.value - low, high - reported.value) / 2
+    assert reported.uncertainty == pytest.approx(expected, rel=0.05)
 
 
 def test_the_rms_is_by_area():
@@ -167,7 +167,7 @@ def test_a_small_effect_is_propagated_through_the_figure():
         assert figure.value == pytest.approx(TRUE[name], rel=5e-3)
 
 
-def test_noise_is_told_from_form_and_drift():
+def test_noise_is_distinguished_from_form_and_drift():
     slow = np.cumsum(np.random.default_rng(1).normal(0, 1e-10, POINTS))
     wave = 40e-9 * np.sin(np.linspace(0, 40, POINTS))
     noise = np.random.default_rng(2).normal(0, 1e-8, POINTS)
@@ -180,14 +180,14 @@ def test_quantiles_are_by_weight():
     assert weighted_quantiles(values, weights, (0.25, 0.625)) == (1.0, 2.0)
 
 
-def test_noise_is_told_from_ripple_in_any_order_of_points():
+def test_noise_is_distinguished_from_ripple_in_any_order_of_points():
     """In random order successive points are far apart; those beside each other are not."""
     rng = np.random.default_rng(3)
     x, y = rng.uniform(-0.02, 0.02, (2, 40_000))
     value = 1e-7 * np.sin(2 * np.pi * x / 4e-3) + rng.normal(0, 1e-9, 40_000)
     assert noise_of(value) > 5e-8
-    assert 0.9e-9 < noise_beside(x, y, value) < 6e-9
-    assert noise_beside(x, 0 * y, value) == pytest.approx(1e-9, rel=0.1)
+    assert 0.9e-9 < neighbour_noise(x, y, value) < 6e-9
+    assert neighbour_noise(x, 0 * y, value) == pytest.approx(1e-9, rel=0.1)
 
 
 def test_a_figure_from_which_errors_take_more_than_there_is_is_not_known_to_be_zero():

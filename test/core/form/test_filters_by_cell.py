@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.deviation_map import Cells, Figure, gaussian_weights
+from omsm_ros.core.form.deviation_map import GridCells, UncertainValue, gaussian_weights
 from omsm_ros.core.form.texture import bands_of, power_density, slopes_without_second_order, texture
 
 RNG = np.random.default_rng(12)
@@ -15,7 +15,7 @@ def cells_of(values, present=None, noise=0.0, effects=()):
     shape = values.shape
     present = np.ones(shape, bool) if present is None else present
     rows = np.array(effects).reshape(len(effects), *shape)
-    return Cells(
+    return GridCells(
         x=1e-4 * np.arange(shape[1]), y=1e-4 * np.arange(shape[0]), pitch=1e-4, present=present,
         mean=values, noise=np.full(shape, noise), effects=rows,
     )  # fmt: skip
@@ -85,7 +85,7 @@ def test_slopes_of_a_plane_are_its_own_whatever_cells_are_missing():
 
 def test_a_single_cell_has_no_slope():
     one = cells_of(np.ones((1, 1)))
-    assert texture(one, one, bands_of(one))["slope_rms"] == Figure(None, None)
+    assert texture(one, one, bands_of(one))["slope_rms"] == UncertainValue(None, None)
 
 
 def test_a_constant_effect_makes_no_texture_uncertain():

@@ -9,10 +9,10 @@ import pytest
 
 from omsm_ros.core.form.analyse import optical_terms
 from omsm_ros.core.form.deviation_map import (
-    Cells,
     DeviationMap,
-    Figure,
-    noise_beside,
+    GridCells,
+    UncertainValue,
+    neighbour_noise,
     root_mean_square,
     weighted_quantiles,
 )
@@ -21,15 +21,15 @@ from omsm_ros.core.form.part_figures import (
     asymmetric,
     extents_of_part,
     rms_of_part,
-    without,
+    without_columns,
     without_form,
     without_power,
     without_tilt,
 )
-from omsm_ros.core.form.texture import Curve, profiles
+from omsm_ros.core.form.texture import UncertainCurve, profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.surface.zernike_terms import Term, terms_up_to, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 
 RNG = np.random.default_rng(12)
@@ -46,7 +46,7 @@ def map_of(deviation, noise=0.0, effects=(), x=X, y=Y, area=AREA):
 
 
 def term(n, m, size=50e-9, x=X, y=Y):
-    return size * zernike_values(x / RADIUS, y / RADIUS, [Term(n, m)])[0]
+    return size * zernike_values(x / RADIUS, y / RADIUS, [ZernikeIndex(n, m)])[0]
 
 
 # Figures.
@@ -91,19 +91,19 @@ def test_the_rms_is_by_area_and_about_zero():
     assert root_mean_square(map_of(error, area=1e-6 * AREA)) == pytest.approx(expected)
 
 
-def test_noise_beside_each_other_is_the_same_in_any_order_and_unit():
+def test_neighbour_noise_is_independent_of_order_and_unit():
     values = term(3, 1) + RNG.normal(0, 2e-9, 3000)
-    found = noise_beside(X, Y, values)
+    found = neighbour_noise(X, Y, values)
     assert found == pytest.approx(2e-9, rel=0.2)
     order = RNG.permutation(3000)
-    assert noise_beside(X[order], Y[order], values[order]) == pytest.approx(found)
-    assert noise_beside(1e3 * X, 1e3 * Y, 5 * values) == pytest.approx(5 * found)
-    assert noise_beside(np.zeros(9), np.zeros(9), np.zeros(9)) == 0.0
+    assert neighbour_noise(X[order], Y[order], values[order]) == pytest.approx(found)
+    assert neighbour_noise(1e3 * X, 1e3 * Y, 5 * values) == pytest.approx(5 * found)
+    assert neighbour_noise(np.zeros(9), np.zeros(9), np.zeros(9)) == 0.0
 
 
 def test_a_figure_is_written_as_value_and_uncertainty():
-    assert Figure(1.0, None).entry() == {"value": 1.0, "uncertainty": None}
-    curve = Curve(np.arange(2.0), np.ones(2), np.zeros(2))
+    assert UncertainValue(1.0, None).entry() == {"value": 1.0, "uncertainty": None}
+    curve = UncertainCurve(np.arange(2.0), np.ones(2), np.zeros(2))
     assert curve.entry() == {
         "position": [0.0, 1.0], "value": [1.0, 1.0], "uncertainty": [0.0, 0.0],
     }  # fmt: skip
@@ -162,9 +162,9 @@ def test_columns_in_any_unit_and_any_mixture_take_the_same_away():
     map_ = map_of(term(4, 2) + term(1, 1))
     mixed = RNG.normal(size=(6, 6)) @ columns
     np.testing.assert_allclose(
-        without(map_, mixed).deviation, without(map_, columns).deviation, atol=1e-18
+        without_columns(map_, mixed).deviation, without_columns(map_, columns).deviation, atol=1e-18
     )
-    np.testing.assert_array_equal(without(map_, columns).area, AREA)
+    np.testing.assert_array_equal(without_columns(map_, columns).area, AREA)
 
 
 # Zernike terms.
@@ -238,7 +238,7 @@ def test_optical_terms_do_not_know_where_the_part_sits_and_scale_with_it():
 
 def test_cells_hold_the_mean_of_their_points_one_by_one():
     map_ = map_of(RNG.normal(size=3000), noise=0.3, effects=[X])
-    cells = Cells.of(map_)
+    cells = GridCells.of(map_)
     found = {}
     for x, y, d, e in zip(X - X.min(), Y - Y.min(), map_.deviation, X, strict=True):
         found.setdefault((int(y / cells.pitch), int(x / cells.pitch)), []).append((d, e))

@@ -35,9 +35,9 @@ def test_the_error_that_is_expected_is_the_error(noise, length):
 
 def test_noise_alone_is_averaged_widest_and_a_clean_map_least():
     noise = RANDOM.normal(size=len(X))
-    wide, fine = closest_means(X, Y, noise, 1.0), closest_means(X, Y, np.sin(30 * X), 1e-6)
-    assert wide.error < 0.01
-    assert wide.means.along_x[20, 20 + 8] > fine.means.along_x[20, 20 + 8]
+    broad, fine = closest_means(X, Y, noise, 1.0), closest_means(X, Y, np.sin(30 * X), 1e-6)
+    assert broad.error < 0.01
+    assert broad.means.along_x[20, 20 + 8] > fine.means.along_x[20, 20 + 8]
 
 
 def test_of_a_line_of_points():

@@ -56,7 +56,7 @@ def test_half_a_cell_beyond_the_last_its_offset_goes_on_and_no_farther():
         assert np.isnan(found.between(far[:1], far[1:]))[0]
 
 
-def test_beside_a_missing_cell_those_that_are_there_count():
+def test_next_to_a_missing_cell_the_present_ones_count():
     found = plane(slope=(0.0, 0.0))
     found.offset[9:12, 9:12] = np.nan
     there = np.array([7e-4, 5.1e-4, 1e-4])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import Aperture, Portion
+from omsm_ros.core.registration.placement import Aperture, PointBatch
 from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
 
@@ -17,7 +17,7 @@ def terms_of(shift, *asked):
     r, angle = np.linspace(RADIUS, 0, 6000), np.linspace(0, 120 * np.pi, 6000)
     x, y = r * np.cos(angle), r * np.sin(angle)
     height = part.height(x - shift, y) + np.random.default_rng(1).normal(0, 1e-9, len(x))
-    portion = Portion(x, y, height, np.empty((0, len(x))))
+    portion = PointBatch(x, y, height, np.empty((0, len(x))))
     found = analyse_form(Sphere(-0.1), lambda: [portion], asked, aperture=Aperture(RADIUS))
     return {(t.n, t.m): row for t, *row in zip(
         found.zernike.terms, found.zernike.coefficients, found.zernike.uncertainty, strict=True

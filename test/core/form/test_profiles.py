@@ -11,7 +11,7 @@ from omsm_ros.core.form.part_figures import without_form
 from omsm_ros.core.form.texture import profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, first_terms, zernike_values
 
 DISC = Aperture(10e-3, 1e-3, -2e-3)
 
@@ -46,7 +46,7 @@ def test_a_scan_of_few_turns_has_a_radial_profile_too():
 
 def test_profiles_run_where_they_say():
     """Astigmatism is ρ² along x, −ρ² along y, nothing at 45°, and cos 2θ around."""
-    found = profiles(disc_map({Term(2, 2): 1e-8}, noise=1e-10), DISC)
+    found = profiles(disc_map({ZernikeIndex(2, 2): 1e-8}, noise=1e-10), DISC)
     for name, sign in (("x", 1), ("y", -1), ("diagonal", 0)):
         curve = found[name]
         expected = sign * 1e-8 * (curve.position / DISC.radius) ** 2
@@ -60,7 +60,7 @@ def test_profiles_run_where_they_say():
 
 
 def test_what_is_unknown_of_a_profile_is_noise_and_effects():
-    map_ = disc_map({Term(2, 0): 1e-8}, noise=1e-9, effects=({Term(1, 1): 3e-9},))
+    map_ = disc_map({ZernikeIndex(2, 0): 1e-8}, noise=1e-9, effects=({ZernikeIndex(1, 1): 3e-9},))
     curve = profiles(map_, DISC)["x"]
     rim = np.abs(curve.position) > 0.9 * DISC.radius
     assert np.mean(curve.uncertainty[rim]) == pytest.approx(3e-9 * 0.95, rel=0.05)
@@ -70,8 +70,8 @@ def test_what_is_unknown_of_a_profile_is_noise_and_effects():
 
 def test_terms_of_the_standard_are_those_of_known_zernikes():
     """Power 20 nm at the rim, spherical 10, astigmatism 5: ISO 10110-5, 3.3 to 3.5."""
-    sizes = {Term(2, 0): 20e-9, Term(4, 0): 10e-9, Term(2, 2): 5e-9}
-    map_ = disc_map(sizes, effects=({Term(2, 0): 1e-9},))
+    sizes = {ZernikeIndex(2, 0): 20e-9, ZernikeIndex(4, 0): 10e-9, ZernikeIndex(2, 2): 5e-9}
+    map_ = disc_map(sizes, effects=({ZernikeIndex(2, 0): 1e-9},))
     fit = fit_zernikes(map_.x, map_.y, map_.deviation, first_terms(37), DISC, effects=map_.effects)
     found = optical_terms(map_, fit)
     # Random points are no even disc: their best sphere is 40.002 nm.
@@ -96,7 +96,7 @@ def test_terms_of_the_standard_are_those_of_known_zernikes():
 
 def test_the_symmetric_irregularity_is_as_uncertain_as_its_scatter():
     """Noise shakes its few terms: as much as twenty scans scatter, not nothing."""
-    still = disc_map({Term(4, 0): 10e-9, Term(2, 2): 5e-9}, points=4_000)
+    still = disc_map({ZernikeIndex(4, 0): 10e-9, ZernikeIndex(2, 2): 5e-9}, points=4_000)
     rng, values = np.random.default_rng(12), []
     for _ in range(20):
         noisy = still.deviation + rng.normal(0, 5e-9, len(still))
@@ -129,6 +129,6 @@ def test_the_sagitta_of_a_part_of_a_disc_is_that_of_the_sphere_that_fits_it(kind
 
 
 def test_form_goes_and_ripple_stays():
-    sizes = {Term(2, 2): 50e-9, Term(3, 1): 15e-9, Term(12, 0): 4e-9}
+    sizes = {ZernikeIndex(2, 2): 50e-9, ZernikeIndex(3, 1): 15e-9, ZernikeIndex(12, 0): 4e-9}
     rest = without_form(disc_map(sizes), DISC)
     assert np.std(rest.deviation) == pytest.approx(4e-9 / np.sqrt(13), rel=0.03)

@@ -10,9 +10,9 @@ def test_the_second_order_goes_and_nothing_else():
     x, y = rng.uniform(-0.25, 0.25, 4000), rng.uniform(0.01, 0.04, 4000)
     area = rng.uniform(0.1, 2, 4000)
     rest = 1e-8 * np.sin(60 * x) * np.cos(300 * y)
-    bent = 1e-6 * (1 + x - 3 * y + 4 * x * x - x * y + 9 * y * y)
-    map_ = DeviationMap(x=x, y=y, deviation=rest + bent, area=area,
-                        effects=np.stack([bent, rest]), noise=1e-9)  # fmt: skip
+    curved = 1e-6 * (1 + x - 3 * y + 4 * x * x - x * y + 9 * y * y)
+    map_ = DeviationMap(x=x, y=y, deviation=rest + curved, area=area,
+                        effects=np.stack([curved, rest]), noise=1e-9)  # fmt: skip
     found = without_second_order(map_)
     design = np.stack([x**i * y**j for i in range(3) for j in range(3 - i)], axis=1)
     root = np.sqrt(area)

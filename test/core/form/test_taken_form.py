@@ -10,7 +10,7 @@ import pytest
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.form.deviation_map import DeviationMap
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
-from omsm_ros.core.registration.placement import Aperture, Portion
+from omsm_ros.core.registration.placement import Aperture, PointBatch
 from omsm_ros.core.surface.aspheres import Biconic
 
 RADIUS = 5e-3
@@ -52,7 +52,7 @@ def measured(curvature, conic, size, rng):
         part[one], part[other] = c * part[one] - s * part[other], s * part[one] + c * part[other]
     part += rng.uniform(-4e-4, 4e-4, 3)[:, np.newaxis]
     noisy = part[2] + 5e-9 * rng.standard_normal(len(x))
-    return Portion(part[0], part[1], noisy, np.empty((0, len(x)))), (x, y, form)
+    return PointBatch(part[0], part[1], noisy, np.empty((0, len(x)))), (x, y, form)
 
 
 # Radii of curvature 118 and -174 mm, and 197 and 79 mm: on both the first fit went to and fro by
@@ -91,7 +91,7 @@ def test_form_that_was_taken_away_is_added_again_on_the_average():
     rng = np.random.default_rng(5)
     x, y = spiral(2000)
     shape = term(2, 2, x, y)
-    squares, told = [], []
+    squares, reported = [], []
     for _ in range(200):
         kept, lost = 30e-9 * rng.standard_normal(2)
         seen = DeviationMap(
@@ -99,8 +99,8 @@ def test_form_that_was_taken_away_is_added_again_on_the_average():
             effects=30e-9 * shape[np.newaxis], taken=np.eye(1),
         )  # fmt: skip
         squares.append(np.mean(((kept + lost) * shape) ** 2))
-        told.append(rms_of_part(seen).value ** 2)
-    assert np.mean(told) == pytest.approx(np.mean(squares), rel=0.25, abs=0)
+        reported.append(rms_of_part(seen).value ** 2)
+    assert np.mean(reported) == pytest.approx(np.mean(squares), rel=0.25, abs=0)
     whole, _ = extents_of_part(seen, Aperture(RADIUS))
     # Of that last one: the extent of c times the shape is twice c.
     assert whole.value == pytest.approx(2 * np.hypot(kept, 30e-9), rel=0.15)

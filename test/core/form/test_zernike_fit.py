@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
-from omsm_ros.core.surface.zernike_terms import Term, first_terms, zernike_values
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, first_terms, zernike_values
 from omsm_ros.errors import DataError
 
 DISC, TERMS = Aperture(12.7e-3, 1e-4, -2e-4), first_terms(37)
@@ -148,7 +148,7 @@ def test_sums_that_cancel_to_rounding_leave_the_scatter_of_points():
     x, y = np.meshgrid(np.linspace(-1, 1, 19) * 3e-6, np.linspace(-1, 1, 19) * 3e-3)
     x, y = x.ravel(), y.ravel()
     deviation = 1e-6 * np.sin(2 * np.pi * x / 3.7e-6)
-    terms = (Term(0, 0), Term(1, -1), Term(1, 1))
+    terms = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1))
     with np.errstate(all="raise"):
         found = fit_zernikes(x, y, deviation, terms, Aperture(3e-3, 0.0, 0.0))
         assert np.all(np.isfinite(found.uncertainty))

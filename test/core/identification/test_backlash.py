@@ -6,7 +6,7 @@ from scipy import signal
 
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.model_errors.families import lost_in_gaps, through_gap, without_noise
+from omsm_ros.core.model_errors.families import backlash_lead, through_backlash, without_noise
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER = 1e-3, 20
@@ -27,12 +27,12 @@ def played(motion, half):
 def test_a_gap_is_the_play_operator(half):
     rng = np.random.default_rng(7)
     motion = np.repeat(np.cumsum(rng.normal(size=200)), 2)
-    np.testing.assert_allclose(through_gap(motion, half), played(motion, half), atol=1e-12)
+    np.testing.assert_allclose(through_backlash(motion, half), played(motion, half), atol=1e-12)
 
 
 def test_what_is_lost_lies_within_the_gap_and_its_start_is_forgotten_when_crossed():
     motion = np.concatenate([np.linspace(0, 1, 50), np.linspace(1, -1, 100)])
-    ahead, start = lost_in_gaps(motion, [0.5])
+    ahead, start = backlash_lead(motion, [0.5])
     assert (np.min(ahead), np.max(ahead)) == (pytest.approx(-1), pytest.approx(1))
     assert start[0] == 1.0
     assert np.all(start[motion.cumsum() > 15] == 0)
@@ -62,9 +62,9 @@ def overshooting(seed, half_gap):
 @pytest.mark.soak
 def test_backlash_behind_an_overshooting_servo_is_found_and_bends_no_pole():
     found = identify(overshooting(3, HALF_GAP_M)).calibration
-    (departure,) = found.certificate["departures"]
-    assert departure["family"] == "backlash"
-    assert departure["size_m"] == pytest.approx(HALF_GAP_M, rel=0.1)
+    (model_error,) = found.certificate["departures"]
+    assert model_error["family"] == "backlash"
+    assert model_error["size_m"] == pytest.approx(HALF_GAP_M, rel=0.1)
     assert found.certificate["order"] <= 2
     off = found.dynamics.response(1.0) * (1 + 2j * np.pi * LAG_S) - 1
     # Three nanometres on a tenth of a millimetre.

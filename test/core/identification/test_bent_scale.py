@@ -13,7 +13,7 @@ from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER, DWELL = 1e-3, 20, 0.75
 STEP_M, RISE_S, NOISE_M = 9.8e-6, 20e-3, 10e-9
-LAGS_S, DELAY_S, BENT_M = (1.33e-3, 0.23e-3), 0.37e-3, 0.3e-6
+LAGS_S, DELAY_S, CURVATURE_M = (1.33e-3, 0.23e-3), 0.37e-3, 0.3e-6
 
 
 def staircase(time):
@@ -39,15 +39,15 @@ def calibration():
     random = np.random.default_rng(4)
     noise = NOISE_M * random.normal(size=len(z))
     return identify(
-        MotionRecord.from_arrays(PERIOD, z, -40e-6 - seen - BENT_M * place**3 + noise)
+        MotionRecord.from_arrays(PERIOD, z, -40e-6 - seen - CURVATURE_M * place**3 + noise)
     ).calibration
 
 
-def test_a_bent_scale_leaves_the_lag_alone(calibration):
+def test_a_curved_scale_leaves_the_lag_alone(calibration):
     certificate = calibration.certificate
     assert certificate["verdict"] != "rejected"
     (found,) = (d for d in certificate["departures"] if d["family"] == "probe linearity")
-    assert found["size_m"] == pytest.approx(BENT_M, rel=0.05)
+    assert found["size_m"] == pytest.approx(CURVATURE_M, rel=0.05)
     off = calibration.dynamics.low_frequency_delay - sum(LAGS_S) - DELAY_S
     # A bend of the axis's position put it 11 µs off.
     assert abs(off) < min(3 * certificate["low_frequency_delay_uncertainty_s"], 5e-6)

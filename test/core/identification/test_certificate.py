@@ -6,13 +6,13 @@ import pytest
 
 from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.identify import certificate_of, verdict
 from omsm_ros.core.identification.model_choice import choose_model
-from omsm_ros.core.identification.model_error_search import Searched
+from omsm_ros.core.identification.model_error_search import SearchResult
 from omsm_ros.core.identification.response_uncertainty import response_uncertainty
 from omsm_ros.core.lti.frequency_response import ResponseLimits
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.streams.motion_record import assemble
 
 
@@ -21,9 +21,11 @@ def evidence(step_test):
     record, limits = assemble([step_test.axes], [step_test.distance]), ResponseLimits()
     prepared = prepare(record, "encoder")
     model = choose_model(prepared, 1)
-    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
+    diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
     known = response_uncertainty(prepared, model, limits)
-    return Evidence(record, prepared, model, known, limits, Searched(prepared, model, survey))
+    return IdentificationEvidence(
+        record, prepared, model, known, limits, SearchResult(prepared, model, diagnostics)
+    )
 
 
 def test_the_verdict_says_what_the_data_support():

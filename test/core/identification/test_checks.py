@@ -7,14 +7,14 @@ import pytest
 from omsm_ros.core.identification.checks import (
     late,
     misfit,
-    poles_beyond,
+    poles_beyond_valid_range,
     requested_order,
     scale,
     separable_gain,
     trusted_range,
     two_clocks,
 )
-from omsm_ros.core.identification.covariance_terms import hidden_motion_finding
+from omsm_ros.core.identification.covariance_terms import inter_sample_motion_finding
 from omsm_ros.core.lti.frequency_response import ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
@@ -49,8 +49,8 @@ def test_good_evidence_gives_no_reason_and_no_warning():
         separable_gain(1e-5, 0.01),
         trusted_range(80.0, LIMITS),
         requested_order(3, 1.0),
-        poles_beyond(SLOW, 80.0, 500.0),
-        hidden_motion_finding(1e-8, 1e-6),
+        poles_beyond_valid_range(SLOW, 80.0, 500.0),
+        inter_sample_motion_finding(1e-8, 1e-6),
     ]
     assert not list(chain.from_iterable(f.reasons + f.warnings for f in good))
 
@@ -61,7 +61,7 @@ def test_good_evidence_gives_no_reason_and_no_warning():
         (misfit(2.0, 1e-8, None), "misses something"),
         (misfit(0.1, 1e-8, None), "not quiet"),
         (trusted_range(1.0, LIMITS), "more or larger steps"),
-        (hidden_motion_finding(20e-6, 1e-6), "between samples may shift the lag by 20.0 µs"),
+        (inter_sample_motion_finding(20e-6, 1e-6), "between samples may shift the lag by 20.0 µs"),
         (separable_gain(0.02, 0.01), "uncertain by 3.9 %"),
     ],
 )
@@ -78,12 +78,12 @@ def test_the_band_of_the_gain_is_95_percent():
 
 def test_a_bias_below_five_nanometres_of_a_scan_is_held_by_the_band():
     """It is 3 mdeg at 15 Hz: a lag known even better need not be rejected for it."""
-    assert not hidden_motion_finding(6.9e-6, 1e-9).reasons
-    assert hidden_motion_finding(7.1e-6, 1e-9).reasons
+    assert not inter_sample_motion_finding(6.9e-6, 1e-9).reasons
+    assert inter_sample_motion_finding(7.1e-6, 1e-9).reasons
 
 
 def test_a_pole_beyond_the_trusted_band_is_warned_of():
-    (text,) = poles_beyond(FAST, 80.0, 500.0).warnings
+    (text,) = poles_beyond_valid_range(FAST, 80.0, 500.0).warnings
     assert "1.59 kHz" in text
 
 

@@ -16,7 +16,7 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
     HALVES,
     SIZES,
     UP_DOWN,
-    Survey,
+    ResidualDiagnostics,
     contrasts,
 )
 from omsm_ros.core.streams.motion_record import MotionRecord
@@ -45,7 +45,7 @@ def stepped(lags, gains=None, heights=HEIGHTS, seed=1):
 def survey_of(record):
     prepared = prepare(record, "encoder")
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
-    return Survey(prepared.problem, late, prepared.steps)
+    return ResidualDiagnostics(prepared.problem, late, prepared.steps)
 
 
 def found(record):
@@ -103,9 +103,9 @@ def test_only_parts_that_the_test_has_are_compared(heights, parts):
 
 
 def test_the_band_holds_the_difference():
-    survey = survey_of(stepped(LAG + np.where(FIRST[SIZES], 20e-6, 0.0)))
-    term = consistency(survey)
-    lag = low_frequency_delay_uncertainty(survey.fitted.dynamics, term.covariance)
+    diagnostics = survey_of(stepped(LAG + np.where(FIRST[SIZES], 20e-6, 0.0)))
+    term = consistency(diagnostics)
+    lag = low_frequency_delay_uncertainty(diagnostics.fitted.dynamics, term.covariance)
     assert lag >= 19e-6
     assert "small steps and large differ by" in term.finding.reservations[0]
     assert "by chance" in term.finding.reservations[0]
@@ -126,13 +126,13 @@ def test_the_certificate_states_every_comparison():
 
 def test_what_rang_before_the_record_is_no_part_of_the_answer_to_the_motion():
     """Decays that are over when the comparison begins may have any size before."""
-    survey = survey_of(stepped(alike()))
-    problem = replace(survey.problem, fits_initial_condition=True)
+    diagnostics = survey_of(stepped(alike()))
+    problem = replace(diagnostics.problem, fits_initial_condition=True)
     structure = Structure(2, 1, False)
     start = problem.parametrised(structure).nonlinear_of(np.array([-20.0 + 0j, -30.0]), 0.0)
     fitted = fit(problem, structure, [start])
     ringing = np.concatenate([fitted.driven[:2], 1e6 * np.ones(2)])
-    huge = Survey(problem, replace(fitted, driven=ringing), survey.steps)
-    quiet = Survey(problem, fitted, survey.steps)
-    expected = quiet.departures.creep().columns
-    assert huge.departures.creep().columns == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    huge = ResidualDiagnostics(problem, replace(fitted, driven=ringing), diagnostics.steps)
+    quiet = ResidualDiagnostics(problem, fitted, diagnostics.steps)
+    expected = quiet.model_errors.creep().columns
+    assert huge.model_errors.creep().columns == pytest.approx(expected, rel=1e-9, abs=1e-15)

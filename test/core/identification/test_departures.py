@@ -9,12 +9,17 @@ from scipy import signal
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.checks import agreement, departures, independence
+from omsm_ros.core.identification.checks import agreement, independence, model_errors
 from omsm_ros.core.identification.covariance_terms import reference_lag
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.identification.model_error_search import Searched, _beside, _with_columns, search
-from omsm_ros.core.identification.response_uncertainty import gain_above_rest
+from omsm_ros.core.identification.model_error_search import (
+    SearchResult,
+    _select_nuisance_terms,
+    _with_columns,
+    search_model_errors,
+)
+from omsm_ros.core.identification.response_uncertainty import dynamic_gain_finding
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -25,11 +30,11 @@ from omsm_ros.core.model_errors.families import (
     FRICTION,
     MODE,
     VIBRATION,
-    dahl,
-    relaxed,
+    dahl_friction,
+    low_pass_response,
 )
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
-from omsm_ros.core.model_errors.undetected import hidden_terms, relaxation_found
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
+from omsm_ros.core.model_errors.undetected import fitted_relaxation, undetected_terms
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
@@ -47,17 +52,17 @@ def record_of(added=0.0, seed=1, noise=10e-9):
 
 
 def searched(added=0.0, seed=1):
-    return search(prepare(record_of(added, seed), "encoder"), model_from_start)
+    return search_model_errors(prepare(record_of(added, seed), "encoder"), model_from_start)
 
 
 def survey_of(added=0.0, seed=1):
     prepared = prepare(record_of(added, seed), "encoder")
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
-    return Survey(prepared.problem, late, prepared.steps)
+    return ResidualDiagnostics(prepared.problem, late, prepared.steps)
 
 
 def crept(size, time_constant):
-    return size * (relaxed(LATE, PERIOD / time_constant) - LATE)
+    return size * (low_pass_response(LATE, PERIOD / time_constant) - LATE)
 
 
 def ringing(participation, frequency, damping):
@@ -68,29 +73,29 @@ def ringing(participation, frequency, damping):
 
 def test_a_relaxation_follows_a_ramp_late_by_its_time_constant():
     ramp = np.maximum(TIME - 1.0, 0.0)
-    late = relaxed(ramp, PERIOD / 0.05)
+    late = low_pass_response(ramp, PERIOD / 0.05)
     expected = ramp - 0.05 * (1 - np.exp(-ramp / 0.05))
     assert late == pytest.approx(expected, abs=1e-9)
 
 
 def test_friction_after_a_reversal_is_dahls_exponential():
     there_and_back = np.concatenate([np.linspace(0, 5e-6, 501), np.linspace(5e-6, 0, 501)[1:]])
-    force, _ = dahl(there_and_back, 1e-6)
+    force, _ = dahl_friction(there_and_back, 1e-6)
     assert force[500] == pytest.approx(1 - np.exp(-5), rel=1e-9)
     back = 5e-6 - there_and_back[501:]
     assert force[501:] == pytest.approx(-1 + (1 + force[500]) * np.exp(-back / 1e-6), rel=1e-9)
 
 
 def test_what_friction_started_with_is_forgotten_along_the_way():
-    _, start = dahl(np.linspace(0, 3e-6, 100), 1e-6)
+    _, start = dahl_friction(np.linspace(0, 3e-6, 100), 1e-6)
     assert start[-1] == pytest.approx(np.exp(-3), rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_clean_test_shows_nothing(seed):
     found = searched(seed=seed)
-    assert not found.beside
-    assert not found.in_response
+    assert not found.nuisance_terms
+    assert not found.added_poles
     assert not found.unmodelled
 
 
@@ -103,8 +108,8 @@ def test_a_clean_test_shows_nothing(seed):
     ],
 )
 def test_the_residual_names_what_is_there(added, family, parameter):
-    survey = survey_of(added)
-    first = survey.significant()[0].term
+    diagnostics = survey_of(added)
+    first = diagnostics.significant()[0].term
     assert first.family == family
     assert first.parameter == pytest.approx(parameter, rel=1.0 if family == CREEP else 0.05)
 
@@ -129,7 +134,7 @@ def test_scores_of_clean_tests_scatter_by_their_uncertainty():
 
 def test_a_soft_mode_becomes_a_pole_and_the_response_right():
     found = searched(ringing(1e-3, 8.0, 0.03))
-    assert [term.family for term in found.in_response] == [MODE]
+    assert [term.family for term in found.added_poles] == [MODE]
     omega = 2 * np.pi * 8.0
     mode = TransferFunction.from_ascending([1.0], [1.0, 0.06 / omega, omega**-2])
     lines = np.array([1.0, 4.0, 12.0])
@@ -165,13 +170,13 @@ def test_a_light_mode_takes_the_place_of_poles_that_imitated_it():
 
 def test_a_line_of_vibration_is_no_pole():
     found = searched(20e-9 * np.sin(2 * np.pi * 13.7 * TIME + 1.0))
-    assert {modelled.term.family for modelled in found.beside} == {VIBRATION}
+    assert {modelled.term.family for modelled in found.nuisance_terms} == {VIBRATION}
     assert all(abs(pole) > 200 for pole in found.model.chosen.fit.dynamics.poles())
 
 
-def test_a_bent_drift_is_drift_and_no_pole():
+def test_a_curved_drift_is_drift_and_no_pole():
     found = searched(200e-9 * np.sin(2 * np.pi * TIME / 20))
-    assert {modelled.term.family for modelled in found.beside} == {DRIFT}
+    assert {modelled.term.family for modelled in found.nuisance_terms} == {DRIFT}
     assert all(abs(pole) > 200 for pole in found.model.chosen.fit.dynamics.poles())
 
 
@@ -196,12 +201,12 @@ def test_backlash_is_named_with_its_size_and_leaves_the_lag_alone():
 def test_backlash_and_friction_cancel_each_other_and_only_their_sum_is_lost():
     prepared = prepare(record_of(played(10e-9)), "encoder")
     prepared, model = model_from_start(prepared)
-    survey = Survey(prepared.problem, model.chosen.fit, prepared.steps)
-    alike = [survey.best[BACKLASH], survey.best[FRICTION]]
-    assert len(_beside(survey, alike)) == 1
+    diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
+    alike = [diagnostics.best[BACKLASH], diagnostics.best[FRICTION]]
+    assert len(_select_nuisance_terms(diagnostics, alike)) == 1
     prepared, both = _with_columns(prepared, alike)
     prepared, model = model_from_start(prepared)
-    entries = departures(Searched(prepared, model, survey, both)).entries
+    entries = model_errors(SearchResult(prepared, model, diagnostics, both)).entries
     assert sum(entry["uncertainty_m"] for entry in entries["departures"]) > 5e-9
     assert entries["motion_error_m"] == pytest.approx(5e-9, rel=0.2)
 
@@ -222,40 +227,40 @@ def test_a_plateau_is_the_time_between_edges():
     assert survey_of().plateau == pytest.approx(StepTest().dwell, abs=2 * PERIOD)
 
 
-class TestHidden:
+class TestUndetectedTerms:
     def test_a_missed_relaxation_would_have_been_seen(self):
         """The size said to be missed with 5 % is found nearly always, a third of it hardly."""
-        hidden = hidden_terms(survey_of())[0]
-        assert hidden.family == CREEP
+        undetected = undetected_terms(survey_of())[0]
+        assert undetected.family == CREEP
         found = [
             CREEP
             in [
                 j.term.family
-                for j in survey_of(crept(hidden.missed, hidden.parameter), k).significant()
+                for j in survey_of(crept(undetected.missed, undetected.parameter), k).significant()
             ]
             for k in range(6)
         ]
         assert sum(found) >= 5
 
     def test_what_is_carried_holds_estimate_and_uncertainty(self):
-        for term in hidden_terms(survey_of(crept(6e-5, 1.0))):
+        for term in undetected_terms(survey_of(crept(6e-5, 1.0))):
             assert term.carried**2 == pytest.approx(
                 term.size**2 + term.uncertainty**2, rel=1e-6, abs=0
             )
 
     def test_the_gain_above_rest_is_open_in_the_covariance(self):
-        hidden = hidden_terms(survey_of())[0]
-        covariance = hidden.covariance(1e-4)
-        assert covariance[0, 0] == pytest.approx((1e-4 * hidden.above) ** 2)
+        undetected = undetected_terms(survey_of())[0]
+        covariance = undetected.covariance(1e-4)
+        assert covariance[0, 0] == pytest.approx((1e-4 * undetected.above) ** 2)
 
     def test_a_declared_prior_narrows_the_band(self):
         free = identify(record_of()).calibration
-        told = identify(record_of(), settings={"priors": {CREEP: 1e-6}}).calibration
-        assert told.covariance[0, 0] < 0.01 * free.covariance[0, 0]
-        entry = next(e for e in told.certificate["could_hide"] if e["family"] == CREEP)
+        reported = identify(record_of(), settings={"priors": {CREEP: 1e-6}}).calibration
+        assert reported.covariance[0, 0] < 0.01 * free.covariance[0, 0]
+        entry = next(e for e in reported.certificate["could_hide"] if e["family"] == CREEP)
         assert entry["prior"] == entry["carried"] == 1e-6
         # Both costs on a scan are of one effect per unit: of what is carried, of what is missed.
-        for each in told.certificate["could_hide"]:
+        for each in reported.certificate["could_hide"]:
             effect = each["effect_on_scan_m"] / each["carried"]
             assert each["missed_effect_on_scan_m"] == pytest.approx(effect * each["missed"])
 
@@ -270,7 +275,7 @@ class TestHidden:
         dynamics = TransferFunction.from_ascending(
             [1.0, slow * (1 - size)], [1.0, slow + fast, slow * fast]
         )
-        assert relaxation_found(dynamics) == pytest.approx(size, rel=1e-2)
+        assert fitted_relaxation(dynamics) == pytest.approx(size, rel=1e-2)
 
 
 def test_a_residual_that_follows_the_motion_rejects():
@@ -326,8 +331,8 @@ def test_a_reference_on_time_is_accepted():
 
 
 def test_a_gain_that_drift_leaves_open_rejects_with_the_plateau_that_would_tell():
-    assert not gain_above_rest(1e-4, 5.0, 0.5, 5e-3).reasons
-    (reason,) = gain_above_rest(1e-2, 5.0, 0.5, 5e-3).reasons
+    assert not dynamic_gain_finding(1e-4, 5.0, 0.5, 5e-3).reasons
+    (reason,) = dynamic_gain_finding(1e-2, 5.0, 0.5, 5e-3).reasons
     assert "by 2.0 %" in reason
     assert "rest 5.0 s on each plateau" in reason
 

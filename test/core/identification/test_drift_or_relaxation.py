@@ -7,12 +7,16 @@ from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.identification.model_error_search import search_model_errors
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.model_errors.families import CREEP, DRIFT, FASTEST_CREEP_S, relaxed
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
-from omsm_ros.core.model_errors.undetected import hidden_terms, relaxation_found, without_drift
+from omsm_ros.core.model_errors.families import CREEP, DRIFT, FASTEST_CREEP_S, low_pass_response
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
+from omsm_ros.core.model_errors.undetected import (
+    fitted_relaxation,
+    undetected_terms,
+    with_drift_as_noise,
+)
 
 
 def walk(size, seed=3):
@@ -21,22 +25,22 @@ def walk(size, seed=3):
 
 
 def test_drift_taken_for_noise_comes_back_into_the_residual():
-    searched = search(prepare(late_record(-walk(15e-9)), "encoder"), model_from_start)
-    drift = [b.columns for b in searched.beside if b.term.family == DRIFT]
-    survey = searched.survey
-    bare = without_drift(survey, drift)
-    columns = survey.problem.background[survey.problem.used]
-    modelled = sum(columns[:, part] @ survey.fitted.background[part] for part in drift)
-    assert bare.fitted.residual - survey.fitted.residual == pytest.approx(modelled, abs=1e-15)
-    kept = survey.problem.background.shape[1] - sum(part.stop - part.start for part in drift)
+    searched = search_model_errors(prepare(late_record(-walk(15e-9)), "encoder"), model_from_start)
+    drift = [b.columns for b in searched.nuisance_terms if b.term.family == DRIFT]
+    diagnostics = searched.diagnostics
+    bare = with_drift_as_noise(diagnostics, drift)
+    columns = diagnostics.problem.background[diagnostics.problem.used]
+    modelled = sum(columns[:, part] @ diagnostics.fitted.background[part] for part in drift)
+    assert bare.fitted.residual - diagnostics.fitted.residual == pytest.approx(modelled, abs=1e-15)
+    kept = diagnostics.problem.background.shape[1] - sum(part.stop - part.start for part in drift)
     assert bare.problem.background.shape[1] == len(bare.fitted.background) == kept
-    assert isinstance(bare, Survey)
+    assert isinstance(bare, ResidualDiagnostics)
     # Of micrometres of relaxation a drift of nanometres hides a small part.
-    free, as_noise = (max(map(open_to, one.creep)) for one in (survey, bare))
+    free, as_noise = (max(map(open_to, one.creep)) for one in (diagnostics, bare))
     assert as_noise < 0.5 * free
     # The band takes no more than the least of what either says.
-    worst = hidden_terms(survey, drift)[0]
-    assert worst.carried <= hidden_terms(survey)[0].carried
+    worst = undetected_terms(diagnostics, drift)[0]
+    assert worst.carried <= undetected_terms(diagnostics)[0].carried
 
 
 def open_to(judged):
@@ -46,11 +50,11 @@ def open_to(judged):
 @pytest.mark.parametrize(("seconds", "size"), [(80.0, 3e-4), (80.0, 1e-3), (120.0, 3e-4)])
 def test_a_relaxation_of_minutes_that_looks_like_a_steady_drift_is_in_the_band(seconds, size):
     """In ten seconds it goes on evenly, by a nanometre, and is missing whole at 1 Hz."""
-    crept = size * (relaxed(LATE, PERIOD / seconds) - LATE)
+    crept = size * (low_pass_response(LATE, PERIOD / seconds) - LATE)
     assert sigmas(identify(late_record(-crept)).calibration, size) < 3
 
 
-def test_a_steady_drift_that_does_not_show_hides_no_relaxation_and_one_that_does_may():
+def test_only_a_significant_drift_can_mask_a_relaxation():
     quiet, drifting = (identify(late_record(rate * TIME)).calibration for rate in (0.0, 1e-9))
     at = np.array([1.0])
     still, open_ = (response_band(c.dynamics, c.covariance, at).gain[0] for c in (quiet, drifting))
@@ -80,7 +84,7 @@ def test_a_machine_that_wanders_a_little_is_calibrated():
 def test_the_band_holds_a_relaxation_that_only_begins_in_the_record(records):
     """It looks like a drift; of 0.1 % of the motion all is missing at 1 Hz."""
     size = 1e-3
-    crept = size * (relaxed(LATE, PERIOD / (records * TIME[-1])) - LATE)
+    crept = size * (low_pass_response(LATE, PERIOD / (records * TIME[-1])) - LATE)
     calibration = identify(late_record(-crept)).calibration
     assert sigmas(calibration, size) < 3
 
@@ -101,14 +105,14 @@ def test_the_share_of_slow_poles_is_their_partial_fraction(share):
     slow, fast = 4 * FASTEST_CREEP_S, 0.5 * FASTEST_CREEP_S
     numerator = [1.0, share * fast + (1 - share) * slow]
     whole = TransferFunction.from_ascending(numerator, [1.0, slow + fast, slow * fast])
-    assert relaxation_found(whole) == pytest.approx(abs(share), rel=1e-9)
+    assert fitted_relaxation(whole) == pytest.approx(abs(share), rel=1e-9)
 
 
-def test_beside_a_relaxation_lag_and_roll_off_stay_independent():
+def test_next_to_a_relaxation_lag_and_roll_off_stay_independent():
     """With a lag alone beside it the band would close at the upper end, where nothing is known."""
-    crept = 1e-3 * (relaxed(LATE, PERIOD / 1.0) - LATE)
-    searched = search(prepare(late_record(-crept), "encoder"), model_from_start)
-    assert [term.family for term in searched.in_response] == [CREEP]
+    crept = 1e-3 * (low_pass_response(LATE, PERIOD / 1.0) - LATE)
+    searched = search_model_errors(prepare(late_record(-crept), "encoder"), model_from_start)
+    assert [term.family for term in searched.added_poles] == [CREEP]
     pole_and_zero, lag_and_roll_off = 2, 3
     structure = searched.model.chosen.fit.structure
     assert structure.size >= pole_and_zero + lag_and_roll_off

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.estimation.model_structure import Scaled
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.fitted_record import (
@@ -123,7 +123,7 @@ def later(identified, delay):
     """The fit with ``delay`` [s] more, and the residual of that."""
     found, problem = identified.fit, identified.prepared.problem
     assert not found.structure.delay
-    scaled = Scaled(replace(found.structure, delay=True), problem.rate)
+    scaled = ScaledStructure(replace(found.structure, delay=True), problem.rate)
     nonlinear = np.append(found.nonlinear, delay * problem.rate)
     moved = replace(found, scaled=scaled, nonlinear=nonlinear)
     return replace(moved, residual=(problem.output - problem.modelled(moved))[problem.used])

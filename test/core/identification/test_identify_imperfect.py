@@ -45,12 +45,12 @@ class TestImperfectData:
     def test_coloured_noise_widens_the_band(self):
         recording = recorded(seed=12)
         noise = np.random.default_rng(3).normal(0, 5e-9, len(recording.axes))
-        wide, narrow = (
+        broad, narrow = (
             identify(record_of(recording, distance=recording.distance.distance + extra)).calibration
             for extra in (signal.lfilter([1.0], [1.0, -0.9], noise), noise)
         )
         key = "low_frequency_delay_uncertainty_s"
-        assert wide.certificate[key] > 1.5 * narrow.certificate[key]
+        assert broad.certificate[key] > 1.5 * narrow.certificate[key]
 
     def test_backlash_is_found_and_stated(self):
         recording = recorded(seed=13)
@@ -74,7 +74,7 @@ class TestImperfectData:
         assert np.all(np.abs(phase) < 1.96 * band.phase)
         assert np.all(np.abs(gain) < 1.96 * band.gain)
 
-    def test_a_probe_mounted_the_other_way_is_told_by_its_polarity(self):
+    def test_a_probe_mounted_the_other_way_is_reported_by_its_polarity(self):
         recording = recorded()
         turned = identify(record_of(recording, distance=-recording.distance.distance)).calibration
         assert turned.certificate["polarity"] == -1

@@ -32,7 +32,7 @@ def bias_of(rise, servo, dynamics=PAPER_DYNAMICS):
     one = StepTest(rise=rise, count=1)
     # One edge from the middle of its first plateau to the middle of the next.
     moved = respond(Plant(dynamics, servo_bandwidth=servo), one, 850, PERIOD, substeps=64)
-    input_, output = moved.carriage[250:], moved.probe[250:]
+    input_, output = moved.slide[250:], moved.probe[250:]
     area = PERIOD * np.sum(input_ - output) / (input_[-1] - input_[0])
     return float(area) - dynamics.low_frequency_delay
 
@@ -59,20 +59,20 @@ def test_of_a_response_that_rises_beyond_half_the_rate_the_bound_is_no_exaggerat
     assert bound_of(rise, servo) < 1.5 * abs(bias_of(rise, servo))
 
 
-def test_jerk_limited_edges_hide_nothing_worth_a_tenth_of_a_microsecond():
+def test_jerk_limited_edges_mask_nothing_worth_a_tenth_of_a_microsecond():
     assert bound_of(20e-3) < 0.1e-6
     assert abs(bias_of(20e-3, 200.0)) < 1e-9
 
 
-def test_faster_sampling_hides_less():
+def test_faster_sampling_masks_less():
     assert bound_of(0.0, period=1e-4) < 1e-2 * bound_of(0.0, period=1e-3)
 
 
-def test_a_slow_path_hides_nothing():
+def test_a_slow_path_masks_nothing():
     z = record(Cell(), Chirp(), Flat()).axes.z
     assert inter_sample_delay_bound(z, find_steps(z, 1e-3), 1e-3) < 0.1e-6
 
 
-def test_an_edge_between_two_samples_hides_much():
+def test_an_edge_between_two_samples_masks_much_motion():
     z = np.where(np.arange(2000) < 1000, 0.0, 1e-5)
     assert inter_sample_delay_bound(z, find_steps(z, 1e-3), 1e-3) > 100e-6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
-from omsm_ros.core.estimation.model_structure import Scaled, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
@@ -94,7 +94,7 @@ def test_what_fewer_samples_cannot_show_is_seen_in_the_residual():
         [1.0, 0.04 / omega, 0.98 / omega**2], [1.0, 0.04 / omega, omega**-2]
     )
     structure = Structure(2, 2, False)
-    start = Scaled(structure, 600.0).nonlinear_of(light.poles() / 600.0, 0.0)
+    start = ScaledStructure(structure, 600.0).nonlinear_of(light.poles() / 600.0, 0.0)
     problem = driven(light)
     coarse = coarser(problem, 3)
     without = fit(problem, Structure(0, 0, True), [np.array([0.0])])

@@ -7,14 +7,14 @@ import pytest
 
 from omsm_ros.core.estimation.model_order import Candidate, StartingPoints, information
 from omsm_ros.core.estimation.model_structure import Structure
-from omsm_ros.core.estimation.optimisation import Effort
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.model_choice import Model, chosen_alike, no_worse
+from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
 
 from .recorded_motions import record_of, recorded
 
-SPENT = Effort(comparisons=10**6)
+SPENT = EvaluationBudget(comparisons=10**6)
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +28,12 @@ def fitted():
 
 def chosen(found):
     candidate = Candidate(found, information(found))
-    return Model(candidate, [candidate])
+    return ChosenModel(candidate, [candidate])
 
 
 def test_where_not_all_was_tried_the_structure_before_stays(fitted):
     problem, lag, two = fitted
-    kept = no_worse(replace(problem, effort=SPENT), chosen(lag), two)
+    kept = keep_better(replace(problem, effort=SPENT), chosen(lag), two)
     assert kept.chosen.fit.structure == two.structure
     assert kept.chosen.fit.sum_of_squares <= two.sum_of_squares * (1 + 1e-9)
     assert kept.candidates[-1] is kept.chosen
@@ -48,7 +48,7 @@ def test_it_is_fitted_to_the_problem_as_it_is_now(fitted):
         background=np.column_stack([problem.background, line]),
         effort=SPENT,
     )
-    kept = no_worse(changed, chosen(lag), two).chosen.fit
+    kept = keep_better(changed, chosen(lag), two).chosen.fit
     assert kept.background[-1] == pytest.approx(1.0, abs=0.05)
     assert kept.rms == pytest.approx(two.rms, rel=0.01)
 
@@ -56,19 +56,19 @@ def test_it_is_fitted_to_the_problem_as_it_is_now(fitted):
 def test_what_describes_more_is_not_given_up(fitted):
     problem, lag, two = fitted
     found = chosen(two)
-    assert no_worse(replace(problem, effort=SPENT), found, lag) is found
+    assert keep_better(replace(problem, effort=SPENT), found, lag) is found
 
 
 def test_where_all_was_tried_the_choice_stands(fitted):
     problem, lag, two = fitted
     found = chosen(lag)
-    assert no_worse(replace(problem, effort=Effort()), found, two) is found
+    assert keep_better(replace(problem, effort=EvaluationBudget()), found, two) is found
 
 
 def among(lag, two):
     """The choice of ``two`` among both."""
     candidates = [Candidate(each, information(each)) for each in (lag, two)]
-    return Model(candidates[1], candidates)
+    return ChosenModel(candidates[1], candidates)
 
 
 def test_what_all_candidates_lack_alike_leaves_the_choice(fitted):
@@ -77,7 +77,7 @@ def test_what_all_candidates_lack_alike_leaves_the_choice(fitted):
     three = fit(problem, Structure(2, 1, True), [np.append(two.nonlinear, 0.01)])
     line = 3e-9 * np.sin(2 * np.pi * 40.0 * problem.period * np.arange(len(problem.used)))
     quieter = replace(problem, output=problem.output - line)
-    kept = chosen_alike(quieter, among(three, two))
+    kept = rechosen(quieter, among(three, two))
     again = fit(quieter, two.structure, [two.nonlinear])
     assert kept.chosen.fit.sum_of_squares == pytest.approx(again.sum_of_squares, rel=1e-9, abs=0)
     assert kept.chosen in kept.candidates
@@ -92,11 +92,11 @@ def test_what_one_candidate_gains_more_by_asks_for_another_choice(fitted):
     exact = replace(
         problem, output=problem.modelled(two) + 0.1 * (problem.output - problem.modelled(two))
     )
-    assert chosen_alike(exact, among(two, lag)) is None
-    assert chosen_alike(problem, among(two, lag)) is not None
+    assert rechosen(exact, among(two, lag)) is None
+    assert rechosen(problem, among(two, lag)) is not None
 
 
 def test_of_an_order_that_was_asked_for_the_free_choice_is_made_anew(fitted):
     problem, lag, two = fitted
     asked = replace(among(lag, two), free=among(lag, two))
-    assert chosen_alike(problem, asked) is None
+    assert rechosen(problem, asked) is None

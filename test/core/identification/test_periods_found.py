@@ -8,9 +8,9 @@ from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.identification.model_error_search import search_model_errors
 from omsm_ros.core.model_errors.families import DRIFT, PERIODIC, VIBRATION
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 
 
 def prepared_of(added):
@@ -20,7 +20,7 @@ def prepared_of(added):
 def best(added, family):
     prepared = prepared_of(added)
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
-    return Survey(prepared.problem, late, prepared.steps, (family,)).best[family]
+    return ResidualDiagnostics(prepared.problem, late, prepared.steps, (family,)).best[family]
 
 
 @pytest.mark.parametrize(
@@ -44,8 +44,10 @@ def test_a_line_is_found_between_the_lines_of_the_record(frequency):
 @pytest.mark.parametrize("period", [2.413e-6, pytest.param(7.03e-6, marks=pytest.mark.soak)])
 def test_an_error_between_two_periods_of_the_travel_is_one_error(period):
     size = 20e-9
-    searched = search(prepared_of(size * np.sin(2 * np.pi * LATE / period + 1.0)), model_from_start)
-    found = [b.term.parameter for b in searched.beside if b.term.family == PERIODIC]
+    searched = search_model_errors(
+        prepared_of(size * np.sin(2 * np.pi * LATE / period + 1.0)), model_from_start
+    )
+    found = [b.term.parameter for b in searched.nuisance_terms if b.term.family == PERIODIC]
     assert len(found) == 1
     assert found[0] == pytest.approx(period, rel=0.01)
 
@@ -54,7 +56,7 @@ def test_an_error_between_two_periods_of_the_travel_is_one_error(period):
 def test_what_wanders_slowly_is_a_drift_and_what_repeats_is_a_line(periods, family):
     """Lines begin at two periods over the record; either leaves nothing of it."""
     wandering = 50e-9 * np.sin(2 * np.pi * periods * TIME / TIME[-1] + 0.3)
-    searched = search(prepared_of(wandering), model_from_start)
-    assert family in {b.term.family for b in searched.beside}
+    searched = search_model_errors(prepared_of(wandering), model_from_start)
+    assert family in {b.term.family for b in searched.nuisance_terms}
     assert searched.unmodelled == []
     assert searched.model.chosen.fit.rms == pytest.approx(NOISE, rel=0.03)

@@ -79,7 +79,7 @@ def test_a_wrong_model_shows_where_the_axis_moves():
 
 
 @pytest.mark.parametrize("noise", [0.5e-9, 1.5e-9])
-def test_rounding_that_rests_hide_is_no_misfit(noise):
+def test_rounding_masked_in_stationary_segments_is_no_misfit(noise):
     """Readings in steps of 10 nm scatter by 2.9 nm where they move, and hardly where they rest."""
     quantum, (problem, steps) = 10e-9, stepped(0.0005, noise)
     rounded = np.round(problem.output / quantum) * quantum
@@ -95,7 +95,7 @@ def test_fig_9_of_the_paper():
     chirp, plant = Chirp(), Plant(PAPER_EQ_12)
     moved = respond(plant, chirp, 25_000, 1e-3)
     predicted = respond(Plant(PAPER_EQ_12.normalised()), chirp, 25_000, 1e-3).probe
-    check = check_path(moved.carriage, -moved.probe, predicted, PAPER_EQ_12.dc_gain, 1e-3)
+    check = check_path(moved.slide, -moved.probe, predicted, PAPER_EQ_12.dc_gain, 1e-3)
     fast = (check.frequency > 13) & (check.frequency < 14.5)
     assert np.degrees(np.median(check.lag_before[fast])) == pytest.approx(1.69, abs=0.1)
     assert abs(np.degrees(np.median(check.lag_after[fast]))) < 0.02

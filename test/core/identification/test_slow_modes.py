@@ -8,11 +8,11 @@ from scipy import signal
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
-from omsm_ros.core.identification.model_error_search import search
+from omsm_ros.core.identification.model_error_search import search_model_errors
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.model_errors.families import MODE, VIBRATION
-from omsm_ros.core.model_errors.undetected import spread_of_modes
+from omsm_ros.core.model_errors.undetected import alternative_mode_covariance
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 
@@ -47,11 +47,15 @@ def test_a_mode_between_the_teeth_of_even_steps_is_no_surer_than_which_mode_it_i
     random = np.random.default_rng(1)
     seen = -late - ringing(size, frequency, damping, late) + random.normal(0, NOISE, len(time))
     z = steps.positions(time).z + random.normal(0, 0.3e-9, len(time))
-    found = search(prepare(MotionRecord.from_arrays(PERIOD, z, seen), "encoder"), model_from_start)
-    (mode,), (without,) = found.in_response, found.without
+    found = search_model_errors(
+        prepare(MotionRecord.from_arrays(PERIOD, z, seen), "encoder"), model_from_start
+    )
+    (mode,), (without,) = found.added_poles, found.without
     fitted = found.model.chosen.fit
     lines = np.linspace(1.2, 2.0, 40)
-    spread = response_band(fitted.dynamics, spread_of_modes(without, mode, fitted), lines)
+    spread = response_band(
+        fitted.dynamics, alternative_mode_covariance(without, mode, fitted), lines
+    )
     ratio = 1j * lines / frequency
     truth = np.exp(-2j * np.pi * lines * LAG) * (
         1 + size * (1 / (1 + 2 * damping * ratio + ratio**2) - 1)
@@ -62,17 +66,21 @@ def test_a_mode_between_the_teeth_of_even_steps_is_no_surer_than_which_mode_it_i
 
 
 def test_a_mode_that_shows_clearly_is_no_other():
-    clear = search(prepare(late_record(-ringing(1e-3, 8.0, 0.05), 1), "encoder"), model_from_start)
-    (mode,), (without,) = clear.in_response, clear.without
+    clear = search_model_errors(
+        prepare(late_record(-ringing(1e-3, 8.0, 0.05), 1), "encoder"), model_from_start
+    )
+    (mode,), (without,) = clear.added_poles, clear.without
     fitted = clear.model.chosen.fit
     spread = response_band(
-        fitted.dynamics, spread_of_modes(without, mode, fitted), np.array([0.5, 1.0, 2.0])
+        fitted.dynamics,
+        alternative_mode_covariance(without, mode, fitted),
+        np.array([0.5, 1.0, 2.0]),
     )
     assert np.max(np.hypot(spread.gain, spread.phase)) < 1e-5
 
 
 def test_a_slow_line_of_vibration_is_no_mode():
     line = 1.5e-9 * np.sin(2 * np.pi * 0.73 * TIME + 1.0)
-    found = search(prepare(late_record(line), "encoder"), model_from_start)
-    assert {modelled.term.family for modelled in found.beside} == {VIBRATION}
-    assert not found.in_response
+    found = search_model_errors(prepare(late_record(line), "encoder"), model_from_start)
+    assert {modelled.term.family for modelled in found.nuisance_terms} == {VIBRATION}
+    assert not found.added_poles

@@ -53,7 +53,7 @@ def test_exchanged_channels_are_named():
 
 
 @pytest.mark.parametrize(
-    ("lag", "uncertainty", "noises", "told"),
+    ("lag", "uncertainty", "noises", "reported"),
     [
         (0.3e-3, 1e-6, (1e-9, 1e-8), ""),
         (-3e-6, 1e-7, (1e-9, 1e-8), ""),
@@ -62,12 +62,12 @@ def test_exchanged_channels_are_named():
         (-30e-6, 1e-6, (1e-8, 1e-9), "channels are exchanged"),
     ],
 )
-def test_a_probe_that_leads(lag, uncertainty, noises, told):
+def test_a_probe_that_leads(lag, uncertainty, noises, reported):
     found = lead(lag, uncertainty, *noises)
     words = " ".join((*found.reasons, *found.reservations))
-    assert told in words
-    assert bool(told) == bool(words)
-    assert bool(found.reasons) == ("exchanged" in told)
+    assert reported in words
+    assert bool(reported) == bool(words)
+    assert bool(found.reasons) == ("exchanged" in reported)
 
 
 def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
@@ -84,7 +84,7 @@ def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
 
 
 @pytest.mark.parametrize("name", ["Creep", "crep", "backlash"])
-def test_a_prior_of_what_does_not_hide_is_refused(name):
+def test_a_prior_on_a_detectable_family_is_refused(name):
     rng = np.random.default_rng(1)
     z = StepTest(count=2).positions(TIME).z
     record = MotionRecord.from_arrays(PERIOD, z, rng.normal(-z, 10e-9))

@@ -131,7 +131,7 @@ def test_a_beam_along_z_is_not_turned():
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "told"),
+    ("name", "value", "reported"),
     [
         ("centre_x", 11.0, "centre_x is 11.0 m.*metres"),
         ("probe_z", -1e3, "probe_z is -1000.0 m"),
@@ -139,6 +139,6 @@ def test_a_beam_along_z_is_not_turned():
         ("beam_y", "steep", "beam_y is 'steep'"),
     ],
 )
-def test_what_no_cell_has_is_refused_by_name_value_and_unit(name, value, told):
-    with pytest.raises(ConfigurationError, match=told):
+def test_what_no_cell_has_is_refused_by_name_value_and_unit(name, value, reported):
+    with pytest.raises(ConfigurationError, match=reported):
         Geometry(**{name: value})

@@ -12,7 +12,7 @@ from omsm_ros.core.kinematics.limits import (
     highest_factor,
     speed_limits,
 )
-from omsm_ros.core.kinematics.scan_path import PathStart, ScanPath, content_frequency, steepest
+from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader, content_frequency, steepest
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
@@ -144,7 +144,7 @@ def test_readings_that_span_less_show_a_better_servo() -> None:
 
 
 def test_the_start_of_a_path_is_gathered_from_blocks() -> None:
-    start = PathStart(150)
+    start = ScanPathReader(150)
     assert start.path() is None
     ramp = np.arange(100.0)
     for first in (0, 100):

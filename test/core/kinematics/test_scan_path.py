@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from omsm_ros.core.kinematics.scan_path import PathStart
+from omsm_ros.core.kinematics.scan_path import ScanPathReader
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 
 TIME = np.arange(1000) * 1e-3
@@ -26,7 +26,7 @@ def distance(first: int, stop: int) -> DistanceBlock:
 
 
 def path_of(*blocks: AxisBlock | DistanceBlock, most: int = 10_000):
-    start = PathStart(most)
+    start = ScanPathReader(most)
     for block in blocks:
         start.add(block)
     return start.path()

@@ -18,7 +18,7 @@ from omsm_ros.core.kinematics.limits import (
     highest_factor,
     speed_limits,
 )
-from omsm_ros.core.kinematics.scan_path import PathStart, ScanPath, content_frequency, steepest
+from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader, content_frequency, steepest
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
@@ -221,7 +221,7 @@ def test_the_highest_factor_is_allowed_and_one_a_little_higher_is_not(factor, po
 @settings(max_examples=30)
 def test_a_path_does_not_know_how_it_was_cut_into_blocks(lengths, most):
     total = sum(lengths)
-    start, first = PathStart(most), 0
+    start, first = ScanPathReader(most), 0
     for length in lengths:
         part = slice(first, first + length)
         channels = {n: SWING[part] + k for k, n in enumerate("xyzbc")}
@@ -238,7 +238,7 @@ def test_a_path_does_not_know_how_it_was_cut_into_blocks(lengths, most):
 
 
 def test_without_readings_a_path_has_no_distance():
-    start = PathStart(100)
+    start = ScanPathReader(100)
     zero = dict.fromkeys("xyzbc", np.zeros(5))
     start.add(AxisBlock(stamp_ns=0, first_sample=0, sample_period=PERIOD, **zero))
     assert start.path().distance is None
@@ -261,10 +261,10 @@ def test_differences_of_a_quadratic_are_its_slopes():
 def test_differences_of_a_mirror_are_closer_the_shorter_the_step():
     x, y = np.random.default_rng(4).uniform(-1e-2, 1e-2, (2, 50))
     true = PAPER_MIRROR.gradient(x, y)[0]
-    wide, half = (
+    broad, half = (
         np.abs(slopes_by_differences(PAPER_MIRROR, x, y, s)[0] - true).max() for s in (2e-3, 1e-3)
     )
-    assert wide / half == pytest.approx(4, rel=0.05)
+    assert broad / half == pytest.approx(4, rel=0.05)
 
 
 def test_a_pitch_is_straight_between_its_places_and_grows_with_the_arm():

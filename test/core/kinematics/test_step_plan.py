@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepPlan, plan_csv, plan_gcode, plan_steps
-from omsm_ros.core.model_errors.families import relaxed
+from omsm_ros.core.model_errors.families import low_pass_response
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
@@ -30,13 +30,13 @@ def test_a_motion_about_its_middle_tells_creep_from_drift():
     time = np.arange(0.0, PLAN.duration, 1e-3)
     to_the_end = StepPlan(PLAN.starts, (9.8e-6,) * 10 + (-9.8e-6,) * 10, PLAN.rise, PLAN.duration)
     left = [
-        np.linalg.norm(freed(relaxed(z, 1e-3 / PLAN.duration) - z, z))
+        np.linalg.norm(projected(low_pass_response(z, 1e-3 / PLAN.duration) - z, z))
         for z in (PLAN.z(time), to_the_end.z(time))
     ]
     assert left[0] > 1.4 * left[1]
 
 
-def freed(column, z):
+def projected(column, z):
     """``column`` less what offset, drift, gain and lag imitate of it, each (n,)."""
     ramp = np.linspace(-1, 1, len(z))
     others = np.column_stack([np.ones(len(z)), ramp, 1e6 * z, 1e6 * np.gradient(z)])

@@ -18,15 +18,15 @@ from omsm_ros.core.calibration.calibration import (
     Latency,
     age_at,
     content_id,
-    declared,
+    declared_latency,
     latency_of,
     settings_with,
-    unresolved,
+    unresolved_latency,
     verdict_of,
     with_latency,
 )
 from omsm_ros.core.calibration.calibration_set import calibration_set
-from omsm_ros.core.calibration.repeatability import compare
+from omsm_ros.core.calibration.repeatability import compare_calibrations
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
@@ -109,7 +109,7 @@ def test_a_part_that_cannot_be_is_named(part: str, value: object, said: str) -> 
 def test_without_a_word_all_of_the_covariance_is_noise() -> None:
     calibration = made()
     assert np.array_equal(calibration.noise_covariance, WHOLE)
-    assert not np.any(calibration.hidden_covariance)
+    assert not np.any(calibration.undetected_error_covariance)
     assert calibration.low_frequency_delay_noise == pytest.approx(LAG_U)
     assert calibration.low_frequency_delay_uncertainty == pytest.approx(LAG_U)
 
@@ -123,17 +123,17 @@ def test_noise_that_is_none_is_not_believed(stated: object) -> None:
     assert np.array_equal(certified(noise_covariance=stated).noise_covariance, WHOLE)
 
 
-def test_noise_and_what_could_hide_make_the_whole() -> None:
+def test_noise_and_undetected_error_make_the_whole() -> None:
     noise = np.diag([0.0, (0.6 * LAG_U) ** 2, 0.0])
     calibration = certified(noise_covariance=flat(noise))
     assert np.array_equal(calibration.noise_covariance, noise)
-    assert np.allclose(calibration.hidden_covariance + noise, WHOLE, rtol=1e-12, atol=0)
+    assert np.allclose(calibration.undetected_error_covariance + noise, WHOLE, rtol=1e-12, atol=0)
     assert calibration.low_frequency_delay_noise == pytest.approx(0.6 * LAG_U)
     # Repeated tests scatter by their noise, but a scan pays for both.
     assert calibration.low_frequency_delay_uncertainty == pytest.approx(LAG_U)
 
 
-def test_a_difference_of_covariances_that_is_none_hides_nothing() -> None:
+def test_a_difference_of_covariances_that_is_none_masks_nothing() -> None:
     """Correlated more than the whole: along one direction less than nothing would be left."""
     whole = np.zeros((4, 4))
     whole[1:3, 1:3] = [[1e-12, 0.0], [0.0, 1e-6]]
@@ -143,7 +143,7 @@ def test_a_difference_of_covariances_that_is_none_hides_nothing() -> None:
     stated = {"noise_covariance": flat(noise)}
     calibration = made(dynamics=two, covariance=whole, certificate=stated)
     assert np.array_equal(calibration.noise_covariance, noise)
-    assert not np.any(calibration.hidden_covariance)
+    assert not np.any(calibration.undetected_error_covariance)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_static_gain_is_as_uncertain_as_stated() -> None:
 
 USES: dict[str, Callable[[Calibration], object]] = {
     "correction": ErrorSources.of,
-    "comparison": lambda c: compare(made(), c),
+    "comparison": lambda c: compare_calibrations(made(), c),
     "self-calibration": after_step_test,
     "set": lambda c: calibration_set("x", [(0.0, c), (1e-3, c)]),
 }
@@ -227,7 +227,7 @@ def test_an_uncertainty_that_is_none_is_named_by_all(
 def test_a_declared_latency_is_read_back_as_it_was_stated(
     lag: float, share: float, u: float
 ) -> None:
-    stated = declared(lag, share * lag, u, "data sheet")
+    stated = declared_latency(lag, share * lag, u, "data sheet")
     found = latency_of(with_latency(made(), stated))
     assert found == stated == Latency.of_entry(json.loads(json.dumps(stated.entry())))
     assert found.share == pytest.approx(share, rel=1e-6, abs=0)
@@ -236,18 +236,18 @@ def test_a_declared_latency_is_read_back_as_it_was_stated(
 
 def test_declaring_a_latency_leaves_all_else() -> None:
     before = certified(reasons=["none"])
-    after = with_latency(before, declared(3e-4, 1e-4, 1e-6, "data sheet"))
+    after = with_latency(before, declared_latency(3e-4, 1e-4, 1e-6, "data sheet"))
     assert {k: v for k, v in after.certificate.items() if k != "latency"} == before.certificate
     assert replace(after, certificate=before.certificate).id == before.id
     assert "latency" not in before.certificate
 
 
 def test_a_lead_leaves_as_much_open_as_a_lag() -> None:
-    assert unresolved(-3e-4).beside_z_s == unresolved(3e-4).beside_z_s
-    assert declared(0.0, 1e-4, 1e-6, "data sheet").share is None
+    assert unresolved_latency(-3e-4).beside_z_s == unresolved_latency(3e-4).beside_z_s
+    assert declared_latency(0.0, 1e-4, 1e-6, "data sheet").share is None
 
 
-ENTRY = declared(3e-4, 1e-4, 1e-6, "data sheet").entry()
+ENTRY = declared_latency(3e-4, 1e-4, 1e-6, "data sheet").entry()
 
 
 @pytest.mark.parametrize(

@@ -139,8 +139,8 @@ def test_above_the_band_no_error_is_claimed() -> None:
     alone = discretisation_error(PAPER, digital, low, up_to=20.0)
     both = discretisation_error(PAPER, digital, low + high, up_to=20.0)
     assert both[0] == pytest.approx(alone[0], rel=0.02, abs=0)
-    wide, fast = (discretisation_error(PAPER, digital, z, up_to=60.0) for z in (low + high, high))
-    assert wide[0] == pytest.approx(np.hypot(alone[0], fast[0]), rel=0.02, abs=0)
+    broad, fast = (discretisation_error(PAPER, digital, z, up_to=60.0) for z in (low + high, high))
+    assert broad[0] == pytest.approx(np.hypot(alone[0], fast[0]), rel=0.02, abs=0)
     assert fast[0] > 0.5 * alone[0]
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.estimation.sampled_fit import held_equivalent
+from omsm_ros.core.estimation.sampled_fit import zero_order_hold_equivalent
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
 PERIOD = 0.05
@@ -32,7 +32,7 @@ def sampled(g, hold):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_there_and_back(name, hold):
     g = SYSTEMS[name]
-    found = held_equivalent(*sampled(g, hold), PERIOD, hold)
+    found = zero_order_hold_equivalent(*sampled(g, hold), PERIOD, hold)
     lines = np.array([0.01, 0.1, 1.0, 5.0])
     np.testing.assert_allclose(found.response(lines), g.response(lines), rtol=1e-7)
 
@@ -40,7 +40,7 @@ def test_there_and_back(name, hold):
 def test_the_two_holds_differ():
     b, a = sampled(SYSTEMS["mode"], "zero-order")
     lines = np.array([3.0])
-    by_hold = [held_equivalent(b, a, PERIOD, hold).response(lines) for hold in METHODS]
+    by_hold = [zero_order_hold_equivalent(b, a, PERIOD, hold).response(lines) for hold in METHODS]
     assert abs(by_hold[0] / by_hold[1] - 1)[0] > 0.05
 
 
@@ -51,9 +51,9 @@ def test_the_two_holds_differ():
 )
 def test_what_no_continuous_system_makes_has_no_equivalent(denominator):
     b = np.ones(len(denominator))
-    assert held_equivalent(b, np.array(denominator), PERIOD, "zero-order") is None
+    assert zero_order_hold_equivalent(b, np.array(denominator), PERIOD, "zero-order") is None
 
 
 def test_a_gain_is_a_gain():
-    found = held_equivalent(np.array([3.0]), np.ones(1), PERIOD, "zero-order")
+    found = zero_order_hold_equivalent(np.array([3.0]), np.ones(1), PERIOD, "zero-order")
     assert found.response([1.0]) == pytest.approx(3.0)

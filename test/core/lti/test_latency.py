@@ -9,10 +9,10 @@ from omsm_ros.core.calibration.calibration import (
     DECLARED,
     UNRESOLVED,
     Calibration,
-    beyond_lag,
-    declared,
+    declared_latency,
+    excess_latency_text,
     latency_of,
-    unresolved,
+    unresolved_latency,
     with_latency,
 )
 from omsm_ros.core.correction.uncertainty import ErrorSources
@@ -41,11 +41,11 @@ def test_without_a_word_any_part_of_the_lag_may_be_latency() -> None:
 
 
 def test_no_lag_leaves_nothing_open() -> None:
-    assert unresolved(0.0).beside_z_s == 0.0
+    assert unresolved_latency(0.0).beside_z_s == 0.0
 
 
 def test_what_is_declared_counts_with_its_uncertainty() -> None:
-    made = with_latency(KNOWN, declared(LAG, LAG / 2, 5e-6, "data sheet, 0.3 ms exposure"))
+    made = with_latency(KNOWN, declared_latency(LAG, LAG / 2, 5e-6, "data sheet, 0.3 ms exposure"))
     found = latency_of(made)
     assert (found.source, found.resolved, found.share) == (DECLARED, True, pytest.approx(0.5))
     assert ErrorSources.of(made).lateral_lag == 5e-6
@@ -64,16 +64,16 @@ def test_what_cannot_be_declared_is_refused(
     delay: float, uncertainty: float, reason: str, named: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=named):
-        declared(LAG, delay, uncertainty, reason)
+        declared_latency(LAG, delay, uncertainty, reason)
 
 
 @pytest.mark.parametrize(("delay", "uncertainty"), [(0.0, 0.0), (LAG, 0.0), (3.2e-4, 1e-5)])
 def test_a_delay_within_the_lag_is_a_part_of_it(delay: float, uncertainty: float) -> None:
-    assert beyond_lag(KNOWN, delay, uncertainty) is None
+    assert excess_latency_text(KNOWN, delay, uncertainty) is None
 
 
 @pytest.mark.parametrize(("delay", "uncertainty"), [(0.1, 1e-5), (3.2e-4, 1e-6)])
 def test_a_delay_in_a_wrong_unit_is_more_than_the_lag(delay: float, uncertainty: float) -> None:
-    said = beyond_lag(KNOWN, delay, uncertainty)
+    said = excess_latency_text(KNOWN, delay, uncertainty)
     assert said is not None
     assert "is more than the whole lag of Z, 300 µs ± 0 s" in said

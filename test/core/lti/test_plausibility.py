@@ -11,7 +11,7 @@ from omsm_ros.core.calibration.calibration import (
     MAX_TIME_CONSTANT_SAMPLES,
     Calibration,
     latency_of,
-    unresolved,
+    unresolved_latency,
 )
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -131,7 +131,7 @@ def test_reasons_that_are_no_texts_are_refused(texts: object) -> None:
         changed(certificate={"reasons": texts})
 
 
-GOOD_LATENCY = unresolved(1e-4).entry()
+GOOD_LATENCY = unresolved_latency(1e-4).entry()
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_a_latency_comes_back_as_it_was() -> None:
 
 @pytest.mark.parametrize(("place", "power"), [(1, 1), (2, 1), (3, 2), (4, 1)])
 @pytest.mark.parametrize("trusted", [20.0, 100.0])
-def test_how_far_a_coefficient_leaves_the_response_open_is_told(
+def test_the_effect_of_a_coefficient_uncertainty_on_the_response_is_reported(
     place: int, power: int, trusted: float
 ) -> None:
     """A coefficient of s^k that is uncertain by u leaves u ω^k at the end of the trusted band."""

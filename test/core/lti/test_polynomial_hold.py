@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from omsm_ros.core.lti.discretisation import held_zeros, matrix_exponential
+from omsm_ros.core.lti.discretisation import matrix_exponential, polynomial_hold_zeros
 
 NONE = np.empty(0, np.complex128)
 
 
 def test_a_gain_has_no_zeros() -> None:
-    assert len(held_zeros(NONE, NONE, 3)) == 0
+    assert len(polynomial_hold_zeros(NONE, NONE, 3)) == 0
 
 
 @pytest.mark.parametrize("rate", [1e-4, 0.1, 1.0, 20.0])
@@ -21,7 +21,7 @@ def test_first_order_hold_of_a_lag_by_hand(rate: float) -> None:
     decay = np.exp(-rate)
     new = 1 - (1 - decay) / rate
     old = (1 - decay) / rate - decay
-    found = held_zeros(NONE, np.array([-rate + 0j]), 1)
+    found = polynomial_hold_zeros(NONE, np.array([-rate + 0j]), 1)
     assert found.shape == (2,)
     # y[k] = decay y[k-1] + new u[k] + old u[k-1]; the other zero cancels the spare state.
     assert np.min(abs(found - (-old / new))) < 1e-7 * max(1.0, old / new)
@@ -49,7 +49,7 @@ def response_by_brute_force(
 def test_response_of_the_sampled_system_is_that_of_the_integral(order: int) -> None:
     zeros = np.array([0.7, -2.0 + 0.5j, -2.0 - 0.5j])
     poles = np.array([-0.3 + 0.9j, -0.3 - 0.9j, -1.5, -4.0, -0.05])
-    found = held_zeros(zeros, poles, order)
+    found = polynomial_hold_zeros(zeros, poles, order)
     assert len(found) == len(poles) + order
 
     def sampled(angle: float) -> complex:
@@ -70,13 +70,13 @@ def test_zeros_come_in_exact_conjugate_pairs() -> None:
     for _ in range(50):
         real, imaginary = -random.uniform(0.01, 9, 3), random.uniform(0.1, 9, 3)
         poles = np.concatenate([real + 1j * imaginary, real - 1j * imaginary])
-        found = held_zeros(np.zeros(2, np.complex128), poles, 3, at_rest=2)
+        found = polynomial_hold_zeros(np.zeros(2, np.complex128), poles, 3, dc_zeros=2)
         assert np.array_equal(np.sort_complex(found), np.sort_complex(found.conj()))
 
 
 def test_a_differentiator_of_a_resonance_is_blind_to_rest() -> None:
     poles = np.array([-0.1 + 2j, -0.1 - 2j, -0.1 + 2j, -0.1 - 2j])
-    found = held_zeros(np.zeros(3, np.complex128), poles, 5, at_rest=3)
+    found = polynomial_hold_zeros(np.zeros(3, np.complex128), poles, 5, dc_zeros=3)
     assert np.count_nonzero(found == 1.0) == 3
 
 
@@ -98,12 +98,12 @@ def test_the_exponential_of_nothing_is_one() -> None:
 
 @pytest.mark.parametrize("slow", [-6e-3, -3e-3, 1e-3])
 @pytest.mark.parametrize("fast", [1.0, 2.0, 3.0])
-def test_a_slow_zero_beside_one_at_rest_is_not_lost_nor_doubled(slow: float, fast: float) -> None:
+def test_a_slow_zero_near_one_at_dc_is_neither_lost_nor_doubled(slow: float, fast: float) -> None:
     """Rounding makes a conjugate pair of the two: 1 takes the place of one, the other stays."""
     above = [-21 + 55j, -21 - 55j, -29 + 14j, -29 - 14j]
     poles = np.array([*above, -0.08, *above, -0.08, -6e-3]) * fast
     zeros = np.array([1443.0, -4 + 33j, -4 - 33j, -22, 0.19, -0.1, -0.014, slow, 9e-4, 0j]) * fast
-    found = held_zeros(zeros, poles, 5, at_rest=1)
+    found = polynomial_hold_zeros(zeros, poles, 5, dc_zeros=1)
     assert len(found) == len(poles) + 5
     assert np.array_equal(np.sort_complex(found), np.sort_complex(found.conj()))
     assert np.count_nonzero(found == 1.0) == 1

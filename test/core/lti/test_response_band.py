@@ -8,7 +8,7 @@ from scipy import signal
 
 from omsm_ros.core.estimation.covariance import (
     autoregression,
-    hidden_motion_covariance,
+    inter_sample_motion_covariance,
     noise_spectrum,
     parameter_covariance,
     weighted_gram,
@@ -18,10 +18,10 @@ from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
     Band,
     ResponseLimits,
+    excited_up_to,
     low_frequency_delay_uncertainty,
     relative_response_jacobian,
     response_band,
-    shown_up_to,
     trusted_up_to,
     widening,
 )
@@ -143,8 +143,8 @@ def test_an_uncertain_delay_is_an_uncertain_phase_only():
     "dynamics",
     [G, TransferFunction([1.0], [1.0, 1e-3]), TransferFunction([1.0], [1.0], 3e-4)],
 )
-def test_hidden_motion_is_a_delay_at_low_frequency(dynamics):
-    covariance = hidden_motion_covariance(dynamics, 3e-6, 1e-3)
+def test_inter_sample_motion_is_a_delay_at_low_frequency(dynamics):
+    covariance = inter_sample_motion_covariance(dynamics, 3e-6, 1e-3)
     band = response_band(dynamics, covariance, np.array([0.01]))
     assert band.phase[0] == pytest.approx(2 * np.pi * 0.01 * 3e-6 / np.sqrt(3), rel=1e-3)
 
@@ -176,8 +176,8 @@ def test_a_widened_band_just_holds_the_other():
 
 
 def test_a_band_that_holds_the_other_is_not_narrowed():
-    wide, narrow = (Band(np.ones(1), np.full(1, u), np.full(1, u)) for u in (1e-2, 1e-3))
-    assert widening(wide, narrow, np.zeros(1, complex)) == 1.0
+    broad, narrow = (Band(np.ones(1), np.full(1, u), np.full(1, u)) for u in (1e-2, 1e-3))
+    assert widening(broad, narrow, np.zeros(1, complex)) == 1.0
 
 
 @pytest.mark.parametrize(("noise", "expected"), [(1e-8, 40.0), (3e-4, 0.0)])
@@ -185,7 +185,7 @@ def test_a_motion_shows_the_response_as_far_as_it_goes(noise, expected):
     """m lines of power a² at noise s know gain and phase to √(s / 2 m a²): here to 3e-5 or 5e-3."""
     frequency = np.arange(501.0)
     answer = np.where(frequency <= 40, 1.0, 0.0).astype(complex)
-    found = shown_up_to(frequency, answer, np.full(501, noise), ResponseLimits())
+    found = excited_up_to(frequency, answer, np.full(501, noise), ResponseLimits())
     # The band of a third of an octave still reaches down to 40 Hz from 45 Hz.
     assert expected <= found <= expected * 2 ** (1 / 6)
 
@@ -203,13 +203,13 @@ def test_the_deviation_that_shows_is_that_of_a_fit():
     for factor, shown in ((1.1, True), (0.9, False)):
         limits = ResponseLimits(gain=factor * spread, phase=1.0)
         at_centre = np.where(np.arange(501) <= 112, answer, 0.0)
-        found = shown_up_to(frequency, at_centre, np.ones(501), limits)
+        found = excited_up_to(frequency, at_centre, np.ones(501), limits)
         assert (found > 95.0) is shown
 
 
 def test_without_motion_nothing_is_shown():
     assert (
-        shown_up_to(np.arange(10.0), np.zeros(10, complex), np.zeros(10), ResponseLimits()) == 0.0
+        excited_up_to(np.arange(10.0), np.zeros(10, complex), np.zeros(10), ResponseLimits()) == 0.0
     )
 
 

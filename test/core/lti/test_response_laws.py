@@ -17,7 +17,7 @@ from omsm_ros.core.lti.frequency_response import (
     spread_along,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian, to_control
-from omsm_ros.core.ripple.density import folded_frequency
+from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import DataError
 
@@ -248,24 +248,24 @@ rates = st.floats(10.0, 1e5)
 @given(share=st.floats(0.0, 40.0), rate=rates)
 def test_samples_of_a_wave_are_those_of_its_folded_one(share: float, rate: float) -> None:
     frequency = share * rate
-    seen = float(folded_frequency(frequency, rate))
+    seen = float(aliased_frequency(frequency, rate))
     assert 0 <= seen <= rate / 2 * (1 + 1e-12)
     k = np.arange(30)
     np.testing.assert_allclose(
         np.cos(2 * np.pi * np.mod(k * share, 1.0)), np.cos(2 * np.pi * k * seen / rate), atol=1e-8
     )
-    assert float(folded_frequency(frequency + 3 * rate, rate)) == pytest.approx(
+    assert float(aliased_frequency(frequency + 3 * rate, rate)) == pytest.approx(
         seen, abs=1e-6 * rate
     )
-    assert float(folded_frequency(-frequency, rate)) == pytest.approx(seen, abs=1e-9 * rate)
+    assert float(aliased_frequency(-frequency, rate)) == pytest.approx(seen, abs=1e-9 * rate)
 
 
 def test_below_half_the_rate_nothing_folds() -> None:
     lines = np.array([[0.0, 10.0], [499.0, 500.0]])
-    assert np.array_equal(folded_frequency(lines, 1000.0), lines)
+    assert np.array_equal(aliased_frequency(lines, 1000.0), lines)
 
 
 @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan")])
 def test_a_rate_that_is_none_is_named(rate: float) -> None:
     with pytest.raises(DataError, match=f"sample_rate {rate!r} Hz is not positive"):
-        folded_frequency(1.0, rate)
+        aliased_frequency(1.0, rate)

@@ -9,7 +9,7 @@ from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG, NOISE = 2e-3, 0.7e-3, 10e-9
@@ -18,7 +18,7 @@ TIME = np.arange(round(STEPS.duration / PERIOD)) * PERIOD
 Z, LATE = STEPS.positions(TIME).z, STEPS.positions(TIME - LAG).z
 
 
-def survey(added=0.0, seed=1, lost=(), **options):
+def diagnostics(added=0.0, seed=1, lost=(), **options):
     """added: to what the probe sees, along the motion (n,) [m];  lost: readings (k,) without"""
     random = np.random.default_rng(seed)
     seen = -(LATE + added) + random.normal(0, NOISE, len(TIME))
@@ -26,14 +26,16 @@ def survey(added=0.0, seed=1, lost=(), **options):
     record = MotionRecord.from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
     prepared = prepare(record, "encoder")
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
-    return Survey(prepared.problem, late, prepared.steps, **options)
+    return ResidualDiagnostics(prepared.problem, late, prepared.steps, **options)
 
 
 @pytest.fixture(scope="session")
 def step_test_of():
-    return SimpleNamespace(survey=survey, period=PERIOD, lag=LAG, noise=NOISE, time=TIME, late=LATE)
+    return SimpleNamespace(
+        diagnostics=diagnostics, period=PERIOD, lag=LAG, noise=NOISE, time=TIME, late=LATE
+    )
 
 
 @pytest.fixture(scope="session")
 def clean():
-    return survey()
+    return diagnostics()

@@ -17,15 +17,15 @@ from omsm_ros.core.model_errors.families import (
     PERIODIC,
     STIFFENING,
     VIBRATION,
-    Departures,
-    Family,
-    relaxed,
+    ModelErrorFamilies,
+    ModelErrorFamily,
+    low_pass_response,
 )
 
 
 @pytest.fixture(scope="module")
-def departures(clean):
-    return clean.departures
+def model_errors(clean):
+    return clean.model_errors
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def through(numerator, denominator, values, period):
 class TestRelaxation:
     @pytest.mark.parametrize("time_constant", [3e-3, 0.05, 2.0, 400.0])
     def test_it_is_its_differential_equation(self, time_constant, answer, step_test_of):
-        found = relaxed(answer, step_test_of.period / time_constant)
+        found = low_pass_response(answer, step_test_of.period / time_constant)
         expected = through([1.0], [time_constant, 1.0], answer, step_test_of.period)
         np.testing.assert_allclose(found, answer[0] + expected, atol=1e-9 * np.ptp(answer))
 
@@ -51,35 +51,43 @@ class TestRelaxation:
         rng = np.random.default_rng(1)
         one, other = rng.normal(size=(2, 60))
         np.testing.assert_allclose(
-            relaxed(2 * one - 3 * other, 0.1), 2 * relaxed(one, 0.1) - 3 * relaxed(other, 0.1)
+            low_pass_response(2 * one - 3 * other, 0.1),
+            2 * low_pass_response(one, 0.1) - 3 * low_pass_response(other, 0.1),
         )
-        np.testing.assert_allclose(relaxed(np.full(5, 4.0), 0.3), 4.0)
+        np.testing.assert_allclose(low_pass_response(np.full(5, 4.0), 0.3), 4.0)
 
     def test_what_is_fast_follows_and_what_is_slow_stays(self):
         values = np.random.default_rng(2).normal(size=50)
-        np.testing.assert_allclose(relaxed(values, 1e4), values, atol=1e-3)
-        np.testing.assert_allclose(relaxed(values, 1e-7), values[0], atol=1e-4)
+        np.testing.assert_allclose(low_pass_response(values, 1e4), values, atol=1e-3)
+        np.testing.assert_allclose(low_pass_response(values, 1e-7), values[0], atol=1e-4)
 
-    def test_the_time_constants_reach_from_a_structures_to_the_record(self, clean, departures):
-        found = departures.time_constants()
+    def test_the_time_constants_reach_from_a_structures_to_the_record(self, clean, model_errors):
+        found = model_errors.time_constants()
         assert found[0] == pytest.approx(20e-3)
-        assert found[-1] == pytest.approx(departures.duration) == pytest.approx(3.5)
+        assert found[-1] == pytest.approx(model_errors.duration) == pytest.approx(3.5)
         assert np.max(found[1:] / found[:-1]) < 1.7
-        longer = replace(departures, slower=10.0).time_constants()
+        longer = replace(model_errors, slower=10.0).time_constants()
         assert longer[-1] == pytest.approx(35.0)
-        assert replace(clean, slower=10.0).slowest_creep == pytest.approx(35.0)
+        assert replace(clean, slower=10.0).longest_time_constant == pytest.approx(35.0)
 
-    def test_its_columns_are_the_departure_and_its_derivative(self, departures, answer):
-        family, period = departures.creep(), departures.problem.period
+    def test_its_columns_are_the_model_error_and_its_derivative(self, model_errors, answer):
+        family, period = model_errors.creep(), model_errors.problem.period
         assert family.width == 2
         for index in range(0, len(family.parameters), 4):
             term = family.term(index)
             assert (term.family, term.damping) == (CREEP, 0.0)
             first, second = term.columns.T
             step = period / term.parameter
-            np.testing.assert_allclose(first, relaxed(answer, step) - answer, atol=1e-12)
+            np.testing.assert_allclose(first, low_pass_response(answer, step) - answer, atol=1e-12)
             h = 1e-4
-            slope = (relaxed(answer, step * np.exp(-h)) - relaxed(answer, step * np.exp(h))) / 2 / h
+            slope = (
+                (
+                    low_pass_response(answer, step * np.exp(-h))
+                    - low_pass_response(answer, step * np.exp(h))
+                )
+                / 2
+                / h
+            )
             # A relaxation of a relaxation is drawn straight from sample to sample twice.
             np.testing.assert_allclose(second, slope, atol=2 * step**2 * np.ptp(answer) + 1e-12)
 
@@ -87,36 +95,36 @@ class TestRelaxation:
 class TestModes:
     @pytest.mark.parametrize(("frequency", "damping"), [(8.0, 0.1), (11.0, 0.2)])
     def test_a_mode_and_its_velocity_are_their_differential_equation(
-        self, departures, answer, frequency, damping
+        self, model_errors, answer, frequency, damping
     ):
-        departure, velocity = departures.mode(frequency, damping).T
-        omega, period = 2 * np.pi * frequency, departures.problem.period
+        model_error, velocity = model_errors.mode(frequency, damping).T
+        omega, period = 2 * np.pi * frequency, model_errors.problem.period
         bottom = [omega**-2, 2 * damping / omega, 1.0]
         moved = through([1.0], bottom, answer, period)
         fast = through([1 / omega, 0.0], bottom, answer, period)
         expected = moved - (answer - answer[0])
         # Between samples one is straight, the other band-limited.
         tolerance = 5e-4 * np.ptp(answer)
-        np.testing.assert_allclose(departure, expected, atol=tolerance)
+        np.testing.assert_allclose(model_error, expected, atol=tolerance)
         np.testing.assert_allclose(velocity, fast, atol=tolerance)
 
-    def test_modes_cover_their_band_and_stand_as_they_are_alone(self, departures):
-        family = departures.modes()
+    def test_modes_cover_their_band_and_stand_as_they_are_alone(self, model_errors):
+        family = model_errors.modes()
         for damping in np.unique(family.dampings):
             lines = family.parameters[family.dampings == damping]
-            assert lines[0] == pytest.approx(2 / departures.duration)
+            assert lines[0] == pytest.approx(2 / model_errors.duration)
             assert np.all(np.diff(np.log(lines)) < 2.5 * damping)
             assert lines[-1] <= 100.0
         for index in (0, len(family.parameters) - 1):
             term = family.term(index)
-            alone = departures.mode(term.parameter, term.damping)
+            alone = model_errors.mode(term.parameter, term.damping)
             np.testing.assert_allclose(term.columns, alone, atol=1e-18)
 
 
 class TestLines:
     def with_residual(self, clean, values):
         fitted = replace(clean.fitted, residual=values[clean.problem.used])
-        return Departures(clean.problem, fitted, clean.steps)
+        return ModelErrorFamilies(clean.problem, fitted, clean.steps)
 
     def test_the_strongest_lines_are_found_in_their_order_by_sine_and_cosine(
         self, clean, step_test_of
@@ -137,11 +145,11 @@ class TestLines:
         assert np.min(abs(family.parameters - 40)) < 0.02
         assert np.min(family.parameters) > 1.9 / 3.5
 
-    def test_drifts_bend_and_neither_shift_nor_tilt(self, departures):
-        families = list(departures.drift())
-        time = np.linspace(-1, 1, len(departures.problem.input))
+    def test_drifts_bend_and_neither_shift_nor_tilt(self, model_errors):
+        families = list(model_errors.drift())
+        time = np.linspace(-1, 1, len(model_errors.problem.input))
         for family in families:
-            degree = round(departures.duration / family.parameters[0])
+            degree = round(model_errors.duration / family.parameters[0])
             assert (family.name, family.columns.shape[1]) == (DRIFT, degree - 1)
             # With offset and tilt they make any polynomial of that degree.
             every = np.column_stack([np.ones(len(time)), time, family.columns])
@@ -153,20 +161,22 @@ class TestLines:
 
 
 class TestOfThePosition:
-    def test_a_bent_probe_is_square_and_cube_of_the_place_that_it_sees(self, departures, answer):
-        motion, seen = departures.problem.input, answer / departures.fitted.gain
+    def test_a_curved_probe_is_square_and_cube_of_the_place_that_it_sees(
+        self, model_errors, answer
+    ):
+        motion, seen = model_errors.problem.input, answer / model_errors.fitted.gain
         place = (seen - np.mean([motion.min(), motion.max()])) / (np.ptp(motion) / 2)
-        columns = departures.linearity().columns
+        columns = model_errors.linearity().columns
         np.testing.assert_allclose(columns, np.column_stack([place**2, place**3]), atol=1e-9)
         assert np.max(abs(columns)) == pytest.approx(1.0, abs=1e-3)
 
     def test_an_axis_at_rest_bends_nothing(self, clean):
         still = replace(clean.problem, input=np.zeros(len(clean.problem.input)))
-        assert not Departures(still, clean.fitted, clean.steps).linearity().columns.any()
+        assert not ModelErrorFamilies(still, clean.fitted, clean.steps).linearity().columns.any()
 
-    def test_what_stiffens_is_the_cube_of_what_the_probe_is_behind(self, departures, answer):
-        (column,) = departures.stiffening().columns.T
-        behind = answer / departures.fitted.gain - departures.problem.input
+    def test_what_stiffens_is_the_cube_of_what_the_probe_is_behind(self, model_errors, answer):
+        (column,) = model_errors.stiffening().columns.T
+        behind = answer / model_errors.fitted.gain - model_errors.problem.input
         assert np.max(abs(column)) == pytest.approx(1.0)
         line = np.polyfit(np.cbrt(column), behind, 1)
         np.testing.assert_allclose(
@@ -174,9 +184,9 @@ class TestOfThePosition:
         )
 
     @pytest.mark.parametrize("near", [None, 1e-6])
-    def test_a_periodic_error_is_sine_and_cosine_of_the_place(self, departures, answer, near):
-        family = departures.periodic(near)
-        place = answer / departures.fitted.gain
+    def test_a_periodic_error_is_sine_and_cosine_of_the_place(self, model_errors, answer, near):
+        family = model_errors.periodic(near)
+        place = answer / model_errors.fitted.gain
         for index in range(0, len(family.parameters), 9):
             term = family.term(index)
             angle = 2 * np.pi * place / term.parameter
@@ -184,12 +194,12 @@ class TestOfThePosition:
                 term.columns, np.column_stack([np.sin(angle), np.cos(angle)]), atol=1e-9
             )
 
-    def test_periods_reach_from_a_third_of_the_travel_and_then_about_one(self, departures):
-        travel = np.ptp(departures.problem.input)
-        periods = departures.periodic().parameters
+    def test_periods_reach_from_a_third_of_the_travel_and_then_about_one(self, model_errors):
+        travel = np.ptp(model_errors.problem.input)
+        periods = model_errors.periodic().parameters
         assert periods[0] == pytest.approx(travel / 3, rel=1e-3)
         assert np.diff(travel / periods) == pytest.approx(1.0, rel=1e-3)
-        between = departures.periodic(periods[20]).parameters
+        between = model_errors.periodic(periods[20]).parameters
         assert periods[20] == pytest.approx(between[len(between) // 2])
         assert np.all((between < periods[19]) & (between > periods[21]))
 
@@ -197,34 +207,34 @@ class TestOfThePosition:
 class TestWhichFamilies:
     EVERY = (CREEP, MODE, VIBRATION, DRIFT, LINEARITY, STIFFENING, PERIODIC, FRICTION, BACKLASH)
 
-    def test_a_step_test_shows_all_of_them(self, departures):
-        assert {family.name for family in departures.families()} == set(self.EVERY)
+    def test_a_step_test_shows_all_of_them(self, model_errors):
+        assert {family.name for family in model_errors.families()} == set(self.EVERY)
 
     @pytest.mark.parametrize("only", [(CREEP,), (BACKLASH, DRIFT), (LINEARITY, STIFFENING)])
-    def test_those_named_come_alone(self, departures, only):
-        assert {family.name for family in departures.families(only)} == set(only)
+    def test_those_named_come_alone(self, model_errors, only):
+        assert {family.name for family in model_errors.families(only)} == set(only)
 
     def test_a_motion_without_edges_shows_neither_friction_nor_backlash(self, clean):
         moving = np.ones(len(clean.problem.input), bool)
         endless = Steps((), moving, clean.steps.noise, clean.steps.travel)
-        found = Departures(clean.problem, clean.fitted, endless)
+        found = ModelErrorFamilies(clean.problem, clean.fitted, endless)
         assert not list(found.families((FRICTION, BACKLASH)))
 
     def test_steps_all_up_show_a_gap_of_the_motion_and_none_of_the_steps(self, clean):
         rising = replace(clean.steps, edges=clean.steps.edges[:3])
-        departures = Departures(clean.problem, clean.fitted, rising)
-        names = [family.parameters[0] for family in departures.families((BACKLASH,))]
+        model_errors = ModelErrorFamilies(clean.problem, clean.fitted, rising)
+        names = [family.parameters[0] for family in model_errors.families((BACKLASH,))]
         assert len(names) == 1
         assert names[0] > 0
-        assert len(list(clean.departures.families((BACKLASH,)))) == 2
+        assert len(list(clean.model_errors.families((BACKLASH,)))) == 2
 
-    def test_friction_and_gap_have_the_size_of_a_force_and_of_a_lead(self, departures):
-        for family in departures.families((FRICTION, BACKLASH)):
+    def test_friction_and_gap_have_the_size_of_a_force_and_of_a_lead(self, model_errors):
+        for family in model_errors.families((FRICTION, BACKLASH)):
             assert np.max(abs(family.columns)) == pytest.approx(1.0, rel=0.01)
 
-    def test_what_a_gap_loses_is_what_the_probe_does_not_follow(self, departures, step_test_of):
+    def test_what_a_gap_loses_is_what_the_probe_does_not_follow(self, model_errors, step_test_of):
         """Half a gap of 300 nm, against the play operator on the true motion."""
-        (of_travel, _) = departures.families((BACKLASH,))
+        (of_travel, _) = model_errors.families((BACKLASH,))
         half, state, lost = 150e-9, step_test_of.late[0], []
         for value in step_test_of.late:
             state = min(max(state, value - half), value + half)
@@ -232,14 +242,14 @@ class TestWhichFamilies:
         (index,) = np.flatnonzero(of_travel.parameters == 300e-9)
         column, start = of_travel.term(int(index)).columns.T
         # The probe reads the other way; the encoder's noise moves what is lost by a hundredth.
-        found = column / departures.fitted.gain
+        found = column / model_errors.fitted.gain
         moved = abs(np.array(lost)) > 0.99
         np.testing.assert_allclose(found[moved], np.array(lost)[moved], atol=0.03)
-        assert start[0] == pytest.approx(-departures.fitted.gain)
+        assert start[0] == pytest.approx(-model_errors.fitted.gain)
 
     def test_a_term_has_its_columns_in_another_fit(self, clean, step_test_of):
-        other = step_test_of.survey(seed=9).departures
-        for family in clean.departures.families((CREEP, PERIODIC, LINEARITY)):
+        other = step_test_of.diagnostics(seed=9).model_errors
+        for family in clean.model_errors.families((CREEP, PERIODIC, LINEARITY)):
             term = family.term(0)
             again = other.again(term)
             assert (again.family, again.damping) == (term.family, term.damping)
@@ -253,7 +263,7 @@ class TestWhichFamilies:
 
 def test_a_family_gives_its_terms_with_their_own_columns():
     columns = np.arange(12.0).reshape(2, 6)
-    made = Family.of("some", np.array([5.0, 7.0, 9.0]), 2.5, columns)
+    made = ModelErrorFamily.of("some", np.array([5.0, 7.0, 9.0]), 2.5, columns)
     family = replace(made, dampings=np.array([0.1, 0.2, 0.3]))
     term = family.term(1)
     assert (family.width, term.parameter, term.damping, term.trials) == (2, 7.0, 0.2, 2.5)

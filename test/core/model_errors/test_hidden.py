@@ -12,16 +12,16 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import CREEP, MODE, STIFFENING
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
 from omsm_ros.core.model_errors.undetected import (
-    PAPER_SCAN,
-    HiddenTerm,
-    hidden_terms,
-    omitted,
-    relaxation_found,
-    with_slower_creep,
-    without_drift,
+    PAPER_SCAN_LINES,
+    UndetectedTerm,
+    fitted_relaxation,
+    omission_shift,
+    undetected_terms,
+    with_drift_as_noise,
+    with_slow_creep,
 )
 
-SCAN_RMS = np.sqrt(sum(rms**2 for _, rms in PAPER_SCAN))
+SCAN_RMS = np.sqrt(sum(rms**2 for _, rms in PAPER_SCAN_LINES))
 
 
 def coefficients(fitted):
@@ -30,8 +30,8 @@ def coefficients(fitted):
     return np.concatenate([g.numerator, g.denominator[1:], [g.delay]])
 
 
-def fitted_anew(survey, structure, starts, added=0.0):
-    problem = replace(survey.problem, output=survey.problem.output + added)
+def fitted_anew(diagnostics, structure, starts, added=0.0):
+    problem = replace(diagnostics.problem, output=diagnostics.problem.output + added)
     return fit(problem, structure, starts)
 
 
@@ -44,16 +44,16 @@ def with_a_pole(clean):
 class TestOmitted:
     @pytest.mark.parametrize("frequency", [2.0, 9.0])
     def test_it_is_what_fitting_anew_with_the_term_in_the_data_gives(self, clean, frequency):
-        mode = clean.departures.mode(frequency, 0.1)[:, 0]
+        mode = clean.model_errors.mode(frequency, 0.1)[:, 0]
         size = 1e-4
         anew = fitted_anew(clean, Structure(0, 0, True), [clean.fitted.nonlinear], size * mode)
         found = coefficients(anew) - coefficients(clean.fitted)
-        expected = size * omitted(clean, mode)
+        expected = size * omission_shift(clean, mode)
         assert found == pytest.approx(expected, rel=0.02, abs=1e-9)
         assert abs(expected[-1]) > 1e-9
 
     def test_with_a_pole_too(self, with_a_pole):
-        mode = with_a_pole.departures.mode(6.0, 0.1)[:, 0]
+        mode = with_a_pole.model_errors.mode(6.0, 0.1)[:, 0]
         size = 1e-5
         start = [with_a_pole.fitted.nonlinear]
         before, after = (
@@ -61,21 +61,22 @@ class TestOmitted:
             for part in (-size, size)
         )
         found = (coefficients(after) - coefficients(before)) / 2
-        assert found == pytest.approx(size * omitted(with_a_pole, mode), rel=0.1, abs=1e-9)
+        assert found == pytest.approx(size * omission_shift(with_a_pole, mode), rel=0.1, abs=1e-9)
 
     def test_what_the_background_holds_shifts_nothing(self, clean):
-        shift = omitted(clean, clean.problem.background @ np.array([3e-9, 5e-9]))
+        shift = omission_shift(clean, clean.problem.background @ np.array([3e-9, 5e-9]))
         assert np.max(abs(shift)) < 1e-15
 
     def test_a_delay_of_the_answer_is_a_shift_of_the_delay(self, clean):
         answer = clean.fitted.gain * clean.problem.response(clean.fitted)
-        shift = omitted(clean, -np.gradient(answer, clean.problem.period))
+        shift = omission_shift(clean, -np.gradient(answer, clean.problem.period))
         assert shift[-1] == pytest.approx(1.0, rel=0.01)
 
     def test_it_is_linear(self, clean):
-        one, other = clean.departures.mode(5.0, 0.1).T
+        one, other = clean.model_errors.mode(5.0, 0.1).T
         np.testing.assert_allclose(
-            omitted(clean, 2 * one - other), 2 * omitted(clean, one) - omitted(clean, other)
+            omission_shift(clean, 2 * one - other),
+            2 * omission_shift(clean, one) - omission_shift(clean, other),
         )
 
 
@@ -86,7 +87,7 @@ class TestSizes:
             "shift": np.array([1.0, -2.0, 0.5]), "gain": np.array([1.0, 0.0, 0.0]),
             "late": np.array([0.0, 0.0, 1.0]), "above": 0.5, "lag": 2e-3, "effect": 1e-5,
         }  # fmt: skip
-        return HiddenTerm(**(whole | changed))
+        return UndetectedTerm(**(whole | changed))
 
     def test_carried_are_size_and_uncertainty_together(self):
         assert self.term().carried == pytest.approx(5e-4)
@@ -126,32 +127,32 @@ class TestRelaxationFound:
                 term *= np.polynomial.Polynomial([1.0, other])
             top += term
         found = TransferFunction.from_ascending(top.coef, bottom.coef)
-        assert relaxation_found(found) == pytest.approx(sum(map(abs, sizes)), rel=1e-6)
-        assert relaxation_found(found) == pytest.approx(self.shares(found), rel=1e-6)
+        assert fitted_relaxation(found) == pytest.approx(sum(map(abs, sizes)), rel=1e-6)
+        assert fitted_relaxation(found) == pytest.approx(self.shares(found), rel=1e-6)
 
     def test_a_fast_pole_and_a_pair_of_slow_ones_are_none(self):
-        assert relaxation_found(TransferFunction.from_ascending([1.0], [1.0, 15e-3])) == 0.0
+        assert fitted_relaxation(TransferFunction.from_ascending([1.0], [1.0, 15e-3])) == 0.0
         ringing = TransferFunction.from_ascending([1.0], [1.0, 0.02, 0.02])
-        assert relaxation_found(ringing) == 0.0
-        assert relaxation_found(TransferFunction.from_ascending([1.0], [1.0, 25e-3])) == 1.0
+        assert fitted_relaxation(ringing) == 0.0
+        assert fitted_relaxation(TransferFunction.from_ascending([1.0], [1.0, 25e-3])) == 1.0
 
 
 @pytest.fixture(scope="module")
-def hidden(clean):
-    return hidden_terms(clean)
+def undetected(clean):
+    return undetected_terms(clean)
 
 
-class TestTheSurveyOfWhatHides:
+class TestDiagnosticsOfUndetectedTerms:
     def test_relaxations_up_to_a_minute_are_looked_for_or_to_ten_records(self, clean):
-        assert with_slower_creep(clean).slowest_creep == pytest.approx(35.0)
+        assert with_slow_creep(clean).longest_time_constant == pytest.approx(35.0)
         period = clean.problem.period
         longer = replace(clean, problem=replace(clean.problem, period=10 * period))
-        assert with_slower_creep(longer).slowest_creep == pytest.approx(50.0)
+        assert with_slow_creep(longer).longest_time_constant == pytest.approx(50.0)
         longest = replace(clean, problem=replace(clean.problem, period=30 * period))
-        assert with_slower_creep(longest).slowest_creep == pytest.approx(105.0)
+        assert with_slow_creep(longest).longest_time_constant == pytest.approx(105.0)
 
     def test_a_drift_taken_for_noise_is_in_the_residual_and_no_column(self, clean):
-        moved = without_drift(clean, [slice(1, 2)])
+        moved = with_drift_as_noise(clean, [slice(1, 2)])
         assert moved.problem.background.shape[1] == clean.problem.background.shape[1] - 1
         drifted = clean.problem.background[:, 1] * clean.fitted.background[1]
         added = moved.fitted.residual - clean.fitted.residual
@@ -161,34 +162,40 @@ class TestTheSurveyOfWhatHides:
         np.testing.assert_allclose(same, whole, atol=1e-15)
 
     def test_a_slow_relaxation_is_surer_without_a_drift_of_any_size(self, clean):
-        free = with_slower_creep(clean).creep[-1].score.uncertainty
-        held = without_drift(with_slower_creep(clean), [slice(1, 2)]).creep[-1].score.uncertainty
+        free = with_slow_creep(clean).creep[-1].score.uncertainty
+        held = (
+            with_drift_as_noise(with_slow_creep(clean), [slice(1, 2)]).creep[-1].score.uncertainty
+        )
         assert held < 0.5 * free
 
-    def test_of_relaxations_the_worst_comes_first_and_costs_no_more_than_all_of_it(self, hidden):
-        worst, *others = hidden
+    def test_of_relaxations_the_worst_comes_first_and_costs_no_more_than_all_of_it(
+        self, undetected
+    ):
+        worst, *others = undetected
         assert worst.family == CREEP
         assert 0 < worst.above <= 1.05
         assert 0 < worst.effect < 1.05 * SCAN_RMS
         assert {term.family for term in others} <= {CREEP, MODE, STIFFENING}
         assert not worst.shift.any()
 
-    def test_what_would_be_missed_is_the_alarm_and_five_per_cent_of_the_normal(self, clean, hidden):
-        worst = hidden[0]
-        found = with_slower_creep(clean).creep
+    def test_what_would_be_missed_is_the_alarm_and_five_per_cent_of_the_normal(
+        self, clean, undetected
+    ):
+        worst = undetected[0]
+        found = with_slow_creep(clean).creep
         (alone,) = [j for j in found if j.term.parameter == worst.parameter]
         alarm = stats.norm.isf(FALSE_ALARM / 3 / 2)
         expected = (alarm + stats.norm.isf(0.05)) * alone.score.uncertainty
         assert worst.missed == pytest.approx(expected, rel=1e-3)
 
     def test_the_gain_scales_and_the_lateness_delays_the_whole_response(self, with_a_pole):
-        worst = hidden_terms(with_a_pole)[0]
+        worst = undetected_terms(with_a_pole)[0]
         g = with_a_pole.fitted.dynamics
         assert worst.gain == pytest.approx([*g.numerator, *np.zeros(len(g.denominator))])
         assert worst.late == pytest.approx([*np.zeros(len(worst.gain) - 1), 1.0])
 
-    def test_a_stiffness_bends_coefficients_by_what_is_omitted(self, clean, hidden):
-        (stiff,) = [term for term in hidden if term.family == STIFFENING]
-        column = clean.departures.stiffening().columns[:, 0]
-        np.testing.assert_allclose(stiff.shift, omitted(clean, column))
+    def test_a_stiffness_bends_coefficients_by_what_is_omitted(self, clean, undetected):
+        (stiff,) = [term for term in undetected if term.family == STIFFENING]
+        column = clean.model_errors.stiffening().columns[:, 0]
+        np.testing.assert_allclose(stiff.shift, omission_shift(clean, column))
         assert (stiff.above, stiff.lag) == (0.0, 0.0)

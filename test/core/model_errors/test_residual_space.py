@@ -6,41 +6,47 @@ import numpy as np
 import pytest
 from scipy import special
 
-from omsm_ros.core.model_errors.residual_diagnostics import ResidualSpace, Score, broad_noise
+from omsm_ros.core.model_errors.residual_diagnostics import (
+    ResidualSpace,
+    Score,
+    smoothed_noise_spectrum,
+)
 
 
-def columns_like(survey, count, seed=3):
+def columns_like(diagnostics, count, seed=3):
     """Smooth ones: half of them follow the motion, so the fit imitates a part of each."""
-    time = np.linspace(0, 1, len(survey.problem.input))
+    time = np.linspace(0, 1, len(diagnostics.problem.input))
     rng = np.random.default_rng(seed)
     waves = [np.sin(2 * np.pi * f * time + p) for f, p in rng.uniform(2, 40, (count, 2))]
-    return np.column_stack([w + survey.problem.input * 3e4 * (k % 2) for k, w in enumerate(waves)])
+    return np.column_stack(
+        [w + diagnostics.problem.input * 3e4 * (k % 2) for k, w in enumerate(waves)]
+    )
 
 
-def at_once(survey, columns):
+def at_once(diagnostics, columns):
     """Return coefficients of ``columns`` beside all that the fit may change, and squares left."""
-    used = survey.problem.used
-    every = np.column_stack([survey.problem.sensitivity(survey.fitted), columns[used]])
+    used = diagnostics.problem.used
+    every = np.column_stack([diagnostics.problem.sensitivity(diagnostics.fitted), columns[used]])
     scale = np.linalg.norm(every, axis=0)
-    found = np.linalg.lstsq(every / scale, survey.fitted.residual, rcond=1e-12)[0]
-    left = survey.fitted.residual - every / scale @ found
+    found = np.linalg.lstsq(every / scale, diagnostics.fitted.residual, rcond=1e-12)[0]
+    left = diagnostics.fitted.residual - every / scale @ found
     return (found / scale)[-columns.shape[1] :], float(left @ left)
 
 
 @pytest.fixture(scope="module")
 def holed(step_test_of):
-    return step_test_of.survey(lost=[*range(300, 330), 900, 1500])
+    return step_test_of.diagnostics(lost=[*range(300, 330), 900, 1500])
 
 
 class TestWhatIsFree:
     def test_it_is_at_right_angles_to_all_that_the_fit_may_change(self, holed):
         space = holed.space
-        freed = space.freed(columns_like(holed, 4))
+        projected = space.projected(columns_like(holed, 4))
         moved = holed.problem.sensitivity(holed.fitted)
-        cosines = (freed / np.linalg.norm(freed, axis=0)).T @ (
+        cosines = (projected / np.linalg.norm(projected, axis=0)).T @ (
             moved / np.linalg.norm(moved, axis=0)
         )
-        assert len(freed) == holed.fitted.samples < len(holed.problem.input)
+        assert len(projected) == holed.fitted.samples < len(holed.problem.input)
         assert np.max(abs(cosines)) < 1e-9
 
     def test_what_the_fit_imitates_adds_nothing(self, clean):
@@ -49,7 +55,7 @@ class TestWhatIsFree:
         moved[clean.problem.used] = clean.problem.sensitivity(clean.fitted)[:, :1]
         moved *= np.linalg.norm(columns[:, 0]) / np.linalg.norm(moved)
         np.testing.assert_allclose(
-            clean.space.freed(columns + 5 * moved), clean.space.freed(columns), atol=1e-9
+            clean.space.projected(columns + 5 * moved), clean.space.projected(columns), atol=1e-9
         )
 
 
@@ -63,8 +69,8 @@ class TestScore:
 
     def test_in_white_noise_its_covariance_is_that_of_least_squares(self, clean, step_test_of):
         columns = columns_like(clean, 3)
-        freed = clean.space.freed(columns)
-        expected = step_test_of.noise**2 * np.linalg.inv(freed.T @ freed)
+        projected = clean.space.projected(columns)
+        expected = step_test_of.noise**2 * np.linalg.inv(projected.T @ projected)
         score = clean.space.score(columns)
         # The level of noise beside each line is known to a quarter, and taken large.
         ratio = np.diag(score.covariance) / np.diag(expected)
@@ -81,11 +87,11 @@ class TestScore:
         assert mixed.degrees == plain.degrees == 2
 
     def test_what_is_there_is_found_within_its_uncertainty(self, step_test_of):
-        empty = step_test_of.survey()
+        empty = step_test_of.diagnostics()
         wave = np.sin(2 * np.pi * 3.7 * step_test_of.time)[:, np.newaxis]
         pulls = []
         for seed in range(12):
-            there = step_test_of.survey(-30e-9 * wave[:, 0], seed)
+            there = step_test_of.diagnostics(-30e-9 * wave[:, 0], seed)
             score = there.space.score(wave)
             pulls.append((score.size[0] - 30e-9) / score.uncertainty)
             assert score.log_p < -20
@@ -101,7 +107,7 @@ class TestScore:
         assert np.isinf(score.uncertainty)
         assert not score.size.any()
 
-    def test_beside_it_a_free_column_is_judged_as_if_it_were_alone(self, clean):
+    def test_an_orthogonal_column_is_scored_as_if_it_were_alone(self, clean):
         free = columns_like(clean, 1)
         both = clean.space.score(np.column_stack([clean.problem.background[:, 0], free]))
         alone = clean.space.score(free)
@@ -148,15 +154,15 @@ class TestScreen:
     def test_the_true_one_of_many_is_first(self, step_test_of):
         frequencies = np.arange(2.0, 30.0, 0.5)
         angle = 2 * np.pi * np.outer(step_test_of.time, frequencies)
-        survey = step_test_of.survey(15e-9 * np.sin(angle[:, 21] + 1))
+        diagnostics = step_test_of.diagnostics(15e-9 * np.sin(angle[:, 21] + 1))
         waves = np.stack([np.sin(angle), np.cos(angle)], axis=2).reshape(len(angle), -1)
-        assert np.argmax(survey.space.screen(waves, 2)) == 21
+        assert np.argmax(diagnostics.space.screen(waves, 2)) == 21
 
 
 class TestNoise:
     def test_white_noise_has_its_variance_at_every_frequency(self):
         values = np.random.default_rng(1).normal(0, 3.0, 6000)
-        found = broad_noise(values, np.arange(6000), 6000, 6000)
+        found = smoothed_noise_spectrum(values, np.arange(6000), 6000, 6000)
         assert len(found) == 3001
         assert np.mean(found[10:]) == pytest.approx(9.0, rel=0.1)
         assert np.min(found) > 0.5 * 9.0
@@ -165,7 +171,7 @@ class TestNoise:
         rng = np.random.default_rng(2)
         values = rng.normal(0, 1.0, 6000)
         kept = np.flatnonzero(rng.uniform(size=6000) > 0.3)
-        found = broad_noise(values[kept], kept, 6000, 6000)
+        found = smoothed_noise_spectrum(values[kept], kept, 6000, 6000)
         assert np.mean(found[10:]) == pytest.approx(1.0, rel=0.1)
 
     def test_a_slow_line_lifts_its_octave_and_no_other(self):
@@ -173,7 +179,7 @@ class TestNoise:
         line = 400
         quiet = np.random.default_rng(3).normal(0, 1.0, 8192)
         loud = quiet + 0.5 * np.cos(2 * np.pi * line * place / 8192)
-        before, after = (broad_noise(v, place, 8192, 8192) for v in (quiet, loud))
+        before, after = (smoothed_noise_spectrum(v, place, 8192, 8192) for v in (quiet, loud))
         ratio = after / before
         # Over an octave: 0.5²/4 of power on each of 8192 lines, spread over 0.71 to 1.41 of it.
         expected = 1 + 0.25 / 4 * 8192 / (line * (2**0.5 - 0.5**0.5))
@@ -184,8 +190,8 @@ class TestNoise:
         values = np.cumsum(np.random.default_rng(4).normal(size=500))
         place = np.arange(500)
         np.testing.assert_allclose(
-            broad_noise(1e-9 * values, place, 500, 512),
-            1e-18 * broad_noise(values, place, 500, 512),
+            smoothed_noise_spectrum(1e-9 * values, place, 500, 512),
+            1e-18 * smoothed_noise_spectrum(values, place, 500, 512),
             rtol=1e-9,
         )
 

@@ -13,15 +13,15 @@ from omsm_ros.core.model_errors.families import (
     PERIODIC,
     STIFFENING,
     VIBRATION,
-    Term,
+    ModelErrorTerm,
 )
-from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Judged, Score
+from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Score, ScoreTest
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 
 def judged(chi_square, degrees=2, trials=1.0):
     score = Score(np.zeros(degrees), np.eye(degrees), chi_square, degrees)
-    return Judged(Term("any", 0.0, trials, np.zeros((4, degrees))), score)
+    return ScoreTest(ModelErrorTerm("any", 0.0, trials, np.zeros((4, degrees))), score)
 
 
 def test_a_term_found_among_many_is_as_many_times_as_likely_by_chance():
@@ -45,25 +45,27 @@ def test_evidence_is_half_the_chi_square_less_the_price_of_the_coefficients():
 
 def test_the_clearest_comes_first_and_those_named_are_left_out(step_test_of):
     time = step_test_of.time
-    survey = step_test_of.survey(
+    diagnostics = step_test_of.diagnostics(
         200e-9 * np.sin(2 * np.pi * 40 * time) + 20e-9 * (2 * time / time[-1] - 1) ** 2,
         only=(VIBRATION, DRIFT, STIFFENING),
     )
-    found = survey.significant()
+    found = diagnostics.significant()
     assert found[0].term.family == VIBRATION
-    assert [survey.evidence(one) for one in found] == sorted(
-        map(survey.evidence, found), reverse=True
+    assert [diagnostics.evidence(one) for one in found] == sorted(
+        map(diagnostics.evidence, found), reverse=True
     )
-    assert VIBRATION not in {one.term.family for one in survey.significant(but=(VIBRATION,))}
-    assert set(survey.best) <= {VIBRATION, DRIFT, STIFFENING}
-    assert survey.evidence(found[0]) == pytest.approx(found[0].evidence(survey.fitted.samples))
+    assert VIBRATION not in {one.term.family for one in diagnostics.significant(but=(VIBRATION,))}
+    assert set(diagnostics.best) <= {VIBRATION, DRIFT, STIFFENING}
+    assert diagnostics.evidence(found[0]) == pytest.approx(
+        found[0].evidence(diagnostics.fitted.samples)
+    )
 
 
 @pytest.mark.parametrize("degree", [2, 4])
 def test_of_several_drifts_that_bends_enough_and_no_more(step_test_of, degree):
     time = 2 * step_test_of.time / step_test_of.time[-1] - 1
     wave = np.polynomial.legendre.legval(time, [0.0] * degree + [1.0])
-    best = step_test_of.survey(12e-9 * wave, 2, only=(DRIFT,)).best[DRIFT]
+    best = step_test_of.diagnostics(12e-9 * wave, 2, only=(DRIFT,)).best[DRIFT]
     assert best.term.columns.shape[1] == degree - 1
     assert best.score.size[-1] == pytest.approx(-12e-9, rel=0.3)
 
@@ -72,24 +74,26 @@ def test_a_period_between_those_of_the_travel_is_found(step_test_of):
     travel = np.ptp(step_test_of.late)
     period = travel / 7.45
     added = 40e-9 * np.sin(2 * np.pi * step_test_of.late / period)
-    best = step_test_of.survey(added, only=(PERIODIC,)).best[PERIODIC]
+    best = step_test_of.diagnostics(added, only=(PERIODIC,)).best[PERIODIC]
     assert best.significant
     assert best.term.parameter == pytest.approx(period, rel=0.02)
 
 
-def test_backlash_by_steps_is_told_from_none_by_its_size(step_test_of):
+def test_backlash_by_steps_is_distinguished_from_none_by_its_size(step_test_of):
     half, state, added = 40e-9, step_test_of.late[0], []
     for value in step_test_of.late:
         state = min(max(state, value - half), value + half)
         added.append(state - value)
-    best = step_test_of.survey(np.array(added), only=(BACKLASH,)).best[BACKLASH]
+    best = step_test_of.diagnostics(np.array(added), only=(BACKLASH,)).best[BACKLASH]
     assert best.significant
     assert best.score.size[0] == pytest.approx(half, rel=0.15)
 
 
 def test_every_relaxation_is_judged_by_its_first_column_alone(clean):
     found = clean.creep
-    assert [one.term.parameter for one in found] == pytest.approx(clean.departures.time_constants())
+    assert [one.term.parameter for one in found] == pytest.approx(
+        clean.model_errors.time_constants()
+    )
     for one in found[::3]:
         assert one.term.family == CREEP
         alone = clean.space.score(one.term.columns[:, :1])
@@ -101,11 +105,11 @@ class TestIndependence:
     def test_what_follows_the_rate_is_no_chance(self, step_test_of):
         rate = np.gradient(step_test_of.late)
         later = np.roll(rate, 12) * (np.arange(len(rate)) > 25)
-        bent = 60e-9 * (later / np.max(abs(later))) ** 3
-        assert step_test_of.survey(bent).independence < 1e-6
+        curved = 60e-9 * (later / np.max(abs(later))) ** 3
+        assert step_test_of.diagnostics(curved).independence < 1e-6
 
     def test_what_follows_nothing_is(self, step_test_of):
-        chances = [step_test_of.survey(seed=seed).independence for seed in range(8)]
+        chances = [step_test_of.diagnostics(seed=seed).independence for seed in range(8)]
         assert np.all((np.array(chances) > 0) & (np.array(chances) <= 1))
         assert np.median(chances) > 0.05
 

@@ -10,8 +10,8 @@ from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Steps
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.model_errors.families import BACKLASH, CREEP, MODE, PERIODIC, relaxed
-from omsm_ros.core.model_errors.residual_diagnostics import Survey
+from omsm_ros.core.model_errors.families import BACKLASH, CREEP, MODE, PERIODIC, low_pass_response
+from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG = 2e-3, 0.7e-3
@@ -26,7 +26,7 @@ def surveyed(added=0.0):
     record = MotionRecord.from_arrays(PERIOD, z, -(LATE + added) + random.normal(0, 1e-8, len(z)))
     prepared = prepare(record, "encoder")
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
-    return Survey(prepared.problem, late, prepared.steps)
+    return ResidualDiagnostics(prepared.problem, late, prepared.steps)
 
 
 @pytest.fixture(scope="module")
@@ -55,17 +55,17 @@ def test_the_edges_are_where_they_were_in_time(long):
 
 @pytest.mark.parametrize("time_constant", [0.1, 3.0])
 def test_the_relaxation_that_is_there_is_the_one_found(time_constant):
-    found = surveyed(2e-3 * (relaxed(LATE, PERIOD / time_constant) - LATE)).best[CREEP]
+    found = surveyed(2e-3 * (low_pass_response(LATE, PERIOD / time_constant) - LATE)).best[CREEP]
     assert found.significant
     assert abs(np.log(found.term.parameter / time_constant)) < 0.5
     assert len(found.term.columns) == len(TIME)
 
 
 def test_each_family_has_the_same_terms_there(long):
-    for family in long.departures.families((CREEP, MODE, PERIODIC, BACKLASH)):
+    for family in long.model_errors.families((CREEP, MODE, PERIODIC, BACKLASH)):
         if len(family.parameters) == 1:
             continue
-        alike = long.thinned.departures.alike(family)
+        alike = long.thinned.model_errors.alike(family)
         assert (alike.name, alike.width, alike.trials) == (family.name, family.width, family.trials)
         np.testing.assert_array_equal(alike.parameters, family.parameters)
         every = round(long.thinned.problem.period / PERIOD)

@@ -6,16 +6,22 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from omsm_ros.core.registration.degrees_of_freedom import Freedoms, Open, root_of, shares_of, widest
+from omsm_ros.core.registration.degrees_of_freedom import (
+    DegreesOfFreedom,
+    OpenUncertainty,
+    root_of,
+    shares_of,
+    typical_range,
+)
 from omsm_ros.core.registration.form_model import (
     GROUP,
     LEAST_LIMIT_M,
     FormBasis,
-    NormalEquations,
+    FormNormalEquations,
+    best_matching_sum,
     estimate,
-    limit_of,
-    most_like,
-    relaxed,
+    outlier_limit,
+    relaxation_factor,
 )
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
@@ -98,7 +104,7 @@ def test_points_at_one_place_show_no_form():
 def test_sums_are_those_of_a_loop_over_points_and_groups():
     columns, systematic = RNG.normal(size=(4, 300)), RNG.normal(size=(2, 300))
     deviation, residual = RNG.normal(size=(2, 300))
-    sums = NormalEquations(4, 2)
+    sums = FormNormalEquations(4, 2)
     sums.add(columns, deviation, systematic, residual)
     expected, scores = np.zeros((4, 7)), np.zeros(4)
     for k in range(300):
@@ -117,7 +123,7 @@ def test_sums_are_those_of_a_loop_over_points_and_groups():
 def test_whole_groups_may_come_one_by_one():
     columns, deviation, residual = RNG.normal(size=(3, 4 * GROUP)), *RNG.normal(size=(2, 4 * GROUP))
     none = np.empty((0, 4 * GROUP))
-    whole, parts = NormalEquations(3, 0), NormalEquations(3, 0)
+    whole, parts = FormNormalEquations(3, 0), FormNormalEquations(3, 0)
     whole.add(columns, deviation, none, residual)
     for k in range(4):
         part = slice(k * GROUP, (k + 1) * GROUP)
@@ -131,7 +137,7 @@ def test_whole_groups_may_come_one_by_one():
 
 
 GROUPS = np.array([2, 2, 2, 3, 3, 3, 3])
-WIDE = (np.zeros(2), np.full(2, 1e3))
+BROAD = (np.zeros(2), np.full(2, 1e3))
 
 
 def problem(form, step, noise=1e-9, points=2000, seed=1):
@@ -144,7 +150,7 @@ def problem(form, step, noise=1e-9, points=2000, seed=1):
     return columns @ columns.T, columns @ data, float(np.mean(data**2))
 
 
-def solved(gram, moments, largest, noise=1e-9, expected=WIDE):
+def solved(gram, moments, largest, noise=1e-9, expected=BROAD):
     return estimate(gram, moments, noise**2, largest, GROUPS, expected)
 
 
@@ -186,7 +192,7 @@ def test_in_another_unit_of_a_freedom_its_step_is_as_many_times_larger():
     usual = solved(gram, moments, largest)
     other = solved(
         gram * np.outer(unit, unit), moments * unit, largest,
-        expected=(np.zeros(2), WIDE[1] / unit[:2]),
+        expected=(np.zeros(2), BROAD[1] / unit[:2]),
     )  # fmt: skip
     np.testing.assert_allclose(other.step * unit[:2], usual.step, rtol=1e-6)
     np.testing.assert_allclose(other.form, usual.form, rtol=1e-6)
@@ -215,12 +221,12 @@ def test_a_sum_of_columns_is_found_whatever_a_few_specks_do():
     columns[2] *= 1e6
     truth = np.array([1e-7, -2e-7, 3e-13])
     deviation = truth @ columns + 1e-9 * RNG.normal(size=2000)
-    clean, limit = most_like(columns, deviation)
+    clean, limit = best_matching_sum(columns, deviation)
     np.testing.assert_allclose(clean, truth, rtol=0.02)
     assert limit == pytest.approx(5e-9, rel=0.15)
     dusty = deviation.copy()
     dusty[::100] += 1e-5
-    found, limit = most_like(columns, dusty)
+    found, limit = best_matching_sum(columns, dusty)
     np.testing.assert_allclose(found, clean, rtol=0.01)
     assert limit < 1e-8
 
@@ -228,40 +234,40 @@ def test_a_sum_of_columns_is_found_whatever_a_few_specks_do():
 def test_without_specks_it_is_the_least_squares_of_numpy():
     columns = RNG.normal(size=(3, 500))
     deviation = RNG.uniform(-1, 1, 500)
-    found, _ = most_like(columns, deviation)
+    found, _ = best_matching_sum(columns, deviation)
     expected = np.linalg.lstsq(columns.T, deviation, rcond=None)[0]
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_column_of_nothing_takes_no_part():
     columns = np.stack([np.ones(100), np.zeros(100)])
-    found, limit = most_like(columns, np.full(100, 3e-9))
+    found, limit = best_matching_sum(columns, np.full(100, 3e-9))
     np.testing.assert_allclose(found, [3e-9, 0.0])
     assert limit == LEAST_LIMIT_M
 
 
 def test_what_more_than_one_point_of_twenty_does_is_no_dust():
     residual = 1e-9 * RNG.normal(size=10_000)
-    assert limit_of(residual) == pytest.approx(5e-9, rel=0.05)
+    assert outlier_limit(residual) == pytest.approx(5e-9, rel=0.05)
     steps = np.where(np.arange(10_000) % 10 == 0, 1e-6, residual)
-    assert limit_of(steps) > 1e-6
+    assert outlier_limit(steps) > 1e-6
     few = np.where(np.arange(10_000) % 50 == 0, 1e-6, residual)
-    assert limit_of(few) < 6e-9
-    assert limit_of(np.zeros(100)) == LEAST_LIMIT_M
+    assert outlier_limit(few) < 6e-9
+    assert outlier_limit(np.zeros(100)) == LEAST_LIMIT_M
 
 
 @pytest.mark.parametrize("rate", [0.5, -0.5, -1.5])
 def test_a_relaxed_step_finds_the_end_of_a_series_at_once(rate):
     """Of steps that shrink, or swing, by a factor: Aitken's share is 1/(1 − rate) of the next."""
     step = np.array([1.0, -2.0])
-    share = relaxed(1.0, step, rate * step)
+    share = relaxation_factor(1.0, step, rate * step)
     assert share == pytest.approx(min(1 / (1 - rate), 1.0))
 
 
 def test_the_first_step_is_taken_whole_and_none_less_than_a_tenth():
-    assert relaxed(0.3, np.zeros(2), np.ones(2)) == 1.0
-    assert relaxed(1.0, np.ones(2), np.ones(2)) == 1.0
-    assert relaxed(1.0, np.ones(2), -1e9 * np.ones(2)) == 0.1
+    assert relaxation_factor(0.3, np.zeros(2), np.ones(2)) == 1.0
+    assert relaxation_factor(1.0, np.ones(2), np.ones(2)) == 1.0
+    assert relaxation_factor(1.0, np.ones(2), -1e9 * np.ones(2)) == 0.1
 
 
 # The budget.
@@ -298,16 +304,18 @@ def test_shares_of_rows_make_up_another_covariance():
 def test_uncertainties_of_a_freedom_add_up_from_where_they_come():
     covariance = np.diag([9e-18, 16e-12])
     moved = np.array([[4e-9, 0.0, 1e-9], [0.0, 2e-6, 0.0]])
-    dragged = {"clocking": {"x": np.array([3e-9, 4e-9]), "tip": np.zeros(2), "y": np.ones(2)}}
-    found = Open(dragged, np.array([[4e-10]]))
+    correlated_moves = {
+        "clocking": {"x": np.array([3e-9, 4e-9]), "tip": np.zeros(2), "y": np.ones(2)}
+    }
+    found = OpenUncertainty(correlated_moves, np.array([[4e-10]]))
     by_source = found.by_source(("x", "tip"), covariance, ("slide", "gain", "slide"), moved)
     np.testing.assert_allclose(by_source["noise and form"], [3e-9, 4e-6])
     np.testing.assert_allclose(by_source["slide"], [np.sqrt(17) * 1e-9, 0.0])
     np.testing.assert_allclose(by_source["gain"], [0.0, 2e-6])
     np.testing.assert_allclose(by_source["clocking"], [5e-9, 0.0])
-    freedoms = Freedoms(("x", "tip"), {"clocking": "why"}, {"y": "why"})
-    spread = found.spread(freedoms, by_source)
+    dofs = DegreesOfFreedom(("x", "tip"), {"clocking": "why"}, {"y": "why"})
+    spread = found.spread(dofs, by_source)
     assert spread["x"] == pytest.approx(np.sqrt(9 + 17 + 25) * 1e-9)
     assert spread["tip"] == pytest.approx(np.sqrt(20) * 1e-6)
     assert spread["y"] == pytest.approx(np.sqrt(4e-10 + 2))
-    assert spread["clocking"] == widest("clocking")
+    assert spread["clocking"] == typical_range("clocking")

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.registration.degrees_of_freedom import parsed_freedoms
-from omsm_ros.core.registration.form_model import Estimate, _unlucky
-from omsm_ros.core.registration.placement import FREEDOMS, Aperture, Portion
+from omsm_ros.core.registration.degrees_of_freedom import parse_dofs
+from omsm_ros.core.registration.form_model import Estimate, _variance_upper_factor
+from omsm_ros.core.registration.placement import DEGREES_OF_FREEDOM, Aperture, PointBatch
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
-from omsm_ros.twin.part import PartPose, posed
+from omsm_ros.twin.part import PartPose, mounted_surface
 
 RADIUS = 12.7e-3
 
@@ -30,7 +30,7 @@ def test_a_step_is_measured_in_its_own_uncertainty():
 @pytest.mark.parametrize("unknown", [0.0, 0.5])
 def test_a_size_found_from_few_terms_may_be_larger(terms, unknown):
     """A mean of ν squares lies below that of all by ν/χ²(ν) in one of seven; half known, half ν."""
-    factor = _unlucky(np.full(terms, unknown), np.zeros(terms, np.int64))
+    factor = _variance_upper_factor(np.full(terms, unknown), np.zeros(terms, np.int64))
     known = terms * (1 - unknown)
     assert factor == pytest.approx(known / stats.chi2.ppf(0.15, known), rel=0.03)
 
@@ -42,8 +42,8 @@ def test_a_pose_that_goes_to_and_fro_within_its_uncertainty_stands():
     rng = np.random.default_rng([7, 7])
     s = rng.uniform(-1, 1, 6)
     a, b = rng.uniform(0, 2 * np.pi, 2)
-    bent = (50e-9 * np.cos(a), 50e-9 * np.sin(a), 15e-9 * np.cos(b), 15e-9 * np.sin(b))
-    part = Sum((nominal, ZernikeSurface(RADIUS, (0, 0, 0, 0, *bent))))
+    curved = (50e-9 * np.cos(a), 50e-9 * np.sin(a), 15e-9 * np.cos(b), 15e-9 * np.sin(b))
+    part = Sum((nominal, ZernikeSurface(RADIUS, (0, 0, 0, 0, *curved))))
     half = np.radians(0.5)
     pose = {"x": 5e-4 * s[0], "y": 5e-4 * s[1], "piston": 5e-4 * s[2]}
     pose |= {"tip": half * s[3], "tilt": half * s[4], "clocking": half * s[5]}
@@ -53,8 +53,8 @@ def test_a_pose_that_goes_to_and_fro_within_its_uncertainty_stands():
     )  # fmt: skip
     r, angle = np.linspace(RADIUS, 0, 20_000), np.linspace(0, 254 * np.pi, 20_000)
     x, y = r * np.cos(angle), r * np.sin(angle)
-    height = posed(part, sits).height(x, y) + rng.normal(0, 10e-9, len(x))
-    portion = Portion(x, y, height, np.empty((0, len(x))))
-    found = register(nominal, lambda: [portion], parsed_freedoms("auto"), aperture=Aperture(RADIUS))
-    for name in FREEDOMS[:6]:
+    height = mounted_surface(part, sits).height(x, y) + rng.normal(0, 10e-9, len(x))
+    portion = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(nominal, lambda: [portion], parse_dofs("auto"), aperture=Aperture(RADIUS))
+    for name in DEGREES_OF_FREEDOM[:6]:
         assert abs(found.placement.value(name) - pose[name]) < 3 * found.uncertainty(name)

@@ -7,17 +7,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.registration.placement import (
-    FREEDOMS,
+    DEGREES_OF_FREEDOM,
     LEAST_POINTS,
     Aperture,
     Placed,
     Placement,
-    Portion,
-    about_the_origin,
-    freedom_columns,
+    PointBatch,
+    centred_aperture,
+    dof_columns,
+    inside_aperture,
     placed,
     selection,
-    usable,
 )
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
@@ -33,10 +33,10 @@ POSE = Pose(x=1e-3, y=-2e-3, piston=5e-4, tip=0.03, tilt=-0.05, clocking=0.9)
 
 
 def portion(points):
-    return Portion(*points, np.empty((0, points.shape[1])))
+    return PointBatch(*points, np.empty((0, points.shape[1])))
 
 
-def beside(surface, off=OFF):
+def adjacent(surface, off=OFF):
     """Points of the part that lie ``off`` [m] along its normal, (3, n)."""
     foot = np.stack([X, Y, surface.height(X, Y)])
     return foot + off * unit_normal(*gradient_of(surface, X, Y))
@@ -51,17 +51,17 @@ def carried(pose, points):
 @pytest.mark.parametrize("surface", [PAPER_MIRROR, Sphere(-0.03), Toroid(0.05, -0.04), Flat(1e-4)])
 def test_points_along_the_normal_deviate_by_their_distance(surface, pose):
     """Exact but for deviation squared times curvature: 2 µm squared over 30 mm are 0.1 nm."""
-    found = placed(surface, Placement(pose), portion(carried(pose, beside(surface))))
+    found = placed(surface, Placement(pose), portion(carried(pose, adjacent(surface))))
     np.testing.assert_allclose(found.deviation, OFF, atol=1e-12)
-    np.testing.assert_allclose(np.stack([found.x, found.y]), beside(surface)[:2], atol=1e-16)
+    np.testing.assert_allclose(np.stack([found.x, found.y]), adjacent(surface)[:2], atol=1e-16)
     np.testing.assert_allclose(found.normal, unit_normal(*gradient_of(surface, X, Y)), atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(found.normal, axis=0), np.ones(N))
 
 
 def test_the_deviation_does_not_know_where_the_part_sits():
     """Points and pose moved alike: nothing changes."""
-    here = placed(PAPER_MIRROR, Placement(), portion(beside(PAPER_MIRROR)))
-    there = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, beside(PAPER_MIRROR))))
+    here = placed(PAPER_MIRROR, Placement(), portion(adjacent(PAPER_MIRROR)))
+    there = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, adjacent(PAPER_MIRROR))))
     np.testing.assert_allclose(there.deviation, here.deviation, atol=1e-17)
     turn = Rotation.from_euler("xyz", [POSE.tip, POSE.tilt, POSE.clocking])
     np.testing.assert_allclose(there.from_origin, turn.apply(here.from_origin.T).T, atol=1e-16)
@@ -78,7 +78,7 @@ def test_power_is_a_bowl_that_the_nominal_does_not_have():
 def test_of_a_plane_moves_do_what_geometry_says():
     """Piston lowers the points beside it, a tip those of y, a tilt raises those of x."""
     flat = portion(np.stack([X, Y, 0 * X]))
-    columns = freedom_columns(Placement(), placed(Flat(), Placement(), flat), FREEDOMS)
+    columns = dof_columns(Placement(), placed(Flat(), Placement(), flat), DEGREES_OF_FREEDOM)
     expected = [-np.ones(N), -Y, X, 0 * X, 0 * X, 0 * X, -(X**2 + Y**2) / 2]
     np.testing.assert_allclose(columns, expected, atol=1e-18)
 
@@ -86,7 +86,9 @@ def test_of_a_plane_moves_do_what_geometry_says():
 def test_of_a_sphere_a_shift_does_what_a_tilt_does_by_its_radius():
     on_it = portion(np.stack([X, Y, Sphere(0.05).height(X, Y)]))
     at = placed(Sphere(0.05), Placement(), on_it)
-    columns = dict(zip(FREEDOMS, freedom_columns(Placement(), at, FREEDOMS), strict=True))
+    columns = dict(
+        zip(DEGREES_OF_FREEDOM, dof_columns(Placement(), at, DEGREES_OF_FREEDOM), strict=True)
+    )
     # Turned by an angle about the vertex, the centre, R above it, moves by R times the angle.
     np.testing.assert_allclose(columns["tilt"], 0.05 * columns["x"], atol=1e-16)
     np.testing.assert_allclose(columns["tip"], -0.05 * columns["y"], atol=1e-16)
@@ -94,12 +96,14 @@ def test_of_a_sphere_a_shift_does_what_a_tilt_does_by_its_radius():
 
 
 def test_columns_come_in_the_order_in_which_freedoms_are_named():
-    at = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, beside(PAPER_MIRROR))))
-    every = dict(zip(FREEDOMS, freedom_columns(Placement(POSE), at, FREEDOMS), strict=True))
+    at = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, adjacent(PAPER_MIRROR))))
+    every = dict(
+        zip(DEGREES_OF_FREEDOM, dof_columns(Placement(POSE), at, DEGREES_OF_FREEDOM), strict=True)
+    )
     names = ("power", "x", "piston", "clocking")
-    some = freedom_columns(Placement(POSE), at, names)
+    some = dof_columns(Placement(POSE), at, names)
     np.testing.assert_array_equal(some, [every[name] for name in names])
-    assert freedom_columns(Placement(POSE), at, ()).shape == (0, N)
+    assert dof_columns(Placement(POSE), at, ()).shape == (0, N)
 
 
 # Placements.
@@ -109,14 +113,14 @@ def test_a_placement_moves_by_the_names_of_its_freedoms():
     found = Placement(Pose(x=1e-3, tip=0.1), 0.5).moved(
         ("tip", "power", "clocking"), np.array([0.05, -0.2, 0.3])
     )
-    values = [found.value(name) for name in FREEDOMS]
+    values = [found.value(name) for name in DEGREES_OF_FREEDOM]
     assert values == pytest.approx([0.0, 0.15, 0.0, 1e-3, 0.0, 0.3, 0.3])
     back = found.moved(("tip", "power", "clocking"), np.array([-0.05, 0.2, -0.3]))
     assert back.value("tip") == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(("name", "step"), [("x", 20.0), ("tip", 4.0), ("piston", np.nan)])
-def test_a_fit_that_strays_is_told_with_what_to_check(name, step):
+def test_a_fit_that_strays_is_reported_with_what_to_check(name, step):
     with pytest.raises(DataError, match=r"no pose brings the points .* sign of its radii"):
         Placement().moved([name], np.array([step]))
 
@@ -140,9 +144,9 @@ def test_points_beyond_the_aperture_or_the_surface_do_not_count():
     x, y = RNG.uniform(-0.03, 0.03, (2, 4000))
     z = np.where(np.hypot(x, y) < 0.02, Sphere(0.02).height(x, y), 0.0)
     at = placed(Sphere(0.02), Placement(), portion(np.stack([x, y, z])))
-    whole = usable(at, None)
+    whole = inside_aperture(at, None)
     assert np.all(np.hypot(whole.x, whole.y) < 0.02)
-    inner = usable(at, Aperture(0.01))
+    inner = inside_aperture(at, Aperture(0.01))
     assert len(inner.x) == np.sum(np.hypot(x, y) <= 0.01)
     assert inner.normal.shape == inner.from_origin.shape == (3, len(inner.x))
     np.testing.assert_allclose(inner.deviation, np.zeros(len(inner.x)), atol=1e-15)
@@ -153,10 +157,10 @@ def test_as_many_points_as_the_fit_needs_are_enough(count):
     on_it = np.stack([X[:count], Y[:count], 0 * X[:count]])
     at = placed(Flat(), Placement(), portion(on_it))
     if count == LEAST_POINTS:
-        assert len(usable(at, None).x) == count
+        assert len(inside_aperture(at, None).x) == count
         return
     with pytest.raises(DataError, match="199 points lie on the nominal surface, expected 200"):
-        usable(at, None)
+        inside_aperture(at, None)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +170,7 @@ def test_points_closer_than_atoms_are_refused(size, said):
     """A cloud in a unit that it does not have; squares of the least vanish, and no form is left."""
     at = placed(Flat(), Placement(), portion(size / 6e-3 * np.stack([X, Y, 0 * X])))
     with pytest.raises(DataError, match=f"within .*{said}.*check the units of the cloud"):
-        usable(at, None)
+        inside_aperture(at, None)
 
 
 def placed_at(x, y):
@@ -175,14 +179,14 @@ def placed_at(x, y):
 
 
 def test_about_the_origin_is_the_disc_that_holds_all_points():
-    found = about_the_origin(placed_at(X, Y))
+    found = centred_aperture(placed_at(X, Y))
     assert (found.x, found.y) == (0.0, 0.0)
     assert found.radius == np.hypot(X, Y).max()
 
 
 @pytest.mark.parametrize("away", [(0.1, 0.0), (0.0, -0.2), (0.3, 0.4)])
-def test_a_part_beside_the_origin_has_a_disc_of_its_own(away):
-    found = about_the_origin(placed_at(X + away[0], Y + away[1]))
+def test_a_part_off_the_origin_has_its_own_disc(away):
+    found = centred_aperture(placed_at(X + away[0], Y + away[1]))
     assert abs(found.x - away[0]) < 3e-4
     assert abs(found.y - away[1]) < 3e-4
     assert np.all(found.holds(X + away[0], Y + away[1]))
@@ -190,7 +194,7 @@ def test_a_part_beside_the_origin_has_a_disc_of_its_own(away):
 
 
 def test_a_single_place_has_a_disc_too():
-    assert about_the_origin(placed_at(np.zeros(3), np.zeros(3))).radius == 1.0
+    assert centred_aperture(placed_at(np.zeros(3), np.zeros(3))).radius == 1.0
 
 
 # Selections.

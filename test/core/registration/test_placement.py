@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.registration.placement import Aperture, Placement, Portion, placed, usable
+from omsm_ros.core.registration.placement import (
+    Aperture,
+    Placement,
+    PointBatch,
+    inside_aperture,
+    placed,
+)
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import DataError
 
@@ -12,6 +18,6 @@ from omsm_ros.errors import DataError
 def test_a_pose_at_which_the_points_miss_the_part_is_refused(level, aperture):
     """The refinement may arrive there: heights that wrapped by metres left it without a point."""
     x, y = np.random.default_rng(1).uniform(-0.01, 0.01, (2, 1000))
-    points = Portion(x, y, np.full(len(x), level), np.empty((0, len(x))))
+    points = PointBatch(x, y, np.full(len(x), level), np.empty((0, len(x))))
     with pytest.raises(DataError, match="0 points lie on the nominal surface, expected 200"):
-        usable(placed(PAPER_MIRROR, Placement(), points), aperture)
+        inside_aperture(placed(PAPER_MIRROR, Placement(), points), aperture)

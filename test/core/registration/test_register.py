@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.registration import register as registering
-from omsm_ros.core.registration.degrees_of_freedom import parsed_freedoms
+from omsm_ros.core.registration.degrees_of_freedom import parse_dofs
 from omsm_ros.core.registration.placement import (
-    FREEDOMS,
+    DEGREES_OF_FREEDOM,
     Aperture,
     Placement,
-    Portion,
-    freedom_columns,
+    PointBatch,
+    dof_columns,
     placed,
 )
 from omsm_ros.core.registration.register import register
@@ -29,7 +29,7 @@ from omsm_ros.core.surface.nominal import (
 )
 from omsm_ros.core.surface.posed import Pose, Sum
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.twin.part import FigureError, PartPose, posed
+from omsm_ros.twin.part import FigureError, PartPose, mounted_surface
 
 STRAIGHT = Pose()
 RADIUS, NOISE = 12.7e-3, 10e-9
@@ -59,13 +59,13 @@ def scan(part, pose=STRAIGHT, noise=NOISE, seed=1, dust=0.0, points=12_000):
         x_m=pose.x, y_m=pose.y, z_m=pose.piston,
         tilt_x_rad=pose.tip, tilt_y_rad=pose.tilt, clocking_rad=pose.clocking,
     )  # fmt: skip
-    height = posed(part, sits).height(x, y) + rng.normal(0, 1, points) * noise
+    height = mounted_surface(part, sits).height(x, y) + rng.normal(0, 1, points) * noise
     height = height + 5e-6 * (rng.random(points) < dust)
-    return Portion(x, y, height, np.empty((0, points)))
+    return PointBatch(x, y, height, np.empty((0, points)))
 
 
 def fitted(nominal, portion, text="auto", **options):
-    return register(nominal, lambda: [portion], parsed_freedoms(text), **options)
+    return register(nominal, lambda: [portion], parse_dofs(text), **options)
 
 
 POSE = Pose(x=4e-4, y=-5e-4, piston=2e-4, tip=8e-3, tilt=-7e-3)
@@ -85,8 +85,8 @@ def test_derivatives_are_those_of_the_deviation():
     """By differences in every freedom, at a pose far from zero, where the deviation is small."""
     at = Placement(Pose(x=1e-3, y=-2e-3, piston=1e-3, tip=0.02, tilt=-0.03, clocking=0.5), 0.01)
     portion = scan(FREEFORM, at.pose, noise=1e-7, points=300)
-    columns = freedom_columns(at, placed(FREEFORM, at, portion), FREEDOMS)
-    for k, name in enumerate(FREEDOMS):
+    columns = dof_columns(at, placed(FREEFORM, at, portion), DEGREES_OF_FREEDOM)
+    for k, name in enumerate(DEGREES_OF_FREEDOM):
         step = 1e-7
         high, low = (
             placed(FREEFORM, at.moved([name], np.array([s])), portion).deviation
@@ -101,7 +101,7 @@ def test_the_deviation_is_the_distance_along_the_normal():
     rng = np.random.default_rng(3)
     x, y = spiral(500)
     z = Sphere(0.02).height(x, y) + rng.normal(0, 5e-6, 500)
-    found = placed(Sphere(0.02), Placement(), Portion(x, y, z, np.empty((0, 500)))).deviation
+    found = placed(Sphere(0.02), Placement(), PointBatch(x, y, z, np.empty((0, 500)))).deviation
     np.testing.assert_allclose(found, 0.02 - np.sqrt(x**2 + y**2 + (z - 0.02) ** 2), atol=2e-12)
 
 
@@ -122,7 +122,7 @@ def test_the_deviation_is_the_distance_along_the_normal():
     ],
 )
 def test_what_a_surface_determines_is_found(nominal, fitted_, refused):
-    found = fitted(nominal, scan(nominal)).freedoms
+    found = fitted(nominal, scan(nominal)).dofs
     assert set(found.fitted) == fitted_
     assert set(found.refused) == refused
 
@@ -133,13 +133,13 @@ def test_a_freedom_that_was_asked_for_in_vain_is_refused_with_the_reason():
         fitted(Sphere(0.1), portion, "piston,clocking")
     with pytest.raises(DataError, match=r"x cannot be fitted: .* it does what tilt does"):
         fitted(Sphere(0.1), portion, "piston,tip,tilt,x")
-    assert fitted(Sphere(0.1), portion, "piston,x,y").freedoms.fitted == ("piston", "x", "y")
+    assert fitted(Sphere(0.1), portion, "piston,x,y").dofs.fitted == ("piston", "x", "y")
 
 
 @pytest.mark.parametrize("text", ["", "yaw", "piston,piston", "piston,,yaw"])
 def test_names_that_are_no_freedoms_are_refused(text):
     with pytest.raises(ConfigurationError, match=r"freedom|no freedom"):
-        parsed_freedoms(text)
+        parse_dofs(text)
 
 
 def deviations_in_units(nominal, error, names, seeds, pose):
@@ -170,13 +170,13 @@ def test_the_stated_uncertainty_holds_what_the_form_of_the_part_does_to_the_pose
     Where a part's form happens to be just what a shift makes, nothing tells: one run in twenty.
     """
 
-    def bent(seed):
+    def curved(seed):
         angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, 2)
         sizes = [50e-9 * np.cos(angles[0]), 50e-9 * np.sin(angles[0]),
                  15e-9 * np.cos(angles[1]), 15e-9 * np.sin(angles[1])]  # fmt: skip
         return ZernikeSurface(RADIUS, (0, 0, 0, 0, *sizes))
 
-    off = deviations_in_units(PAPER_MIRROR, bent, "piston,tip,tilt,x,y", 15, POSE)
+    off = deviations_in_units(PAPER_MIRROR, curved, "piston,tip,tilt,x,y", 15, POSE)
     assert np.mean(np.abs(off) < 2) > 0.9
     assert np.sqrt(np.mean(off**2)) > 0.05
 
@@ -197,7 +197,7 @@ def test_what_is_not_determined_widens_what_follows_it():
     """Clocking of an off-axis paraboloid about its parent's axis, 50.8 mm away."""
     pose = Pose(clocking=5e-3)
     found = fitted(PAPER_MIRROR, scan(PAPER_MIRROR, pose))
-    for name in FREEDOMS[:6]:
+    for name in DEGREES_OF_FREEDOM[:6]:
         off = found.placement.value(name) - getattr(pose, name)
         assert abs(off) < 2 * found.uncertainty(name)
     assert found.uncertainty("y") > 5e-4
@@ -213,8 +213,8 @@ def test_a_move_that_form_looks_like_is_held_and_may_do_what_is_stated():
     """A part that sits 3 µm beside its place: some 10 nm of form, which nobody can tell."""
     pose = Pose(x=3e-6, y=-2e-6, tip=1e-3)
     found = fitted(PAPER_MIRROR, scan(Part(PAPER_MIRROR, ASTIGMATIC), pose))
-    assert set(found.freedoms.held) == {"x", "y"}
-    assert "do not show that the part was moved" in found.freedoms.held["x"]
+    assert set(found.dofs.held) == {"x", "y"}
+    assert "do not show that the part was moved" in found.dofs.held["x"]
     for name in ("x", "y"):
         assert found.placement.value(name) == 0
         assert abs(getattr(pose, name)) < 2 * found.uncertainty(name)
@@ -222,7 +222,7 @@ def test_a_move_that_form_looks_like_is_held_and_may_do_what_is_stated():
     there = scan(PAPER_MIRROR, pose, noise=0.0)
     points = placed(PAPER_MIRROR, Placement(), there)
     names = ("piston", "tip", "tilt")
-    columns = freedom_columns(Placement(), points, names).T
+    columns = dof_columns(Placement(), points, names).T
     left = points.deviation - columns @ np.linalg.lstsq(columns, points.deviation, rcond=None)[0]
     opened = found.effects(points, np.empty((0, len(there.x))))[1]
     assert opened.shape == (4, len(there.x))
@@ -232,13 +232,13 @@ def test_a_move_that_form_looks_like_is_held_and_may_do_what_is_stated():
 def test_a_part_that_was_plainly_moved_is_fitted_there():
     pose = Pose(x=4e-4, y=-3e-4, tip=1e-3)
     found = fitted(PAPER_MIRROR, scan(Part(PAPER_MIRROR, ASTIGMATIC), pose))
-    assert set(found.freedoms.fitted) >= {"x", "y"}
-    assert not found.freedoms.held
+    assert set(found.dofs.fitted) >= {"x", "y"}
+    assert not found.dofs.held
 
 
 def test_what_was_asked_for_by_name_is_never_held():
     found = fitted(PAPER_MIRROR, scan(Part(PAPER_MIRROR, ASTIGMATIC)), "piston,tip,tilt,x,y")
-    assert found.freedoms.fitted == ("piston", "tip", "tilt", "x", "y")
+    assert found.dofs.fitted == ("piston", "tip", "tilt", "x", "y")
     assert found.held_effects.shape == (0, 0)
 
 
@@ -247,7 +247,7 @@ def test_dust_is_left_out():
         fitted(PAPER_MIRROR, scan(PAPER_MIRROR, POSE, dust=d), "piston,tip,tilt,x,y")
         for d in (0.0, 1e-3)
     )
-    for name in clean.freedoms.fitted:
+    for name in clean.dofs.fitted:
         change = abs(dusty.placement.value(name) - clean.placement.value(name))
         assert change < 0.5 * clean.uncertainty(name)
     assert dusty.limit < 1e-7
@@ -257,7 +257,7 @@ def test_steps_of_the_part_are_no_dust():
     """A tenth of a flat stands 20 nm above the rest, and no noise hides it."""
     x, y = spiral()
     step = 20e-9 * ((np.arctan2(y, x) > 0) & (np.arctan2(y, x) < 0.2 * np.pi))
-    portion = Portion(x, y, step, np.empty((0, len(x))))
+    portion = PointBatch(x, y, step, np.empty((0, len(x))))
     found = fitted(Flat(), portion, "piston,tip,tilt")
     points = placed(Flat(), found.placement, portion)
     assert np.mean(found.good(points)) > 0.95
@@ -270,11 +270,11 @@ def test_a_small_piece_settles_though_its_form_looks_like_a_pose(size, seed):
     part = FigureError(PAPER_MIRROR, 3e-3, seed=seed, astigmatism=size)
     x, y = (v * 3e-3 / RADIUS for v in spiral(20_000, 30))
     noise = np.random.default_rng(seed).normal(0, NOISE, len(x))
-    portion = Portion(x, y, part.height(x, y) + noise, np.empty((0, len(x))))
+    portion = PointBatch(x, y, part.height(x, y) + noise, np.empty((0, len(x))))
     found = fitted(PAPER_MIRROR, portion)
     assert found.noise == pytest.approx(NOISE, rel=0.1)
     assert np.mean(found.good(placed(PAPER_MIRROR, found.placement, portion))) > 0.999
-    for name in found.freedoms.fitted:
+    for name in found.dofs.fitted:
         assert abs(found.placement.value(name)) < 2 * found.uncertainty(name)
 
 
@@ -288,13 +288,13 @@ def test_a_systematic_source_moves_the_pose_by_what_it_says():
     """A height that is off by a plane: the tilt follows, and the uncertainty of it is that."""
     portion = scan(PAPER_MIRROR)
     slope = 1e-6
-    told = portion._replace(systematic=slope * portion.x[np.newaxis])
-    found = fitted(PAPER_MIRROR, told, "piston,tip,tilt", sources=("slide",))
+    reported = portion._replace(systematic=slope * portion.x[np.newaxis])
+    found = fitted(PAPER_MIRROR, reported, "piston,tip,tilt", sources=("slide",))
     moved = fitted(
         PAPER_MIRROR, portion._replace(height=portion.height + slope * portion.x), "piston,tip,tilt"
     )
     plain = fitted(PAPER_MIRROR, portion, "piston,tip,tilt")
-    for k, name in enumerate(plain.freedoms.fitted):
+    for k, name in enumerate(plain.dofs.fitted):
         step = moved.placement.value(name) - plain.placement.value(name)
         assert found.moved[k, 0] == pytest.approx(step, rel=0.05, abs=1e-10)
         assert found.from_source["slide"][k] == abs(found.moved[k, 0])
@@ -302,8 +302,8 @@ def test_a_systematic_source_moves_the_pose_by_what_it_says():
 
 
 def test_power_is_the_curvature_that_the_part_has_more():
-    bent = Part(PAPER_MIRROR, Asphere(even_terms=(0.5e-3,)))
-    found = fitted(PAPER_MIRROR, scan(bent), "piston,tip,tilt,power")
+    curved = Part(PAPER_MIRROR, Asphere(even_terms=(0.5e-3,)))
+    found = fitted(PAPER_MIRROR, scan(curved), "piston,tip,tilt,power")
     assert found.placement.power == pytest.approx(1e-3, abs=4 * found.uncertainty("power"))
 
 
@@ -320,10 +320,10 @@ def test_the_aperture_leaves_out_what_lies_beyond():
 @pytest.mark.parametrize(
     ("portion", "named"),
     [
-        (Portion(*np.zeros((3, 0)), np.empty((0, 0))), "0 points"),
-        (Portion(*np.zeros((3, 50)), np.empty((0, 50))), "50 points"),
-        (Portion(*np.full((3, 500), np.nan), np.empty((0, 500))), r"0 points lie"),
-        (Portion(*np.zeros((3, 500)), np.empty((0, 500))), "within 0 m .*measure across"),
+        (PointBatch(*np.zeros((3, 0)), np.empty((0, 0))), "0 points"),
+        (PointBatch(*np.zeros((3, 50)), np.empty((0, 50))), "50 points"),
+        (PointBatch(*np.full((3, 500), np.nan), np.empty((0, 500))), r"0 points lie"),
+        (PointBatch(*np.zeros((3, 500)), np.empty((0, 500))), "within 0 m .*measure across"),
         (
             scan(Sphere(0.1))._replace(x=spiral()[0] * 100, y=spiral()[1] * 100),
             "settle|lie on the nominal",

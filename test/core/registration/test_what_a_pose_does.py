@@ -12,8 +12,8 @@ from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.registration.placement import (
     Aperture,
     Placement,
-    Portion,
-    freedom_columns,
+    PointBatch,
+    dof_columns,
     placed,
 )
 from omsm_ros.core.registration.probe_alignment import (
@@ -38,7 +38,7 @@ NAMES = ("piston", "tip", "tilt", "x", "y")
 
 
 def portion(part=slice(None), systematic=0):
-    return Portion(X[part], Y[part], HEIGHT[part], np.zeros((systematic, len(X[part]))))
+    return PointBatch(X[part], Y[part], HEIGHT[part], np.zeros((systematic, len(X[part]))))
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +70,7 @@ def test_before_the_fit_the_deviation_was_that_of_the_part_where_it_sits(found):
 def test_effects_of_the_pose_add_up_to_its_covariance(found, points):
     """At each point the variance of what the uncertain pose does to the deviation."""
     pose, sources = found.effects(points, np.empty((0, len(points.x))))
-    columns = freedom_columns(found.placement, points, NAMES)
+    columns = dof_columns(found.placement, points, NAMES)
     covariance = found.pose_effects.T @ found.pose_effects
     expected = np.einsum("pn,pq,qn->n", columns, covariance, columns)
     np.testing.assert_allclose(np.sum(pose**2, axis=0), expected, rtol=1e-6)
@@ -94,7 +94,7 @@ def test_what_the_pose_may_be_off_by_displaces_the_places_of_the_part(found, poi
         back = turn.inv().apply((there - other.origin[:, np.newaxis]).T).T
         np.testing.assert_allclose(way, (back - local)[:2], atol=1e-15)
     assert found.moves.tolist() == [0, 1, 2, 3, 4]
-    assert found.glides(x, y).shape == (0, 2, len(x))
+    assert found.undetermined_displacements(x, y).shape == (0, 2, len(x))
 
 
 def test_points_far_from_the_smooth_form_are_no_good_ones(found, points):
@@ -107,7 +107,7 @@ def test_points_far_from_the_smooth_form_are_no_good_ones(found, points):
 def test_a_machine_whose_zero_is_elsewhere_finds_the_part_elsewhere(found):
     """All points shifted, by whole millimetres: the origin goes with them, and nothing turns."""
     away = {"x": 1e-3, "y": -2e-3, "piston": 3e-3}
-    moved = Portion(X + 1e-3, Y - 2e-3, HEIGHT + 3e-3, np.empty((0, POINTS)))
+    moved = PointBatch(X + 1e-3, Y - 2e-3, HEIGHT + 3e-3, np.empty((0, POINTS)))
     there = register(PAPER_MIRROR, lambda: [moved], NAMES)
     for name in NAMES:
         expected = found.placement.value(name) + away.get(name, 0.0)

@@ -8,13 +8,13 @@ import pytest
 from omsm_ros.core.registration.degrees_of_freedom import (
     AUTO,
     RIGID,
-    Freedoms,
-    determined,
-    parsed_freedoms,
-    weakest,
-    widest,
+    DegreesOfFreedom,
+    determined_dofs,
+    parse_dofs,
+    typical_range,
+    weakest_dof,
 )
-from omsm_ros.core.registration.placement import FREEDOMS
+from omsm_ros.core.registration.placement import DEGREES_OF_FREEDOM
 from omsm_ros.errors import ConfigurationError, DataError
 
 RNG = np.random.default_rng(3)
@@ -24,7 +24,7 @@ X, Y = RNG.uniform(-1e-2, 1e-2, (2, POINTS))
 
 def gram_of(**columns):
     """Products of the columns of all freedoms, none where it is not named."""
-    rows = np.array([columns.get(name, np.zeros(POINTS)) for name in FREEDOMS])
+    rows = np.array([columns.get(name, np.zeros(POINTS)) for name in DEGREES_OF_FREEDOM])
     return rows @ rows.T
 
 
@@ -32,7 +32,7 @@ PLANE = {"piston": np.ones(POINTS), "tip": Y, "tilt": -X}
 
 
 def test_of_a_plane_its_three_moves_are_determined():
-    found = determined([AUTO], gram_of(**PLANE), POINTS)
+    found = determined_dofs([AUTO], gram_of(**PLANE), POINTS)
     assert found.fitted == ("piston", "tip", "tilt")
     assert found.held == {}
     assert set(found.refused) == {"x", "y", "clocking"}
@@ -41,9 +41,9 @@ def test_of_a_plane_its_three_moves_are_determined():
 
 def test_a_freedom_that_does_what_others_do_together_is_refused_with_their_names():
     both = gram_of(**PLANE, x=0.3 * X + 0.4 * Y)
-    found = determined([AUTO], both, POINTS)
+    found = determined_dofs([AUTO], both, POINTS)
     assert found.refused["x"] == "on this surface it does what tip and tilt do"
-    one = determined([AUTO], gram_of(**PLANE, x=-0.3 * X), POINTS)
+    one = determined_dofs([AUTO], gram_of(**PLANE, x=-0.3 * X), POINTS)
     assert one.refused["x"] == "on this surface it does what tilt does"
 
 
@@ -56,30 +56,30 @@ def test_a_freedom_is_determined_by_a_nanometre_of_form_of_a_part_put_on_by_hand
         - np.stack(list(PLANE.values()), axis=1)
         @ np.linalg.lstsq(np.stack(list(PLANE.values()), axis=1), own, rcond=None)[0]
     )
-    column = form / widest("x") * own / np.sqrt(np.mean(own**2))
-    found = determined([AUTO], gram_of(**PLANE, x=column + 0.1 * X), POINTS)
+    column = form / typical_range("x") * own / np.sqrt(np.mean(own**2))
+    found = determined_dofs([AUTO], gram_of(**PLANE, x=column + 0.1 * X), POINTS)
     assert ("x" in found.fitted) == fitted
 
 
 def test_what_was_asked_for_by_name_and_is_not_determined_is_an_error():
     gram = gram_of(**PLANE)
-    assert determined(["tip", "piston"], gram, POINTS).fitted == ("piston", "tip")
+    assert determined_dofs(["tip", "piston"], gram, POINTS).fitted == ("piston", "tip")
     with pytest.raises(DataError, match=r"clocking cannot be fitted: .* leave it out of the fit"):
-        determined([AUTO, "clocking"], gram, POINTS)
+        determined_dofs([AUTO, "clocking"], gram, POINTS)
     with pytest.raises(DataError, match="y cannot be fitted"):
-        determined(["piston", "y"], gram, POINTS)
+        determined_dofs(["piston", "y"], gram, POINTS)
 
 
 def test_auto_takes_no_power_unless_it_is_named():
     bowl = {**PLANE, "power": (X**2 + Y**2) / 2}
-    assert determined([AUTO], gram_of(**bowl), POINTS).fitted == ("piston", "tip", "tilt")
-    named = determined([AUTO, "power"], gram_of(**bowl), POINTS)
+    assert determined_dofs([AUTO], gram_of(**bowl), POINTS).fitted == ("piston", "tip", "tilt")
+    named = determined_dofs([AUTO, "power"], gram_of(**bowl), POINTS)
     assert named.fitted == ("piston", "tip", "tilt", "power")
 
 
 def test_twice_as_many_points_of_the_same_kind_determine_the_same():
     gram = gram_of(**PLANE, x=X * Y, y=1e-3 * X)
-    one, two = determined([AUTO], gram, POINTS), determined([AUTO], 2 * gram, 2 * POINTS)
+    one, two = determined_dofs([AUTO], gram, POINTS), determined_dofs([AUTO], 2 * gram, 2 * POINTS)
     assert one == two
 
 
@@ -96,11 +96,11 @@ def test_twice_as_many_points_of_the_same_kind_determine_the_same():
     ],
 )
 def test_names_are_read_with_or_without_spaces(text, names):
-    assert parsed_freedoms(text) == names
+    assert parse_dofs(text) == names
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("roll", "'roll' is unknown, expected a list of .*clocking"),
         ("x,y,x", "'x' stands twice"),
@@ -108,19 +108,21 @@ def test_names_are_read_with_or_without_spaces(text, names):
         ("X", "'X' is unknown"),
     ],
 )
-def test_other_names_are_told_with_those_there_are(text, told):
-    with pytest.raises(ConfigurationError, match=told):
-        parsed_freedoms(text)
+def test_other_names_are_reported_with_those_there_are(text, reported):
+    with pytest.raises(ConfigurationError, match=reported):
+        parse_dofs(text)
 
 
 def test_a_part_put_on_by_hand_is_off_by_a_millimetre_and_a_degree():
-    assert [widest(name) for name in FREEDOMS] == pytest.approx(
+    assert [typical_range(name) for name in DEGREES_OF_FREEDOM] == pytest.approx(
         [1e-3, np.radians(1), np.radians(1), 1e-3, 1e-3, np.radians(1), 1.0]
     )
 
 
 def test_a_freedom_that_is_held_is_no_longer_fitted():
-    found = Freedoms(("piston", "x", "y"), {"clocking": "no"}, {"tip": "weak"}).without("x", "why")
+    found = DegreesOfFreedom(("piston", "x", "y"), {"clocking": "no"}, {"tip": "weak"}).without(
+        "x", "why"
+    )
     assert found.fitted == ("piston", "y")
     assert found.held == {"tip": "weak", "x": "why"}
     assert found.refused == {"clocking": "no"}
@@ -131,7 +133,7 @@ def test_a_freedom_that_is_held_is_no_longer_fitted():
 
 def weak(values, spreads, effects, names=("piston", "x", "y")):
     """Of freedoms independent of each other, each of so much form a unit."""
-    return weakest(
+    return weakest_dof(
         names, np.array(values), np.diag(np.square(spreads)), np.diag(np.square(effects))
     )
 
@@ -170,9 +172,9 @@ def test_what_another_freedom_does_is_not_counted_as_its_own():
     gram = 1e-6 * np.array([[1.0, 1 - 5e-7], [1 - 5e-7, 1.0]])
     names = ("x", "y")
     covariance = np.diag([1e-10, 1e-10])
-    apart = weakest(names, np.zeros(2), covariance, np.diag(np.diag(gram)))
+    apart = weakest_dof(names, np.zeros(2), covariance, np.diag(np.diag(gram)))
     assert apart is not None
-    assert weakest(names, np.zeros(2), covariance, gram) is None
+    assert weakest_dof(names, np.zeros(2), covariance, gram) is None
 
 
 def test_rigid_freedoms_are_the_six_of_a_pose():

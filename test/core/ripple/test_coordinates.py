@@ -142,7 +142,7 @@ class TestSameLine:
         assert (share, frequency) == (pytest.approx(1.0), pytest.approx(200.0))
 
     @pytest.mark.parametrize("bend", [0.002, 0.01, 0.05])
-    def test_what_a_bent_coordinate_takes_is_the_best_of_plain_sums(self, bend):
+    def test_the_power_a_curved_coordinate_explains_is_the_best_of_plain_sums(self, bend):
         other = self.coordinate(PATH, TIMES + bend * TIMES**2)
         share, frequency = same_line(self.coordinate(TIME, TIMES), 30.0, other)
 
@@ -157,15 +157,15 @@ class TestSameLine:
         assert share < 1 - 1e-4
 
     def test_the_more_waves_the_less_is_one(self):
-        one, bent = self.coordinate(TIME, TIMES), self.coordinate(PATH, TIMES + 0.003 * TIMES**2)
-        shares = [same_line(one, frequency, bent)[0] for frequency in (5.0, 50.0, 200.0, 450.0)]
+        one, curved = self.coordinate(TIME, TIMES), self.coordinate(PATH, TIMES + 0.003 * TIMES**2)
+        shares = [same_line(one, frequency, curved)[0] for frequency in (5.0, 50.0, 200.0, 450.0)]
         assert shares == sorted(shares, reverse=True)
         assert shares[0] > 0.98
         assert shares[-1] < 0.6
 
     def test_a_long_scan_is_judged_by_some_of_its_samples_as_by_all(self):
         time = np.arange(40_000) * PERIOD
-        bent = time + 1e-4 * time**2
-        many = same_line(self.coordinate(TIME, time), 3.0, self.coordinate(PATH, bent))
-        few = same_line(self.coordinate(TIME, time[::13]), 3.0, self.coordinate(PATH, bent[::13]))
+        curved = time + 1e-4 * time**2
+        many = same_line(self.coordinate(TIME, time), 3.0, self.coordinate(PATH, curved))
+        few = same_line(self.coordinate(TIME, time[::13]), 3.0, self.coordinate(PATH, curved[::13]))
         assert many == pytest.approx(few, rel=2e-2)

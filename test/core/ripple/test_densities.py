@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.ripple.accelerometer import CARRIAGE, MonitorOptions, RunningSpectrum
+from omsm_ros.core.ripple.accelerometer import SLIDE, MonitorOptions, RunningSpectrum
 from omsm_ros.core.ripple.density import Density, density, evenly, smoothed
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.errors import ConfigurationError
@@ -166,15 +166,15 @@ class TestLevels:
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [
         ({"edges": (50.0, 20.0)}, "rising"),
         ({"edges": (0.0, 50.0)}, "above zero"),
         ({"edges": (50.0, 50.0)}, "rising"),
         ({"edges": (20.0, 30.0), "window": 0.1}, "first 160 Hz or more wide"),
-        ({"mount": "ceiling"}, f"'ceiling'.*expected .*'{CARRIAGE}'"),
+        ({"mount": "ceiling"}, f"'ceiling'.*expected .*'{SLIDE}'"),
     ],
 )
-def test_options_that_cannot_be_are_refused(options, told):
-    with pytest.raises(ConfigurationError, match=told):
+def test_options_that_cannot_be_are_refused(options, reported):
+    with pytest.raises(ConfigurationError, match=reported):
         MonitorOptions(**options)

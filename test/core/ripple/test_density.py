@@ -30,7 +30,7 @@ def test_white_noise_has_its_variance_over_half_the_rate():
     assert level[-1] == pytest.approx(1.0 / 500.0, rel=0.05)
 
 
-def test_millimetres_hide_no_nanometre():
+def test_millimetres_mask_no_nanometre():
     time = np.arange(20_000) * 1e-3
     large = 1e-3 * np.sin(2 * np.pi * 0.5 * time)
     spectrum = density(large + 1e-9 * np.sin(2 * np.pi * 80 * time), 1e-3)

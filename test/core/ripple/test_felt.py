@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.accelerometer import accelerations_of, felt
+from omsm_ros.core.ripple.accelerometer import acceleration_lines, accelerations_of
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.errors import DataError
 
@@ -29,7 +29,7 @@ def test_the_longest_run_without_a_gap_is_taken():
     period, axes = accelerations_of([*blocks(300), *blocks(2000, first=1000)])
     assert period == PERIOD
     assert {name: len(values) for name, values in axes.items()} == dict.fromkeys("xyz", 2000)
-    (line,) = felt(period, axes).lines
+    (line,) = acceleration_lines(period, axes).lines
     assert line.frequency == pytest.approx(120.0, abs=0.5)
     assert line.acceleration == pytest.approx(0.02, rel=0.05)
 

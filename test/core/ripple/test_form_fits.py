@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.form_removal import FormFit, Order, without_form
+from omsm_ros.core.ripple.form_removal import FormFit, SpindleOrder, without_form
 from omsm_ros.core.ripple.scan_signal import ScanSignal
 
 NM = 1e-9
@@ -146,10 +146,10 @@ class TestOrders:
         assert {one.order for one in without_form(scan()).orders} <= set(range(2, 13))
 
     def test_an_amplitude_is_that_of_both(self):
-        assert Order(3, 3 * NM, -4 * NM, 0.0).amplitude == pytest.approx(5 * NM)
+        assert SpindleOrder(3, 3 * NM, -4 * NM, 0.0).amplitude == pytest.approx(5 * NM)
 
 
-class TestBesideLines:
+class TestFormNextToLines:
     def test_a_line_that_is_known_stays_in_whole(self):
         """Near an order it would lose a part to it."""
         signal = scan(turns=12.0)
@@ -157,8 +157,8 @@ class TestBesideLines:
         wave = np.column_stack([np.cos(2 * np.pi * 59.3 * at), np.sin(2 * np.pi * 59.3 * at)])
         with_line = replace(signal, height=signal.height + 20 * NM * wave[:, 0])
         alone = FormFit(with_line).without().residual
-        beside = FormFit(with_line).without(lambda chosen: wave[chosen]).residual
-        kept = [2 * np.mean(left * wave[:, 0]) for left in (alone, beside)]
+        adjacent = FormFit(with_line).without(lambda chosen: wave[chosen]).residual
+        kept = [2 * np.mean(left * wave[:, 0]) for left in (alone, adjacent)]
         assert abs(kept[1] - 20 * NM) < 0.2 * NM
         assert abs(kept[1] - 20 * NM) < 0.2 * abs(kept[0] - 20 * NM)
 
@@ -186,7 +186,7 @@ class TestBesideLines:
 
 
 class TestOwned:
-    def test_the_orders_are_owned_each_as_wide_as_its_radial_functions(self):
+    def test_each_order_owns_the_bandwidth_of_its_radial_functions(self):
         owned = dict(FormFit(scan()).owned())
         assert set(owned) == {float(k) for k in range(1, 13)}
         # Second degree: one radial function of one and of two waves, none of three.

@@ -51,7 +51,7 @@ def test_the_twins_mirror_is_left_with_the_probes_noise():
 
 def test_less_than_a_turn_is_a_polynomial_of_time(made):
     signal = made("A", [("t", 40.0, 5e-9)], rpm=0.14, feed=0.0)
-    bent = replace(signal, height=signal.height + 3e-6 * np.cos(2 * np.pi * signal.turn * 5))
-    found = without_form(bent)
+    curved = replace(signal, height=signal.height + 3e-6 * np.cos(2 * np.pi * signal.turn * 5))
+    found = without_form(curved)
     assert found.orders == ()
     assert np.std(found.residual) == pytest.approx(np.hypot(5e-9, 5e-9 / 2**0.5), rel=0.03)

@@ -9,7 +9,7 @@ from scipy import signal as scipy_signal
 from omsm_ros.core.ripple.density import significance
 from omsm_ros.core.ripple.lines import LEAST_SIGMA, MOST_LINES, find_lines
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
-from omsm_ros.core.ripple.spectral_line import Line, sum_of
+from omsm_ros.core.ripple.spectral_line import SpectralLine, sum_of
 
 NM = 1e-9
 COUNT, RATE = 6000, 1000.0
@@ -105,7 +105,7 @@ class TestWhatIsNone:
         free = find_lines(circle(), values).lines
         assert sorted(round(line.frequency) for line in free) == [6, 61]
 
-    def test_no_more_than_so_many_are_told(self):
+    def test_the_number_of_reported_items_is_limited(self):
         frequencies = 9.7 * np.arange(1, 50)
         values = noise(0.1 * NM) + sum(sine(f, 5 * NM, f) for f in frequencies)
         found = find_lines(still(), values).lines
@@ -117,12 +117,12 @@ class TestWhatIsNone:
 class TestKnown:
     def test_a_line_that_was_known_is_found_no_second_time(self):
         values = noise() + sine(123.4, 3 * NM)
-        known = [Line(coordinate=TIME, frequency=123.37, cosine=0.0, sine=0.0)]
+        known = [SpectralLine(coordinate=TIME, frequency=123.37, cosine=0.0, sine=0.0)]
         (line,) = find_lines(still(), values, known).lines
         assert line.frequency == pytest.approx(123.4, abs=4 * line.frequency_uncertainty)
 
-    def test_one_that_is_not_there_is_not_told(self):
-        known = [Line(coordinate=TIME, frequency=200.0, cosine=9 * NM, sine=0.0)]
+    def test_an_absent_one_is_not_reported(self):
+        known = [SpectralLine(coordinate=TIME, frequency=200.0, cosine=9 * NM, sine=0.0)]
         assert find_lines(still(), noise(), known).lines == ()
 
     def test_missing_samples_cost_their_share(self):
@@ -142,7 +142,7 @@ class TestWhere:
         assert line.possible[TURN] == pytest.approx(30.5, rel=1e-3)
         assert line.possible[PATH] == pytest.approx(30.5 / (np.pi * 10e-3), rel=1e-3)
 
-    def test_a_wave_of_a_spindle_that_changes_its_speed_is_told_from_one_in_time(self):
+    def test_a_wave_of_a_spindle_that_changes_its_speed_is_distinguished_from_one_in_time(self):
         turn = 2.0 * SECONDS + 0.05 * SECONDS**2
         signal = replace(circle(), turn=turn, path=2 * np.pi * 5e-3 * turn)
         values = noise() + sine(20.0, 4 * NM, over=turn) + sine(170.0, 3 * NM)

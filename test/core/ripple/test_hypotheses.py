@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from even_scans import NM, folded, line, scan
+from even_scans import NM, aliased, line, scan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,14 +12,14 @@ from omsm_ros.core.ripple.source_hypotheses import (
     PART,
     SYNCHRONOUS,
     VIBRATION,
+    ExpectedLine,
     Hypothesis,
-    Place,
     apart,
-    by_chance,
-    found_at,
+    chance_probability,
     hypotheses_of,
+    is_detected,
+    lines_at,
     place_in,
-    shows,
     spread_of,
     whole_order,
 )
@@ -32,8 +32,8 @@ class TestWhatALineMayBe:
         assert sorted(h.frequency for h in found)[:4] == [320.0, 680.0, 1320.0, 1680.0]
         assert len(found) == len({h.frequency for h in found}) == 11
         for h in found:
-            assert folded(h.frequency, 1000.0) == pytest.approx(320.0)
-            assert h.folds == round(h.frequency / 1000.0)
+            assert aliased(h.frequency, 1000.0) == pytest.approx(320.0)
+            assert h.alias_count == round(h.frequency / 1000.0)
             # What was sampled anew from a whole number of rates away is as uncertain.
             assert h.uncertainty == found[0].uncertainty
 
@@ -46,7 +46,7 @@ class TestWhatALineMayBe:
 
     def test_what_is_sharp_along_the_path_alone_is_on_the_part(self):
         (only,) = hypotheses_of(scan(), line(225.0, coordinate=PATH))
-        assert (only.kind, only.coordinate, only.folds) == (PART, PATH, 0)
+        assert (only.kind, only.coordinate, only.alias_count) == (PART, PATH, 0)
 
     def test_its_uncertainty_grows_with_the_lines_own_and_with_its_frequency(self):
         sure, unsure = line(100.0), line(100.0, uncertainty=1e-2)
@@ -85,8 +85,8 @@ class TestPlaces:
     def test_a_texture_of_an_even_scan_is_where_its_frequency_folds(self, waves, pace, rate):
         place = place_in(scan(rate, pace), Hypothesis(PART, PATH, waves, 0.0))
         assert place.coordinate == TIME
-        assert place.frequency == pytest.approx(folded(waves * pace, rate), abs=1e-6 * rate)
-        assert place.folded == (waves * pace > rate / 2)
+        assert place.frequency == pytest.approx(aliased(waves * pace, rate), abs=1e-6 * rate)
+        assert place.aliased == (waves * pace > rate / 2)
         assert 0 <= place.frequency <= (0.5 + 1e-9) * rate
 
     @pytest.mark.parametrize(
@@ -101,14 +101,14 @@ class TestPlaces:
     def test_vibration_order_and_rings_too(self, kind, coordinate, frequency, seen):
         place = place_in(scan(), Hypothesis(kind, coordinate, frequency, 0.0))
         assert place.frequency == pytest.approx(seen)
-        assert place.folded == (frequency > 500.0 and coordinate == TIME)
+        assert place.aliased == (frequency > 500.0 and coordinate == TIME)
 
     def test_where_the_pace_changes_it_stays_in_its_coordinate(self):
-        bent = scan(path_like=PATH)
-        place = place_in(bent, Hypothesis(PART, PATH, 3000.0, 2.0))
-        assert (place.coordinate, place.frequency, place.folded) == (PATH, 3000.0, False)
+        curved = scan(path_like=PATH)
+        place = place_in(curved, Hypothesis(PART, PATH, 3000.0, 2.0))
+        assert (place.coordinate, place.frequency, place.aliased) == (PATH, 3000.0, False)
         assert place.tolerance == pytest.approx(2.0 + 0.3 / 0.8)
-        assert place_in(bent, Hypothesis(PART, PATH, 13_000.0, 2.0)).folded
+        assert place_in(curved, Hypothesis(PART, PATH, 13_000.0, 2.0)).aliased
 
     def test_what_is_uncertain_on_the_part_is_so_in_time(self):
         sure, unsure = (
@@ -121,13 +121,13 @@ class TestPlaces:
         still = scan()
         del still.coordinates[RADIUS]
         assert place_in(still, Hypothesis(PART, RADIUS, 1e4, 0.0)) is None
-        assert shows(still, Hypothesis(PART, RADIUS, 1e4, 0.0), NM) is None
+        assert is_detected(still, Hypothesis(PART, RADIUS, 1e4, 0.0), NM) is None
 
     def test_two_places_are_apart_beyond_what_both_leave_open(self):
-        one = Place(TIME, 100.0, 0.2, False)
-        assert not apart(one, Place(TIME, 100.49, 0.3, True))
-        assert apart(one, Place(TIME, 100.51, 0.3, False))
-        assert apart(one, Place(PATH, 100.0, 0.3, False))
+        one = ExpectedLine(TIME, 100.0, 0.2, False)
+        assert not apart(one, ExpectedLine(TIME, 100.49, 0.3, True))
+        assert apart(one, ExpectedLine(TIME, 100.51, 0.3, False))
+        assert apart(one, ExpectedLine(PATH, 100.0, 0.3, False))
         assert apart(one, None)
         assert apart(None, one)
 
@@ -136,57 +136,61 @@ class TestWhatIsThere:
     def test_of_several_lines_at_a_place_the_strongest(self):
         weak, strong = line(100.0, 1 * NM), line(100.01, 9 * NM)
         there = scan(lines=[weak, strong, line(140.0, 50 * NM)])
-        assert found_at(there, Place(TIME, 100.0, 0.02, False)) is strong
-        assert found_at(there, Place(TIME, 120.0, 0.02, False)) is None
-        assert found_at(there, Place(PATH, 100.0, 0.02, False)) is None
+        assert lines_at(there, ExpectedLine(TIME, 100.0, 0.02, False)) is strong
+        assert lines_at(there, ExpectedLine(TIME, 120.0, 0.02, False)) is None
+        assert lines_at(there, ExpectedLine(PATH, 100.0, 0.02, False)) is None
 
     def test_a_line_of_uncertain_frequency_is_there_within_four_of_it(self):
         there = scan(lines=[line(100.0, uncertainty=0.01)])
-        assert found_at(there, Place(TIME, 100.059, 0.02, False)) is not None
-        assert found_at(there, Place(TIME, 100.061, 0.02, False)) is None
+        assert lines_at(there, ExpectedLine(TIME, 100.059, 0.02, False)) is not None
+        assert lines_at(there, ExpectedLine(TIME, 100.061, 0.02, False)) is None
 
     def test_chance_is_the_share_of_the_band_that_the_places_of_all_lines_cover(self):
         there = scan(lines=[line(100.0), line(200.0), line(3000.0, coordinate=PATH)])
-        assert by_chance(there, Place(TIME, 5.0, 0.25, False)) == pytest.approx(2 * 0.5 / 500)
+        assert chance_probability(there, ExpectedLine(TIME, 5.0, 0.25, False)) == pytest.approx(
+            2 * 0.5 / 500
+        )
 
     HUM = Hypothesis(VIBRATION, TIME, 100.0, 0.0)
     MARKS = Hypothesis(PART, PATH, 2500.0, 0.0)  # 100 Hz at 40 mm/s
 
     def test_the_same_line_may_be_a_few_times_as_strong_and_else_nothing_is_known(self):
         there = scan(lines=[line(100.0, 5 * NM)])
-        assert shows(there, self.MARKS, 5 * NM) is True
-        assert shows(there, self.MARKS, 2 * NM) is True
-        assert shows(there, self.MARKS, 1 * NM) is None
-        assert shows(there, self.MARKS, 50 * NM) is None
-        assert shows(there, self.HUM, 50 * NM) is True
+        assert is_detected(there, self.MARKS, 5 * NM) is True
+        assert is_detected(there, self.MARKS, 2 * NM) is True
+        assert is_detected(there, self.MARKS, 1 * NM) is None
+        assert is_detected(there, self.MARKS, 50 * NM) is None
+        assert is_detected(there, self.HUM, 50 * NM) is True
 
     def test_an_absent_line_is_absent_only_where_it_would_be_seen(self):
-        assert shows(scan(), self.MARKS, 5 * NM) is False
-        assert shows(scan(sigma=1 * NM), self.MARKS, 5 * NM) is None
-        assert shows(scan(), Hypothesis(PART, PATH, 2.5, 0.0), 5 * NM) is None  # 2 waves: form
+        assert is_detected(scan(), self.MARKS, 5 * NM) is False
+        assert is_detected(scan(sigma=1 * NM), self.MARKS, 5 * NM) is None
+        assert (
+            is_detected(scan(), Hypothesis(PART, PATH, 2.5, 0.0), 5 * NM) is None
+        )  # 2 waves: form
         at_an_order = Hypothesis(PART, PATH, 3.5 / 0.04, 0.0)  # 7 waves a turn
-        assert shows(scan(), at_an_order, 5 * NM) is None
+        assert is_detected(scan(), at_an_order, 5 * NM) is None
 
     def test_a_vibration_is_never_absent_for_a_machine_may_stand_still(self):
-        assert shows(scan(), self.HUM, 5 * NM) is False
+        assert is_detected(scan(), self.HUM, 5 * NM) is False
 
     def test_a_fine_texture_is_averaged_away_over_a_sample(self):
         """At a wave a sample nothing of it is left, so that nothing is no evidence."""
         fine = Hypothesis(PART, PATH, 1000.0 / 0.04 * 1.13, 0.0)
         share = abs(np.sinc(1.13))
-        assert shows(scan(sigma=share * 5 * NM / 8.9), fine, 5 * NM) is None
-        assert shows(scan(sigma=share * 5 * NM / 9.1), fine, 5 * NM) is False
+        assert is_detected(scan(sigma=share * 5 * NM / 8.9), fine, 5 * NM) is None
+        assert is_detected(scan(sigma=share * 5 * NM / 9.1), fine, 5 * NM) is False
         weak = scan(lines=[line(130.0, share * 1.5 * NM)])
-        assert shows(weak, fine, 5 * NM) is True
+        assert is_detected(weak, fine, 5 * NM) is True
 
-    def test_a_place_as_wide_as_the_band_tells_nothing(self):
-        wide = Hypothesis(PART, PATH, 2500.0, 1000.0)
-        assert shows(scan(lines=[line(300.0)]), wide, 5 * NM) is None
+    def test_an_expected_line_as_broad_as_the_band_gives_no_evidence(self):
+        broad = Hypothesis(PART, PATH, 2500.0, 1000.0)
+        assert is_detected(scan(lines=[line(300.0)]), broad, 5 * NM) is None
 
     def test_where_the_pace_changes_a_texture_is_missed_by_the_noise_of_all_samples(self):
-        bent = scan(path_like=PATH)
+        curved = scan(path_like=PATH)
         sigma = 5 * NM * np.sqrt(2 / 20_000)
-        assert shows(bent, self.MARKS, 8.9 * sigma) is None
+        assert is_detected(curved, self.MARKS, 8.9 * sigma) is None
         # Averaged over a sample a tenth of its wave goes by: 1.6 % less is left.
-        assert shows(bent, self.MARKS, 9.3 * sigma) is False
-        assert shows(bent, Hypothesis(PART, PATH, 13_000.0, 0.0), 9.0) is None
+        assert is_detected(curved, self.MARKS, 9.3 * sigma) is False
+        assert is_detected(curved, Hypothesis(PART, PATH, 13_000.0, 0.0), 9.0) is None

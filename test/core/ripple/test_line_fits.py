@@ -8,7 +8,7 @@ from omsm_ros.core.ripple.coordinates import Coordinate
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.spectral_line import (
     CLOSEST,
-    Line,
+    SpectralLine,
     fitted,
     start,
     sum_of,
@@ -34,7 +34,7 @@ def wave(over, frequency, cosine, sine):
 
 
 def line(coordinate, frequency, cosine=0.0, sine=0.0):
-    return Line(coordinate=coordinate, frequency=frequency, cosine=cosine, sine=sine)
+    return SpectralLine(coordinate=coordinate, frequency=frequency, cosine=cosine, sine=sine)
 
 
 def at_start(lines, values):
@@ -67,7 +67,7 @@ class TestFit:
         assert found.cosine == pytest.approx(3 * NM, rel=1e-5)
         assert found.sine == pytest.approx(-4 * NM, rel=1e-5)
 
-    def test_lines_of_several_coordinates_are_fitted_beside_each_other(self):
+    def test_lines_of_several_coordinates_are_fitted_jointly(self):
         true = [
             (TIME, 40.1, 5 * NM, 1 * NM),
             (TIME, 40.1 + 1.2 * RESOLUTION, -2 * NM, 3 * NM),

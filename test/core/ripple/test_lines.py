@@ -49,7 +49,7 @@ def test_significance_is_the_inverse_of_its_ratio():
             assert float(found) == pytest.approx(sigma, abs=0.2)
 
 
-def test_a_weak_line_beside_a_strong_one_and_none_else(made):
+def test_a_weak_line_next_to_a_strong_one_and_none_else(made):
     signal = made("A", [("t", 100.0, 500 * NM), ("t", 103.0, 1 * NM)])
     assert sorted(round(line.frequency) for line in lines_of(signal)) == [100, 103]
 

@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
-from even_scans import NM, folded, line, scan, seen_by
+from even_scans import NM, aliased, line, scan, seen_by
 
-from omsm_ros.core.ripple.accelerometer import Felt, FeltLine
+from omsm_ros.core.ripple.accelerometer import AccelerationLine, AccelerationLines
 from omsm_ros.core.ripple.ripple_guard import name_lines
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN
 from omsm_ros.core.ripple.source_hypotheses import (
@@ -38,7 +38,7 @@ ONE_OF_EACH = [("t", 123.4, 4 * NM), ("s", 1500.0, 6 * NM), ("r", 9e4, 5 * NM), 
 
 
 class TestOfTwoScans:
-    def test_marks_rings_vibration_and_spindle_are_told_apart(self):
+    def test_marks_rings_vibration_and_spindle_are_distinguished(self):
         truth = [VIBRATION, PART, PART, SYNCHRONOUS]
         for rows in name_lines(machine(*two(), waves=ONE_OF_EACH)):
             assert [row.kind for row in rows] == truth
@@ -87,7 +87,7 @@ class TestOfTwoScans:
             assert [row.kind for row in rows] == [FOLDED, VIBRATION]
             assert rows[0].frequency == pytest.approx(680.0, abs=0.1)
             assert rows[1].frequency == pytest.approx(77.7, abs=0.1)
-            assert rows[0].line.frequency == pytest.approx(folded(680.0, one.signal.rate))
+            assert rows[0].line.frequency == pytest.approx(aliased(680.0, one.signal.rate))
 
     def test_a_third_scan_tells_the_first_two_which_image_it_is(self):
         third = scan(name="C", rate=1300.0, pace=0.02, turning=0.31)
@@ -104,7 +104,7 @@ class TestOfTwoScans:
         assert image.kind == ARTEFACT
         assert image.wavelength == pytest.approx(1 / 10_700.0)
         assert "S resolves a texture of 93.46 µm" in image.evidence[0]
-        assert image.line.frequency == pytest.approx(folded(10_700 * 0.0567, 1000.0))
+        assert image.line.frequency == pytest.approx(aliased(10_700 * 0.0567, 1000.0))
 
     def test_on_one_circle_the_spindle_is_named_with_what_looks_the_same(self):
         """Waves of the path come as often a turn there, so they are no other explanation."""
@@ -188,7 +188,9 @@ class TestOfOneScan:
 
 class TestCoincidences:
     @pytest.mark.parametrize(("mark", "shake"), [(9.0, 3.6), (7.0, 4.0), (4.0, 7.0), (3.6, 9.0)])
-    def test_two_things_at_one_place_are_named_by_the_stronger_and_both_are_told(self, mark, shake):
+    def test_two_sources_of_one_line_are_named_after_the_stronger_and_both_reported(
+        self, mark, shake
+    ):
         """By how strong each is in the scan that shows it alone."""
         marks, hum = 1500.0, 1500.0 * 0.04
         a, b = machine(*two(), waves=[("s", marks, mark * NM), ("t", hum, shake * NM)])
@@ -216,9 +218,9 @@ class TestCoincidences:
 
 def feels(*lines, rate=4000.0):
     """An accelerometer that feels (frequency, motion [m]) along z."""
-    return Felt(
+    return AccelerationLines(
         lines=tuple(
-            FeltLine(
+            AccelerationLine(
                 axis="z", frequency=f, frequency_uncertainty=1e-4,
                 acceleration=a * (2 * np.pi * f) ** 2, significance=20.0,
             )
@@ -229,10 +231,10 @@ def feels(*lines, rate=4000.0):
     )  # fmt: skip
 
 
-class TestFelt:
+class TestAccelerometerLines:
     @pytest.mark.parametrize(("frequency", "kind"), [(123.4, VIBRATION), (680.0, FOLDED)])
     def test_what_the_accelerometer_feels_is_known_from_one_scan(self, frequency, kind):
-        one = scan(felt=feels((frequency, 4 * NM)))
+        one = scan(acceleration_lines=feels((frequency, 4 * NM)))
         ((row,),) = name_lines(machine(one, waves=[("t", frequency, 4 * NM)]))
         assert (row.kind, row.frequency) == (kind, frequency)
         assert "along z" in row.evidence[0]
@@ -241,34 +243,34 @@ class TestFelt:
 
     @pytest.mark.parametrize("moved", [0.03 * NM, 400 * NM])
     def test_a_motion_of_quite_another_size_explains_nothing(self, moved):
-        one = scan(felt=feels((123.4, moved)))
+        one = scan(acceleration_lines=feels((123.4, moved)))
         assert kinds(*machine(one, waves=[("t", 123.4, 4 * NM)])) == [[UNDECIDED]]
 
     def test_of_two_that_would_be_seen_there_it_is_the_one_of_its_size(self):
-        one = scan(felt=feels((320.0, 30 * NM), (680.0, 4 * NM)))
+        one = scan(acceleration_lines=feels((320.0, 30 * NM), (680.0, 4 * NM)))
         ((row,),) = name_lines(machine(one, waves=[("t", 680.0, 4 * NM)]))
         assert (row.kind, row.frequency) == (FOLDED, 680.0)
 
     def test_one_that_is_off_by_more_than_a_resolution_is_another(self):
         for off, kind in ((0.04, VIBRATION), (0.06, UNDECIDED)):
-            one = scan(felt=feels((123.4 + off, 4 * NM)))
+            one = scan(acceleration_lines=feels((123.4 + off, 4 * NM)))
             assert kinds(*machine(one, waves=[("t", 123.4, 4 * NM)])) == [[kind]]
 
-    def test_many_felt_lines_have_to_agree_four_times_as_well(self):
+    def test_many_acceleration_lines_must_agree_four_times_as_well(self):
         """Of 600 lines over 500 Hz one lies within a resolution of any place by chance."""
         many = [(2.0 + 0.8 * k, 4 * NM) for k in range(600)]
         for off, kind in ((0.012, VIBRATION), (0.03, UNDECIDED)):
-            near = [f for f in many if abs(folded(f[0], 1000.0) - 123.4) > 1.0]
-            one = scan(felt=feels(*near, (123.4 + off, 4 * NM)))
+            near = [f for f in many if abs(aliased(f[0], 1000.0) - 123.4) > 1.0]
+            one = scan(acceleration_lines=feels(*near, (123.4 + off, 4 * NM)))
             assert kinds(*machine(one, waves=[("t", 123.4, 4 * NM)])) == [[kind]]
 
     def test_marks_that_a_weak_vibration_coincides_with_stay_marks(self):
         a, b = machine(*two(), waves=[("s", 1500.0, 9 * NM)])
-        a.felt = feels((1500.0 * 0.04, 1 * NM))
+        a.acceleration_lines = feels((1500.0 * 0.04, 1 * NM))
         (mark,), (other,) = name_lines((a, b))
         assert (mark.kind, mark.also) == (PART, VIBRATION)
         assert other.kind == PART
-        a.felt = feels((1500.0 * 0.04, 30 * NM))
+        a.acceleration_lines = feels((1500.0 * 0.04, 30 * NM))
         (shaken,), _ = name_lines((a, b))
         assert (shaken.kind, shaken.also) == (VIBRATION, PART)
 

@@ -4,16 +4,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from omsm_ros.core.ripple.ripple_guard import images, to_decide
+from omsm_ros.core.ripple.ripple_guard import images, missing_evidence
 from omsm_ros.core.ripple.scan_signal import PATH, TIME
 from omsm_ros.core.ripple.source_hypotheses import PART
 
 VIBRATION = "vibration"
 
 
-def scan(pace, felt=None):
+def scan(pace, acceleration_lines=None):
     coordinates = {TIME: SimpleNamespace(pace=1.0), PATH: SimpleNamespace(pace=pace)}
-    return SimpleNamespace(coordinates=coordinates, felt=felt)
+    return SimpleNamespace(coordinates=coordinates, acceleration_lines=acceleration_lines)
 
 
 LINE = SimpleNamespace(possible=(TIME, PATH))
@@ -32,11 +32,11 @@ LINE = SimpleNamespace(possible=(TIME, PATH))
 def test_the_scan_that_is_asked_for_is_one_that_is_not_there(own, paces, kinds, first):
     scans = [scan(pace) for pace in paces]
     own = min(own, len(scans) - 1)
-    said = to_decide(scans, own, LINE, kinds)
+    said = missing_evidence(scans, own, LINE, kinds)
     assert said.startswith(f"needs {first}")
     assert said.endswith(" or an accelerometer in the bag")
-    scans[own] = scan(paces[own], felt=object())
-    assert "accelerometer" not in to_decide(scans, own, LINE, kinds)
+    scans[own] = scan(paces[own], acceleration_lines=object())
+    assert "accelerometer" not in missing_evidence(scans, own, LINE, kinds)
 
 
 def test_frequencies_that_fold_are_named_from_the_lowest():

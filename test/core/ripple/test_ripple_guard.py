@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.accelerometer import felt
-from omsm_ros.core.ripple.ripple_guard import name_lines, study_all
+from omsm_ros.core.ripple.accelerometer import acceleration_lines
+from omsm_ros.core.ripple.ripple_guard import analyse_scans, name_lines
 from omsm_ros.core.ripple.source_hypotheses import (
     ARTEFACT,
     FOLDED,
@@ -23,12 +23,12 @@ def accelerometer(lines, seconds=20.0, rate=4000.0, noise=6e-4):
     z = rng.normal(0, noise, len(time))
     for frequency, amplitude in lines:
         z = z + amplitude * (2 * np.pi * frequency) ** 2 * np.sin(2 * np.pi * frequency * time)
-    return felt(1 / rate, {"x": rng.normal(0, noise, len(time)), "z": z})
+    return acceleration_lines(1 / rate, {"x": rng.normal(0, noise, len(time)), "z": z})
 
 
 def named(*scans):
     """Of each scan, {frequency in time to 0.1 Hz or wavelength in µm: row}."""
-    studied = study_all([scan if isinstance(scan, tuple) else (scan, None) for scan in scans])
+    studied = analyse_scans([scan if isinstance(scan, tuple) else (scan, None) for scan in scans])
     return [
         {
             round(row.line.possible["time"], 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.accelerometer import CARRIAGE, Alarm, MonitorOptions, RunningSpectrum
+from omsm_ros.core.ripple.accelerometer import SLIDE, Alarm, MonitorOptions, RunningSpectrum
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_DYNAMICS
@@ -55,7 +55,7 @@ def test_what_the_encoder_does_not_see_moves_the_height_by_its_motion():
 @pytest.mark.parametrize("frequency", [30.0, 100.0, 300.0])
 def test_what_the_encoder_sees_moves_it_by_what_the_response_lacks(frequency):
     moved = 10e-9
-    running = fed(shaken(frequency, moved * (2 * np.pi * frequency) ** 2), mount=CARRIAGE)
+    running = fed(shaken(frequency, moved * (2 * np.pi * frequency) ** 2), mount=SLIDE)
     assert running.levels().effect is None
     lacks = abs(1 - PAPER_DYNAMICS.response([frequency])[0])
     levels = running.levels(PAPER_DYNAMICS)
@@ -79,7 +79,7 @@ def test_what_moves_the_height_most_is_named_apart_from_what_shakes_most():
     levels = fed(z).levels()
     assert levels.line[:2] == ("z", pytest.approx(1900.0))
     assert levels.height_line == (pytest.approx(40.0), pytest.approx(3e-9, rel=0.01))
-    assert fed(z, mount=CARRIAGE).levels().height_line is None
+    assert fed(z, mount=SLIDE).levels().height_line is None
 
 
 def test_cut_anyhow_the_levels_are_the_same():
@@ -115,11 +115,11 @@ def test_before_a_window_is_full_nothing_is_said():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "reported"),
     [({"edges": (5.0,)}, "rising"), ({"edges": (5.0, 6.0)}, "16 Hz"), ({"axis": "q"}, "along 'q'")],
 )
-def test_what_cannot_be_is_refused(options, told):
-    with pytest.raises(ConfigurationError, match=told):
+def test_what_cannot_be_is_refused(options, reported):
+    with pytest.raises(ConfigurationError, match=reported):
         MonitorOptions(**options)
 
 

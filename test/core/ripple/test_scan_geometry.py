@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.accelerometer import FeltLine, felt
+from omsm_ros.core.ripple.accelerometer import AccelerationLine, acceleration_lines
 from omsm_ros.core.ripple.density import band_stop
 from omsm_ros.core.ripple.lines import find_lines
 from omsm_ros.core.ripple.scan_signal import (
@@ -12,10 +12,10 @@ from omsm_ros.core.ripple.scan_signal import (
     TIME,
     TURN,
     ScanSignal,
-    counted_on,
     sampling_over,
     scan_signal,
     track,
+    unwrapped_angle,
 )
 from omsm_ros.errors import DataError
 
@@ -64,16 +64,16 @@ class TestTurns:
     def test_an_encoder_that_starts_anew_is_counted_on_whichever_way(self, pace):
         angle = pace * EVERY
         wrapped = np.remainder(angle + np.pi, 2 * np.pi) - np.pi
-        found = counted_on(EVERY, wrapped)
+        found = unwrapped_angle(EVERY, wrapped)
         np.testing.assert_allclose(found - found[0], angle - angle[0], atol=1e-8)
 
     def test_less_than_a_turn_and_noise_are_left_alone(self):
         angle = 1.0 + 1e-5 * np.random.default_rng(1).normal(size=COUNT)
-        assert counted_on(EVERY, angle) is angle
+        assert unwrapped_angle(EVERY, angle) is angle
 
     def test_over_a_gap_it_has_kept_its_pace(self):
         count = np.r_[np.arange(2000), np.arange(9000, 11_000)]
-        found = counted_on(count, np.remainder(0.011 * count, 2 * np.pi))
+        found = unwrapped_angle(count, np.remainder(0.011 * count, 2 * np.pi))
         np.testing.assert_allclose(found, 0.011 * count, atol=1e-8)
 
 
@@ -214,7 +214,7 @@ class TestBandStop:
         np.testing.assert_allclose(found[600:-600], back[600:-600], atol=1e-6)
 
 
-class TestFelt:
+class TestAccelerometerLines:
     RATE = 2000.0
     TIME = np.arange(8000) / RATE
 
@@ -223,23 +223,25 @@ class TestFelt:
         return values + sum(a * np.sin(2 * np.pi * f * self.TIME + 1) for f, a in lines)
 
     def test_an_acceleration_is_a_motion_twice_differentiated(self):
-        line = FeltLine(
+        line = AccelerationLine(
             axis="z", frequency=50.0, frequency_uncertainty=0.0, acceleration=0.0, significance=9.0
         )
         assert line.displacement == 0.0
         motion = 3e-9 * np.sin(2 * np.pi * 120.0 * self.TIME)
         acceleration = np.gradient(np.gradient(motion, 1 / self.RATE), 1 / self.RATE)
-        (found,) = felt(1 / self.RATE, {"z": acceleration + 1e-6 * self.shaken()}).lines
+        (found,) = acceleration_lines(
+            1 / self.RATE, {"z": acceleration + 1e-6 * self.shaken()}
+        ).lines
         # Differences of neighbours are the less the fewer a wave: sinc² of 120 Hz over 2 kHz,
         # twice for they are central.
         assert found.displacement == pytest.approx(3e-9 * np.sinc(0.12) ** 2, rel=1e-3)
 
-    def test_a_line_on_several_axes_is_told_of_the_one_where_it_is_strongest(self):
+    def test_a_line_on_several_axes_is_reported_of_the_one_where_it_is_strongest(self):
         axes = {
             "x": self.shaken((120.0, 1e-2), (300.0, 5e-2)),
             "y": self.shaken((120.05, 3e-2), seed=2),
         }
-        found = felt(1 / self.RATE, axes)
+        found = acceleration_lines(1 / self.RATE, axes)
         assert [(one.axis, round(one.frequency)) for one in found.lines] == [("x", 300), ("y", 120)]
         assert (found.highest, found.duration) == (1000.0, pytest.approx(4.0))
 
@@ -247,11 +249,11 @@ class TestFelt:
         x = self.shaken((120.0, 1e-2))
         x[::7] = np.nan
         axes = {"x": x, "y": np.zeros(8000), "z": np.full(8000, np.nan)}
-        (found,) = felt(1 / self.RATE, axes).lines
+        (found,) = acceleration_lines(1 / self.RATE, axes).lines
         assert found.axis == "x"
         assert found.acceleration == pytest.approx(1e-2, rel=0.02)
         assert found.frequency == pytest.approx(120.0, abs=5 * found.frequency_uncertainty)
         assert found.significance > 20
 
     def test_gravity_is_no_line(self):
-        assert felt(1 / self.RATE, {"z": 9.81 + self.shaken()}).lines == ()
+        assert acceleration_lines(1 / self.RATE, {"z": 9.81 + self.shaken()}).lines == ()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.scan_signal import counted_on, sampling_over, scan_signal, track
+from omsm_ros.core.ripple.scan_signal import sampling_over, scan_signal, track, unwrapped_angle
 from omsm_ros.errors import DataError
 
 
@@ -52,8 +52,8 @@ def test_an_encoder_that_starts_anew_each_turn_is_counted_on_over_gaps():
     true = 2 * np.pi * 0.5e-3 * count
     kept = (count < 9_000) | (count >= 16_100)
     wrapped = np.remainder(true[kept], 2 * np.pi)
-    np.testing.assert_allclose(counted_on(count[kept], wrapped), true[kept], atol=1e-9)
-    np.testing.assert_array_equal(counted_on(count[kept], true[kept]), true[kept])
+    np.testing.assert_allclose(unwrapped_angle(count[kept], wrapped), true[kept], atol=1e-9)
+    np.testing.assert_array_equal(unwrapped_angle(count[kept], true[kept]), true[kept])
 
 
 def test_the_longest_run_of_the_trigger_is_taken():

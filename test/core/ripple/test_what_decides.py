@@ -8,7 +8,7 @@ from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TURN
 from omsm_ros.core.ripple.source_hypotheses import PART, SYNCHRONOUS, UNDECIDED, VIBRATION
 
 
-def test_what_is_sharp_in_one_coordinate_alone_is_told_in_its_unit():
+def test_a_line_sharp_in_one_coordinate_is_reported_in_its_unit():
     one = scan(path_like=PATH)
     one.lines = (line(2500.0, coordinate=PATH), line(123.4), line(7.0, coordinate=TURN))
     ((mark, shake, order),) = name_lines([one])

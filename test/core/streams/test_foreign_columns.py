@@ -12,14 +12,14 @@ from omsm_ros.core.streams.imported_columns import (
     CHANNELS,
     Column,
     ColumnMap,
-    Rows,
+    TableRows,
     axis_blocks,
     check_epoch,
     counter_of_times,
     counter_of_triggers,
     distance_blocks,
-    in_step,
     period_of,
+    share_trigger,
 )
 from omsm_ros.errors import DataError
 from omsm_ros.units import UNITS
@@ -137,7 +137,7 @@ class TestPeriods:
         with pytest.raises(DataError, match=said):
             period_of(np.asarray(times, float), stated)
 
-    def test_uneven_stamps_are_told_from_a_wrong_period(self):
+    def test_uneven_stamps_are_distinguished_from_a_wrong_period(self):
         times = np.cumsum(np.random.default_rng(2).uniform(0.5e-3, 1.9e-3, 400))
         with pytest.raises(DataError, match=r"\d+ % of the times lie off an even grid; where only"):
             period_of(times, 1e-3)
@@ -155,7 +155,7 @@ class TestPeriods:
         ],
     )
     def test_streams_in_step_have_one_period_and_fall_on_one_grid(self, starts, periods, said):
-        assert in_step(starts, periods) is said
+        assert share_trigger(starts, periods) is said
 
 
 class TestCounting:
@@ -244,7 +244,7 @@ class TestEpochs:
 class TestBlocks:
     def rows(self, counter, start=0.0, period=1e-3):
         counter = np.asarray(counter)
-        return Rows(counter, (counter - counter[0]) * period, period, start)
+        return TableRows(counter, (counter - counter[0]) * period, period, start)
 
     @few
     @given(st.lists(st.sampled_from([1, 1, 1, 2, 7]), min_size=1, max_size=50))
@@ -267,7 +267,7 @@ class TestBlocks:
 
     def test_stamps_of_today_are_right_to_the_nanosecond(self):
         """A float of seconds since 1970 is not."""
-        rows = Rows(np.array([0, 5]), np.array([0.0, 3e-9]), 1e-3, 1_760_000_000.5)
+        rows = TableRows(np.array([0, 5]), np.array([0.0, 3e-9]), 1e-3, 1_760_000_000.5)
         assert [stamp for _, stamp, _ in rows.parts()] == [
             1_760_000_000_500_000_000, 1_760_000_000_500_000_003,
         ]  # fmt: skip

@@ -206,7 +206,7 @@ def test_a_scan_with_two_clocks_is_corrected_like_one_with_a_trigger() -> None:
     assert np.max(abs(points.height - truth)) < 0.1e-9
 
 
-def test_counts_are_told_apart_to_the_highest_that_is_taken() -> None:
+def test_counts_are_distinguished_up_to_the_highest_accepted() -> None:
     """Two samples beyond 2**53 had one time."""
     axes, probe = axis_blocks(), probe_blocks()
     above = int(COUNTER.high) - axes[-1].first_sample

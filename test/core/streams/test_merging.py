@@ -79,7 +79,7 @@ def test_what_does_not_follow_on_stays_apart(gap: str) -> None:
     assert [len(block) for block in merged(blocks)] == [20, 10]
 
 
-def test_a_status_that_is_not_told_is_not_made_up() -> None:
+def test_a_status_that_is_not_reported_is_not_invented() -> None:
     blocks = [
         probe(0, np.ones(5)),
         probe(5, np.ones(5), np.array([0, 0, 3, 0, 0], np.uint8)),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.streams.blocks import DistanceBlock
-from omsm_ros.core.streams.pairing import Intake
+from omsm_ros.core.streams.pairing import StreamInput
 
 PERIOD = 1e-3
 
@@ -30,7 +30,7 @@ def test_missing_is_what_was_left_out(seed: int) -> None:
     cuts = np.unique(random.integers(0, 20_000, 200))
     pieces = [(int(a), int(b)) for a, b in itertools.pairwise(cuts)]
     kept = [piece for piece in pieces if random.random() < 0.7]
-    intake = Intake()
+    intake = StreamInput()
     for a, b in kept:
         intake.new(block(a, b - a))
     came = {k for a, b in kept for k in range(a, b)}
@@ -39,7 +39,7 @@ def test_missing_is_what_was_left_out(seed: int) -> None:
 
 
 def test_what_comes_late_is_missing_no_longer() -> None:
-    intake = Intake()
+    intake = StreamInput()
     for first in (0, 200, 100):
         intake.new(block(first, 100))
     assert intake.tally.missing == 0
@@ -47,7 +47,7 @@ def test_what_comes_late_is_missing_no_longer() -> None:
 
 
 def test_a_device_that_counts_anew_has_left_nothing_out() -> None:
-    intake = Intake()
+    intake = StreamInput()
     intake.new(block(5000, 100))
     intake.new(block(0, 100, stamp=20.0))
     intake.new(block(150, 100, stamp=20.15))

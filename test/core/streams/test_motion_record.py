@@ -83,8 +83,8 @@ def test_every_sample_received_is_accounted_for():
     axes, probe = blocks()
     del axes[5]
     counts = assemble(axes, [*probe, probe[0]]).counts
-    told = counts["paired"] + counts["not_ok"] + counts["unmatched"] + counts["duplicates"]
-    assert told == counts["received"]
+    reported = counts["paired"] + counts["not_ok"] + counts["unmatched"] + counts["duplicates"]
+    assert reported == counts["received"]
 
 
 def test_streams_without_a_common_count_are_refused():
@@ -180,8 +180,8 @@ def test_every_reading_is_accounted_for_on_a_finer_grid_too():
     assert counts["received"] == 1300
     assert counts["duplicates"] == 100
     assert counts["paired"] == np.sum(record.ok)
-    told = counts["paired"] + counts["not_ok"] + counts["unmatched"] + counts["duplicates"]
-    assert told == counts["received"]
+    reported = counts["paired"] + counts["not_ok"] + counts["unmatched"] + counts["duplicates"]
+    assert reported == counts["received"]
     # A hole of 125 ms in the axis, 200 ms after its end, and the lost reading.
     assert counts["paired"] == pytest.approx(1200 - 125 - 200 - 1, abs=3)
     assert not np.any(record.ok[4 * 100])

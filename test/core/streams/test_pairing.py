@@ -9,28 +9,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.streams.blocks import Reason
-from omsm_ros.core.streams.pairing import Intake, Pairing, Run
+from omsm_ros.core.streams.blocks import RejectionReason
+from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
 
 
-def run(session: int, first: int, length: int, start_s: float | None = None, bad: int = 0) -> Run:
+def run(
+    session: int, first: int, length: int, start_s: float | None = None, bad: int = 0
+) -> SampleRun:
     stamp_s = first * 1e-3 if start_s is None else start_s
     reasons = np.zeros(length, np.uint8)
-    reasons[:bad] = Reason.INVALID
+    reasons[:bad] = RejectionReason.INVALID
     values = np.arange(first, first + length, dtype=np.float64)[np.newaxis]
-    return Run(session, first, round(stamp_s * 1e9), 1e6, reasons, values)
+    return SampleRun(session, first, round(stamp_s * 1e9), 1e6, reasons, values)
 
 
 class Bench:
     """A pairing, its tallies and the pairs found so far."""
 
     def __init__(self) -> None:
-        axes, distance = Intake(), Intake()
+        axes, distance = StreamInput(), StreamInput()
         self.axes, self.distance = axes.tally, distance.tally
         self.pairing = Pairing(axes, distance)
         self.found: list[tuple[int, int, int]] = []
 
-    def push(self, axes: list[Run], distance: list[Run]) -> Bench:
+    def push(self, axes: list[SampleRun], distance: list[SampleRun]) -> Bench:
         for r in axes:
             self.pairing.axes.push(r)
         for r in distance:
@@ -185,7 +187,7 @@ def test_what_was_given_up_in_an_old_session_excuses_nothing_in_a_new_one() -> N
     assert bench.distance.snapshot(0).counted == {"unmatched": 50}
 
 
-def pieces(draw_cuts: list[int], runs: list[Run]) -> list[Run]:
+def pieces(draw_cuts: list[int], runs: list[SampleRun]) -> list[SampleRun]:
     cut = []
     for r in runs:
         edges = [0, *sorted({c for c in draw_cuts if 0 < c < len(r)}), len(r)]
@@ -228,9 +230,9 @@ def test_expected_outcome_of_the_mixed_case(swap: bool) -> None:
     assert bench.found == expected
 
 
-def random_streams(random: np.random.Generator) -> tuple[list[Run], list[Run]]:
+def random_streams(random: np.random.Generator) -> tuple[list[SampleRun], list[SampleRun]]:
     """Some sessions of 5 to 6000 samples, seen by one stream or both, with gaps."""
-    streams: tuple[list[Run], list[Run]] = ([], [])
+    streams: tuple[list[SampleRun], list[SampleRun]] = ([], [])
     start, sessions = 0.0, [0, 0]
     for _ in range(random.integers(1, 5)):
         start += random.choice([1.0, 5.0, 30.0])

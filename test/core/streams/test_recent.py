@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from omsm_ros.core.streams.stamps import Flow, RecentIncrease
+from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
 
 
 def test_a_fault_is_recent_for_the_window_and_history_after() -> None:
@@ -30,14 +30,14 @@ def test_a_count_that_began_anew_counts_from_zero() -> None:
     assert recent.update({"lost": 4}, 11.0) == {"lost": 4}
 
 
-def test_names_are_told_apart() -> None:
+def test_names_are_distinguished() -> None:
     recent = RecentIncrease(window=10.0)
     recent.update({"a": 0, "b": 0}, 0.0)
     assert recent.update({"a": 1, "b": 0}, 1.0) == {"a": 1}
 
 
 def test_a_flow_that_never_began_is_not_one_that_ended() -> None:
-    flow = Flow(window=10.0)
+    flow = SampleFlow(window=10.0)
     flow.update(0, 0.0)
     flow.update(0, 50.0)
     assert flow.silent(50.0) is None
@@ -45,7 +45,7 @@ def test_a_flow_that_never_began_is_not_one_that_ended() -> None:
 
 
 def test_silence_counts_from_the_last_look_that_saw_samples() -> None:
-    flow = Flow(window=10.0)
+    flow = SampleFlow(window=10.0)
     for second in range(5):
         flow.update(1000 * second, float(second))
     assert flow.silent(4.0) == 0
@@ -54,7 +54,7 @@ def test_silence_counts_from_the_last_look_that_saw_samples() -> None:
 
 
 def test_the_rate_is_that_of_the_window() -> None:
-    flow = Flow(window=10.0)
+    flow = SampleFlow(window=10.0)
     for second in range(20):
         flow.update(1000 * second, float(second))
     assert flow.rate == pytest.approx(1000.0)

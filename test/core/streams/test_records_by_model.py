@@ -91,8 +91,8 @@ class TestByCounter:
         assert counts["duplicates"] == repeated
         assert counts["paired"] == sum(k in known and k in usable for k in readings)
         assert counts["unmatched"] == sum(k not in positions for k in usable)
-        told = sum(counts[name] for name in ("paired", "unmatched", "not_ok", "duplicates"))
-        assert told == counts["received"]
+        reported = sum(counts[name] for name in ("paired", "unmatched", "not_ok", "duplicates"))
+        assert reported == counts["received"]
 
     def test_plain_arrays_are_a_record_of_themselves(self):
         z = np.array([0.0, np.nan, 2.0, 3.0, 4.0])

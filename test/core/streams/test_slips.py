@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.streams.blocks import AxisBlock, StreamAccount
-from omsm_ros.core.streams.pairing import Intake, Pairing, Run
-from omsm_ros.core.streams.trigger_slips import CommonTrigger, SlipWatch
+from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
+from omsm_ros.core.streams.trigger_slips import CommonTrigger, TriggerSlipDetector
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.blocks import DeviceClock
 
@@ -74,7 +74,7 @@ class Joined:
     seen_from: int | None = None
     held: list[int] = field(default_factory=list)
     accounts: tuple[StreamAccount, StreamAccount] = (StreamAccount(), StreamAccount())
-    watch: SlipWatch | None = None
+    watch: TriggerSlipDetector | None = None
 
     @property
     def wrong(self) -> np.ndarray:
@@ -95,7 +95,7 @@ def join(
 ) -> Joined:
     """Push both in the order of their stamps, or as ``order`` says, or one after the other."""
     done = Joined()
-    intakes = Intake(), Intake(trigger.counter_offset)
+    intakes = StreamInput(), StreamInput(trigger.counter_offset)
     pairing = Pairing(*intakes, trigger)
     queues = pairing.axes, pairing.distance
     both = [(k, *b) for k, blocks in enumerate((axes, distance)) for b in blocks]
@@ -107,7 +107,7 @@ def join(
     for k, block, numbers in both:
         if (arrival := intakes[k].new(block)) is not None:
             values = np.asarray(numbers, np.float64)[np.newaxis]
-            queues[k].push(Run.of(block, arrival, np.zeros(len(block), np.uint8), values))
+            queues[k].push(SampleRun.of(block, arrival, np.zeros(len(block), np.uint8), values))
         for a, d in pairing.pairs():
             done.axes += [int(v) for v in a.values[0]]
             done.distance += [int(v) for v in d.values[0]]

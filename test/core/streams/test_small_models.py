@@ -15,7 +15,7 @@ from omsm_ros.core.streams.blocks import (
     AxisBlock,
     Block,
     DistanceBlock,
-    Reason,
+    RejectionReason,
     Tally,
     consecutive,
     joined,
@@ -24,10 +24,10 @@ from omsm_ros.core.streams.blocks import (
 from omsm_ros.core.streams.continuity import LoadMeter, TriggerCount
 from omsm_ros.core.streams.motion_record import BlockBuffer
 from omsm_ros.core.streams.stamps import (
-    Clock,
-    Flow,
     Playback,
     RecentIncrease,
+    SampleFlow,
+    StampClock,
     fit_clock,
     stamped_period,
 )
@@ -125,7 +125,7 @@ class TestCounts:
         assert sum(map(len, made)) == sum(map(len, blocks))
 
     @few
-    @given(st.lists(st.tuples(st.sampled_from(Reason), st.integers(0, 9)), max_size=12))
+    @given(st.lists(st.tuples(st.sampled_from(RejectionReason), st.integers(0, 9)), max_size=12))
     def test_a_tally_is_a_sum_however_it_was_counted(self, entries):
         at_once, each, expected = Tally(), Tally(), Counter()
         for reason, samples in entries:
@@ -134,9 +134,9 @@ class TestCounts:
             expected[reason] += samples
         assert at_once.snapshot(2) == each.snapshot(2)
         found = at_once.snapshot(2)
-        assert found.corrected == expected.pop(Reason.NONE, 0)
+        assert found.corrected == expected.pop(RejectionReason.NONE, 0)
         assert found.counted == {r.name.lower(): n for r, n in expected.items() if n}
-        assert list(found.counted) == [r.name.lower() for r in Reason if expected[r]]
+        assert list(found.counted) == [r.name.lower() for r in RejectionReason if expected[r]]
         assert Account().as_dict()["axes"]["pending"] == 0
 
 
@@ -207,7 +207,7 @@ class TestClocks:
         assert clock.since(np.array([1_000_010.0]), 5_000_000_000) == pytest.approx(10e-3)
 
     def test_a_time_is_exact_however_long_ago_the_origin_is(self):
-        clock = Clock(2**52, 1_760_000_000_000_000_000, 0.25, 1e6, 0.0)
+        clock = StampClock(2**52, 1_760_000_000_000_000_000, 0.25, 1e6, 0.0)
         found = clock.since(np.array([2.0**52 + 3]), 1_760_000_000_000_000_000)
         assert found[0] == pytest.approx(3e-3 + 0.25e-9, abs=1e-15)
 
@@ -252,7 +252,7 @@ class TestScatter:
             assert found == pytest.approx(3.0, rel=0.05)
         assert spread(7.0 + values) > 6.0
 
-    def test_noise_is_told_from_what_is_straight_from_point_to_point(self):
+    def test_noise_is_distinguished_from_locally_straight_signals(self):
         rng = np.random.default_rng(2)
         place = np.arange(8000.0)
         noise = rng.normal(0, 5e-9, 8000)
@@ -301,7 +301,7 @@ class TestLately:
     @few
     @given(st.lists(st.tuples(st.floats(0.1, 4.0), st.integers(0, 5)), min_size=2, max_size=25))
     def test_silence_and_rate_are_those_of_the_looks(self, looks):
-        flow, now, samples, seen, last = Flow(window=10.0), 0.0, 0, [], None
+        flow, now, samples, seen, last = SampleFlow(window=10.0), 0.0, 0, [], None
         for after, more in looks:
             now += after
             samples += more

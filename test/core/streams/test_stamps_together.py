@@ -10,7 +10,7 @@ import pytest
 
 from omsm_ros.core.streams import trigger_slips
 from omsm_ros.core.streams.blocks import AxisBlock, joined, uninterrupted
-from omsm_ros.core.streams.continuity import StampHistory, StampLine, stamps_ahead
+from omsm_ros.core.streams.continuity import StampHistory, StampLine, upcoming_stamps
 from omsm_ros.core.streams.trigger_slips import CommonTrigger
 
 from .test_slips import Device, join, without
@@ -97,7 +97,9 @@ def test_pairs_and_accounts_are_those_of_blocks_one_by_one(name: str) -> None:
     assert each.watch is not None
     assert together.watch.found == each.watch.found
     assert (
-        together.watch.one_driver is each.watch.one_driver is (name in ("one driver", "one clock"))
+        together.watch.same_stamps
+        is each.watch.same_stamps
+        is (name in ("one driver", "one clock"))
     )
     assert (each.slipped > 10_000) is (name == "slip")
 
@@ -105,13 +107,13 @@ def test_pairs_and_accounts_are_those_of_blocks_one_by_one(name: str) -> None:
 @pytest.mark.parametrize("name", ["one driver", "two drivers", "lost", "pause"])
 def test_few_stamps_are_looked_at_by_themselves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    observe = trigger_slips.SlipWatch._observe
+    observe = trigger_slips.TriggerSlipDetector._observe
 
-    def counted(watch: trigger_slips.SlipWatch, count: int, period_ns: float) -> None:
+    def counted(watch: trigger_slips.TriggerSlipDetector, count: int, period_ns: float) -> None:
         seen.append(count)
         observe(watch, count, period_ns)
 
-    monkeypatch.setattr(trigger_slips.SlipWatch, "_observe", counted)
+    monkeypatch.setattr(trigger_slips.TriggerSlipDetector, "_observe", counted)
     axes, probe = RECORDINGS[name]()
     join(as_a_bag_gives_them(axes), as_a_bag_gives_them(probe), CommonTrigger())
     # Of 1537: those of the first two seconds, and a few where streams are cut.
@@ -130,16 +132,16 @@ def test_stamps_ahead_are_those_that_the_lines_tell_one_by_one() -> None:
             other.add(0, count, stamp)
         for each in (line, other):
             each.advance(0, 200)
-    ahead = stamps_ahead(lines, (0, 0), 9000, 1e6)
+    ahead = upcoming_stamps(lines, (0, 0), 9000, 1e6)
     assert ahead is not None
     rows, leaps = ahead
     assert np.sum(leaps) == 2
     axes, distance = single
     for (count, skew, *begun, time), leap in zip(rows.tolist(), leaps.tolist(), strict=True):
         assert min(line.next_in(0, 9000) for line in single) == count
-        assert any(line.leaps(0, int(count), 1e6) for line in single) == leap
+        assert any(line.follows_gap(0, int(count), 1e6) for line in single) == leap
         assert [line.advance(0, int(count)) for line in single] == begun
-        assert axes.later_than(distance, (0, 0), 1e6) == skew
+        assert axes.stamp_difference(distance, (0, 0), 1e6) == skew
         assert axes.stamp_of(0, int(count), 1e6) == time
     assert min(line.next_in(0, 9000) for line in single) == 9000
 

@@ -57,7 +57,7 @@ def test_what_comes_late_into_a_gap_was_not_missing() -> None:
     assert watched(axes(0), axes(200), axes(100)).missing == 0
 
 
-def test_a_restart_and_a_repetition_are_told_apart() -> None:
+def test_a_restart_and_a_repetition_are_distinguished() -> None:
     later = replace(axes(0), stamp_ns=EPOCH + 3_600 * 10**9)
     assert "began anew 1 times" in faults(axes(0), axes(100), later)[0]
     assert "100 samples repeat" in faults(axes(0), axes(100), axes(100))[0]

@@ -78,7 +78,7 @@ def test_within_a_turn_each_part_of_it_counts_by_its_area(path) -> None:
 
 @pytest.mark.parametrize("clipped", [False, True])
 @pytest.mark.parametrize("off", [(0.04, 0.0), (-0.02, 0.03)])
-def test_beside_the_axis_a_rim_seen_in_part_counts_by_that_part(off, clipped) -> None:
+def test_off_the_axis_a_partly_covered_rim_counts_by_its_covered_part(off, clipped) -> None:
     """The part's centre is half a millimetre off: of its rim the scan sees a crescent."""
     dx, dy = (RADIUS * share for share in off)
     x, y = (v - d for v, d in zip(spiral(254_000), (dx, dy), strict=True))
@@ -181,7 +181,7 @@ def test_turns_are_those_about_the_origin() -> None:
     assert turns(x + 0.1, y) < 1
 
 
-def test_points_told_again_or_a_rest_take_no_area_from_the_others():
+def test_repeated_points_and_dwells_take_no_area_from_the_others():
     x, y = spiral(9000, 30.0)
     once = area_weights(x, y)
     thrice = area_weights(np.repeat(x, 3), np.repeat(y, 3))
@@ -293,7 +293,7 @@ def test_points_of_an_even_grid_weigh_alike_whatever_their_order_says() -> None:
     np.testing.assert_array_equal(area_weights(x, y, even=True), np.ones(500))
 
 
-def test_on_one_circle_all_points_weigh_alike_but_those_beside_a_gap() -> None:
+def test_points_on_a_circle_have_equal_weights_except_next_to_a_gap() -> None:
     angle = np.linspace(0, 6 * np.pi, 3001)
     weights = area_weights(*polar(np.full(3001, RADIUS), angle))
     np.testing.assert_allclose(weights, np.ones(3001), rtol=1e-6)

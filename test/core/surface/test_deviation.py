@@ -172,7 +172,7 @@ class TestProfiles:
         assert np.all(np.abs(cut.position) >= 2e-3)
         assert np.all(np.diff(cut.position) > 0)
 
-    def test_a_line_beside_the_cloud_is_empty(self):
+    def test_a_line_next_to_the_cloud_is_empty(self):
         ones = np.ones(5)
         assert len(form.line_profile(ones, ones, ones, half_width=0.1, spacing=0.1).position) == 0
 
@@ -261,7 +261,7 @@ def test_points_of_the_surface_with_errors_of_form_are_not_called_others(spiral,
 
 
 @pytest.mark.parametrize("radius", [-0.2, 0.13, 0.4, 200.0])
-def test_a_wrong_radius_sign_or_unit_is_told_with_both_sizes(spiral, radius):
+def test_a_wrong_radius_sign_or_unit_is_reported_with_both_sizes(spiral, radius):
     x, y = spiral
     (said,) = form.unlike(x, y, Sphere(radius=0.2).height(x, y), Sphere(radius=radius))
     left = form.level(x, y, x**2 + y**2, tilt=True) * (1 / 0.4 - 0.5 / radius)

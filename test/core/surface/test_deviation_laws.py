@@ -98,7 +98,7 @@ def test_the_deviation_is_that_in_height_whatever_the_pose():
 
 
 @pytest.mark.parametrize(
-    ("columns", "told"),
+    ("columns", "reported"),
     [
         ((np.zeros((2, 2)),) * 3, r"\(2, 2\).*one row"),
         ((np.empty(0),) * 3, "x is empty"),
@@ -106,8 +106,8 @@ def test_the_deviation_is_that_in_height_whatever_the_pose():
         ((np.zeros(2), np.full(2, np.nan), np.zeros(2)), "2 of 2 values of y.*drop and count"),
     ],
 )
-def test_clouds_that_are_none_are_refused_with_what_is_wrong(columns, told):
-    with pytest.raises(DataError, match=told):
+def test_clouds_that_are_none_are_refused_with_what_is_wrong(columns, reported):
+    with pytest.raises(DataError, match=reported):
         form.deviation(*columns, Flat())
     with pytest.raises(DataError):
         form.radial_profile(*columns, spacing=1e-3)

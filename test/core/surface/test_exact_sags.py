@@ -111,9 +111,9 @@ def test_a_saddle_is_exact_to_rounding_where_its_bends_cancel(kx):
     for x, y, z in zip(X, Y, found, strict=True):
         u, v = Decimal(float(x)), Decimal(float(y))
         rx, ry = Decimal(1 / cx), Decimal(1 / cy)
-        bent = u * u / rx + v * v / ry
+        curved = u * u / rx + v * v / ry
         p, q = (1 + Decimal(kx)) / rx**2, (1 + Decimal(ky)) / ry**2
-        exact = bent / (1 + (1 - p * u * u - q * v * v).sqrt())
+        exact = curved / (1 + (1 - p * u * u - q * v * v).sqrt())
         size = float(u * u / rx + v * v / abs(ry))
         assert z == pytest.approx(float(exact), abs=4 * EPS * size)
 

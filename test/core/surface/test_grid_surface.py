@@ -198,7 +198,7 @@ def test_a_handful_of_places_of_a_fine_raster_is_a_list():
 
 
 @pytest.mark.parametrize("moved", ["x", "y"])
-def test_one_place_beside_its_row_or_column_makes_it_no_map(moved):
+def test_one_point_off_its_row_or_column_makes_it_no_map(moved):
     p = mapped(10, 12).points()
     columns = {"x": p.x.copy(), "y": p.y.copy(), "height": p.height}
     columns[moved][37] += 1e-4

@@ -61,7 +61,7 @@ def test_points_without_a_height_are_counted_and_left_out():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"x": np.zeros(3)}, "one length"),
         ({"uncertainty": np.zeros(3)}, "one length"),
@@ -69,9 +69,9 @@ def test_points_without_a_height_are_counted_and_left_out():
         ({"height": np.array([1.0, 1e9])}, "height"),
     ],
 )
-def test_points_that_are_none_are_refused(change, told):
+def test_points_that_are_none_are_refused(change, reported):
     columns = {"x": np.zeros(2), "y": np.zeros(2), "height": np.zeros(2)} | change
-    with pytest.raises(DataError, match=told):
+    with pytest.raises(DataError, match=reported):
         MeasuredPoints(**columns)
 
 

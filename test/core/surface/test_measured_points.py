@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.surface.measured_points import MeasuredPoints, each_once, measured
+from omsm_ros.core.surface.measured_points import MeasuredPoints, measured, without_duplicates
 from omsm_ros.errors import DataError
 
 
@@ -31,7 +31,7 @@ def test_points_that_stand_there_again_count_once_and_a_note_says_so():
     rng = np.random.default_rng(1)
     x, y, height = rng.normal(size=(3, 500)) * 1e-3
     twice = [np.concatenate([v, v[::-1], v[:7]]) for v in (x, y, height)]
-    found = each_once(measured(*twice))
+    found = without_duplicates(measured(*twice))
     np.testing.assert_array_equal(found.x, x)
     np.testing.assert_array_equal(found.height, height)
     assert found.notes == ("507 points stand there again in every digit: left out",)
@@ -83,7 +83,7 @@ def test_whole_numbers_are_heights_too():
 
 
 @pytest.mark.parametrize(
-    ("columns", "told"),
+    ("columns", "reported"),
     [
         ({"sample": np.array([0.0, 1.0, 2.0, 3.0, 4.0, -1.0])}, r"sample\[5\] is -1"),
         ({"uncertainty": np.full(6, -1e-9)}, r"uncertainty\[0\] is -1e-09 m"),
@@ -92,8 +92,8 @@ def test_whole_numbers_are_heights_too():
         ({n: np.zeros((2, 3)) for n in ("x", "y", "height")}, "one row of one length"),
     ],
 )
-def test_what_no_instrument_delivers_is_refused_by_name_and_place(columns, told):
-    with pytest.raises(DataError, match=told):
+def test_what_no_instrument_delivers_is_refused_by_name_and_place(columns, reported):
+    with pytest.raises(DataError, match=reported):
         points(**columns)
 
 
@@ -106,15 +106,18 @@ def test_a_place_where_all_is_missing_is_no_surface():
 @pytest.mark.parametrize("name", ["x", "y", "height"])
 def test_one_bit_in_one_coordinate_makes_another_point(name):
     columns = {n: np.array([v, v]) for n, v in (("x", 0.1), ("y", -0.2), ("height", 3e-6))}
-    assert len(each_once(MeasuredPoints(**columns))) == 1
+    assert len(without_duplicates(MeasuredPoints(**columns))) == 1
     columns[name][1] = np.nextafter(columns[name][1], 1.0)
-    assert len(each_once(MeasuredPoints(**columns))) == 2
+    assert len(without_duplicates(MeasuredPoints(**columns))) == 2
 
 
 def test_exchanged_coordinates_are_another_point():
     """Each of the six orders of three numbers stands for itself."""
     orders = np.array(list(permutations((1e-3, 2e-3, 3e-3))))
-    assert len(each_once(MeasuredPoints(x=orders[:, 0], y=orders[:, 1], height=orders[:, 2]))) == 6
+    assert (
+        len(without_duplicates(MeasuredPoints(x=orders[:, 0], y=orders[:, 1], height=orders[:, 2])))
+        == 6
+    )
 
 
 def test_the_first_of_equal_points_stays_with_its_own_order_and_uncertainty():
@@ -127,7 +130,7 @@ def test_the_first_of_equal_points_stays_with_its_own_order_and_uncertainty():
         sample=np.array([10, 11, 12, 13]),
         notes=("seen",),
     )
-    once = each_once(twice)
+    once = without_duplicates(twice)
     assert once.sample.tolist() == [10, 11, 13]
     assert once.uncertainty.tolist() == [1e-9, 2e-9, 4e-9]
     assert once.notes[0] == "seen"
@@ -138,5 +141,5 @@ def test_the_first_of_equal_points_stays_with_its_own_order_and_uncertainty():
 @settings(max_examples=30)
 def test_as_many_points_stay_as_a_set_holds(numbers):
     values = np.array(numbers, float)
-    once = each_once(MeasuredPoints(x=values, y=-values, height=1e-6 * values))
+    once = without_duplicates(MeasuredPoints(x=values, y=-values, height=1e-6 * values))
     assert once.x.tolist() == list(dict.fromkeys(values.tolist()))

@@ -21,7 +21,7 @@ from omsm_ros.core.surface.nominal import (
 )
 from omsm_ros.core.surface.zernike_terms import (
     NUMBERING,
-    Term,
+    ZernikeIndex,
     first_terms,
     noll,
     rms_of,
@@ -81,7 +81,7 @@ def test_the_fringe_set_grows_by_n_plus_m():
 
 def test_terms_from_an_order_on_are_those_without_the_lower_ones():
     assert set(terms_up_to(6, 3)) == set(terms_up_to(6)) - set(terms_up_to(2))
-    assert terms_up_to(0) == (Term(0, 0),)
+    assert terms_up_to(0) == (ZernikeIndex(0, 0),)
     assert terms_up_to(2, 3) == ()
 
 
@@ -115,7 +115,7 @@ def test_the_last_fringe_term_is_right_in_fractions():
     whole = (924, -2772, 3150, -1680, 420, -42, 1)
     for share in (Fraction(1, 4), Fraction(1, 2), Fraction(7, 8)):
         exact = sum(c * share ** (12 - 2 * k) for k, c in enumerate(whole))
-        found = zernike_values(np.array([float(share)]), np.zeros(1), [Term(12, 0)])
+        found = zernike_values(np.array([float(share)]), np.zeros(1), [ZernikeIndex(12, 0)])
         assert found[0, 0] == pytest.approx(float(exact), abs=1e-13)
 
 
@@ -134,7 +134,13 @@ def test_turning_the_disc_mixes_each_cosine_with_its_sine_alone(turn):
 
 
 def test_terms_come_in_the_order_and_as_often_as_they_are_asked_for():
-    asked = [Term(4, 2), Term(0, 0), Term(3, -1), Term(4, 2), Term(2, 0)]
+    asked = [
+        ZernikeIndex(4, 2),
+        ZernikeIndex(0, 0),
+        ZernikeIndex(3, -1),
+        ZernikeIndex(4, 2),
+        ZernikeIndex(2, 0),
+    ]
     table = dict(zip(terms_up_to(4), zernike_values(X, Y, terms_up_to(4)), strict=True))
     np.testing.assert_allclose(zernike_values(X, Y, asked), [table[t] for t in asked], atol=1e-15)
     slopes = zernike_slopes(X, Y, asked)
@@ -147,7 +153,9 @@ def test_terms_come_in_the_order_and_as_often_as_they_are_asked_for():
 
 def test_slopes_of_low_terms_are_their_polynomials():
     """2ρ² − 1, ρ² cos 2θ, ρ² sin 2θ and (3ρ³ − 2ρ) cos θ, differentiated by hand."""
-    along_x, along_y = zernike_slopes(X, Y, [Term(2, 0), Term(2, 2), Term(2, -2), Term(3, 1)])
+    along_x, along_y = zernike_slopes(
+        X, Y, [ZernikeIndex(2, 0), ZernikeIndex(2, 2), ZernikeIndex(2, -2), ZernikeIndex(3, 1)]
+    )
     square = X**2 + Y**2
     np.testing.assert_allclose(
         along_x, [4 * X, 2 * X, 2 * Y, 3 * square + 6 * X**2 - 2], atol=1e-13
@@ -294,13 +302,13 @@ def test_a_freeform_without_terms_is_its_sphere_and_equal_terms_add_up():
     assert not np.any(QFreeform(0.01, ()).height(x, y))
 
 
-def test_the_departure_is_along_the_normal():
+def test_the_deviation_is_along_the_normal():
     """At the rim of u = 1 a term of m = 2, n = 0 rises over a sphere by its flat height / cos."""
     angle = np.linspace(0, 2 * np.pi, 9)
     x, y = 0.01 * np.cos(angle), 0.01 * np.sin(angle)
     flat = QFreeform(0.01, (QTerm(0, 2, 1e-6),)).height(x, y)
-    bent = QFreeform(0.01, (QTerm(0, 2, 1e-6),), 0.02).height(x, y) - Sphere(0.02).height(x, y)
-    np.testing.assert_allclose(bent, flat / np.sqrt(1 - 0.25), atol=1e-17)
+    curved = QFreeform(0.01, (QTerm(0, 2, 1e-6),), 0.02).height(x, y) - Sphere(0.02).height(x, y)
+    np.testing.assert_allclose(curved, flat / np.sqrt(1 - 0.25), atol=1e-17)
     bfs, sphere = (QBfs(0.01, a, 0.02).height(x / 2, y / 2) for a in ((1e-6, 2e-6), ()))
     flat = QBfs(0.01, (1e-6, 2e-6)).height(x / 2, y / 2)
     np.testing.assert_allclose(bfs - sphere, flat / np.sqrt(1 - 1 / 16), atol=1e-17)

@@ -60,7 +60,7 @@ def test_a_fringe_is_half_a_wavelength(tmp_path, resolution, steps, intensity):
     assert (points.x[half], points.y[half]) == pytest.approx((0, PIXEL))
 
 
-def test_a_unit_that_no_format_asks_for_is_told_as_not_used(tmp_path):
+def test_a_unit_that_no_format_asks_for_is_reported_as_not_used(tmp_path):
     path = tmp_path / "zygo.dat"
     path.write_bytes(metropro(np.array([[4096, 0], [0, 0]])))
     points = read_points(path, units_of("mm"))
@@ -68,7 +68,7 @@ def test_a_unit_that_no_format_asks_for_is_told_as_not_used(tmp_path):
     assert points.height.max() == pytest.approx(WAVELENGTH / 16, rel=1e-6)
 
 
-def test_an_inverted_sign_is_told(tmp_path):
+def test_an_inverted_sign_is_reported(tmp_path):
     path = tmp_path / "zygo.dat"
     path.write_bytes(metropro(np.array([[4096, 0], [0, 0]]), sign=1))
     points = read_points(path)
@@ -77,7 +77,7 @@ def test_an_inverted_sign_is_told(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("raw", "told"),
+    ("raw", "reported"),
     [
         (metropro(np.zeros((2, 2)))[:-1], "too few for 2 × 2 points"),
         (metropro(np.zeros((2, 2)))[:500], "no header"),
@@ -88,10 +88,10 @@ def test_an_inverted_sign_is_told(tmp_path):
         (metropro(np.zeros((0, 0))), "number of points is 0"),
     ],
 )
-def test_a_metropro_file_that_cannot_be_scaled_is_refused(tmp_path, raw, told):
+def test_a_metropro_file_that_cannot_be_scaled_is_refused(tmp_path, raw, reported):
     path = tmp_path / "zygo.dat"
     path.write_bytes(raw)
-    with pytest.raises(FileError, match=told):
+    with pytest.raises(FileError, match=reported):
         read_points(path)
 
 
@@ -129,7 +129,7 @@ def test_a_datx_carries_its_units(tmp_path, unit, metres):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"unit": "Furlongs"}, "heights in 'Furlongs'"),
         ({"dx": 0.0}, "no lateral calibration"),
@@ -137,9 +137,9 @@ def test_a_datx_carries_its_units(tmp_path, unit, metres):
         ({"height": np.full((2, 2), 1e300)}, "no points"),
     ],
 )
-def test_a_datx_that_cannot_be_scaled_is_refused(tmp_path, change, told):
+def test_a_datx_that_cannot_be_scaled_is_refused(tmp_path, change, reported):
     path = datx(tmp_path / "a.datx", **{"height": np.ones((2, 2)), **change})
-    with pytest.raises(FileError, match=told):
+    with pytest.raises(FileError, match=reported):
         read_points(path)
 
 
@@ -284,7 +284,7 @@ def test_a_pcd_of_a_viewer(tmp_path, form):
 
 
 @pytest.mark.parametrize(
-    ("name", "raw", "told"),
+    ("name", "raw", "reported"),
     [
         ("a.ply", b"ply\nformat ascii 1.0\n", "no end of its header"),
         ("a.ply", PLY.format(form="ascii").encode(), "was cut short"),
@@ -310,9 +310,9 @@ def test_a_pcd_of_a_viewer(tmp_path, form):
         ),
     ],
 )
-def test_a_cloud_that_lies_is_refused(tmp_path, name, raw, told):
+def test_a_cloud_that_lies_is_refused(tmp_path, name, raw, reported):
     (tmp_path / name).write_bytes(raw)
-    with pytest.raises(FileError, match=told) as refused:
+    with pytest.raises(FileError, match=reported) as refused:
         read_points(tmp_path / name, units_of("mm"))
     assert "\n" not in str(refused.value)
 
@@ -343,6 +343,6 @@ def test_bytes_of_no_format_are_refused(tmp_path, raw):
         read_points(tmp_path / "a.bin")
 
 
-def test_a_folder_without_a_result_is_told(tmp_path):
+def test_a_folder_without_a_result_is_reported(tmp_path):
     with pytest.raises(FileError, match=r"no map at .*cloud\.ply"):
         read_points(tmp_path)

@@ -118,7 +118,7 @@ def test_written_is_read_by_hand_and_by_us(tmp_path_factory, rows, columns, dx, 
     assert (back.dx, back.dy) == (dx, dy)
 
 
-def test_slopes_beside_what_is_missing_are_zero_and_none_is_nan(tmp_path):
+def test_slopes_next_to_missing_points_are_zero_and_never_nan(tmp_path):
     """Programs would interpolate with them: what is not known must not be a number at large."""
     y, x = np.mgrid[:7, :7] * 1e-3
     height = 0.3 * x - 0.2 * y
@@ -129,10 +129,10 @@ def test_slopes_beside_what_is_missing_are_zero_and_none_is_nan(tmp_path):
     assert table[3, 3].tolist()[0] == 0
     assert table[3, 3, 4] == 1
     assert np.sum(table[..., 4]) == 1
-    beside = np.zeros((7, 7), bool)
-    beside[3, [2, 3, 4]] = True
-    assert np.all(table[beside][:, 1][[0, 2]] == 0)
-    assert table[~beside][:, 1] == pytest.approx(0.3, rel=1e-8)
+    adjacent = np.zeros((7, 7), bool)
+    adjacent[3, [2, 3, 4]] = True
+    assert np.all(table[adjacent][:, 1][[0, 2]] == 0)
+    assert table[~adjacent][:, 1] == pytest.approx(0.3, rel=1e-8)
     assert table[[0, 1, 5, 6]][..., 2] == pytest.approx(-0.2, rel=1e-8)
 
 
@@ -162,7 +162,7 @@ def test_which_first_lines_are_those_of_a_grid_sag(first, second, is_one):
 
 
 @pytest.mark.parametrize(
-    ("first", "told"),
+    ("first", "reported"),
     [
         ((1, 1, 7), "unit 7, the fifth number of its first line, expected 0 .mm., 1 .cm., 2 .inch"),
         ((1, 1), "must begin with columns, rows .5 or more., two spacings, unit and decentres"),
@@ -171,8 +171,8 @@ def test_which_first_lines_are_those_of_a_grid_sag(first, second, is_one):
         ((1, 1, 3, 1e9, 0), "x0 of the map"),
     ],
 )
-def test_a_first_line_that_cannot_be_is_told(tmp_path, first, told):
-    with pytest.raises(OmsmError, match=told):
+def test_an_impossible_first_line_is_reported(tmp_path, first, reported):
+    with pytest.raises(OmsmError, match=reported):
         read_grid_sag(sag(tmp_path / "a.dat", first))
 
 

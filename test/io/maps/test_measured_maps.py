@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import Portion
+from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import FileError
@@ -70,7 +70,7 @@ def test_a_dabam_profile_of_slopes():
 def test_the_form_of_a_profile_is_what_its_file_and_a_parabola_say(name, rms, extent, slope):
     """Height less a parabola by numpy alone; slope as the header has it, of points 1 mm apart."""
     points = read_points(DATA / "dabam" / f"dabam-{name}.dat")
-    portion = Portion(points.x, points.y, points.height, np.empty((0, len(points))))
+    portion = PointBatch(points.x, points.y, points.height, np.empty((0, len(points))))
     found = analyse_form(Flat(), lambda: [portion], ("piston", "tilt")).deviation
     for figure, truth in (
         ("rms_without_second_order", rms),
@@ -106,7 +106,7 @@ def test_slopes_of_a_circle_integrate_to_it(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("header", "data", "told"),
+    ("header", "data", "reported"),
     [
         (HEADER.replace('FORMAT": 2', 'FORMAT": 7'), None, "FILE_FORMAT 7"),
         (HEADER.replace("0.001", "null"), None, "factors"),
@@ -115,7 +115,7 @@ def test_slopes_of_a_circle_integrate_to_it(tmp_path):
         (HEADER, "x h\n", "no points"),
     ],
 )
-def test_a_profile_that_does_not_fit_its_header(tmp_path, header, data, told):
+def test_a_profile_that_does_not_fit_its_header(tmp_path, header, data, reported):
     path = _dabam(tmp_path, header, *([] if data is None else [data]))
-    with pytest.raises(FileError, match=told):
+    with pytest.raises(FileError, match=reported):
         read_points(path)

@@ -81,7 +81,7 @@ def test_whatever_follows_the_points_is_not_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "reported"),
     [
         ({"header": 65_537}, "says that its header has 65537 bytes; save it again"),
         ({"width": 0}, "number of points is 0"),
@@ -96,9 +96,9 @@ def test_whatever_follows_the_points_is_not_read(tmp_path):
         ({"scale": 1e9}, r"height\[0\] is .* give it in metres"),
     ],
 )
-def test_an_entry_that_cannot_be_is_told(tmp_path, changes, told):
+def test_an_invalid_entry_is_reported(tmp_path, changes, reported):
     path = written(tmp_path / "a.dat", **changes)
-    with pytest.raises(FileError, match=told) as refused:
+    with pytest.raises(FileError, match=reported) as refused:
         read_points(path)
     assert "a.dat" in str(refused.value)
     assert "\n" not in str(refused.value)

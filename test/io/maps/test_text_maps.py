@@ -56,18 +56,18 @@ def test_a_unit_that_is_not_there_is_asked_for(tmp_path, header):
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "told"),
+    ("name", "text", "reported"),
     [
         ("a.xyz", "x_mm y_mm z_nm\n", "x and y are in mm, and --unit says um"),
         ("a.xyz", "x_um y_um z_nm\n", "heights are in nm, and --unit says um"),
         ("a.dat", "5 5 0.1 0.1 0 0 0\n", "x and y are in mm, and --unit says um"),
     ],
 )
-def test_a_unit_that_the_text_contradicts_is_refused(tmp_path, name, text, told):
+def test_a_unit_that_the_text_contradicts_is_refused(tmp_path, name, text, reported):
     """One of the two is wrong by a thousand; the one in the text silently won before."""
     path = tmp_path / name
     path.write_text(text + "1 2 3\n" * 25)
-    with pytest.raises(FileError, match=f"{told}; leave --unit out"):
+    with pytest.raises(FileError, match=f"{reported}; leave --unit out"):
         read_points(path, units_of("um"))
     # Of two files, the unit is that of the other.
     read_points(path, replace(units_of("um"), where_unsaid=True))
@@ -117,7 +117,7 @@ def test_a_grid_sag_with_a_mark_of_the_encoding_is_one(tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be"])
-def test_text_in_utf_16_is_told(tmp_path, encoding):
+def test_text_in_utf_16_is_reported(tmp_path, encoding):
     path = tmp_path / "map.dat"
     path.write_bytes("\ufeff0 0 5\n1 0 6\n".encode(encoding))
     with pytest.raises(FileError, match=r"map.dat' is text in UTF-16; save it as UTF-8"):
@@ -130,7 +130,7 @@ def test_a_height_that_is_missing_is_counted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("", "is empty"),
         ("hello\nworld\n", "no line of numbers"),
@@ -148,8 +148,8 @@ def test_a_height_that_is_missing_is_counted(tmp_path):
         ("\n" * 60 + "1 2 3\n", "no line of numbers among its first 50"),
     ],
 )
-def test_what_is_no_map_is_told_in_one_line(tmp_path, text, told):
-    with pytest.raises(FileError, match=told) as refused:
+def test_a_file_without_a_map_is_reported_in_one_line(tmp_path, text, reported):
+    with pytest.raises(FileError, match=reported) as refused:
         read_points(_text(tmp_path, text))
     assert "\n" not in str(refused.value)
 
@@ -232,7 +232,7 @@ def test_the_slopes_of_a_grid_sag_are_those_of_the_surface(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "reported"),
     [
         ("6 5 0.5 0.25 0 0 0\n1 0 0 0\n", r"says 6 × 5 points and has 1"),
         ("6 5 0.5 0.25 0 0 0\nz\n", "line 2: 'z' is no row"),
@@ -241,8 +241,8 @@ def test_the_slopes_of_a_grid_sag_are_those_of_the_surface(tmp_path):
         ("! by hand\n6 5 0.5 0.25 -1\n1\n", "has unit -1"),
     ],
 )
-def test_a_grid_sag_that_lies_is_refused(tmp_path, text, told):
-    with pytest.raises(FileError, match=told):
+def test_a_grid_sag_that_lies_is_refused(tmp_path, text, reported):
+    with pytest.raises(FileError, match=reported):
         read_points(_text(tmp_path, text, "sag.dat"))
 
 

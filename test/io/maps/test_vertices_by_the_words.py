@@ -94,7 +94,7 @@ def test_a_height_of_its_own_goes_before_z(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["float", "double"])
-def test_bits_that_are_no_number_are_missing_and_told_as_such(tmp_path, kind):
+def test_non_numeric_bits_are_reported_as_missing(tmp_path, kind):
     """Also a signalling NaN, which a processor may complain of."""
     layout, bits = {"float": ("<f", "<I"), "double": ("<d", "<Q")}[kind]
     signalling = struct.pack(bits, {"float": 0xFFA00001, "double": 0x7FF0000000000001}[kind])
@@ -108,7 +108,7 @@ def test_bits_that_are_no_number_are_missing_and_told_as_such(tmp_path, kind):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "reported"),
     [
         (b"element vertex 3", b"element face 0\nelement vertex 3", "does not begin with its ver"),
         (b"element vertex 3\n", b"", "does not begin with its vertices; write them first"),
@@ -123,12 +123,12 @@ def test_bits_that_are_no_number_are_missing_and_told_as_such(tmp_path, kind):
         (b"vertex 3", b"vertex 4", "says that it has 4 points and holds 36 bytes"),
     ],
 )
-def test_a_header_that_contradicts_itself_is_told(tmp_path, old, new, told):
+def test_a_header_that_contradicts_itself_is_reported(tmp_path, old, new, reported):
     path = ply(tmp_path / "a.ply", [(n, "float") for n in "xyz"], ROWS)
     raw = path.read_bytes()
     assert old in raw
     path.write_bytes(raw.replace(old, new, 1))
-    with pytest.raises(FileError, match=told) as refused:
+    with pytest.raises(FileError, match=reported) as refused:
         read_points(path, METRE)
     assert "a.ply" in str(refused.value)
 
@@ -196,7 +196,7 @@ def test_places_without_a_reading_are_missing_in_a_pcd(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "told"),
+    ("old", "new", "reported"),
     [
         ("COUNT 1 1 1", "COUNT 1 1 2", "do not fit each other"),
         ("SIZE 4 4 4", "SIZE 4 four 4", "fields of unknown type.*write numbers"),
@@ -207,12 +207,12 @@ def test_places_without_a_reading_are_missing_in_a_pcd(tmp_path):
         ("DATA binary\n", "", "no end of its header"),
     ],
 )
-def test_a_pcd_that_contradicts_itself_is_told(tmp_path, old, new, told):
+def test_a_pcd_that_contradicts_itself_is_reported(tmp_path, old, new, reported):
     head = PCD.format(
         names="x y z", sizes="4 4 4", kinds="F F F", n=1, form="binary", count="COUNT 1 1 1\n"
     )
     assert old in head
     (tmp_path / "a.pcd").write_bytes(head.replace(old, new, 1).encode() + b"\0" * 12)
-    with pytest.raises(FileError, match=told) as refused:
+    with pytest.raises(FileError, match=reported) as refused:
         read_points(tmp_path / "a.pcd", METRE)
     assert "a.pcd" in str(refused.value)

@@ -85,7 +85,7 @@ def test_every_bit_of_a_table_is_in_hdf5(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "reported"),
     [
         ({"x": np.zeros((2, 2))}, r"shape \(2, 2\), expected 1"),
         ({"height": np.array([b"high", b"low"])}, r"'\|S4', expected numbers"),
@@ -93,7 +93,7 @@ def test_every_bit_of_a_table_is_in_hdf5(tmp_path):
         ({"height": None}, "a.h5' has no column 'height'; write it again"),
     ],
 )
-def test_a_table_of_ours_that_was_altered_is_told_by_its_part(tmp_path, change, told):
+def test_a_table_of_ours_that_was_altered_is_reported_by_its_part(tmp_path, change, reported):
     h5py = pytest.importorskip("h5py", reason="the extra 'formats' is not installed")
     path = tmp_path / "a.h5"
     write_hdf5(path, dict.fromkeys(NAMES, np.zeros(2)), "")
@@ -102,7 +102,7 @@ def test_a_table_of_ours_that_was_altered_is_told_by_its_part(tmp_path, change, 
             del content[name]
             if values is not None:
                 content[name] = values
-    with pytest.raises(FileError, match=told) as refused:
+    with pytest.raises(FileError, match=reported) as refused:
         read_points(path)
     assert "a.h5" in str(refused.value)
 

@@ -3,7 +3,7 @@ import html
 import numpy as np
 import pytest
 
-from omsm_ros.report.campaign import Measurement, judge, remarks, render
+from omsm_ros.report.campaign import CampaignEntry, judge, remarks, render
 
 DAY_NS = 86_400 * 10**9
 
@@ -15,7 +15,7 @@ def measurement(i, rms, state="done", name=None):
         "uncertainty": {"median": 10e-9},
     }
     said = "" if state == "done" else "no axes"
-    return Measurement(
+    return CampaignEntry(
         name or f"{i}.mcap", state, said, i * DAY_NS, f"{i}/report.html",
         summary if state == "done" else {},
     )  # fmt: skip
@@ -31,31 +31,31 @@ def drifting():
 
 
 def test_outliers_and_drift_are_named_with_their_size(drifting):
-    told = remarks(drifting, judge(drifting))
-    assert any(t.startswith("11.mcap stands out: deviation from nominal") for t in told)
-    (drift,) = [t for t in told if "rms by area drifts" in t]
+    reported = remarks(drifting, judge(drifting))
+    assert any(t.startswith("11.mcap stands out: deviation from nominal") for t in reported)
+    (drift,) = [t for t in reported if "rms by area drifts" in t]
     assert "pm a day" in drift or "nm a day" in drift
-    assert not any("ncertainty" in t for t in told)
+    assert not any("ncertainty" in t for t in reported)
 
 
-def test_what_goes_with_the_temperature_is_told_with_its_size():
+def test_correlation_with_temperature_is_reported_with_its_size():
     """2 nm a kelvin, over a fortnight that gets neither warmer nor older; all at one age."""
     random = np.random.default_rng(2)
     warm = 20.0 + random.normal(0, 0.5, 14)
-    told = [measurement(i, 20e-9 + 2e-9 * (t - 20)) for i, t in enumerate(warm)]
-    for one, t in zip(told, warm, strict=True):
+    reported = [measurement(i, 20e-9 + 2e-9 * (t - 20)) for i, t in enumerate(warm)]
+    for one, t in zip(reported, warm, strict=True):
         one.summary["conditions"] = {"temperature": {"mean": t}, "calibration_age": 86400.0}
-    (said,) = [t for t in remarks(told, judge(told)) if "rms by area goes" in t]
+    (said,) = [t for t in remarks(reported, judge(reported)) if "rms by area goes" in t]
     assert "temperature, 2.00 nm to 2.00 nm a kelvin" in said
-    assert not any("Age" in t for t in remarks(told, judge(told)))
+    assert not any("Age" in t for t in remarks(reported, judge(reported)))
 
 
 def test_what_three_digits_do_not_show_is_no_finding():
     random = np.random.default_rng(3)
     alike = 20e-9 * (1 + 1e-5 * np.arange(14) + 1e-6 * random.normal(size=14))
     alike[5] *= 1.001
-    told = [measurement(i, value) for i, value in enumerate(alike)]
-    assert remarks(told, judge(told)) == []
+    reported = [measurement(i, value) for i, value in enumerate(alike)]
+    assert remarks(reported, judge(reported)) == []
 
 
 def test_few_measurements_are_said_to_be_too_few():

@@ -17,7 +17,7 @@ from .certificates import ATTACK
 
 
 class TestMarkdown:
-    def test_names_the_pictures_beside_it(self, certificate):
+    def test_the_pictures_next_to_the_page_are_named(self, certificate):
         found = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", render_markdown(certificate))
         assert sorted(found) == sorted(picture_name(name) for name in CAPTIONS)
 

@@ -71,7 +71,7 @@ def test_all_parts_are_there(model, record):
     assert ("H(z)" in page) is (model is HELD)
 
 
-def test_a_coefficient_stands_beside_its_uncertainty(record):
+def test_a_coefficient_stands_next_to_its_uncertainty(record):
     page = render_model(page_of(HELD, record))
     row = page[page.index(">b1<") :]
     assert row.index("0.4000000000") < row.index("0.0020") < row.index(">a1<")

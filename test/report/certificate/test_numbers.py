@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.report.certificate.page import hidden_table, mode_table, shape_table, two_mass_table
+from omsm_ros.report.certificate.page import (
+    mode_table,
+    shape_table,
+    two_mass_table,
+    undetected_error_table,
+)
 from omsm_ros.report.certificate.tables import order_table
 
 from .certificates import by_name, certified
@@ -91,7 +96,7 @@ class TestNumbers:
         assert texts["c2 / m1"] == "80.0 N·s/(m·kg) ± 4.0 N·s/(m·kg)"
 
 
-def test_what_could_hide_has_its_own_time_or_frequency_and_the_unit_of_its_kind():
+def test_undetected_error_states_its_time_or_frequency_and_its_unit():
     """A share of the motion for what follows it, a length for the rest."""
     entries = {
         "could_hide": [
@@ -101,7 +106,10 @@ def test_what_could_hide_has_its_own_time_or_frequency_and_the_unit_of_its_kind(
         ],
         "plateau_that_would_tell_s": 60.0,
     }
-    rows = [[text.replace("\u202f", " ") for text in row] for row in hidden_table(entries).rows]
+    rows = [
+        [text.replace("\u202f", " ") for text in row]
+        for row in undetected_error_table(entries).rows
+    ]
     assert [row[:2] for row in rows[:3]] == [
         ["creep over 20 s", "0.040 % of the motion"],
         ["soft mode at 8.0 Hz", "0.10 % of the motion"],

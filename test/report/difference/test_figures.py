@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.compare import compare
-from omsm_ros.core.comparison.stated_errors import Measurement
+from omsm_ros.core.comparison.compare import compare_measurements_of_part
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.report.difference import profiles
 
@@ -15,7 +15,9 @@ from omsm_ros.report.difference import profiles
 def test_heights_have_at_most_four_digits(size, unit, largest):
     x, y = (v.ravel() for v in np.meshgrid(*2 * [np.linspace(-1, 1, 41)]))
     points = MeasuredPoints(x=x * 5e-3, y=y * 5e-3, height=size * x**3)
-    found = compare(*(Measurement(name=n, points=points, common=1e-9) for n in "ab"))
+    found = compare_measurements_of_part(
+        *(ComparedMeasurement(name=n, points=points, common=1e-9) for n in "ab")
+    )
     upper, lower = profiles(found)["profile_x"].axes
     assert upper.get_ylabel() == f"height [{unit}]"
     assert lower.get_ylabel() == "A − B [nm]"

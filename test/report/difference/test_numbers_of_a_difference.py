@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from page_tables import PageTables, says
 
-from omsm_ros.core.comparison.compare import compare
-from omsm_ros.core.comparison.stated_errors import Measurement
+from omsm_ros.core.comparison.compare import compare_measurements_of_part
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.pipelines.compare_measurements import facts_of, write_difference
 from omsm_ros.readable import figure
@@ -26,7 +26,7 @@ def one(name, seed, astigmatism, common=2e-9):
     x, y = x[inside], y[inside]
     height = astigmatism * (x**2 - y**2) / RADIUS**2
     height += np.random.default_rng(seed).normal(0, 1e-9, len(x))
-    return Measurement(
+    return ComparedMeasurement(
         name=name, points=MeasuredPoints(x=x, y=y, height=height, notes=("as <it> is",)),
         common=common,
     )  # fmt: skip
@@ -35,7 +35,7 @@ def one(name, seed, astigmatism, common=2e-9):
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("difference")
-    found = compare(one("/a/one.xyz", 0, 80e-9), one("/b/two.xyz", 1, 110e-9))
+    found = compare_measurements_of_part(one("/a/one.xyz", 0, 80e-9), one("/b/two.xyz", 1, 110e-9))
     facts = facts_of(found)
     for key in "ab":
         facts[key]["notes"] = ["as <it> is"]
@@ -116,7 +116,7 @@ def test_the_tables_are_the_numbers_of_the_file(written, page):
         assert says(e_n, term["e_n"])
 
 
-def test_each_side_is_told_by_its_file_its_points_and_its_notes(written, page):
+def test_each_measurement_is_reported_with_file_points_and_notes(written, page):
     rows = page.table("What each brought, k = 1")
     assert rows["file"] == ["/a/one.xyz", "/b/two.xyz"]
     facts = written[2]
@@ -127,7 +127,7 @@ def test_each_side_is_told_by_its_file_its_points_and_its_notes(written, page):
         assert rows["notes"][k] == "as <it> is"
 
 
-def test_how_they_were_matched_is_told_in_its_units(written, page):
+def test_the_matching_is_reported_in_units(written, page):
     rows = page.table("Matching")
     facts = written[2]
     for name, value in facts["registration"]["moved"].items():

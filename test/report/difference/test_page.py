@@ -9,8 +9,8 @@ from html import unescape
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.compare import compare
-from omsm_ros.core.comparison.stated_errors import Measurement
+from omsm_ros.core.comparison.compare import compare_measurements_of_part
+from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.pipelines.compare_measurements import facts_of
 from omsm_ros.report.difference import CAPTIONS, headlines, map_of, records, render
@@ -27,11 +27,13 @@ def measurement(name, seed, added=0.0, common=2e-9):
     height = (80e-9 + added) * (x**2 - y**2) / RADIUS**2
     height += np.random.default_rng(seed).normal(0, 1e-9, len(x))
     points = MeasuredPoints(x=x, y=y, height=height)
-    return Measurement(name=name, points=points, common=common)
+    return ComparedMeasurement(name=name, points=points, common=common)
 
 
 def page(added=0.0, common=2e-9, name="b.xyz"):
-    found = compare(measurement("a.xyz", 0, 0.0, common), measurement(name, 1, added, common))
+    found = compare_measurements_of_part(
+        measurement("a.xyz", 0, 0.0, common), measurement(name, 1, added, common)
+    )
     facts = facts_of(found)
     for key in "ab":
         facts[key]["notes"] = [ATTACK] if name == ATTACK else []

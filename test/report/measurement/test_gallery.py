@@ -48,13 +48,13 @@ def test_a_few_points_are_no_reason_to_fail(cloud, points):
     assert "raw_map" in surface_figures(few, PAPER_MIRROR)
 
 
-def test_a_wide_feed_still_has_profiles(cloud):
+def test_a_coarse_feed_still_has_profiles(cloud):
     share = np.arange(4000) / 4000
     radius, angle = PAPER_MIRROR_RADIUS_M * (1 - share), 2 * np.pi * 8 * share
     few = part_of(cloud, slice(0, 4000))
     x, y = radius * np.cos(angle), radius * np.sin(angle)
-    wide = replace(few, x=x, y=y, height=PAPER_MIRROR.height(x, y))
-    assert set(PROFILES) <= set(surface_figures(wide, PAPER_MIRROR))
+    broad = replace(few, x=x, y=y, height=PAPER_MIRROR.height(x, y))
+    assert set(PROFILES) <= set(surface_figures(broad, PAPER_MIRROR))
 
 
 def test_a_piece_off_the_axes_has_a_map_but_not_all_profiles(cloud):

@@ -116,7 +116,7 @@ def test_without_a_nominal_surface_there_is_no_verdict_on_the_part():
     assert not removed_table({}, {}).rows
 
 
-def test_what_would_say_more_is_told_with_the_figures():
+def test_advice_for_a_better_scan_is_reported_with_the_figures():
     form = {**FORM, "removed": {**FORM["removed"], "notes": ["hold it: --fit piston,tip,tilt"]}}
     assert "hold it: --fit piston,tip,tilt" in verdict_on_part(summary(), form).reasons
 
@@ -146,8 +146,8 @@ def test_the_tightest_limit_comes_first():
 
 
 def test_provenance_names_recording_and_calibration():
-    told = {"bag": "scan.mcap", "calibration": "c0ffee", "admission": {"overridden": True}}
-    rows = dict(provenance_table(told).rows)
+    reported = {"bag": "scan.mcap", "calibration": "c0ffee", "admission": {"overridden": True}}
+    rows = dict(provenance_table(reported).rows)
     assert rows["recording"] == "scan.mcap"
     assert rows["calibration"] == "c0ffee"
     assert rows["overridden"] == "yes"

@@ -69,7 +69,7 @@ def test_a_ring_ends_where_its_tracks_end(points, turns, inner):
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.3, np.pi / 4, np.pi / 2])
-def test_lines_beside_each_other_are_closed_and_what_lies_beyond_is_not(turn):
+def test_small_gaps_between_lines_are_closed_and_the_outside_is_not(turn):
     along, across = np.meshgrid(np.linspace(-1e-2, 1e-2, 10_000), np.linspace(2e-3, 9e-3, 24))
     u, v = along.ravel(), across.ravel()
     x, y = u * np.cos(turn) - v * np.sin(turn), u * np.sin(turn) + v * np.cos(turn)
