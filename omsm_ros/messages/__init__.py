@@ -45,7 +45,7 @@ def sentence(code: str, values: Mapping[str, Any]) -> str:
     template = templates().get(code)
     if template is None:
         return code
-    return _Formatter().vformat(template, (), {**values, "opt": _Options()})
+    return str(_Formatter().vformat(template, (), {**values, "opt": _Options()}))
 
 
 @lru_cache(maxsize=1)
@@ -90,7 +90,7 @@ class _Formatter(string.Formatter):
         if kind == "plain":
             return readable.plain(value, *more)
         if kind == "chance":
-            return readable.chance(value)
+            return readable.p_value_text(value)
         if kind == "count":
             return readable.count(value)
         if kind == "list":

@@ -217,11 +217,11 @@ def _entries_of_band_limited(
     prepared: Prepared, best: Fit, output: FloatArray
 ) -> dict[str, object]:
     problem, variance = prepared.problem, float(np.var(output)) or 1.0
-    held_out = held_out_rms(problem, best, held_out(prepared.steps, len(problem.input)))
+    validation_rms = held_out_rms(problem, best, held_out(prepared.steps, len(problem.input)))
     return {
         "residual_rms": best.rms,
         "explained": 1 - best.rms**2 / variance,
-        "predicted": 1 - held_out**2 / variance,
+        "predicted": 1 - validation_rms**2 / variance,
         "whiteness_p": whiteness(best.residual),
         "independence_p": independence(best.residual, np.gradient(problem.input)[problem.used]),
         "samples": {"received": len(problem.input), "compared": best.samples},
