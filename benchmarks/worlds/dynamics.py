@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import signal
@@ -129,7 +130,7 @@ def backlash(u: Array, width: float) -> Array:
     out = np.array(u, dtype=float)
     last = u[0]
     points = turning_points(u)
-    for i, j in zip(points[:-1], points[1:], strict=True):
+    for i, j in pairwise(points):
         piece = u[i : j + 1]
         if u[j] >= u[i]:
             out[i : j + 1] = np.maximum(last, piece - width / 2)
@@ -144,7 +145,7 @@ def presliding(u: Array, force: float, length: float) -> Array:
     state = np.zeros(len(u))
     last = 0.0
     points = turning_points(u)
-    for i, j in zip(points[:-1], points[1:], strict=True):
+    for i, j in pairwise(points):
         way = np.sign(u[j] - u[i])
         state[i : j + 1] = way + (last - way) * np.exp(-np.abs(u[i : j + 1] - u[i]) / length)
         last = state[j]

@@ -126,6 +126,14 @@ class Recording:
             if isinstance(value, np.ndarray) and value.size:
                 setattr(self, name, value[rows])
 
+    def round(self, machine: Machine) -> None:
+        """Round the channels to what their devices resolve."""
+        steps = {"x": machine.x_resolution, "z": machine.z_resolution}
+        steps |= {"c": machine.c_resolution, "distance": machine.probe_resolution}
+        for name, step in steps.items():
+            if step:
+                setattr(self, name, step * np.round(getattr(self, name) / step))
+
 
 Effect = Callable[..., Array]
 
@@ -196,37 +204,35 @@ def record(machine: Machine, part: Part | Nominal, pose: Pose, path: Path, seed:
     now, distance = _reading(machine, part, pose, drive, trigger - machine.latency)
     distance = distance - jitter
     distance += sum(effect(now, distance) for effect in machine.of("probe"))
-    noise = now.rng("probe").normal(size=n)
-    distance += machine.probe_noise * noise
+    distance += machine.probe_noise * now.rng("probe").normal(size=n)
     distance[np.abs(distance) > machine.half_range] = np.nan
     z = _at(drive, "z", trigger + machine.z_late) + jitter
-    z += machine.z_noise * now.rng("encoder").normal(size=n)
-    x, c = path.x(trigger), path.c(trigger)
-    flat = replace(pose, x=0.0, y=0.0, piston=0.0, tip=0.0, tilt=0.0)
-    px, py, _ = flat.to_part((x * np.cos(c), -x * np.sin(c), np.zeros(n)))
     out = Recording(
         t=stamps,
         x=path.x(trigger + machine.x_late),
         y=np.zeros(n),
-        z=z,
+        z=z + machine.z_noise * now.rng("encoder").normal(size=n),
         b=np.zeros(n),
         c=path.c(trigger + machine.c_late),
         distance=distance,
         intensity=0.8 * (1 - 0.4 * np.square(distance / machine.half_range)),
-        height=part.posed_height(x * np.cos(c), -x * np.sin(c), pose),
-        deviation=part.deviation(px, py),
-        part_x=px,
-        part_y=py,
+        **_truth(part, pose, path.x(trigger), path.c(trigger)),
         path=path,
-        reference=_at(drive, "z", trigger) + machine.reference_noise * now.rng("ref").normal(size=n),
+        reference=_at(drive, "z", trigger),
     )
+    out.reference += machine.reference_noise * now.rng("reference").normal(size=n)
     for effect in machine.of("record"):
         effect(out, now)
-    for name, step in (("x", "x"), ("z", "z"), ("c", "c"), ("distance", "probe")):
-        size = getattr(machine, f"{step}_resolution")
-        if size:
-            setattr(out, name, size * np.round(getattr(out, name) / size))
+    out.round(machine)
     return out
+
+
+def _truth(part: Part, pose: Pose, x: Array, c: Array) -> dict[str, Array]:
+    """Return what a machine without error would find at x and c."""
+    turned = x * np.cos(c), -x * np.sin(c)
+    px, py, _ = Pose(clocking=pose.clocking).to_part((*turned, np.zeros(len(x))))
+    height = part.posed_height(*turned, pose)
+    return {"height": height, "deviation": part.deviation(px, py), "part_x": px, "part_y": py}
 
 
 def _drive(machine: Machine, part: Part, path: Path, seed: int) -> Moment:
