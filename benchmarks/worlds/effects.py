@@ -67,6 +67,18 @@ def walk(rate: float) -> Effect:
     return effect
 
 
+def wandering(rms: float, tau: float) -> Effect:
+    """Drift about zero with a correlation time ``tau``."""
+
+    def effect(now: Moment) -> Array:
+        rng = now.rng("wandering")
+        keep = np.exp(-now.period / tau)
+        noise = np.sqrt(1 - keep**2) * rng.normal(size=len(now.t))
+        return rms * signal.lfilter([1.0], [1.0, -keep], noise, zi=[keep * rng.normal()])[0]
+
+    return effect
+
+
 def ramp(rate: float) -> Effect:
     """Drift evenly, ``rate`` in m/s, since the part was clamped."""
     return lambda now: rate * now.age

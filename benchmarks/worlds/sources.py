@@ -20,6 +20,7 @@ LATENCY_S = 1e-4
 NOISE_M = 10e-9
 RESOLUTION_OF_Z_M = 0.4e-9
 DRIFT_WALK = 1.2e-9
+ABBE_ARM_M = 0.05
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ SOURCES = (
     Source("tilt", 2e-5, "rad", _pass),
     Source("decentre", 5e-6, "m", _pass),
     Source("clocking", 5e-5, "rad", _pass),
-    Source("expansion", 1e-6, "1", _pass),
+    Source("expansion", 1e-6, "1", _add("place", lambda v: effects.aside_by(x_of, dx=-v))),
     Source("centre_x", 3e-7, "m", _add("place", lambda v: effects.aside(dx=v))),
     Source("centre_y", 3e-7, "m", _add("place", lambda v: effects.aside(dy=v))),
     Source("beam", 1e-4, "1", lambda m, v, s: replace(m, beam=(v, v * s.sign()))),
@@ -172,6 +173,16 @@ SOURCES = (
     Source(
         "probe_slope_square", 2e-8, "m/rad",
         _add("probe", lambda v: lambda n, d: v * sum(np.square(s) for s in n.slope)),
+    ),
+    Source(
+        "pitch", 2e-8, "rad",
+        lambda m, v, s: m.plus(
+            "loop", effects.waving(z_of, ABBE_ARM_M * 2**0.5 * v, 1e-3, s.phase())
+        ),
+    ),
+    Source(
+        "drift", 2e-9, "m", _add("loop", lambda v: effects.wandering(abs(v), 30.0)),
+        {"correlation_time": 30.0},
     ),
     Source("drift_rate", 1.5e-10, "m/s", _add("loop", effects.ramp)),
     Source("drift_walk", DRIFT_WALK, "m/√s", _pass),
@@ -221,13 +232,16 @@ def drawn(seed: int, radius: float, share: float = 1.0) -> Shop:
     return Shop(machine, before, pose, values)
 
 
-def declared(machine_latency: float = LATENCY_S) -> dict[str, object]:
-    """Return the sources as a careful shop states them, and the latency that it sets.
+def declared(left_out: str = "") -> dict[str, object]:
+    """Return the sources as a careful shop states them, but for those named ``left_out``.
 
-    ``latency``: from the middle of an exposure to its trigger [s].
+    ``latency``: from the middle of an exposure to its trigger [s]; ``lateral_lag`` is how well it
+    is known. ``abbe_arm`` [m] belongs to ``pitch``.
     """
+    rows = [source.row() for source in SOURCES if source.name != left_out]
     return {
         "schema": "omsm-sources/1",
-        "sources": [source.row() for source in SOURCES],
-        "latency": machine_latency + EXPOSURE_S / 2,
+        "sources": rows,
+        "latency": LATENCY_S + EXPOSURE_S / 2,
+        "abbe_arm": ABBE_ARM_M,
     }

@@ -124,6 +124,13 @@ class World:
         """Return PV, rms and Zernike terms of the part's deviation."""
         return self.part.truth(along)
 
-    def declared(self) -> dict[str, object]:
-        """Return the sources that the shop states, the error not among them."""
-        return declared()
+    def declared(self, left_out: bool = True) -> dict[str, object]:
+        """Return the sources that the shop states.
+
+        Of an undeclared kind the row of its source is missing, but for harmonics, of which others
+        are stated; with ``left_out`` false it stands there, and is untrue.
+        """
+        row = self.row
+        harmonic = row.source.startswith("spindle_")
+        gone = left_out and row.group == "undeclared" and not harmonic
+        return declared(row.source if gone else "")

@@ -89,6 +89,14 @@ def test_reclocked_scan_measures_the_same_part():
     np.testing.assert_allclose(r.deviation, part.deviation(r.part_x, r.part_y), atol=1e-20)
 
 
+def test_kept_back_source():
+    """An undeclared centre_y is missing beside centre_x; a broken declaration stands."""
+    names = [row["source"] for row in World("centre_y").declared()["sources"]]
+    assert "centre_x" in names
+    assert "centre_y" not in names
+    assert "centre_x" in [row["source"] for row in World("centre_x").declared()["sources"]]
+
+
 def test_files(tmp_path):
     """Files carry millimetres, degrees and micrometres; a lost reading is an empty cell."""
     world = World("no_reading", 2)
