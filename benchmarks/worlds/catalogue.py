@@ -88,7 +88,7 @@ def _wave_of_c(per_turn: float, phase: float) -> Callable[[Moment], np.ndarray]:
 
 
 def _radial(per_turn: float, along: str) -> Build:
-    return _place(lambda v, s: e.aside_by(_wave_of_c(per_turn, s.phase()), **{along: v}))
+    return _place(lambda v, s: e.offset_beam_by(_wave_of_c(per_turn, s.phase()), **{along: v}))
 
 
 def _c_error(per_turn: float) -> Build:
@@ -100,7 +100,7 @@ def _c_error(per_turn: float) -> Build:
 
 
 def _backlash_of_x(m: Machine, v: float, s: Site) -> Machine:
-    return m.plus("place", e.aside_by(lambda now: 1.0 if now.path.outward else -1.0, v / 2))
+    return m.plus("place", e.offset_beam_by(lambda now: 1.0 if now.path.outward else -1.0, v / 2))
 
 
 def _up(now: Moment, site: Site) -> np.ndarray:
@@ -129,11 +129,11 @@ def _of(group: str, *rows: tuple) -> list[Kind]:
 
 UNDECLARED = _of(
     "undeclared",
-    ("centre_y", U3, "m", "centre_y", _place(lambda v, s: e.aside(dy=v))),
+    ("centre_y", U3, "m", "centre_y", _place(lambda v, s: e.offset_beam(dy=v))),
     ("z_bow_y", U1, "m", "straightness_z",
-     _place(lambda v, s: e.aside_by(lambda n: _z_norm(n) ** 2, dy=v))),
+     _place(lambda v, s: e.offset_beam_by(lambda n: _z_norm(n) ** 2, dy=v))),
     ("z_bow_x", U1, "m", "straightness_z",
-     _place(lambda v, s: e.aside_by(lambda n: _z_norm(n) ** 2, dx=v))),
+     _place(lambda v, s: e.offset_beam_by(lambda n: _z_norm(n) ** 2, dx=v))),
     ("spindle_axial_1", N20, "m", "spindle_axial", _axial(1)),
     ("spindle_axial_5", N10, "m", "spindle_axial", _axial(5)),
     ("spindle_axial_6", N10, "m", "spindle_axial", _axial(6)),
@@ -230,14 +230,14 @@ OTHER_MACHINE = _of(
 
 BROKEN = _of(
     "broken",
-    ("centre_x", U3, "m", "centre_x", _place(lambda v, s: e.aside(dx=v))),
-    ("centre_xy", U3, "m", "centre_x", _place(lambda v, s: e.aside(v, s.sign() * v))),
+    ("centre_x", U3, "m", "centre_x", _place(lambda v, s: e.offset_beam(dx=v))),
+    ("centre_xy", U3, "m", "centre_x", _place(lambda v, s: e.offset_beam(v, s.sign() * v))),
     ("beam_x", _sizes(2e-3, 1e-2, 3e-2), "1", "beam",
      lambda m, v, s: replace(m, beam=(m.beam[0] + v, m.beam[1]))),
     ("beam_y", _sizes(2e-3, 1e-2, 3e-2), "1", "beam",
      lambda m, v, s: replace(m, beam=(m.beam[0], m.beam[1] + v))),
     ("parallelism_y", _sizes(1e-4, 1e-3, 4e-3), "rad", "parallelism",
-     _place(lambda v, s: e.aside_by(z_of, dy=v))),
+     _place(lambda v, s: e.offset_beam_by(z_of, dy=v))),
     ("squareness", _sizes(5e-6, 2e-5, 1e-4), "rad", "squareness",
      _loop(lambda v, s: e.over(x_of, v))),
     ("straightness_bow", N20, "m", "straightness_x",

@@ -23,7 +23,7 @@ class LinearSystem:
 
     @classmethod
     def paper(cls, unit_gain: bool = True) -> LinearSystem:
-        """Return Eq. 12, by default divided by its gain at rest, 0.9921."""
+        """Return Eq. 12, by default divided by its DC gain, 0.9921."""
         gain = EQ_12_NUMERATOR[-1] / EQ_12_DENOMINATOR[-1] if unit_gain else 1.0
         return cls(tuple(a / gain for a in EQ_12_NUMERATOR), EQ_12_DENOMINATOR)
 
@@ -40,7 +40,7 @@ class LinearSystem:
 
     @classmethod
     def side_mode(cls, frequency: float, damping: float, share: float) -> LinearSystem:
-        """Return 1 + share × (mode − 1): a light mode that takes part with ``share``."""
+        """Return 1 + share × (mode − 1): a weakly excited mode."""
         top, bottom = (np.array(a) for a in _second(frequency, damping))
         total = np.polyadd((1 - share) * bottom, share * top)
         return cls(tuple(total), tuple(bottom))
@@ -73,7 +73,7 @@ class LinearSystem:
     def respond(self, u: Array, dt: float) -> Array:
         """Integrate the state equations, exact for input linear between the points of the grid.
 
-        Starts at rest at the first value of ``u``.
+        Starts in steady state at the first value of ``u``.
         """
         # Time in units of dt keeps the matrices near 1, where their exponential is accurate.
         top = _unscaled(self.numerator, dt)
@@ -126,7 +126,7 @@ def turning_points(u: Array) -> Array:
 
 
 def backlash(u: Array, width: float) -> Array:
-    """Follow ``u`` through play of ``width``: the output rests until one flank is touched."""
+    """Follow ``u`` through play of ``width``: the output stands still until a flank is touched."""
     out = np.array(u, dtype=float)
     last = u[0]
     points = turning_points(u)

@@ -165,12 +165,12 @@ def waving(of: Of, amplitude: float, period: float, phase: float) -> Effect:
 # Place: where the beam lies
 
 
-def aside(dx: float = 0.0, dy: float = 0.0) -> Effect:
+def offset_beam(dx: float = 0.0, dy: float = 0.0) -> Effect:
     """Shift the beam against the spindle's axis."""
     return lambda now: (dx, dy)
 
 
-def aside_by(of: Of, dx: float = 0.0, dy: float = 0.0) -> Effect:
+def offset_beam_by(of: Of, dx: float = 0.0, dy: float = 0.0) -> Effect:
     """Shift the beam in proportion to a quantity of the moment."""
 
     def effect(now: Moment) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ import numpy as np
 Array = np.ndarray
 TERMS = 15
 RINGS_OF_GRID = 240
-SPOKES_OF_GRID = 720
+ANGLES_OF_GRID = 720
 
 
 def noll(j: int) -> tuple[int, int]:
@@ -124,12 +124,12 @@ class Truth:
 
 
 def truth_of(error: Callable[[Array, Array], Array], radius: float) -> Truth:
-    """Describe ``error(x, y)`` over the circle by Gauss–Legendre rings in r² and even spokes."""
+    """Describe ``error(x, y)`` over the circle by Gauss–Legendre rings in r² and even angles."""
     nodes, weights = np.polynomial.legendre.leggauss(RINGS_OF_GRID)
     r = np.sqrt((nodes + 1) / 2)[:, None]
-    theta = 2 * np.pi * np.arange(SPOKES_OF_GRID) / SPOKES_OF_GRID
+    theta = 2 * np.pi * np.arange(ANGLES_OF_GRID) / ANGLES_OF_GRID
     x, y = r * np.cos(theta), r * np.sin(theta)
-    area = np.broadcast_to(weights[:, None] / (2 * SPOKES_OF_GRID), x.shape)
+    area = np.broadcast_to(weights[:, None] / (2 * ANGLES_OF_GRID), x.shape)
     at = error(radius * x, radius * y)
     rim = error(radius * np.cos(theta), radius * np.sin(theta))
     terms = np.array([np.sum(area * at * zernike(j, x, y)) for j in range(1, TERMS + 1)])

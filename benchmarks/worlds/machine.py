@@ -5,9 +5,8 @@ reads distance = surface − its own place, a little late, so that height = z + 
 fixed target, the distance falls when z rises. A part turned by C shows, at slide position x and
 y = 0, its point X = x cos c, Y = −x sin c (b = 0).
 
-Not imitated: B and Y in motion, contact of the probe with the part, cut-off of single readings by
-the spectrometer, heat inside the structure beyond given functions of time, coupling of Z's forces
-into X and C, loss of focus on steep slopes, servo saturation.
+Not imitated: motion of B and Y, spot size and loss of focus on slopes, spectrometer peaks, coupling
+of Z's forces into X and C, servo saturation, aliasing of structure vibration into the encoder.
 """
 
 from __future__ import annotations

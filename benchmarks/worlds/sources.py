@@ -25,7 +25,7 @@ ABBE_ARM_M = 0.05
 
 @dataclass(frozen=True)
 class Site:
-    """What effects need to know when they are made: chance that lasts, part and exposure."""
+    """Random numbers that last, part radius and exposure, as effects need them when made."""
 
     rng: np.random.Generator
     radius: float
@@ -82,7 +82,7 @@ def _harmonic(kind: Callable, per_turn: float) -> Build:
 def _radial(m: Machine, value: float, site: Site) -> Machine:
     """Move the spindle sideways twice a turn."""
     phase = site.phase()
-    wave = effects.aside_by(lambda now: np.cos(2 * now.c + phase), abs(value) * 2**0.5)
+    wave = effects.offset_beam_by(lambda now: np.cos(2 * now.c + phase), abs(value) * 2**0.5)
     return m.plus("place", wave)
 
 
@@ -94,7 +94,7 @@ def _wave(stage: str, of: Callable, share: float) -> Build:
         if stage == "loop":
             return m.plus(stage, effects.waving(of, 2**0.5 * value, period, site.phase()))
         phase = site.phase()
-        turn = effects.aside_by(
+        turn = effects.offset_beam_by(
             lambda now: np.sin(2 * np.pi * of(now) / period + phase), 2**0.5 * value
         )
         return m.plus(stage, turn)
@@ -134,12 +134,12 @@ SOURCES = (
     Source("tilt", 2e-5, "rad", _pass),
     Source("decentre", 5e-6, "m", _pass),
     Source("clocking", 5e-5, "rad", _pass),
-    Source("expansion", 1e-6, "1", _add("place", lambda v: effects.aside_by(x_of, dx=-v))),
-    Source("centre_x", 3e-7, "m", _add("place", lambda v: effects.aside(dx=v))),
-    Source("centre_y", 3e-7, "m", _add("place", lambda v: effects.aside(dy=v))),
+    Source("expansion", 1e-6, "1", _add("place", lambda v: effects.offset_beam_by(x_of, dx=-v))),
+    Source("centre_x", 3e-7, "m", _add("place", lambda v: effects.offset_beam(dx=v))),
+    Source("centre_y", 3e-7, "m", _add("place", lambda v: effects.offset_beam(dy=v))),
     Source("beam", 1e-4, "1", lambda m, v, s: replace(m, beam=(v, v * s.sign()))),
     Source("squareness", 1e-6, "rad", _add("loop", lambda v: effects.over(x_of, v))),
-    Source("parallelism", 5e-6, "rad", _add("place", lambda v: effects.aside_by(z_of, v, v))),
+    Source("parallelism", 5e-6, "rad", _add("place", lambda v: effects.offset_beam_by(z_of, v, v))),
     Source(
         "straightness_x", 5e-9, "m", _wave("loop", x_of, 1.5), {"correlation_length": 5e-3}
     ),

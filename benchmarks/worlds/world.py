@@ -127,8 +127,8 @@ class World:
     def declared(self, left_out: bool = True) -> dict[str, object]:
         """Return the sources that the shop states.
 
-        Of an undeclared kind the row of its source is missing, but for harmonics, of which others
-        are stated; with ``left_out`` false it stands there, and is untrue.
+        For an undeclared kind the row of its source is dropped, unless it is a spindle harmonic
+        (other harmonics are stated). With ``left_out`` false the row stays and is exceeded.
         """
         row = self.row
         harmonic = row.source.startswith("spindle_")

@@ -137,7 +137,7 @@ def test_spindle_harmonic_adds_to_the_height():
 def test_centre_acts_by_the_slope(along):
     """An offset of the beam changes the height by the slope along the machine's axis."""
     offset = 1e-6
-    machine = IDEAL.plus("place", effects.aside(**{f"d{along}": offset}))
+    machine = IDEAL.plus("place", effects.offset_beam(**{f"d{along}": offset}))
     r, wrong = error(machine)
     gx, gy = slopes(SMALL.nominal.height, r.x * np.cos(r.c), -r.x * np.sin(r.c))
     slope = {"x": gx * np.cos(r.c) - gy * np.sin(r.c), "y": gx * np.sin(r.c) + gy * np.cos(r.c)}
