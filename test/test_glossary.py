@@ -1,0 +1,67 @@
+"""The package keeps to the words of docs/glossary.md, in its names and in its texts."""
+
+import ast
+import io
+import re
+import tokenize
+from pathlib import Path
+
+import pytest
+
+import omsm_ros
+
+PACKAGE = Path(omsm_ros.__file__).parent
+ROOT = PACKAGE.parent
+GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+
+
+def _rows(heading):
+    section = GLOSSARY.split(heading)[1].split("\n## ")[0]
+    rows = [line.strip("| \n").split(" | ") for line in section.splitlines() if line[:2] == "| "]
+    return [row for row in rows[1:] if not row[0].startswith("--")]
+
+
+FORBIDDEN = [word for row in _rows("## Words that are not used") for word in row[0].split(", ")]
+PATTERN = re.compile(r"\b(" + "|".join(map(re.escape, FORBIDDEN)) + r")\b", re.IGNORECASE)
+
+
+def forbidden_words(source):
+    """Yield (line, word) of forbidden words in names, comments, docstrings and texts."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.NAME:
+            words = re.sub(r"([a-z])([A-Z])", r"\1 \2", token.string).replace("_", " ")
+        elif token.type in (tokenize.COMMENT, tokenize.STRING):
+            words = token.string
+        else:
+            continue
+        for match in PATTERN.finditer(words):
+            yield token.start[0], match[1]
+
+
+def test_the_glossary_has_terms_in_order():
+    terms = [row[0].lower() for row in _rows("# Glossary")]
+    assert len(terms) > 40
+    assert len(set(terms)) == len(terms)
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda p: p.name)
+def test_a_module_uses_no_forbidden_word(path):
+    assert not list(forbidden_words(path.read_text(encoding="utf-8")))
+
+
+@pytest.mark.parametrize(
+    "page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda p: p.name
+)
+def test_a_page_uses_no_forbidden_word(page):
+    text = page.read_text(encoding="utf-8")
+    if page.name == "glossary.md":
+        text = text.split("## Words that are not used")[0]
+    assert not [match[1] for match in PATTERN.finditer(text)]
+
+
+@pytest.mark.parametrize("word", FORBIDDEN)
+def test_a_forbidden_word_is_found_wherever_it_stands(word):
+    name = word.replace(" ", "_")
+    sources = [f"{name} = 1\n", f"# It is {word}.\n", f'"""It is {word}."""\n']
+    assert all(list(forbidden_words(source)) for source in sources)
+    ast.parse(sources[0])
