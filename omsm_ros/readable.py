@@ -28,6 +28,16 @@ _FIGURES = {
     "iso10110": "ISO 10110",
     "_best_fit": ", best fit of the pose",
 }
+_ZERNIKE_NAMES = {
+    (2, 0): "power",
+    (2, 2): "astigmatism",
+    (2, -2): "oblique astigmatism",
+    (3, 1): "coma in x",
+    (3, -1): "coma in y",
+    (3, 3): "trefoil",
+    (3, -3): "oblique trefoil",
+    (4, 0): "spherical aberration",
+}
 _LEAST_PROBABILITY = 1e-4
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -103,6 +113,12 @@ def figure(name: str) -> str:
     for field, word in _FIGURES.items():
         name = name.replace(field, word)
     return name.replace("_", " ")
+
+
+def zernike(n: int, m: int) -> str:
+    """Return the name of a Zernike term: ``coma in x Z(3, 1)``, ``Z(5, 1)``."""
+    term = f"Z({n}, {m})"
+    return f"{_ZERNIKE_NAMES[n, m]} {term}" if (n, m) in _ZERNIKE_NAMES else term
 
 
 def plain(value: object, digits: int = 3) -> str:

@@ -162,8 +162,8 @@ def facts_of(found: Comparison) -> dict[str, Any]:
     return {
         "schema": "omsm-difference/1",
         "verdict": found.verdict.verdict,
-        "reasons": list(found.verdict.reasons),
-        "reservations": list(found.verdict.reservations),
+        "reasons": [*map(str, found.verdict.reasons)],
+        "reservations": [*map(str, found.verdict.reservations)],
         "a": _side(found.sides[0]),
         "b": _side(found.sides[1]),
         "difference": {
@@ -175,7 +175,7 @@ def facts_of(found: Comparison) -> dict[str, Any]:
         "registration": {
             "fitted": list(matched.dofs),
             "moved": matched.moved,
-            "not_determined": matched.refused,
+            "not_determined": {name: str(why) for name, why in matched.refused.items()},
         },
         "resampling": {"method": _METHOD, "spacing": matched.grid.dx},
         "e_n": _numbers(agreement.figures if agreement is not None else figures_of(matched)),

@@ -195,8 +195,8 @@ def form_facts(
         "zernike": _terms(form),
         "removed": {
             "fitted": list(found.dofs.fitted),
-            "not_determined": dict(found.dofs.refused),
-            "held": dict(found.dofs.held),
+            "not_determined": {name: str(why) for name, why in found.dofs.refused.items()},
+            "held": {name: str(why) for name, why in found.dofs.held.items()},
             "pose_uncertainty": {
                 source: dict(zip(found.dofs.fitted, map(float, shares), strict=True))
                 for source, shares in found.from_source.items()

@@ -98,7 +98,7 @@ def test_a_map_of_another_instrument(results, tmp_path, capsys):
     unit = ("--unit", "mm,nm")
     _, facts = difference(capsys, tmp_path / "d", results["slow"], path, *unit)
     assert facts["verdict"] == "cannot tell"
-    assert "carries no uncertainty; state it, as --uncertainty" in facts["reasons"][0]
+    assert "has no uncertainty; state it with " in facts["reasons"][0]
     assert facts["e_n"]["rms"]["e_n"] is None
     assert facts["zernike"] is None
     stated = (*unit, "--uncertainty", "2e-9")
@@ -159,7 +159,7 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
         (["--fit", "piston,roll"], "freedom 'roll' is unknown"),
         (["--uncertainty", "-1"], "standard uncertainty"),
         (["--nominal", "missing.yaml"], "no surface at 'missing.yaml'"),
-        (["--spacing", "1e-9"], "widen it"),
+        (["--spacing", "1e-9"], "widen "),
         (["--spacing", "2e-6"], "expected 40 401 at most"),  # a minute's work
         (["--register", "auto"], "--register needs the surface"),
         (["--register", "roll"], "roll"),

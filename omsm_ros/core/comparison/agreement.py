@@ -1,9 +1,9 @@
-"""Do two measurements agree within what both of them state?
+"""Test the agreement of two measurements within their stated uncertainties.
 
-``E_n = (a − b) / √(U_a² + U_b²)`` with expanded uncertainties (ISO 13528, 9.7): beyond ±1 they
-disagree. For one figure U has k = 2. Where many are judged together, as the Zernike terms, one of
-twenty would be beyond ±1 with nothing wrong; their U holds for all of them at once with 95 %
-(Šidák), and the whole is judged by ``χ² = cᵀ C⁻¹ c`` with all their covariances.
+``E_n = (a − b) / √(U_a² + U_b²)`` with expanded uncertainties (ISO 13528, 9.7); beyond ±1 the
+measurements disagree. Several figures or Zernike terms are tested together, so their U holds for
+all of them at once with 95 % (Šidák). In addition ``χ² = cᵀ C⁻¹ c`` tests all terms with their
+covariance C.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from omsm_ros.core.comparison.matching import Matched
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
-# Of some 95 % (GUM 6.3.3).
+# For about 95 % (GUM 6.3.3).
 COVERAGE_FACTOR = 2.0
-# From power to the order of the sixth, which tolerances of form name.
+# Orders two to six, for which tolerances of form are stated.
 TERMS: tuple[ZernikeIndex, ...] = terms_up_to(6, 2)
-# Of the area (ISO 10110-5:2015 calls for a share to be stated).
+# Share of the area (ISO 10110-5:2015 calls for it to be stated).
 ROBUST_SHARE = 0.995
 
-# Of pairs that agree: in all terms or figures at once, and in the place that is farthest off.
+# Coverage for all terms or figures at once, and for the place of the largest difference [%].
 _TOGETHER, _PERCENTILE = 0.95, 99.0
-# A share of 95 % of so many draws is known to 1.3 %, one of 99 % to 0.6 %.
+# Draws that give a share of 95 % to 1.3 %, one of 99 % to 0.6 %.
 _DRAWS = 300
-# Above it the width of the filter is no whole place.
+# Share of the variance above which the smoothing is narrower than one place.
 _HARDLY_SMOOTHED = 0.7
-# A term of which the others explain all but this share is not told from them.
+# A term with a smaller independent share is not separable from the others.
 _LEAST_OWN_SHARE = 1e-4
-# Of the largest power of a correlation matrix: what is smaller is the rounding of its entries.
+# Eigenvalues of a correlation matrix below this share of the largest are rounding.
 _ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementErrors:
-    """What one measurement may be wrong by at the places (m,).
+    """Errors of one measurement at the places (m,).
 
-    shapes: by source, each (k, m) [m], sizes independent with standard deviation one
+    shapes: by source (k, m) [m], with independent amplitudes of standard deviation one
     single: independent standard deviation of each height [m], (m,)
-    averaged: the same for means over many places, to which it adds in squares [m], (m,)
+    averaged: independent standard deviation for means over many places [m], (m,)
     """
 
     shapes: dict[str, FloatArray]
@@ -54,7 +54,7 @@ class MeasurementErrors:
 
 @dataclass(frozen=True, slots=True)
 class ComparedFigure:
-    """A figure of both measurements [m], and its E_n; expanded and e_n None: not evaluated."""
+    """Figure of both measurements [m] and its E_n; ``expanded`` and ``e_n`` are None if unknown."""
 
     a: float
     b: float
@@ -64,7 +64,7 @@ class ComparedFigure:
 
 @dataclass(frozen=True, slots=True)
 class ComparedTerm:
-    """A Zernike term of the difference [m], one at the rim; expanded for all terms at once."""
+    """Zernike term of the difference [m], one at the rim; ``expanded`` holds for all terms."""
 
     n: int
     m: int
@@ -76,14 +76,14 @@ class ComparedTerm:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ComparisonAgreement:
-    """E_n of what two measurements were compared in.
+    """Agreement of two measurements in figures, Zernike terms and single places.
 
-    figures: peak_to_valley, robust_peak_to_valley, rms
-    terms: of the difference;  probability: of a χ² as large, if only the stated errors were there
-    within: share of the area where |E_n| < 1 (k = 2)
+    figures: peak_to_valley, robust_peak_to_valley, rms;  terms: of the difference
+    probability: of a larger χ² if only the stated errors were present
+    within: share of the area with |E_n| < 1 (k = 2)
     uncertainty: of the difference at each place [m], k = 1, (m,)
-    farthest: largest |difference| / uncertainty of all places;  allowed: 99 % of pairs without a
-        true difference stay below;  at: its place [m]
+    farthest: largest |difference| / uncertainty of all places;  at: its place [m]
+    allowed: limit of ``farthest`` that 99 % of agreeing pairs keep
     aperture: radius and middle of the disc of the terms [m]
     """
 
@@ -104,12 +104,12 @@ class ComparisonAgreement:
 
 
 def peak_to_valley(values: FloatArray) -> FloatArray:
-    """Return the largest less smallest of values (…, m)."""
+    """Return the range of values (…, m)."""
     return np.asarray(np.ptp(values, axis=-1))
 
 
 def robust_peak_to_valley(values: FloatArray) -> FloatArray:
-    """Return the span of the middle 99.5 % of values (…, m)."""
+    """Return the range of the middle 99.5 % of values (…, m)."""
     tail = 50 * (1 - ROBUST_SHARE)
     low, high = np.percentile(values, [tail, 100 - tail], axis=-1)
     return np.asarray(high - low)
@@ -128,7 +128,7 @@ FIGURES: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def figures_of(matched: Matched) -> dict[str, ComparedFigure]:
-    """Return the figures of both measurements less the fitted freedoms, without any E_n."""
+    """Return the figures of both measurements without the fitted degrees of freedom or E_n."""
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
     return {
         name: ComparedFigure(float(figure(a)), float(figure(b)), None, None)
@@ -139,9 +139,9 @@ def figures_of(matched: Matched) -> dict[str, ComparedFigure]:
 def shapes_of_difference(
     errors: tuple[MeasurementErrors, MeasurementErrors], shared: Collection[str] = ()
 ) -> FloatArray:
-    """Return the shapes (k, m) [m] of what a − b may be wrong by.
+    """Return the shapes (k, m) [m] of the errors of a − b.
 
-    shared: sources of one and the same error in both, so that its two shapes are subtracted
+    shared: sources of an error that both have in common, whose shapes are subtracted
     """
     own = [rows for e in errors for name, rows in e.shapes.items() if name not in shared]
     both = [errors[0].shapes[name] - errors[1].shapes[name] for name in shared]
@@ -153,9 +153,9 @@ def judge(
     errors: tuple[MeasurementErrors, MeasurementErrors],
     shared: Collection[str] = (),
 ) -> ComparisonAgreement:
-    """Return how two measurements agree whose errors at the places are known.
+    """Return the agreement of two measurements with known ``errors`` at the places.
 
-    shared: sources of one and the same error in both
+    shared: sources of an error that both have in common
     """
     shapes = matched.without_fit(shapes_of_difference(errors, shared))
     uncertainty = np.sqrt(np.sum(shapes**2, axis=0) + sum(e.single**2 for e in errors))
@@ -179,14 +179,14 @@ def judge(
 
 
 def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, ComparedFigure]:
-    """Return figures with the scatter of ``errors`` in them, by Monte Carlo (GUM supplement 1)."""
+    """Return the figures with their E_n by Monte Carlo (GUM Supplement 1)."""
     plain = figures_of(matched)
     heights = matched.without_fit(np.stack([matched.a, matched.b]))
     found = {}
     for name, figure in FIGURES.items():
         runs = [figure(own + errors) for own, errors in zip(heights, drawn, strict=True)]
         spread = float(np.std(runs[0] - runs[1]))
-        # Noise widens a peak to valley: by as much as one more noise does, of each its own.
+        # Noise increases a peak to valley; drawing it once more gives the bias to subtract.
         own = (plain[name].a, plain[name].b)
         excess = [float(np.mean(run)) - value for run, value in zip(runs, own, strict=True)]
         expanded = _coverage_factor(len(FIGURES)) * spread
@@ -198,7 +198,7 @@ def _figures(matched: Matched, drawn: Sequence[FloatArray]) -> dict[str, Compare
 def _monte_carlo_errors(
     matched: Matched, errors: tuple[MeasurementErrors, MeasurementErrors], shared: Collection[str]
 ) -> list[FloatArray]:
-    """Return the errors of both, each (draws, m) [m]; the same for the same input."""
+    """Return draws of the errors of both, each (draws, m) [m], with a fixed seed."""
     random = np.random.default_rng(0)
     made = [_noise(matched, side, random) for side in errors]
     common: dict[str, FloatArray] = {}
@@ -212,12 +212,12 @@ def _monte_carlo_errors(
 
 
 def _noise(matched: Matched, side: MeasurementErrors, random: np.random.Generator) -> FloatArray:
-    """Return the independent errors as the local fits pass them on (draws, m) [m].
+    """Return draws of the independent errors with the correlation of the local fits (draws, m) [m].
 
-    Places share points with their neighbours: so much smoothed, white noise of the size of means
-    has the size of single heights. A Gaussian of width σ leaves 1 / 4πσ² of the variance.
+    Neighbouring places share points. White noise of the size ``averaged`` is smoothed to the size
+    ``single``; a Gaussian of width σ leaves 1 / 4πσ² of the variance.
     """
-    # Heights of few digits may not scatter at all: nothing is smoothed then.
+    # Heights with a coarse resolution may have no scatter; they are not smoothed.
     ratios = np.divide(
         side.single, side.averaged, out=np.ones(len(side.single)), where=side.averaged > 0
     )
@@ -233,14 +233,14 @@ def _noise(matched: Matched, side: MeasurementErrors, random: np.random.Generato
 
 
 def _coverage_factor(together: int) -> float:
-    """Return the coverage factor with which 95 % hold of so many ``together`` (Šidák, 1967)."""
+    """Return the coverage factor for 95 % of ``together`` figures at once (Šidák, 1967)."""
     return float(ndtri((1 + _TOGETHER ** (1 / together)) / 2))
 
 
 def _terms(
     matched: Matched, fitted: FloatArray, averaged: FloatArray
 ) -> tuple[tuple[ComparedTerm, ...], float, tuple[float, float, float]]:
-    """Return Zernike terms of the difference beside the fitted freedoms, and how likely all are."""
+    """Return the Zernike terms of the difference, the probability of all, and their disc."""
     x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
     radius = float(np.max(np.hypot(matched.x - x0, matched.y - y0)))
     u, v = (matched.x - x0) / radius, (matched.y - y0) / radius
@@ -249,20 +249,19 @@ def _terms(
     shapes = fitted @ rows.T
     covariance = shapes.T @ shapes + (rows * averaged**2) @ rows.T
     spread = np.sqrt(np.diag(covariance))
-    chi_square, dof_count = _chi_square(value / spread, covariance / np.outer(spread, spread))
+    chi_square, degrees = _chi_square(value / spread, covariance / np.outer(spread, spread))
     factor = _coverage_factor(len(names))
     terms = tuple(
         ComparedTerm(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
         for term, d, s in zip(names, value, spread, strict=True)
     )
-    return terms, float(chdtrc(dof_count, chi_square)), (radius, x0, y0)
+    return terms, float(chdtrc(degrees, chi_square)), (radius, x0, y0)
 
 
 def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]:
-    """Return χ² of ``value`` (t,) with covariance ``correlation`` (t, t), and its degrees.
+    """Return χ² of ``value`` (t,) with covariance ``correlation`` (t, t), and its degrees of freedom.
 
-    Beside errors stated to be very large some mixtures of terms have none but rounding: of those
-    nothing is known.
+    Directions with a variance of rounding only are left out.
     """
     powers, directions = np.linalg.eigh(correlation)
     known = powers > _ROUNDING * powers[-1]
@@ -271,7 +270,7 @@ def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]
 
 
 def _rows(matched: Matched, values: FloatArray) -> tuple[list[ZernikeIndex], FloatArray]:
-    """Return the terms that stay identifiable beside the fitted freedoms, and weights (t, m)."""
+    """Return the terms that are separable from the fitted pose, and their weights (t, m)."""
     free = matched.without_fit(values)
     own = np.linalg.norm(free, axis=1) / np.linalg.norm(values, axis=1)
     kept = np.flatnonzero(own > _LEAST_OWN_SHARE)

@@ -1,4 +1,4 @@
-"""Two measurements of one part: matched, subtracted, judged."""
+"""Compare two measurements of one part: match, subtract, test the agreement."""
 
 from __future__ import annotations
 
@@ -25,49 +25,55 @@ from omsm_ros.core.comparison.stated_errors import (
 )
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.errors import DataError
-from omsm_ros.readable import count, figure, p_value_text, percent, plain, quantity
+from omsm_ros.errors import DataError, Notice
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
-
-# Agree, differ, or cannot tell; and why.
 
 AGREE, DIFFER, CANNOT_TELL = "agree", "differ", "cannot tell"
 
-# Of pairs that agree one in a hundred may look as unlikely.
+# Significance level of the χ² test of all terms.
 _LEAST_PROBABILITY = 0.01
-# A term beyond one, which of pairs that agree one in twenty has, and all terms as unlikely as that.
+# Significance level of the χ² test where a term has |E_n| > 1 as well.
 _UNLIKELY = 0.05
-# What is beyond one but not by this is as well chance as a difference.
+# From this |E_n| on a single term or figure shows a difference; between 1 and it is undecided.
 _CLEARLY_BEYOND = 1.25
-# Of the smaller area: of less, the figures are those of another part.
+# Share of the smaller area below which the figures describe different surfaces.
 _LEAST_SHARED = 0.5
+MOST_ACROSS = 200
+"""Places across the map of a difference: thirty in half a wave of the sixth order."""
+# Finer places would take minutes, and lie between means of the same cells.
+_MOST_PLACES = (MOST_ACROSS + 1) ** 2
+# Correlation length of errors of unknown form over the radius, for which most of their variance
+# lies in the low-order terms that are compared.
+_CORRELATED_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class ComparisonVerdict:
-    """verdict: AGREE, DIFFER or CANNOT_TELL;  reasons: for it, the weightiest first
-    reservations: what it rests on beside the stated uncertainties
+    """Verdict of a comparison.
+
+    verdict: AGREE, DIFFER or CANNOT_TELL;  reasons: the most important first
+    reservations: assumptions in addition to the stated uncertainties
     """
 
     verdict: str
-    reasons: tuple[str, ...]
-    reservations: tuple[str, ...]
+    reasons: tuple[Notice, ...]
+    reservations: tuple[Notice, ...]
 
 
 def verdict_of(
     matched: Matched,
     agreement: ComparisonAgreement | None,
-    unknown: tuple[str, ...],
+    unknown: tuple[Notice, ...],
     shared: float,
-    reservations: tuple[str, ...],
+    reservations: tuple[Notice, ...],
 ) -> ComparisonVerdict:
     """Return the verdict.
 
-    agreement: None if the uncertainty of a measurement is not known;  unknown: why
-    shared: of the smaller area, the share that both cover
+    agreement: None if the uncertainty of a measurement is not known;  unknown: the reasons
+    shared: share of the smaller area that both cover
     """
     if shared < _LEAST_SHARED:
-        unknown += (f"they share {percent(shared)} of the smaller area, expected 50 % or more",)
+        unknown += (Notice("comparison.small_shared_area", shared=shared, least=_LEAST_SHARED),)
     if agreement is None or shared < _LEAST_SHARED:
         return ComparisonVerdict(CANNOT_TELL, unknown, reservations)
     differs = _differences(agreement)
@@ -80,108 +86,88 @@ def verdict_of(
     return ComparisonVerdict(
         AGREE,
         (
-            f"all {len(agreement.terms)} Zernike terms: the largest |E_n| is "
-            f"{plain(abs(largest.e_n))}, of {_named(largest.n, largest.m)}",
-            f"a difference like theirs or larger: {p_value_text(agreement.probability)}",
-            f"|E_n| < 1 on {percent(agreement.within, 3)} of the area",
-            "what may differ unseen, term by term: up to " + _most_uncertain_terms(agreement),
+            Notice(
+                "comparison.largest_term",
+                count=len(agreement.terms),
+                e_n=abs(largest.e_n),
+                term=(largest.n, largest.m),
+            ),
+            Notice("comparison.probability", p=agreement.probability),
+            Notice("comparison.area_within", share=agreement.within),
+            Notice("comparison.undetected", terms=_least_certain(agreement)),
         ),
         reservations,
     )
 
 
-def _most_uncertain_terms(found: ComparisonAgreement) -> str:
-    """Return the terms of the largest uncertainty, with it."""
+def _least_certain(found: ComparisonAgreement) -> tuple[Notice, ...]:
+    """Return the three terms with the largest uncertainty."""
     terms = sorted(found.terms, key=lambda term: -term.expanded)[:3]
-    return ", ".join(f"{quantity(t.expanded, 'm')} of {_named(t.n, t.m)}" for t in terms)
+    return tuple(
+        Notice("comparison.expanded_of_term", expanded=t.expanded, term=(t.n, t.m)) for t in terms
+    )
 
 
-def _differences(found: ComparisonAgreement) -> tuple[str, ...]:
+def _differences(found: ComparisonAgreement) -> tuple[Notice, ...]:
     largest, probability = found.largest, found.probability
     plainly = abs(largest.e_n) > _CLEARLY_BEYOND
     both = abs(largest.e_n) > 1 and probability < _UNLIKELY
     reasons = []
     if plainly or both:
         reasons.append(
-            f"{_named(largest.n, largest.m)} differs by {quantity(largest.difference, 'm')} "
-            f"where {quantity(largest.expanded, 'm')} are explained: E_n = {plain(largest.e_n)}"
+            Notice(
+                "comparison.term_differs",
+                term=(largest.n, largest.m),
+                difference=largest.difference,
+                expanded=largest.expanded,
+                e_n=largest.e_n,
+            )
         )
     if probability < _LEAST_PROBABILITY or both:
-        reasons.append(
-            f"all terms together: {p_value_text(probability)} if only the stated errors were there"
-        )
+        reasons.append(Notice("comparison.improbable", p=probability))
     if found.farthest > _CLEARLY_BEYOND * found.allowed:
-        x, y = (quantity(place, "m") for place in found.at)
+        x, y = found.at
         reasons.append(
-            f"at x = {x}, y = {y} they differ by {plain(found.farthest)} standard "
-            f"uncertainties, where {plain(found.allowed)} are the most to expect of all places"
+            Notice(
+                "comparison.place_differs", x=x, y=y, score=found.farthest, allowed=found.allowed
+            )
         )
     reasons += [
-        f"{figure(name)}: E_n = {plain(number.e_n)}"
+        Notice("comparison.figure_differs", name=name, e_n=number.e_n)
         for name, number in found.figures.items()
         if number.e_n is not None and abs(number.e_n) > _CLEARLY_BEYOND and reasons
     ]
     return tuple(reasons)
 
 
-def _reservation_texts(matched: Matched, found: ComparisonAgreement) -> tuple[str, ...]:
-    beyond = {_named(t.n, t.m): t.e_n for t in found.terms if abs(t.e_n) > 1}
-    beyond |= {
-        figure(name): number.e_n
+def _reservation_texts(matched: Matched, found: ComparisonAgreement) -> tuple[Notice, ...]:
+    doubts = [
+        Notice("comparison.term_undecided", term=(t.n, t.m), e_n=t.e_n)
+        for t in found.terms
+        if abs(t.e_n) > 1
+    ]
+    doubts += [
+        Notice("comparison.figure_undecided", name=name, e_n=number.e_n)
         for name, number in found.figures.items()
         if number.e_n is not None and abs(number.e_n) > 1
-    }
-    doubts = [
-        f"{name} has E_n = {plain(value)}, too little beyond 1 to tell"
-        for name, value in beyond.items()
     ]
     deviation = matched.without_fit(np.stack([matched.a, matched.b]))
     compared = float(np.max(root_mean_square(deviation)))
-    # Of half the terms: a pose that is hardly known leaves two or three open, and tells the others.
+    # The median, because an uncertain pose affects two or three terms only.
     usual = float(np.median([term.expanded for term in found.terms]))
     if usual > compared:
-        doubts.append(
-            f"half of the terms have an uncertainty of {quantity(usual, 'm')} or more, more "
-            f"than all that is compared, {quantity(compared, 'm')} rms; measure with less"
-        )
+        doubts.append(Notice("comparison.uncertainty_too_large", expanded=usual, compared=compared))
     return tuple(doubts)
-
-
-_NAMES = {
-    (2, 0): "power",
-    (2, 2): "astigmatism",
-    (2, -2): "oblique astigmatism",
-    (3, 1): "coma in x",
-    (3, -1): "coma in y",
-    (3, 3): "trefoil",
-    (3, -3): "oblique trefoil",
-    (4, 0): "spherical aberration",
-}
-
-
-def _named(n: int, m: int) -> str:
-    term = f"Z({n}, {m})"
-    return f"{_NAMES[n, m]} {term}" if (n, m) in _NAMES else term
-
-
-MOST_ACROSS = 200
-"""Places across the map of a difference: thirty in half a wave of the sixth order."""
-# Finer places would cost minutes, and lie between means of the same cells.
-_MOST_PLACES = (MOST_ACROSS + 1) ** 2
-
-# Of the radius: an error of a form that nobody knows is correlated over it, which makes most of
-# it the terms of low order that a comparison looks at.
-_CORRELATED_SHARE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class SideSummary:
-    """What a measurement brought to the comparison, lengths [m].
+    """Properties of one measurement in the comparison, lengths [m].
 
     scatter: of a point about its neighbours
     sources: rms over the places of each systematic error, by source; None: not known
-    drift: standard deviation where it is largest;  drift_from: who knows it
-    interpolation: rms error between the points, from above;  cell: of the local fits
+    drift: largest standard deviation;  drift_from: origin of its size
+    interpolation: upper bound of the rms error between the points;  cell: of the local fits
     """
 
     name: str
@@ -196,10 +182,12 @@ class SideSummary:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Comparison:
-    """matched: both at the same places;  agreement: None if an uncertainty is not known
-    shared: of the smaller area, the share that both cover
-    length: over which errors of unknown form are taken for correlated [m]
-    common: sources of one and the same error in both
+    """Result of a comparison.
+
+    matched: both at the same places;  agreement: None if an uncertainty is not known
+    shared: share of the smaller area that both cover
+    length: correlation length of errors of unknown form [m]
+    common: sources of an error that both have in common
     """
 
     matched: Matched
@@ -221,9 +209,9 @@ def compare_measurements_of_part(
     """Compare two measurements of one part, the second moved onto the first by ``dofs``.
 
     spacing: of the places [m], None: as the coarser of both allows
-    length: over which errors of unknown form are correlated [m], None: half the radius
+    length: correlation length of errors of unknown form [m], None: half the radius
 
-    Raises DataError where they share too little, or are no areas.
+    Raises DataError for measurements that hardly overlap, or cover no area.
     """
     cells = [cell_side(m.points.x, m.points.y, MOST_ACROSS) for m in (a, b)]
     side = spacing or max(cells)
@@ -243,7 +231,7 @@ def compare_measurements_of_part(
     if one is not None and other is not None:
         agreement = judge(matched, (one, other), common)
     unknown = tuple(
-        f"{half.measurement.name} carries no uncertainty; state it, as --uncertainty 5e-9"
+        Notice("comparison.no_uncertainty", name=half.measurement.name)
         for half, errors in zip(halves, (one, other), strict=True)
         if errors is None
     )
@@ -262,19 +250,19 @@ def compare_measurements_of_part(
 
 
 def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
-    """Return a grid over what both may cover."""
+    """Return a grid over the rectangle that both cover."""
     low = [max(float(v.min()), float(w.min())) for v, w in ((a.x, b.x), (a.y, b.y))]
     high = [min(float(v.max()), float(w.max())) for v, w in ((a.x, b.x), (a.y, b.y))]
     if low[0] >= high[0] or low[1] >= high[1]:
-        raise DataError(
-            "the two measurements do not overlap; do they lie in one frame, and in one unit?"
-        )
+        raise DataError("comparison.no_overlap")
     counts = [int((h - c) / side) + 1 for c, h in zip(low, high, strict=True)]
     if max(counts) > _MOST_PLACES or counts[0] * counts[1] > _MOST_PLACES:
         raise DataError(
-            f"a spacing of {quantity(side, 'm')} makes {counts[0]:.4g} × {counts[1]:.4g} places, "
-            f"expected {count(_MOST_PLACES)} at most, which is as fine as points are resampled; "
-            "widen it"
+            "comparison.too_many_places",
+            spacing=side,
+            columns=counts[0],
+            rows=counts[1],
+            most=_MOST_PLACES,
         )
     x0, y0 = (c + (h - c) % side / 2 for c, h in zip(low, high, strict=True))
     return HeightGrid(height=np.zeros(counts[::-1]), x0=x0, y0=y0, dx=side, dy=side)
@@ -303,27 +291,23 @@ def _side(
     )
 
 
-def _reservations(sides: tuple[SideSummary, SideSummary], matched: Matched) -> tuple[str, ...]:
-    found: tuple[str, ...] = ()
+def _reservations(sides: tuple[SideSummary, SideSummary], matched: Matched) -> tuple[Notice, ...]:
+    found: tuple[Notice, ...] = ()
     drifts = [side.drift for side in sides if side.drift_from == ESTIMATED]
     if any(drifts):
-        found = (
-            f"nobody states the drift: what of the difference goes with the time of a scan, up to "
-            f"{quantity(max(drifts), 'm', 2)}, is taken for it; a true difference of that form, "
-            "as rings or power of a spiral scan, is not seen; state it, as --drift 20e-9",
-        )
+        found = (Notice("comparison.drift_estimated", drift=max(drifts)),)
     lateral_dofs = [name for name in ("x", "y", "clocking") if name in matched.dofs]
     if lateral_dofs:
-        found += (
-            f"{', '.join(lateral_dofs)} were fitted: a true difference that looks like such a move is "
-            "not seen",
-        )
-    found += _steepness_warning(matched)
-    return found + tuple(f"{name} was not fitted: {why}" for name, why in matched.refused.items())
+        found += (Notice("comparison.moves_fitted", names=lateral_dofs),)
+    found += _lateral_shift(matched)
+    return found + tuple(
+        Notice("comparison.not_fitted", name=name, reason=why)
+        for name, why in matched.refused.items()
+    )
 
 
-def _steepness_warning(matched: Matched) -> tuple[str, ...]:
-    """Return what a small shift between the two would do to heights that are steep."""
+def _lateral_shift(matched: Matched) -> tuple[Notice, ...]:
+    """Return the effect of a lateral shift of a micrometre between whole heights."""
     there = matched.from_b
     each = {"x": there.slope_x, "y": there.slope_y}
     slopes = [slope for name, slope in each.items() if name not in matched.dofs]
@@ -333,12 +317,8 @@ def _steepness_warning(matched: Matched) -> tuple[str, ...]:
     opened = MICROMETRE_M * float(np.sqrt(np.max(np.mean(left**2, axis=1))))
     if opened < NANOMETRE_M:
         return ()
-    height = quantity(float(np.ptp(matched.a)), "m")
-    return (
-        f"whole heights were compared, of {height} PV: where one part lies a micrometre beside the "
-        f"other they differ by {quantity(opened, 'm', 2)} rms; to compare deviations, each in the "
-        "frame of its part, give --nominal SURFACE.yaml --register auto",
-    )
+    height = float(np.ptp(matched.a))
+    return (Notice("comparison.whole_heights", height=height, shift=MICROMETRE_M, rms=opened),)
 
 
 def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:

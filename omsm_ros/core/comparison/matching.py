@@ -1,9 +1,7 @@
-"""Where does one measurement of a part lie on the other?
+"""Match two measurements of one part: move the second onto the first by least squares.
 
-The second is moved until its heights, at the same places, come closest to the first's: by piston,
-tip, tilt and power, which move no point sideways, and where it is asked for by shift and clocking.
-Least squares over places of equal area; shift and clocking by Gauss-Newton with the slopes of the
-local fits.
+Piston, tip, tilt and power are linear; shift and clocking, on request, are found by Gauss-Newton
+with the slopes of the local fits. All places have the same area.
 """
 
 from __future__ import annotations
@@ -16,39 +14,41 @@ import numpy as np
 from omsm_ros.core.comparison.resampling import LocalHeights, LocalQuadratic
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
-from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.readable import quantity
+from omsm_ros.errors import ConfigurationError, DataError, Notice
 
 DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
-"""In this order, with the signs of a pose: tip raises the side of +y, tilt lowers that of +x,
-clocking turns from x towards y."""
+"""Degrees of freedom in this order, with the signs of a pose: tip raises the side of +y, tilt
+lowers the side of +x, clocking turns from x towards y."""
 
 SEATED = ("piston", "tip", "tilt")
 _LATERAL = ("x", "y", "clocking")
-# Each turn squares what is left; a thousandth of a place is beneath what resampling knows.
+# Convergence is quadratic; resampling does not resolve a thousandth of a place.
 _TURNS = 8
 _SETTLED = 1e-3
-# Four for each of the 25 terms that are judged.
+# Four places for each of the 25 tested terms.
 _FEWEST_PLACES = 100
-# A freedom whose column the others explain but for this share is none of its own.
+# A degree of freedom with a smaller independent share of its column is not separable.
 _LEAST_OWN_SHARE = 1e-3
-# Of a column's square that is of the surface: Gauss-Newton with more noise than that in its
-# slopes takes too short a step, and does not settle.
+# Least share of the surface in the mean square of a column; with more noise in the slopes
+# Gauss-Newton takes too short steps and does not converge.
 _LEAST_RELIABLE = 0.7
+# Clocking by which an undetermined rotation is tested [rad].
+_TESTED_RAD = 1e-2
+# Heights below this are not measured [m].
+_LEAST_EFFECT_M = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Matched:
     """Two measurements at the same places (m,), the second moved onto the first.
 
-    grid: of all places, height = difference a − b [m], NaN where one of them has none
-    filled: which of the grid's places have one, flat
-    x, y: [m];  a, b: heights [m], b less the fitted piston, tip, tilt and power
-    columns: change of a − b by each fitted freedom (p, m)
-    dofs: fitted;  moved: b by how much, [m], [rad], power [1/m]
-    refused: freedoms that the surface does not determine, and why
-    from_a, from_b: the local fits
-    b_x, b_y: the places in the second measurement's own frame [m]
+    grid: of all places, with the difference a − b [m], NaN where one of both has no height
+    filled: which places of the grid have a difference, flat
+    x, y: [m];  a, b: heights [m], b without the fitted piston, tip, tilt and power
+    columns: change of a − b by each fitted degree of freedom (p, m)
+    dofs: fitted;  moved: the step of each [m], [rad], power [1/m]
+    refused: degrees of freedom that the surface does not determine, and why
+    from_a, from_b: local fits;  b_x, b_y: places in the frame of the second measurement [m]
     """
 
     grid: HeightGrid
@@ -60,7 +60,7 @@ class Matched:
     columns: FloatArray
     dofs: tuple[str, ...]
     moved: dict[str, float]
-    refused: dict[str, str]
+    refused: dict[str, Notice]
     from_a: LocalHeights
     from_b: LocalHeights
     b_x: FloatArray
@@ -72,28 +72,26 @@ class Matched:
         return self.a - self.b
 
     def without_fit(self, values: FloatArray) -> FloatArray:
-        """Return values (…, m) less what the fitted freedoms explain of them."""
+        """Return values (…, m) without their fit by the fitted degrees of freedom."""
         design = self.columns.T / np.linalg.norm(self.columns, axis=1)
         solved = np.linalg.lstsq(design, values.T, rcond=1e-10)[0]
         return np.asarray(values - (design @ solved).T, np.float64)
 
 
 def ordered_dofs(names: Sequence[str]) -> tuple[str, ...]:
-    """Return freedoms in their order; ConfigurationError for a name that is none."""
+    """Return the degrees of freedom in their order; raise ConfigurationError for other names."""
     for name in names:
         if name not in DEGREES_OF_FREEDOM:
             raise ConfigurationError(
-                f"freedom {name!r} is unknown, expected one of {[*DEGREES_OF_FREEDOM]}"
+                "comparison.unknown_freedom", name=name, known=[*DEGREES_OF_FREEDOM]
             )
     return tuple(name for name in DEGREES_OF_FREEDOM if name in names)
 
 
 def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence[str]) -> Matched:
-    """Move ``b`` onto ``a`` by ``dofs`` and take both at the places of ``grid``.
+    """Move ``b`` onto ``a`` by ``dofs`` and resample both at the places of ``grid``.
 
-    grid: whose heights do not matter
-
-    Raises DataError where they share too few places, or a fit does not settle.
+    Raises DataError for too few common places, or a fit that does not converge.
     """
     places = _Places(a, b, grid)
     wanted = ordered_dofs(dofs)
@@ -109,15 +107,12 @@ def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence
             return places.matched(seen, {**moved, **step}, step, refused)
         for name, value in lateral_step.items():
             moved[name] += value
-    raise DataError(
-        "shift and clocking of the second measurement do not settle; place it nearer, or fit "
-        "fewer freedoms"
-    )
+    raise DataError("comparison.not_converged")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Both measurements where they have heights, and what each freedom does there (n,)."""
+    """Both measurements where they have heights, and the column of each degree of freedom (n,)."""
 
     filled: BoolArray
     a: FloatArray
@@ -128,7 +123,7 @@ class _Seen:
     v: FloatArray
 
     def step(self) -> dict[str, float]:
-        """Return the least-squares size of each freedom."""
+        """Return the least-squares step of each degree of freedom."""
         design = np.stack(list(self.columns.values()), axis=1)
         scale = np.linalg.norm(design, axis=0)
         solved = np.linalg.lstsq(design / scale, self.a - self.b, rcond=1e-10)[0] / scale
@@ -144,28 +139,33 @@ class _Places:
         self._here = a.at(self.x, self.y)
 
     def seen(self, moved: Mapping[str, float], dofs: Sequence[str]) -> _Seen:
-        """Take the second measurement once it is ``moved``."""
+        """Resample the second measurement after it is ``moved``."""
         there, u, v = _resampled_after_move(self._b, self.x, self.y, moved)
         filled = np.isfinite(self._here.value) & np.isfinite(there.value)
         if np.sum(filled) < _FEWEST_PLACES:
             raise DataError(
-                f"the two measurements share {np.sum(filled)} places of "
-                f"{quantity(self._grid.dx, 'm')}, expected {_FEWEST_PLACES} or more; "
-                "do they lie in one frame, and in one unit?"
+                "comparison.few_places",
+                count=int(np.sum(filled)),
+                side=self._grid.dx,
+                least=_FEWEST_PLACES,
             )
         columns = {n: _column(n, u, v, there)[filled] for n in dofs}
         heights = (self._here.value[filled], there.value[filled])
         return _Seen(filled, *heights, columns, there, u[filled], v[filled])
 
     def columns_of_first(self, filled: BoolArray, dofs: Sequence[str]) -> dict[str, FloatArray]:
-        """Return what each freedom does to the first measurement where both have heights (n,)."""
+        """Return the columns (n,) of the first measurement where both have heights."""
         here, x, y = _heights_at(self._here, filled), self.x[filled], self.y[filled]
         return {name: _column(name, x, y, here) for name in dofs}
 
     def matched(
-        self, seen: _Seen, moved: dict[str, float], step: dict[str, float], refused: dict[str, str]
+        self,
+        seen: _Seen,
+        moved: dict[str, float],
+        step: dict[str, float],
+        refused: dict[str, Notice],
     ) -> Matched:
-        """Return what was found, the freedoms of ``step`` taken off."""
+        """Return both measurements with ``step`` removed from the second."""
         level = sum((value * seen.columns[name] for name, value in step.items()), np.zeros(1))
         flat = np.full(self.x.size, np.nan)
         flat[seen.filled] = seen.a - seen.b - level
@@ -191,7 +191,7 @@ class _Places:
 def _resampled_after_move(
     b: LocalQuadratic, x: FloatArray, y: FloatArray, moved: Mapping[str, float]
 ) -> tuple[LocalHeights, FloatArray, FloatArray]:
-    """Return b where its points lie once moved to x, y, and those places in b's own frame."""
+    """Return b, after it is ``moved``, at x, y, and these places in the frame of b."""
     angle = moved.get("clocking", 0.0)
     dx, dy = x - moved.get("x", 0.0), y - moved.get("y", 0.0)
     u = dx * np.cos(angle) + dy * np.sin(angle)
@@ -200,7 +200,7 @@ def _resampled_after_move(
 
 
 def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> FloatArray:
-    """Change of b's height at a place if b is moved by one unit of the freedom."""
+    """Return the change of the height of b at a place for a unit step of ``name``."""
     if name == "piston":
         return np.ones_like(x)
     if name == "clocking":
@@ -213,13 +213,13 @@ def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> Flo
 
 def _not_determined(
     columns: dict[str, FloatArray], of_first: dict[str, FloatArray], place: float
-) -> dict[str, str]:
-    """Return which lateral freedoms the surface does not separate from the others, and why.
+) -> dict[str, Notice]:
+    """Return the lateral degrees of freedom that the surface does not determine, and why.
 
-    columns, of_first: of the second and of the first measurement. What both have in common is of
-    the surface; the rest is the noise of their slopes.
+    columns, of_first: of the second and of the first measurement. Their common part belongs to the
+    surface; the rest is noise of the slopes.
     """
-    refused: dict[str, str] = {}
+    refused: dict[str, Notice] = {}
     for name in _LATERAL:
         if name not in columns:
             continue
@@ -228,22 +228,20 @@ def _not_determined(
             _independent_part(of[name], [of[n] for n in others]) for of in (columns, of_first)
         )
         share = float(np.linalg.norm(own)) / max(float(np.linalg.norm(columns[name])), 1e-300)
-        # By one place, or by what that is at the rim: a smaller change nobody would see.
-        reach = place if name != "clocking" else 1e-2
+        reach = place if name != "clocking" else _TESTED_RAD
         common = max(float(np.mean(own * first)), 0.0)
-        effect = np.sqrt(common) * reach
+        effect = float(np.sqrt(common) * reach)
         noisy = common < _LEAST_RELIABLE * float(np.mean(own**2))
-        if share < _LEAST_OWN_SHARE or effect < 1e-10 or noisy:
-            refused[name] = (
-                "the surface looks alike wherever it is: moved by "
-                f"{quantity(reach, 'rad' if name == 'clocking' else 'm', 2)} it changes by "
-                + (f"{quantity(effect, 'm', 1)}" if effect > 1e-12 else "nothing beyond noise")
-            )
+        if share < _LEAST_OWN_SHARE or effect < _LEAST_EFFECT_M or noisy:
+            code = "comparison.shift_not_determined"
+            if name == "clocking":
+                code = "comparison.rotation_not_determined"
+            refused[name] = Notice(code, step=reach, effect=effect)
     return refused
 
 
 def _independent_part(column: FloatArray, others: Sequence[FloatArray]) -> FloatArray:
-    """Return the part of a column (n,) that the others, if there are any, do not explain."""
+    """Return the part of a column (n,) that is independent of the ``others``."""
     if not others:
         return column
     design = np.stack(others, axis=1) / [float(np.linalg.norm(c)) for c in others]

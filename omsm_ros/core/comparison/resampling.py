@@ -1,11 +1,9 @@
-"""What is the height between the points that were measured?
+"""Interpolate heights between measured points by local quadratic regression.
 
-A trend, a polynomial of the whole surface, is taken off first. The points are averaged in square
-cells, so that a track of dense points counts no more than its neighbours. At each place a
-quadratic surface is fitted to the cells around it, weighted by their distance (tricube, Cleveland
-1979), and its value there is taken: exact where the surface less its trend is a quadratic within
-one radius. What is shorter than the radius is averaged out. No value is given where the cells do
-not surround the place.
+A trend, a polynomial of the whole surface, is subtracted first. The points are averaged in square
+cells, so that a dense track counts no more than its neighbours. At each place a quadratic is
+fitted to the surrounding cells, weighted by distance (tricube; Cleveland 1979). Wavelengths
+shorter than the radius are averaged out. Places that the cells do not surround get no value.
 """
 
 from __future__ import annotations
@@ -22,20 +20,31 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import MAP_SPACING
-from omsm_ros.readable import quantity
 
-# Scattered points as means over square cells, beside a trend of the whole surface.
-
-# The orders that are judged; left in, they would bend within a cell.
+# The highest order that is compared; without it the surface would curve within a cell.
 TREND_DEGREE = 6
-# Seven hundred for each of its 28 terms.
+# Seven hundred points for each of its 28 terms.
 _TREND_POINTS = 20_000
-# Twice as large cells are a quarter as many where the points fill the surface.
+# Ratio of occupied cells at half the side from which the points fill the surface; at most 4.
 _FILLED = 3.5
-# A wave of the sixth order has nearly three of them.
+# A wave of the sixth order has nearly three cells.
 _FEWEST_CELLS_ACROSS = 8
 # Points at a time: eighteen neighbours of each, of six columns, are 17 MB.
 _PORTION = 20_000
+RADIUS_CELLS = 2.4
+"""Radius of a local fit in sides of a cell: about eighteen cells for six coefficients."""
+# One and a half times the six coefficients of a quadratic.
+_LEAST_NEIGHBOURS = 9
+# At the straight edge of evenly spread cells the tricube-weighted centre is 0.30 radii inside; at
+# a larger offset a fit extrapolates.
+_LARGEST_OFFSET = 0.36
+# Largest variance of a value over that of the mean of one cell: 1/3 amid the points, more where
+# the quadratic extrapolates.
+_LARGEST_GAIN = 1.0
+# Least eigenvalue of the scaled normal equations of an independent quadratic.
+_WORST_CONDITION = 1e-6
+# Factor of the radius, and places, for the estimate of the interpolation error (to 3 %).
+_WIDER, _PROBED = 1.5, 3_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +52,7 @@ class AveragedCells:
     """Means of the points in square cells, each (k,).
 
     xx, xy, yy: mean products of the points' distances from the middle of their cell [m²]
-    variance: mean square of their uncertainty [m²];  order: of the scan, 0 to 1
+    variance: mean square of their uncertainty [m²];  order: mean time in the scan, 0 to 1
     """
 
     x: FloatArray
@@ -58,7 +67,7 @@ class AveragedCells:
 
 
 class SurfaceTrend:
-    """A polynomial of the whole surface, by least squares."""
+    """Least-squares polynomial of the whole surface."""
 
     def __init__(self, points: MeasuredPoints) -> None:
         some = slice(None, None, max(len(points) // _TREND_POINTS, 1))
@@ -72,12 +81,12 @@ class SurfaceTrend:
         ]
 
     def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return its height [m], (n,)."""
+        """Return the height [m], (n,)."""
         parts = [self._columns(x[p], y[p]) @ self._coefficients for p in portions(len(x))]
         return np.concatenate([np.empty(0), *parts])
 
     def slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return its slopes [1], each (n,)."""
+        """Return the slopes [1], each (n,)."""
         step = 1e-5 * self._scale
         return (
             (self.at(x + step, y) - self.at(x - step, y)) / (2 * step),
@@ -98,14 +107,14 @@ def _powers(degree: int) -> list[tuple[int, int]]:
 
 
 def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
-    """Return the least side [m] of cells that points (n,) fill, no more than ``most`` across."""
+    """Return the least side [m] of cells that points (n,) fill, at most ``most`` across.
+
+    Raises DataError for points that cover no area.
+    """
     width, high = float(np.ptp(x)), float(np.ptp(y))
     extent = max(width, high)
     if min(width, high) < MAP_SPACING.low:
-        raise DataError(
-            f"the points cover {quantity(width, 'm')} × {quantity(high, 'm')}, which is no area; "
-            "a profile cannot be made into a map; give points that cover one"
-        )
+        raise DataError("comparison.no_area", width=width, height=high)
     side = max(float(np.sqrt(width * high / len(x))), extent / most)
     while extent / side > _FEWEST_CELLS_ACROSS:
         if _occupied(x, y, side) >= _FILLED * _occupied(x, y, 2 * side):
@@ -153,7 +162,7 @@ def averaged(
 
 
 def _order(points: MeasuredPoints) -> FloatArray:
-    """Place of each point in the order of the scan, 0 to 1; NaN where it is not known."""
+    """Return the time of each point in the scan, 0 to 1, NaN where it is unknown (n,)."""
     if points.sample is None:
         return np.full(len(points), np.nan)
     first, span = points.sample.min(), max(float(np.ptp(points.sample)), 1.0)
@@ -168,32 +177,15 @@ def portions(count: int) -> Iterator[slice]:
 
 Rows = Callable[[int, int], FloatArray]
 
-RADIUS_CELLS = 2.4
-"""Radius of a local fit in sides of a cell: some eighteen cells for six coefficients."""
-
-# Half as many again as a quadratic has coefficients.
-_LEAST_NEIGHBOURS = 9
-# A place at the straight edge of evenly spread cells has its tricube-weighted centre 0.30 radii
-# inside; farther out than that a fit extrapolates.
-_LARGEST_OFFSET = 0.36
-# Variance of a value over that of the mean of one cell: a third amid the points; more where the
-# points stand on one side and the quadratic extrapolates.
-_LARGEST_GAIN = 1.0
-# The value of a quadratic whose columns are nearly dependent is a guess.
-_WORST_CONDITION = 1e-6
-# A mean square of so many places is known to 3 %.
-_WIDER, _PROBED = 1.5, 3_000
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LocalHeights:
-    """Heights at places (m,); NaN where the points do not surround a place.
+    """Heights at places (m,), NaN where the points do not surround a place.
 
-    value: [m];  slope_x, slope_y: [1]
-    density: points in a cell there, harmonic mean
-    gain: variance of the value over that of one point, if the points' errors are independent
-    stated: the points' own standard uncertainty there [m]; NaN where none is stated
-    order: mean place of the points in the order of the scan, 0 to 1; NaN where none is known
+    value: [m];  slope_x, slope_y: [1];  density: points in a cell there, harmonic mean
+    gain: variance of the value over that of one point, for independent errors
+    stated: stated standard uncertainty of the points there [m], NaN if unknown
+    order: mean time of the points in the scan, 0 to 1, NaN if unknown
     """
 
     value: FloatArray
@@ -206,7 +198,7 @@ class LocalHeights:
 
 
 class LocalQuadratic:
-    """A surface between its points, by local quadratic regression on cells of side ``cell`` [m].
+    """Surface between its points by local quadratic regression on cells of side ``cell`` [m].
 
     Raises DataError for points that fill fewer than nine cells.
     """
@@ -219,8 +211,10 @@ class LocalQuadratic:
         )
         if len(self._cells.x) < _LEAST_NEIGHBOURS:
             raise DataError(
-                f"the points fill {len(self._cells.x)} cells of {quantity(cell, 'm')}, too few for "
-                "a surface between them; measure an area, or choose smaller cells"
+                "comparison.few_cells",
+                count=len(self._cells.x),
+                cell=cell,
+                least=_LEAST_NEIGHBOURS,
             )
         self._tree = cKDTree(np.column_stack([self._cells.x, self._cells.y]))
         some = slice(None, None, max(len(points) // _PROBED, 1))
@@ -244,17 +238,16 @@ class LocalQuadratic:
 
     @property
     def scatter(self) -> float:
-        """Standard deviation of a single point about the surface between its neighbours [m].
+        """Robust standard deviation of a point about the surface between its neighbours [m].
 
-        By the median of the points' distances, so that dust does not count; it holds what is
-        shorter than a local fit averages over.
+        It includes wavelengths shorter than a local fit resolves.
         """
         return self._scatter
 
     def carried(self, rows: Rows, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Carry errors of the points to x, y (m,): return them row by row, (s, m) [m].
+        """Return errors of the points interpolated to x, y (m,), row by row, (s, m) [m].
 
-        rows: errors (s, c) [m] of ``c`` points from a first one on
+        rows: function of a first point and a count c that returns errors (s, c) [m]
         """
         means = self._means(rows)
         parts = []
@@ -278,11 +271,11 @@ class LocalQuadratic:
         return np.empty((0, 0)) if sums is None else sums / self._cells.points
 
     def method_error(self, x: FloatArray, y: FloatArray) -> float:
-        """Return the rms error of the interpolation at places like x, y (m,) [m], from above.
+        """Return an upper bound of the rms interpolation error at places like x, y (m,) [m].
 
-        The error of a quadratic grows with the fourth power of its radius, and with a lower one
-        where the radius nears the wavelength. With the third, what a radius half as large again
-        changes is 1.5³ − 1 times the error, and noise beside it.
+        The error of a quadratic grows with the fourth power of its radius, and slower where the
+        radius nears the wavelength. With the third power, a change of the radius by 1.5 changes
+        the value by 1.5³ − 1 times the error, plus noise.
         """
         some = slice(None, None, max(len(x) // _PROBED, 1))
         radius = RADIUS_CELLS * self.cell
@@ -293,7 +286,7 @@ class LocalQuadratic:
         return float(np.sqrt(np.mean(change**2))) / (_WIDER**3 - 1)
 
     def _fitted(self, x: FloatArray, y: FloatArray, radius: float) -> FloatArray:
-        """Return what :class:`LocalHeights` holds, less the trend, (7, m)."""
+        """Return the fields of :class:`LocalHeights` without the trend, (7, m)."""
         parts = [self._portion(x[p], y[p], radius) for p in portions(len(x))]
         return np.concatenate([np.empty((7, 0)), *parts], axis=1)
 
@@ -303,7 +296,7 @@ class LocalQuadratic:
         found = np.full((7, len(x)), np.nan)
         for place, scale in enumerate((1.0, 1 / radius, 1 / radius)):
             found[place, good] = scale * np.sum(share[:, place] * cells.height[chosen], axis=1)
-        # Around a place the cells' own values, by the distance alone.
+        # The properties of the cells are averaged with positive weights.
         near = np.abs(share[:, 0]) / np.sum(np.abs(share[:, 0]), axis=1, keepdims=True)
         found[3, good] = 1 / np.sum(near / cells.points[chosen], axis=1)
         found[4, good] = np.sum(share[:, 0] ** 2 / cells.points[chosen], axis=1)
@@ -315,9 +308,9 @@ class LocalQuadratic:
     def _shares(
         self, x: FloatArray, y: FloatArray, radius: float
     ) -> tuple[BoolArray, FloatArray, IntArray]:
-        """Return which places (m,) cells surround; of those, the shares (g, 3, k) of cells (g, k).
+        """Return which places (m,) cells surround, and the weights (g, 3, k) of cells (g, k) there.
 
-        Shares in the value and in both slopes times the radius.
+        Weights in the value and in both slopes times the radius.
         """
         cells = self._cells
         most = min(int(4.5 * (radius / self.cell) ** 2) + 8, len(cells.x))
@@ -327,7 +320,7 @@ class LocalQuadratic:
         inside = index < len(cells.x)
         index = np.where(inside, index, 0)
         weight = np.where(inside, (1 - np.minimum(distance / radius, 1.0) ** 3) ** 3, 0.0)
-        # A cell of many points is no better than the surface is quadratic.
+        # The weight saturates, because the model error does not fall with the number of points.
         weight *= cells.points[index] / (cells.points[index] + np.median(cells.points))
         u = np.where(inside, (cells.x[index] - x[:, None]) / radius, 0.0)
         v = np.where(inside, (cells.y[index] - y[:, None]) / radius, 0.0)
@@ -340,7 +333,7 @@ class LocalQuadratic:
     def _surrounded(
         u: FloatArray, v: FloatArray, weight: FloatArray, inside: BoolArray
     ) -> BoolArray:
-        """Return where the cells lie on all sides of the place, and not along one line."""
+        """Return where the cells surround the place, and do not lie along one line."""
         total = np.maximum(weight.sum(axis=1), np.finfo(np.float64).tiny)
         centre = np.hypot((weight * u).sum(axis=1), (weight * v).sum(axis=1)) / total
         uu, vv, uv = ((weight * p).sum(axis=1) / total for p in (u * u, v * v, u * v))
@@ -352,9 +345,9 @@ class LocalQuadratic:
 def _first_rows(
     u: FloatArray, v: FloatArray, moments: list[FloatArray], weight: FloatArray
 ) -> FloatArray:
-    """Return the cells' weights in value and slopes of the local quadratic, (m, 3, k).
+    """Return the weights of the cells in value and slopes of the local quadratic, (m, 3, k).
 
-    What is fitted to the mean of a cell is the mean of the quadratic over its points.
+    The mean of the quadratic over the points of a cell is fitted to the mean of the cell.
     """
     uu, uv, vv = moments
     basis = np.stack([np.ones_like(u), u, v, u * u + uu, u * v + uv, v * v + vv], axis=2)
@@ -363,8 +356,8 @@ def _first_rows(
     scale = np.sqrt(np.einsum("mii->mi", normal))
     normal /= scale[:, :, None] * scale[:, None, :]
     lowest = np.linalg.eigvalsh(normal)[:, 0] if len(normal) else np.empty(0)
-    # Where cells lie on two lines only, a little of the identity keeps the value and gives up
-    # the curvature across them.
+    # Where cells lie on two lines only, regularisation keeps the value and drops the curvature
+    # across the lines.
     normal += np.where(lowest < _WORST_CONDITION, 1e-4, 0.0)[:, None, None] * np.eye(6)
     first = np.eye(6)[:, :3] / scale[:, :, None]
     solved = np.linalg.solve(normal, first) / scale[:, :, None]
@@ -373,10 +366,7 @@ def _first_rows(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Resampled:
-    """A map made of scattered points, and how.
-
-    grid: heights [m];  method_error: rms error of the interpolation [m], from above
-    """
+    """Map made of scattered points;  method_error: upper bound of its rms error [m]."""
 
     grid: HeightGrid
     method_error: float
@@ -385,26 +375,20 @@ class Resampled:
 def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> Resampled:
     """Return the points as a map of at most ``most`` columns or rows, as fine as they allow.
 
-    spacing: of the map [m] instead
+    spacing: of the map [m], None for the finest that the points fill
 
-    Raises DataError for points that are no area, or a spacing that makes too large a map, or one
-    without a single height.
+    Raises DataError for points without an area, and for a map that is too large or empty.
     """
     side = spacing or cell_side(points.x, points.y, most)
     shape = tuple(int(np.floor(np.ptp(v) / side)) + 1 for v in (points.y, points.x))
     if max(shape) > max(most, 20_000) or shape[0] * shape[1] > 25_000_000:
-        raise DataError(
-            f"a spacing of {quantity(side, 'm')} makes a map of {shape!r} places; widen it"
-        )
+        raise DataError("comparison.map_too_large", spacing=side, columns=shape[1], rows=shape[0])
     x0, y0 = (float(v.min() + (np.ptp(v) % side) / 2) for v in (points.x, points.y))
     empty = HeightGrid(height=np.zeros(shape), x0=x0, y0=y0, dx=side, dy=side)
     x, y = (part.ravel() for part in np.meshgrid(empty.x, empty.y))
     surface = LocalQuadratic(points, side)
     height = surface.at(x, y).value.reshape(shape)
     if not np.any(np.isfinite(height)):
-        raise DataError(
-            f"a spacing of {quantity(side, 'm')} is finer than the points are apart, and leaves a "
-            "map without a height; widen it"
-        )
+        raise DataError("comparison.empty_map", spacing=side)
     grid = HeightGrid(height=height, x0=x0, y0=y0, dx=side, dy=side)
     return Resampled(grid, surface.method_error(x, y))

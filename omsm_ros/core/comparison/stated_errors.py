@@ -1,10 +1,12 @@
-"""What may a measurement be wrong by, at the places where it is compared?
+"""Errors of a measurement at the places where it is compared.
 
-Its noise is read off its own scatter. What its heights share is known by its fields, the effect of
-each source on each point of the scan; where there are none, the stated uncertainty is taken for an
-error of a form that nobody knows, correlated over a length. A drift that nobody states is
-estimated from the difference, and so the part of it that goes with the time of a scan is not held
-against either.
+The noise follows from the scatter of the points. Systematic errors are given by their fields, the
+effect of each source on each point of the scan; without fields, the stated uncertainty counts as an
+error of unknown form with a correlation length. A drift that is not stated is estimated from the
+difference.
+
+A systematic error is a sum of shapes over the surface, each with an independent amplitude of
+standard deviation one (Karhunen-Loève expansion): a shape is its effect on every height [m].
 """
 
 from __future__ import annotations
@@ -27,27 +29,21 @@ from omsm_ros.core.correction.source_kinds import components, random_walk
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints
 
-# In which shapes may a measurement be wrong as a whole?
-#
-# Noise averages out over an area; a drift, a reference surface or a filter that is a little wrong
-# does not. Such an error is a sum of shapes over the surface, each with an independent size of
-# standard deviation one (Karhunen and Loève): a shape then is what it does to every height [m].
-
-# Of an error correlated over half the radius of a disc 19 shapes hold what is kept, over a quarter
-# 57, as with four times as many nodes.
+# An error correlated over half the radius of a disc needs 19 shapes, over a quarter 57; four times
+# as many nodes give the same.
 _NODES = 400
-# Of the variance, which changes a standard uncertainty by 0.25 %.
+# Share of the variance that is left out; it changes a standard uncertainty by 0.25 %.
 _LEFT_OUT = 0.005
-# What is tried: from what no scan shows to what no scan survives, 12 % apart.
+# Sizes of a drift that are tried, 12 % apart, from invisible to implausible.
 _DRIFTS_M = np.geomspace(1e-11, 1e-5, 121)
 
 
 def unknown_form(x: FloatArray, y: FloatArray, size: FloatArray, length: float) -> FloatArray:
     """Return the shapes (k, m) of an error of standard deviation ``size`` (m,) [m] at x, y (m,).
 
-    Its covariance falls with the distance d as ``exp(−d² / 2 length²)``. The shapes are found on
-    400 of the places, as far from each other as can be, and carried to the others (Nyström), and
-    scaled to the full variance. A length shorter than their distance is taken for it.
+    Its correlation falls with the distance d as ``exp(−d² / 2 length²)``. The shapes are computed
+    on 400 distant places, extended to the others (Nyström) and scaled to the full variance. The
+    distance of these places is the least correlation length.
     """
     if len(x) == 0 or not np.any(size > 0):
         return np.empty((0, len(x)))
@@ -66,10 +62,9 @@ def unknown_form(x: FloatArray, y: FloatArray, size: FloatArray, length: float) 
 
 
 def _nodes(x: FloatArray, y: FloatArray) -> tuple[IntArray, float]:
-    """Return the numbers of the nodes, and the least distance between two of them [m].
+    """Return the indices of the nodes, and the least distance between two of them [m].
 
-    Each is the place that is farthest from those before it (T. Gonzalez, Theor. Comput. Sci. 38,
-    293): of a map of rows, every k-th place would leave wide gaps between columns of nodes.
+    Each node is the place farthest from those before it (T. Gonzalez, Theor. Comput. Sci. 38, 293).
     """
     nodes, apart = [0], 0.0
     nearest = np.hypot(x - x[0], y - y[0])
@@ -86,7 +81,7 @@ def _kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
 
 
 def drift(order: FloatArray, size: float) -> FloatArray:
-    """Return the shapes (k, m) of a random walk in time that scatters by ``size`` [m] at its end.
+    """Return the shapes (k, m) of a random walk with standard deviation ``size`` [m] at its end.
 
     order: time of each place (m,), 0 at the beginning of the scan and 1 at its end
     """
@@ -96,16 +91,15 @@ def drift(order: FloatArray, size: float) -> FloatArray:
 def likely_drift(
     difference: FloatArray, known: FloatArray, noise: FloatArray, drifts: FloatArray
 ) -> float:
-    """Return the size of a drift of which nobody knows how large it was [m], from a difference.
+    """Return the standard deviation of an unknown drift [m], estimated from a difference.
 
     difference: (m,) [m];  known: shapes of the other errors (k, m) [m]
     noise: independent standard deviation of each place (m,) [m]
     drifts: shapes for a size of one metre (l, m)
 
-    With ``difference ~ N(0, noise² + knownᵀ known + s² driftsᵀ drifts)`` some sizes s are likelier
-    than others, a priori each alike in its logarithm; two of the size returned hold 95.45 % of
-    what those make together. A drift of which the difference shows little may be larger than
-    the likeliest: where one number alone told its size, the factor would be Student's.
+    The posterior of the size s follows from ``difference ~ N(0, noise² + knownᵀ known + s² driftsᵀ
+    drifts)`` with a prior uniform in log s. Twice the result covers 95.45 % of the drift averaged
+    over that posterior, as a Student factor does for one observation.
     """
     some = np.linspace(0, len(difference) - 1, min(_NODES, len(difference))).astype(np.int64)
     shapes = known[:, some]
@@ -131,7 +125,7 @@ AT_ONCE, STATED, ESTIMATED, NOT_KNOWN = (
 
 
 class ErrorFields(Protocol):
-    """What systematic errors do to points, as a scan's ``ScanFields`` has it."""
+    """Effects of systematic errors on points, as ``ScanFields`` provides them."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -140,7 +134,7 @@ class ErrorFields(Protocol):
 
     @property
     def aligned(self) -> tuple[str, ...]:
-        """Names of those whose fields are the same errors in every scan of one calibration."""
+        """Names of sources with the same error in every scan of one calibration."""
         ...
 
     def at(self, first: int, count: int) -> FloatArray:
@@ -150,16 +144,15 @@ class ErrorFields(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ComparedMeasurement:
-    """Points and what is known of their errors beside the scatter that they show themselves.
+    """Points of a measurement and their systematic errors.
 
-    name: in messages
-    fields: what its systematic errors do to its points; None: not known
-    common: standard uncertainty of what neighbouring heights share where there are no ``fields``
-        [m]; None: that of the points
-    drift: standard deviation of the drift at the end of the scan [m]; None: nobody states it,
-        unless one of the fields is a drift
-    calibration: what the points were corrected by; empty: not known
-    pose: what the pose that was taken off may be wrong by; None: none was
+    name: for messages;  fields: effects of systematic errors on the points; None: unknown
+    common: standard uncertainty that neighbouring heights have in common, without ``fields`` [m];
+        None: that of the points
+    drift: standard deviation of the drift at the end of the scan [m]; None: not stated, unless one
+        of the fields is a drift
+    calibration: id of the calibration that corrected the points; empty: unknown
+    pose: effects of errors of the pose that was removed; None: no pose was removed
     """
 
     name: str
@@ -172,7 +165,7 @@ class ComparedMeasurement:
 
     @property
     def drift_from(self) -> str:
-        """Who knows the size of its drift."""
+        """Origin of the size of the drift."""
         if self.points.sample is None:
             return AT_ONCE
         in_fields = self.fields is not None and any(n.startswith(DRIFT) for n in self.fields.names)
@@ -180,7 +173,7 @@ class ComparedMeasurement:
 
     @property
     def duration(self) -> float:
-        """Samples from the first point to the last."""
+        """Number of samples from the first point to the last."""
         return 1.0 if self.points.sample is None else max(float(np.ptp(self.points.sample)), 1.0)
 
 
@@ -188,8 +181,8 @@ class ComparedMeasurement:
 class ComparisonSide:
     """One measurement in a comparison.
 
-    surface: between its points;  taken: its heights at the places;  x, y: those in its own frame
-    interpolation: rms error between the points, from above [m]
+    surface: between its points;  taken: heights at the places;  x, y: places in its own frame [m]
+    interpolation: upper bound of the rms interpolation error [m]
     """
 
     measurement: ComparedMeasurement
@@ -203,7 +196,7 @@ class ComparisonSide:
 def errors_of(
     halves: tuple[ComparisonSide, ComparisonSide], matched: Matched, length: float
 ) -> tuple[tuple[MeasurementErrors | None, MeasurementErrors | None], tuple[str, ...]]:
-    """Return the errors of both, None for one of which nobody states any, and what they share."""
+    """Return the errors of both, None where they are unknown, and the sources in common."""
     one, other = (_known(half, matched, length) for half in halves)
     if one is None or other is None:
         return (one, other), ()
@@ -220,7 +213,7 @@ def _shared(
     halves: tuple[ComparisonSide, ComparisonSide],
     errors: tuple[MeasurementErrors, MeasurementErrors],
 ) -> tuple[str, ...]:
-    """Return sources of one and the same error in both: those of the calibration that both used."""
+    """Return the sources of a common error: those of a calibration that both used."""
     ids = {half.measurement.calibration for half in halves}
     if len(ids) > 1 or not all(ids):
         return ()
@@ -247,7 +240,7 @@ def _known(half: ComparisonSide, matched: Matched, length: float) -> Measurement
 
 
 def _shapes(half: ComparisonSide, matched: Matched, length: float) -> dict[str, FloatArray] | None:
-    """Return the shapes by source, each (k, m) [m]; None if nobody states any."""
+    """Return the shapes by source, each (k, m) [m], None if they are unknown."""
     m = half.measurement
     pose = {} if m.pose is None else _carried(half, m.pose)
     if m.fields is not None:
@@ -259,7 +252,7 @@ def _shapes(half: ComparisonSide, matched: Matched, length: float) -> dict[str, 
 
 
 def _carried(half: ComparisonSide, fields: ErrorFields) -> dict[str, FloatArray]:
-    """Return the fields of the points as shapes at the places, by source, each (k, m) [m]."""
+    """Return the ``fields`` interpolated to the places, by source, each (k, m) [m]."""
     if not fields.names:
         return {}
     rows = half.surface.carried(fields.at, half.x, half.y)
@@ -275,7 +268,7 @@ def _drifts(
     known: tuple[MeasurementErrors, MeasurementErrors],
     shared: tuple[str, ...],
 ) -> list[dict[str, FloatArray]]:
-    """Return shapes of both drifts; one that nobody states is estimated from the difference."""
+    """Return the shapes of both drifts, estimated from the difference where not stated."""
     found: list[dict[str, FloatArray]] = [{}, {}]
     longest = max(half.measurement.duration for half in halves)
     unit: dict[int, FloatArray] = {}

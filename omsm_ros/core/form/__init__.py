@@ -1,1 +1,1 @@
-"""What shape does the part have? Figures of a registered deviation, each with its uncertainty."""
+"""Figures of a registered deviation, each with its uncertainty; the offsets of the next cut."""

@@ -1,4 +1,4 @@
-"""From scattered points and a nominal surface to the form of the part."""
+"""Analyse the form of a part: from scattered points and a nominal surface to figures."""
 
 from __future__ import annotations
 
@@ -53,22 +53,18 @@ from omsm_ros.core.surface.zernike_terms import (
 )
 from omsm_ros.errors import DataError
 
-# Where on the part do its terms lie, if points tell badly how it was turned or shifted?
-#
-# A sphere may be moved along itself, and its form goes along: terms in the frame that was found are
-# those of the part in its own only as far as such a move changes them. The same holds for a part
-# whose pose is known to tenths of a millimetre.
-
-# Polynomials less one order, moved by millimetres: a hundred points for each term tell them.
+ZERNIKES = first_terms(37, "fringe")
+# Points with all their effects take 50 MB. Extremes and counts are of all points.
+MOST_WEIGHED = 2**19
+# A hundred points for each Zernike term.
 _MOST_POINTS = 4_000
 
 
 def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
-    """Return the fit with what the open place of the part may do to its terms.
+    """Return the fit with the effect of lateral pose errors on its terms.
 
-    Of each freedom that no points determine, and of each error of the pose beside what that does
-    to the deviations. In the first order: the slope of the smooth form times how far its places
-    would move.
+    A lateral shift of the part moves the form: its effect is the slope of the smooth form times
+    the shift, for each undetermined degree of freedom and each pose error.
     """
     few = map_.every(_MOST_POINTS)
     slopes = (
@@ -89,17 +85,13 @@ def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registrati
     return replace(fit, effects=effects)
 
 
-# The terms of ISO 10110-5 for the form of an optic, from its deviation along the normal.
-
-
 def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainValue]:
-    """Return sagitta deviation (A), irregularity (B), its symmetric part (C), and rms, each [m].
+    """Return the terms of ISO 10110-5 for deviations along the normal of the surface, each [m].
 
-    A is the extent over the disc of the power that fits best beside piston and tilts alone; B the
-    extent of what is left without them, over 99.5 % of the area; C that of the part of it that is
-    the same all around. RMSt is the rms without piston and tilts, RMSi without power too, and RMSa
-    that of what is not the same all around. Deviations of the surface, not of a wave that is
-    reflected by it.
+    A (sagitta deviation) is the peak to valley of the power fitted together with piston and
+    tilts; B (irregularity) the extent of the rest over 99.5 % of the area; C the extent of its
+    rotationally symmetric part. RMSt is the rms without piston and tilts, RMSi also without power,
+    and RMSa the rms of the asymmetric rest.
     """
     irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
     return {
@@ -113,10 +105,7 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
 
 
 def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the part of the irregularity that is the same all around.
-
-    It has no noise of single points: what they do to its few terms is in its effects.
-    """
+    """Return the rotationally symmetric part of the irregularity, with noise among its effects."""
     of_noise = replace(
         map_, effects=np.concatenate([map_.effects, _noise_effects(map_, disc)]), noise=0.0
     )
@@ -129,7 +118,7 @@ def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
 
 
 def _noise_effects(map_: DeviationMap, disc: Aperture) -> FloatArray:
-    """Return independent effects (k, n) [m] of the noise of points on the symmetric terms."""
+    """Return the independent effects (k, n) [m] of noise on the symmetric terms."""
     columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
     weighted = columns * map_.area
     solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
@@ -139,11 +128,10 @@ def _noise_effects(map_: DeviationMap, disc: Aperture) -> FloatArray:
 
 
 def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
-    """Return twice the power that fits best beside piston and tilts, over the area.
+    """Return twice the power fitted together with piston and tilts, over the area.
 
-    On a whole disc that is the term of the fit. On a strip or a ring the terms of a fit share what
-    a sphere alone would take, and are extrapolated to where nobody measured. What the fit leaves
-    has no power, so that a sum of its terms is the power with all that is uncertain of it.
+    On a whole disc that is the term of the fit. On a strip or a ring several terms of the fit
+    share the power, and the residual of the fit has none: the sum of their shares is the power.
     """
     if ZernikeIndex(2, 0) not in fit.terms:
         return UncertainValue(None, None)
@@ -157,25 +145,20 @@ def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
         gram += chosen @ columns[places].T
     shares = np.linalg.solve(gram, right)[POWER.index(ZernikeIndex(2, 0))]
     variance = shares @ fit.covariance @ shares + np.sum(np.square(shares @ fit.effects))
-    # Of heights that are metres off, rounding is all that is left of it.
+    # For heights that are metres off, the variance is rounding and may be negative.
     uncertainty = float(2 * np.sqrt(variance)) if variance >= 0 else None
     return UncertainValue(float(2 * np.abs(shares @ fit.coefficients)), uncertainty)
 
 
-ZERNIKES = first_terms(37, "fringe")
-# Twelve numbers each make 50 MB. Extremes and counts are of all points.
-MOST_WEIGHED = 2**19
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FormResult:
-    """The form of a part.
+    """Form of a part.
 
-    registration: how it sits;  aperture: the disc of the part on which it is judged
-    map: its deviations, of all points or of half a million and more, evenly chosen
-    deviation: figures by their name;  zernike: terms of the deviation, one at the rim
+    registration: pose;  aperture: the disc of the part that is evaluated
+    map: deviations of all points, or of an even selection of half a million
+    deviation: figures by name;  zernike: terms of the deviation, one at the rim
     bands: wavelengths of the filters;  profiles, density: curves of the map
-    counts: of the points, by what became of them; they add up to "read"
+    counts: of the points by outcome; they add up to "read"
     """
 
     registration: Registration
@@ -200,16 +183,15 @@ def analyse_form(
     even: bool = False,
     filters: tuple[float | None, float | None] = (None, None),
 ) -> FormResult:
-    """Register the points and judge what they deviate by.
+    """Register the points and evaluate their deviations.
 
-    portions: reads the points, see :class:`omsm_ros.core.registration.placement.PointBatch`
-    asked: freedoms of the fit, or "auto";  sources: names of the systematic ones
-    bounds: of these, the ones of which only an upper bound is known
+    portions: reads the points;  asked: degrees of freedom of the fit, or "auto"
+    sources: names of the systematic errors;  bounds: those of which only an upper bound is known
     aperture: of the part; None: the disc about the part's origin that holds all points
-    even: the points are those of an evenly spaced grid, each of the same area
-    filters: wavelengths of the S- and the L-filter [m], None for what the points allow
+    even: the points form an evenly spaced grid
+    filters: wavelengths of the S- and the L-filter [m], None for the defaults
 
-    Raises DataError for points that are too few, do not fit, or do not determine a freedom.
+    Raises DataError for points that are too few, do not fit, or do not determine the pose.
     """
     found = register(surface, portions, asked, sources=sources, aperture=aperture, even=even)
     gathered = _Gathered(surface, found, aperture)
@@ -217,7 +199,7 @@ def analyse_form(
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
     bounded = [n for n, name in enumerate(sources) if name in bounds]
-    # What is held may be where it should: how far off it is at most is all that is known.
+    # Of a held degree of freedom only an upper bound of its offset is known.
     bounded += range(len(sources), found.moved.shape[1])
     map_ = gathered.map(found, even, bounded)
     points = (map_.x, map_.y, map_.deviation)
@@ -254,11 +236,10 @@ def _figures(
         "rms_best_fit": rms_of_part(fitted),
         "peak_to_valley_without_second_order": extents_of_part(rest, found.disc)[0],
         "rms_without_second_order": rms_of_part(rest),
-        # As measured: what errors have added is in them.
+        # These are as measured, with noise and systematic errors.
         "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
         "point_noise": UncertainValue(map_.noise, None),
-        # Before the fit the pose is part of the deviation, and its uncertainty is not asked for.
         "rms_before_fit": UncertainValue(found.before, None),
     }
 
@@ -273,7 +254,7 @@ def _textures(
 
 
 class _Gathered:
-    """The points in the part's frame, while they pass."""
+    """Collects the deviations of points that come in portions."""
 
     def __init__(self, surface: Surface, found: Registration, aperture: Aperture | None) -> None:
         self._surface, self._found, self._aperture = surface, found, aperture
@@ -285,7 +266,7 @@ class _Gathered:
         )
 
     def add(self, portion: PointBatch) -> None:
-        """Take in the next points."""
+        """Add points."""
         finite = np.isfinite(portion.x) & np.isfinite(portion.y) & np.isfinite(portion.height)
         at, found = self._found.placement, self._found
         whole = placed(self._surface, at, portion)
@@ -317,7 +298,6 @@ class _Gathered:
         self._least = min(self._least, float(points.deviation.min()))
         self._most = max(self._most, float(points.deviation.max()))
         self._noise.append(noise_of(points.deviation))
-        # What a source does to the heights, and what the pose that follows it takes away again.
         pose, along = self._found.effects(points, systematic)
         rows = [points.x, points.y, points.deviation, *pose, *along]
         self._kept.add(np.stack(rows, axis=1))
@@ -328,12 +308,12 @@ class _Gathered:
         return float(self._most - self._least)
 
     def map(self, found: Registration, even: bool, bounds: Sequence[int]) -> DeviationMap:
-        """Return the deviations gathered. Raises DataError if there are none.
+        """Return the collected deviations; raise DataError if there are none.
 
-        bounds: places of the sources of which only an upper bound is known
+        bounds: indices of the sources of which only an upper bound is known
         """
         if not self.counts["used"]:
-            raise DataError(f"no point can be used: {self.counts!r}; check aperture and surface")
+            raise DataError("form.no_usable_point", counts=self.counts)
         rows = np.ascontiguousarray(self._kept.rows().T)
         return DeviationMap(
             x=rows[0],
@@ -341,9 +321,8 @@ class _Gathered:
             deviation=rows[2],
             area=area_weights(rows[0], rows[1], even=even),
             effects=rows[3:],
-            # Points need not come in the order of a path; then their neighbours are elsewhere.
+            # Points may come in any order, where successive points are no neighbours.
             noise=min(float(np.median(self._noise)), neighbour_noise(*rows[:3]), found.noise),
-            # The sources' effects stand behind those of the pose.
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
             moves=found.moves,
             taken=found.taken,

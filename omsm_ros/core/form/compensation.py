@@ -1,8 +1,7 @@
-"""What should the next cut leave off, and where?
+"""Offsets of the next cut from the low-pass filtered deviation, as a grid and along a spiral.
 
-The deviation below a wavelength, turned about: where the part is too high along its normal by d,
-the tool shall go ``d √(1 + |∇z|²)`` deeper along z. What is finer than the low-pass is noise,
-texture, or faster than the axes, and stays.
+Where the part is too high by d along its normal the tool goes ``d √(1 + |∇z|²)`` deeper along z.
+Shorter wavelengths are noise, texture, or too fast for the axes, and are not compensated.
 """
 
 from __future__ import annotations
@@ -16,22 +15,31 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.readable import count, quantity
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M
 
-# Cells beside each other must see one and the same wave.
+# Cells in the shortest wavelength, so that neighbouring cells resolve it.
 _LEAST_CELLS = 4.0
+# Lines of a tool path that controllers accept.
+_MOST_LINES = 2_000_000
+# Offsets are written to a hundredth of a nanometre, below the resolution of any axis.
+_HEAD = (
+    "; offsets of Z for the next cut: add each to the Z of the tool path at the same X and C",
+    "; positive: the tool goes away from the part, so that less is cut",
+    "; X and Z in millimetres, C in degrees; part x = X cos C, part y = -X sin C",
+    "G21",
+    "G90",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
     """Offsets of the next cut on a grid of the part's x and y.
 
-    x, y: of the columns and rows [m];  offset: to be added to the height that is cut, along z [m],
-        (r, c), NaN where nothing was measured;  uncertainty: of each, k = 1 [m]
+    x, y: of the columns and rows [m]
+    offset: to add to the height that is cut, along z [m], (r, c), NaN where nothing was measured
+    uncertainty: of each offset, k = 1 [m]
     low_pass: wavelength of which half is compensated [m]
-    before, after: rms of the deviation now, and less what is compensated; of what the points show,
-        however fine, without their noise [m]
+    before, after: rms deviation without noise now, and with the offsets applied [m]
     """
 
     x: FloatArray
@@ -43,7 +51,7 @@ class Compensation:
     after: float
 
     def between(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the offsets [m] at x, y (n,) [m], linear between cells; NaN beside all of them."""
+        """Return the offsets [m] at x, y (n,) [m], linear between cells; NaN outside of them."""
         column, row = ((v - g[0]) / (g[1] - g[0]) for v, g in ((x, self.x), (y, self.y)))
         total, weight = np.zeros(len(x)), np.zeros(len(x))
         for right in (0, 1):
@@ -61,23 +69,18 @@ class Compensation:
 
 
 def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compensation:
-    """Return what the next cut has to add to its height.
+    """Return the offsets of the next cut.
 
-    Raises DataError for a wavelength that is finer than four cells of the measured points.
+    Raises DataError for a ``low_pass`` [m] below four cells of the points, or points in one row.
     """
     cells = GridCells.of(map_)
     if low_pass < _LEAST_CELLS * cells.pitch:
         raise DataError(
-            f"low-pass of {low_pass!r} m is finer than the points resolve, expected "
-            f"{_LEAST_CELLS * cells.pitch!r} m or more; measure more points, or compensate less"
+            "form.low_pass_too_short", low_pass=low_pass, least=_LEAST_CELLS * cells.pitch
         )
     if min(len(cells.x), len(cells.y)) < 2:
-        raise DataError(
-            f"the points lie within one row of cells of {cells.pitch!r} m, where nothing is known "
-            "across it; measure more tracks"
-        )
+        raise DataError("form.one_row", pitch=cells.pitch)
     smooth = cells.smoothed(np.concatenate([[cells.mean], cells.effects]), low_pass)
-    # Noise of the cells, averaged by the filter: its square by the square of the weights.
     averaged = np.sqrt(cells.smoothed_square(cells.noise**2, low_pass))
     spread = np.sqrt(averaged**2 + np.sum(smooth[1:] ** 2, axis=0))
     x, y = np.meshgrid(cells.x, cells.y)
@@ -98,36 +101,23 @@ def compensation(map_: DeviationMap, surface: Surface, low_pass: float) -> Compe
 
 
 def _along_z(surface: Surface, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return how far along z a unit along the normal is, at x, y, of their shape."""
+    """Return the length along z of a unit along the normal at x, y, of their shape."""
     slopes = np.asarray(gradient_of(surface, x, y), np.float64)
     return np.asarray(np.sqrt(1 + np.sum(slopes**2, axis=0)), np.float64)
 
 
 def _rms(map_: DeviationMap, deviation: FloatArray, there: BoolArray) -> float:
-    """Return the rms by area of the points that are ``there`` (n,), without their noise [m]."""
+    """Return the area-weighted rms of the points ``there`` (n,), without their noise [m]."""
     square = np.average(deviation[there] ** 2, weights=map_.area[there])
     return float(np.sqrt(max(float(square) - map_.noise**2, 0.0)))
 
 
-# The offsets of the next cut where the tool will pass: along a spiral, for axes X, C and Z.
-
-_MOST_LINES = 2_000_000
-# Offsets are written to a hundredth of a nanometre, below what any axis resolves.
-_HEAD = (
-    "; offsets of Z for the next cut: add each to the Z of the tool path at the same X and C",
-    "; positive: the tool goes away from the part, so that less is cut",
-    "; X and Z in millimetres, C in degrees; part x = X cos C, part y = -X sin C",
-    "G21",
-    "G90",
-)
-
-
 @dataclass(frozen=True, eq=False)
 class ToolPath:
-    """Offsets on the way of the tool from the rim to the centre, each (n,).
+    """Offsets along the spiral of the tool from the rim to the centre, each (n,).
 
-    radius: X [m];  angle: C [rad], growing;  offset: to be added to Z [m]
-    left_out: places of the spiral where nothing was measured
+    radius: X [m];  angle: C [rad], growing;  offset: to add to Z [m]
+    left_out: number of places without a measurement
     """
 
     radius: FloatArray
@@ -137,23 +127,23 @@ class ToolPath:
 
 
 def spiral_offsets(found: Compensation, feed: float, per_turn: int) -> ToolPath:
-    """Return the offsets along a spiral of ``feed`` [m] a turn, at ``per_turn`` places of each.
+    """Return the offsets along a spiral of ``feed`` [m] a turn, at ``per_turn`` places of a turn.
 
-    At C the part's point under the tool at X is x = X cos C, y = −X sin C, as everywhere here.
-    Raises ConfigurationError for more places than a controller takes, or less than a turn.
+    The tool at X and C is above x = X cos C, y = −X sin C of the part. Raises ConfigurationError
+    for more places than a controller accepts, or less than a turn.
     """
     known_row, known_column = np.nonzero(np.isfinite(found.offset))
     rim = float(np.max(np.hypot(found.x[known_column], found.y[known_row])))
     if feed > rim:
-        raise ConfigurationError(
-            f"spiral of {quantity(feed, 'm')} a turn from a rim of {quantity(rim, 'm')} makes not "
-            "one turn; take a narrower feed"
-        )
+        raise ConfigurationError("form.spiral_below_one_turn", feed=feed, rim=rim)
     places = rim / feed * per_turn
     if places > _MOST_LINES:
         raise ConfigurationError(
-            f"spiral of {quantity(feed, 'm')} a turn with {per_turn} places of each makes "
-            f"{count(round(places))} lines, at most {count(_MOST_LINES)}; take a wider feed"
+            "form.spiral_too_long",
+            feed=feed,
+            per_turn=per_turn,
+            lines=round(places),
+            most=_MOST_LINES,
         )
     turned = np.arange(int(places) + 1) / per_turn
     radius, angle = rim - feed * turned, 2 * np.pi * turned
@@ -163,7 +153,7 @@ def spiral_offsets(found: Compensation, feed: float, per_turn: int) -> ToolPath:
 
 
 def path_gcode(path: ToolPath) -> str:
-    """Return the offsets as lines ``X C Z``: a table for the controller or the CAM, no motion."""
+    """Return the offsets as lines ``X C Z``, a table for the controller or the CAM."""
     rows = zip(
         path.radius / MILLIMETRE_M, path.angle / DEGREE_RAD, path.offset / MILLIMETRE_M, strict=True
     )

@@ -1,4 +1,9 @@
-"""Figures of a deviation map as it was measured, and the noise in it."""
+"""Deviation map of a part, its means on cells with Gaussian filters, and conformity.
+
+The mean of a cell is the deviation under a square window; cells without a point stay missing. The
+filters of ISO 16610 divide by the weight of the cells present (ISO 16610-28, weighted regression
+of order zero), so that edges are not drawn to zero.
+"""
 
 from __future__ import annotations
 
@@ -19,23 +24,22 @@ class UncertainValue:
     uncertainty: float | None
 
     def entry(self) -> dict[str, float | None]:
-        """Return what a result file says of it."""
+        """Return the JSON values for result files."""
         return {"value": self.value, "uncertainty": self.uncertainty}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeviationMap:
-    """Deviations of a registered part, in the order in which they were measured.
+    """Deviations of a registered part, in the order of measurement.
 
     x, y: in the part's frame [m], (n,);  deviation: along the normal [m], (n,)
-    area: which each point stands for, of mean one (n,)
-    effects: what each independent source of error, off by its standard uncertainty, does to the
-        deviations (e, n) [m]
-    bounds: which of the effects are upper bounds of errors that may not be there at all
-    moves: which of them are of a part that sits elsewhere, in the first order
-    taken: the first t effects are of form that the fit may have taken for a move: it is missing
-        from the deviations, not added to them. Mean products of how much of each is likely to be
-        missing (t, t), at most one
+    area: that each point stands for, of mean one (n,)
+    effects: of one standard uncertainty of each independent error source on the deviations
+        (e, n) [m]
+    bounds: indices of effects that are upper bounds of errors that may be absent
+    moves: indices of effects that are moves of the part, to first order
+    taken: the first t effects are form that the fit may have taken for a move, so that it is
+        missing from the deviations; mean products of their probable shares (t, t), at most one
     noise: standard deviation of one point [m]
     """
 
@@ -66,14 +70,14 @@ class DeviationMap:
 
 
 def root_mean_square(map_: DeviationMap) -> float:
-    """Return the area-weighted rms of the deviations about zero, noise and all [m]."""
+    """Return the area-weighted rms of the deviations about zero, noise included [m]."""
     return float(np.sqrt(np.average(map_.deviation**2, weights=map_.area)))
 
 
 def weighted_quantiles(
     values: FloatArray, weights: FloatArray, shares: tuple[float, ...]
 ) -> tuple[float, ...]:
-    """Return the values below which these shares of the weight lie."""
+    """Return the values below which these ``shares`` of the weight lie."""
     order = np.argsort(values)
     below = np.cumsum(weights[order]) - weights[order] / 2
     found = np.interp(np.array(shares) * weights.sum(), below, values[order])
@@ -81,35 +85,29 @@ def weighted_quantiles(
 
 
 def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
-    """Return the same of points (n,) in any order: from each to those beside it in strips of y."""
+    """Return the noise of points (n,) in any order, from neighbours in strips of y."""
     span_x, span_y = float(np.ptp(x)), float(np.ptp(y))
     spacing = np.sqrt(span_x * span_y / max(len(x), 1))
     strip = np.floor((y - y.min()) / (2 * spacing)) if spacing > 0 else np.zeros(len(y))
     return noise_of(deviation[np.lexsort((x, strip))])
 
 
-# Means of a map on square cells, and the Gaussian filters of ISO 16610 on them.
-#
-# The mean of a cell is the deviation under a window of one cell; cells without a point are missing,
-# and stay so. Filters divide by the weight of the cells that are there (ISO 16610-28, weighted
-# regression of order zero), so that an edge is not dragged to zero.
-
-# Eight points leave a third of their noise in a cell (1/√8).
+# The mean of eight points has a third of their noise (1/√8).
 _MOST_ACROSS, _POINTS_PER_CELL = 256, 8.0
 # A profile has one row; its cells are as fine as its points.
 _MOST_ALONG = 1024
-# Of the weighting function exp(−π (x / α λ)²): half of a sine of wavelength λ passes.
+# Constant of the weighting function exp(−π (x / α λ)²), which halves a sine of wavelength λ.
 _ALPHA = float(np.sqrt(np.log(2) / np.pi))
 
 
 @dataclass(frozen=True, eq=False)
 class GridCells:
-    """Means on cells, rows along y.
+    """Means on square cells, rows along y.
 
     x, y: middles of the columns (c,) and rows (r,) [m];  pitch: of the cells [m]
     present: cells that have points (r, c)
-    mean: of the deviations (r, c) [m], zero where there are none;  noise: of each mean (r, c) [m]
-    effects: the same means of what each source of error does (e, r, c) [m]
+    mean: of the deviations (r, c) [m], zero in empty cells;  noise: of each mean (r, c) [m]
+    effects: means of the effects of each error source (e, r, c) [m]
     """
 
     x: FloatArray
@@ -124,12 +122,12 @@ class GridCells:
     def of(cls, map_: DeviationMap) -> GridCells:
         """Return the means of a map on cells as fine as its points allow, at most 256 across."""
         spans = float(np.ptp(map_.x)), float(np.ptp(map_.y))
-        # Of a strip fewer are needed across; eight points a cell where the area is filled.
+        # The area of a strip is at least 1e-6 of a square's, to keep the cells finite.
         side = np.sqrt(max(spans[0] * spans[1], 1e-6 * max(spans) ** 2) / len(map_))
         pitch = max(float(side * np.sqrt(_POINTS_PER_CELL)), max(spans) / _MOST_ACROSS)
         if min(spans) == 0:
             pitch = max(spans) / min(max(len(map_) - 1, 1), _MOST_ALONG) or 1.0
-        # What lies on an edge but for rounding lies beyond it.
+        # A point within rounding of an edge belongs to the next cell.
         column, row = (
             ((values - values.min()) / pitch + 1e-9).astype(np.int64) for values in (map_.x, map_.y)
         )
@@ -159,7 +157,7 @@ class GridCells:
         )
 
     def smoothed(self, images: FloatArray, cutoff: float) -> FloatArray:
-        """Return images (…, r, c) under the Gaussian of ``cutoff`` wavelength [m] (16610-61)."""
+        """Return images (…, r, c) after a Gaussian low-pass of ``cutoff`` [m] (ISO 16610-61)."""
         rows, columns = (gaussian_weights(size, cutoff / self.pitch) for size in self.present.shape)
         weight = rows @ self.present @ columns
         made = rows @ (images * self.present) @ columns
@@ -174,15 +172,10 @@ class GridCells:
 
 
 def gaussian_weights(size: int, cutoff: float) -> FloatArray:
-    """Return the weights (size, size) of each cell for each other; ``cutoff`` in cells."""
+    """Return the weight of each cell for each other (size, size); ``cutoff`` in cells."""
     apart = np.subtract.outer(np.arange(size), np.arange(size)) / (_ALPHA * cutoff)
     return np.asarray(np.exp(-np.pi * apart**2))
 
-
-# Does the part hold its tolerance? (ISO 14253-1)
-#
-# What is measured holds a tolerance for certain only if it does so with its expanded uncertainty
-# added, and fails it for certain only with that taken off; between the two nobody can tell.
 
 HOLDS, FAILS, OPEN = "holds", "fails", "cannot tell"
 COVERAGE_FACTOR = 2.0
@@ -190,9 +183,10 @@ COVERAGE_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class Conformity:
-    """verdict: HOLDS, FAILS or OPEN;  value, expanded (k = 2), tolerance: [m]
+    """Conformity with a tolerance by the decision rule of ISO 14253-1.
 
-    expanded: None if the uncertainty was not evaluated
+    verdict: HOLDS, FAILS or OPEN;  value, tolerance: [m]
+    expanded: uncertainty (k = 2) [m], None if it was not evaluated
     """
 
     verdict: str
@@ -206,7 +200,11 @@ class Conformity:
 
 
 def conformity(figure: UncertainValue, tolerance: float) -> Conformity | None:
-    """Return whether ``figure`` is at most ``tolerance`` [m]; None for a figure without a value."""
+    """Return whether ``figure`` is at most ``tolerance`` [m], None for a figure without a value.
+
+    It holds if it does with the expanded uncertainty added, and fails if it does with that
+    subtracted; in between the uncertainty leaves it open.
+    """
     if figure.value is None:
         return None
     if figure.uncertainty is None:

@@ -1,24 +1,19 @@
-"""How large are the figures of the *part*, without what noise and systematic errors added to them?
+"""Estimate peak to valley and rms of a part, free of the bias by noise and systematic errors.
 
-A peak to valley or an rms is never made smaller by errors on the whole: that of noise alone is not
-zero. What errors of the same size would add once more is known, by drawing them, and squares of
-such figures add: for an rms that is exact, for an extent it is so where either errors or form are
-all there is. So with F of the deviations and F' of the deviations with errors drawn anew
+Errors increase a peak to valley or an rms on average. Drawing errors of the same size once more
+shows by how much, because squares of such figures add: exactly for an rms, and for an extent where
+either errors or form dominate. With F of the deviations and F' with errors drawn anew
 
     F² of the part = 2 F² − mean F'²
 
-(simulation and extrapolation; J. Cook, L. Stefanski, J. Am. Stat. Assoc. 89, 1314). Noise from
-point to point is first averaged out by smooth terms and means of neighbours; of what they leave,
-the share that is no noise stays. Noise that is left counts as an error.
+(simulation and extrapolation; J. Cook, L. Stefanski, J. Am. Stat. Assoc. 89, 1314). Before, smooth
+terms, means of neighbours and a Wiener filter remove most of the noise; the rest counts as an
+error.
 
-What the fit of the pose may have taken away is no error that was added: form that looks like a move
-is missing from the deviations. Their form and it are independent of each other (the estimate and
-its error, in a fit that knows how large form is), so that its mean square is added, as far as it
-is likely; that there may be more is uncertainty of the figure.
-
-An upper bound is no error that is there: how large an open latency is, nobody knows. It is not
-subtracted. By how much an error of its size would change the square, as mean square about none, is
-uncertainty of the figure.
+Form that the fit of the pose may have taken for a move is missing from the deviations. It is
+independent of the form that is left, so its probable mean square is added; its uncertainty belongs
+to the figure. Upper bounds of errors, as of an unknown latency, are not subtracted; the change of
+the square by an error of that size belongs to the uncertainty.
 """
 
 from __future__ import annotations
@@ -39,22 +34,34 @@ from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
-# Means of scattered values around each of their points, over the width that takes most noise.
-#
-# The Gaussian of ISO 16610 on a fine grid, between whose nodes points lie linearly. Kernels that
-# take less of short waves make more of what is at the rim, where parts are highest.
-
 _MOST_ACROSS = 256
-# Cutoffs in steps of the grid, each half a step of an octave wider than the one before.
+# Cutoffs in steps of the grid, half an octave apart.
 _CUTOFFS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 _SEED_LOCAL_MEANS = 11
 
+# 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).
+ROBUST = (0.0025, 0.9975)
+# Orders of the smooth terms; the highest with forty points for each term is used.
+_ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
+# Two hundred points for each of the 91 terms up to order 12; two thousand show the extent of a
+# smooth form.
+_MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
+# 200 draws give a standard deviation to 5 %.
+_DRAWS, _SEED = 200, 7
+# Draws of the noise, which give its mean effect to a sixth of its standard deviation.
+_NOISES = 40
+# Piston, both tilts and power; the terms that ISO 25178-2 removes as form; the rotationally
+# symmetric terms up to order 12.
+POWER = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1), ZernikeIndex(2, 0))
+_FORM = terms_up_to(4)
+SYMMETRIC = tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
+
 
 class ChosenMeans(NamedTuple):
-    """The width whose means come closest to what is there without noise.
+    """Local means of the width with the least expected error.
 
-    means: of its values (n,);  rest: share of the noise of a point in what they leave of it
-    error: expected mean square of ``means`` from that without noise
+    rest: share of the noise of a point that remains in its difference from the mean
+    error: expected mean square difference of the means from the values without noise
     """
 
     means: LocalMeans
@@ -64,7 +71,7 @@ class ChosenMeans(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LocalMeans:
-    """Means around n points. Linear: those of a sum are the sum of those.
+    """Linear operator: Gaussian means (ISO 16610) around n scattered points, on a fine grid.
 
     nodes, weights: of the four nodes of the grid around each point (4, n)
     along_y, along_x: weights of the Gaussian (r, r), (c, c);  total: of the points at each node
@@ -78,7 +85,7 @@ class LocalMeans:
 
     @classmethod
     def of(cls, x: FloatArray, y: FloatArray, cutoff: float) -> LocalMeans:
-        """Return those at x, y (n,) [m], of a ``cutoff`` in steps of about a point each."""
+        """Return the means at x, y (n,) [m] of a ``cutoff`` in steps of the grid."""
         spans = float(np.ptp(x)), float(np.ptp(y))
         longest = max(spans) or 1.0
         step = max(float(np.sqrt(spans[0] * spans[1] / len(x))), longest / _MOST_ACROSS)
@@ -113,10 +120,9 @@ class LocalMeans:
 
 
 def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float) -> ChosenMeans:
-    """Return the means whose expected error is least for ``values`` at x, y, each (n,).
+    """Return the means with the least expected error for ``values`` at x, y, each (n,).
 
-    The error is told by the values themselves (C. Stein's unbiased estimate), with the trace from
-    one draw of signs.
+    Stein's unbiased risk estimate, with the trace of the operator from one draw of signs.
     """
     signs = np.random.default_rng(_SEED_LOCAL_MEANS).choice([-1.0, 1.0], size=len(x))
     found = []
@@ -129,24 +135,8 @@ def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float
     return min(found, key=lambda each: each.error)
 
 
-# 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).
-ROBUST = (0.0025, 0.9975)
-# Smooth terms of these orders, the most for which there are forty points each.
-_ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
-# Two hundred for each of the 91 terms up to order 12. Drawn are extents, which two thousand points
-# of a smooth form show.
-_MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
-# 200 draws know a standard deviation to 5 %.
-_DRAWS, _SEED = 200, 7
-# Of the noise of the points: its mean effect is known to a sixth of its spread.
-_NOISES = 40
-
-
 def rms_of_part(map_: DeviationMap) -> UncertainValue:
-    """Return the area-weighted rms about zero that the part has, by closed form.
-
-    The mean square of deviations s + e is that of s, of e, and twice their mean product.
-    """
+    """Return the area-weighted rms of the part about zero, in closed form."""
     share = map_.area / map_.area.sum()
     weighted = map_.effects * share
     products = weighted @ map_.effects.T
@@ -158,8 +148,8 @@ def rms_of_part(map_: DeviationMap) -> UncertainValue:
     square = float(share @ map_.deviation**2 - np.trace(among_real) - noise) + missing
     of_form = 4 * max(float(np.sum(shared[real] ** 2)) - float(np.sum(among_real**2)), 0.0)
     of_form += 4 * float(np.sum(shared[taken] ** 2)) + (float(np.sum(own[taken])) - missing) ** 2
-    # With e = Σ a_i f_i that may be there, 2 d·e − e·e has the mean square 4 Σ (d·f_i)² + tr² P +
-    # 2 tr P², P the products of the f_i.
+    # For e = Σ a_i f_i, the mean square of 2 d·e − e·e is 4 Σ (d·f_i)² + tr² P + 2 tr P², with P
+    # the products of the f_i.
     bounded = float(np.sum(own[map_.bounds]))
     of_bounds = 4 * float(np.sum(shared[map_.bounds] ** 2)) + bounded**2
     of_errors = of_form + of_bounds + 2 * float(np.sum(products**2))
@@ -170,7 +160,7 @@ def rms_of_part(map_: DeviationMap) -> UncertainValue:
 def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue, UncertainValue]:
     """Return the peak to valley of the part, and the extent of 99.5 % of its area.
 
-    disc: on which the smooth terms are
+    disc: of the smooth terms
     """
     few = map_.every(_MOST_FITTED)
     noises = few.noise * np.random.default_rng(_SEED + 1).normal(size=(_NOISES, len(few)))
@@ -194,10 +184,10 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue,
         again, more, likely, full, noisy = (extent(drawn, area) ** 2 for drawn in ways)
         square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
         of_taken = _rms(full - np.mean(likely))
-        # Where many points compete for an extreme, the mean of draws follows the figure's own
-        # noise but in part, so that twice its square has once to twice of it: √2.
+        # Where many points compete for an extreme, the mean of the draws follows the noise of the
+        # figure in part, so that it counts once to twice: the factor is √2.
         of_errors = _length(float(np.std(again)), float(np.std(noisy)))
-        # Of the two points that an extent is between.
+        # An extent has two ends, each blurred independently.
         of_blur = 2 * of_some * float(np.sqrt(2)) * blurred
         spread = _length(of_errors, _rms(more - again), of_taken, of_blur)
         figure = _of_square(square, spread)
@@ -208,7 +198,7 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue,
 def _smooth(map_: DeviationMap, disc: Aperture, noises: FloatArray) -> ZernikeFit:
     """Return smooth terms of the deviations, of as high an order as the points allow.
 
-    noises: draws of it (d, n) [m], whose terms are its effects
+    noises: draws of the noise (d, n) [m], fitted as the effects
     """
     orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)]
     terms = terms_up_to(orders[0] if orders else 0)
@@ -219,13 +209,11 @@ def _smooth(map_: DeviationMap, disc: Aperture, noises: FloatArray) -> ZernikeFi
 def _without_noise(
     map_: DeviationMap, fit: ZernikeFit, noises: FloatArray
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return the deviations with as little noise as can be (n,), and what is left of it (d, n).
+    """Return the denoised deviations (n,), the remaining noise (d, n), and the lost form, rms [m].
 
-    And how much form is lost with it, rms.
-
-    Smooth terms; of what they leave, means around each point, where these come closer to it than
-    single points; of what those leave, the share that is no noise (Wiener). ``noises`` are draws
-    (d, n) that go the same way; what the terms follow of them is in the covariance of the terms.
+    The residual of the smooth terms is replaced by local means where these have the smaller
+    expected error; a Wiener filter takes the rest. ``noises`` are draws (d, n) filtered alike; the
+    part that the terms follow is in their covariance.
     """
     terms = zernike_values(*fit.disc.scaled(map_.x, map_.y), fit.terms)
     smooth = fit.coefficients @ terms
@@ -241,10 +229,7 @@ def _without_noise(
 
 
 def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
-    """Return which share of ``values`` (n,) comes closest to them without their ``noise``.
-
-    And what it lacks of them then, rms.
-    """
+    """Return the Wiener factor for ``values`` (n,) with ``noise``, and the form lost by it, rms."""
     variance = float(np.mean(values**2))
     share = max(1 - noise**2 / variance, 0.0) if variance > 0 else 0.0
     return share, (1 - share) * float(np.sqrt(max(variance - noise**2, 0.0)))
@@ -253,10 +238,10 @@ def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
 def _drawn(
     map_: DeviationMap, fit: ZernikeFit, base: FloatArray, left: FloatArray, chosen: slice
 ) -> tuple[FloatArray, ...]:
-    """Return some of the deviations with errors drawn anew (m, draws).
+    """Return the ``chosen`` deviations with five kinds of errors drawn anew, each (m, draws).
 
-    The second has besides what may be there of the upper bounds. The others have, instead of
-    errors, what the fit is likely to have taken away, what it may have, and the noise left alone.
+    All errors that are present; these and the upper bounds; the form that the fit has probably
+    taken; the form that it may have taken at most; the remaining noise alone.
 
     base: without errors (n,);  left: draws of the noise that is left in it (d, n)
     """
@@ -281,7 +266,7 @@ def _root(products: FloatArray) -> FloatArray:
 
 
 def _real(map_: DeviationMap) -> BoolArray:
-    """Return which effects (e,) are of errors that are there, whatever their sign."""
+    """Return which effects (e,) are of errors that are certainly present."""
     real = np.ones(len(map_.effects), np.bool_)
     real[map_.bounds] = False
     real[: len(map_.taken)] = False
@@ -299,18 +284,17 @@ def _rms(values: FloatArray) -> float:
 def _variance_by_noise(map_: DeviationMap, share: FloatArray) -> float:
     """Return the variance of the mean square [m⁴] from the noise of the points.
 
-    4 d²σ² of a point from its form and 2 σ⁴ from its noise, and as much again for not knowing σ.
+    For each point 4 d²σ² from its form, 2 σ⁴ from its noise, and 2 σ⁴ from the uncertainty of σ.
     """
     noise = map_.noise**2
     return float(np.sum(share**2 * (4 * map_.deviation**2 * noise + 4 * noise**2)))
 
 
 def _of_square(square: float, spread: float) -> UncertainValue:
-    """Return the root of a ``square`` [m²] known to ``spread``, k = 1.
+    """Return the root of a ``square`` [m²] with its standard uncertainty ``spread`` [m²].
 
-    Its uncertainty is half of the larger side of the interval that k = 2 of the square is. Errors
-    that are not as they were drawn may take more from the square than there is: then that ends no
-    nearer to zero than the square is known, for no figure is known to be zero.
+    The uncertainty is half the larger side of the interval of the root for k = 2 of the square. A
+    square may be negative by chance; the interval then ends at the root of ``spread``.
     """
     value = float(np.sqrt(max(square, 0.0)))
     high = float(np.sqrt(max(square + 2 * spread, spread)))
@@ -318,21 +302,10 @@ def _of_square(square: float, spread: float) -> UncertainValue:
     return UncertainValue(value, max(high - value, value - low) / 2)
 
 
-# Maps without some of their terms: what bending, focus or turning would take away.
-#
-# Removal is linear, so that what an error does to the map goes the same way as the map.
-
-# Piston, both tilts and power; what a Gaussian of a quarter of the side takes for form; what a
-# turned part has all around, to order 12.
-POWER = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1), ZernikeIndex(2, 0))
-_FORM = terms_up_to(4)
-SYMMETRIC = tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
-
-
 def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
-    """Return the map without its area-weighted best sum of ``columns`` (k, n)."""
+    """Return the map without its area-weighted fit of ``columns`` (k, n), effects included."""
     weighted = columns * map_.area
-    # Of points on a line some columns are the same; then the least solution serves.
+    # For points on a line some columns coincide; the minimum-norm solution is used.
     solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
     values = np.concatenate([map_.deviation[np.newaxis], map_.effects])
     rest = values - (solve @ (weighted @ values.T)).T @ columns
@@ -340,10 +313,9 @@ def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
 
 
 def best_fit(map_: DeviationMap) -> DeviationMap:
-    """Return the map where the part sits as it fits best, in all that was fitted or held.
+    """Return the map after best-fit alignment in all fitted and held degrees of freedom.
 
-    What no move of the part explains: however it sat, so much deviates. Form that looks like a move
-    is not in it, and neither is what the pose leaves open.
+    It contains neither the uncertainty of the pose nor form that looks like a move.
     """
     moves = map_.effects[map_.moves]
     size = np.sqrt(np.mean(moves**2, axis=1))
@@ -369,13 +341,13 @@ def without_power(map_: DeviationMap, disc: Aperture) -> DeviationMap:
 def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map without Zernike terms up to order 4: the F-operation of ISO 25178-2.
 
-    A Gaussian filter would leave them along the rim, where its window is cut off.
+    A Gaussian filter would leave form at the rim, where its window is cut off.
     """
     return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), _FORM))
 
 
 def asymmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the map without power and without what is the same all around, up to order 12."""
+    """Return the map without power and without rotationally symmetric terms up to order 12."""
     return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER + SYMMETRIC))
 
 

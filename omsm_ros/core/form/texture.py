@@ -1,4 +1,11 @@
-"""Texture and slope of a map: ISO 25178-2 parameters, band-limited rms, ISO 10110-14 slopes."""
+"""Texture parameters (ISO 25178-2), slopes (ISO 10110-14), power spectral density and profiles.
+
+The areal density is ``S(f_x, f_y) = dx dy |FFT(w z)|² / Σ w²``, two-sided, in m⁴, with the window
+``w`` of the present cells: its sum over all frequencies times df_x df_y is the mean square of the
+map under that window (Parseval). The radial density is the content of each ring of width Δf over
+the area of the ring, so that ``Σ 2π f S(f) Δf`` is the mean square in the band of the rings; the
+azimuthal density is the mean square per radian of half a turn.
+"""
 
 from __future__ import annotations
 
@@ -13,19 +20,29 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
 from omsm_ros.errors import DataError
 
-# Any, but one: the same points have the same figures.
-_NOISE_SEED = 21
-# An S-filter below this many cells would pass what cells fold; beyond it half a sine passes.
+# Fixed seeds, so that the same points give the same figures.
+_NOISE_SEED, _DENSITY_NOISE_SEED = 21, 22
+# Least cutoff of the S-filter in cells; a shorter one would pass aliased wavelengths.
 _LEAST_CELLS = 3.0
-# Ends of the bands, as shares of the longest side: form, waviness, and what is finer.
+# Limits of the bands, as shares of the longest side.
 _BANDS = {"form": (np.inf, 1 / 4), "waviness": (1 / 4, 1 / 20), "finer": (1 / 20, 0.0)}
-# What is longer is form, by the bands above.
+# Default cutoff of the L-filter, the limit of form.
 _DEFAULT_L = 1 / 4
+# Sectors of five degrees; the other half of the turn is the same.
+_SECTORS = 36
+# Parts along each axis by which a cell of frequency is shared between two rings.
+_PARTS = 3
+# Half-width and spacing of line profiles over the radius.
+_HALF_WIDTH, _SPACING = 1 / 100, 1 / 100
+# The angular profile averages the outer third of the radius over two degrees.
+_OUTER, _DEGREES = 2 / 3, 2.0
+# Widths of rings over the radius; the narrowest that the turns of the scan fill to 80 % is used.
+_RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
 
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """Wavelengths [m] at which half passes: of the S- and the L-filter, and of the bands of rms."""
+    """Cutoff wavelengths [m] of the S- and the L-filter, and limits of the bands of rms."""
 
     s_filter: float
     l_filter: float
@@ -35,18 +52,15 @@ class Bands:
 def bands_of(
     cells: GridCells, s_filter: float | None = None, l_filter: float | None = None
 ) -> Bands:
-    """Return the wavelengths asked for, or else three cells, and a quarter of the longest side.
+    """Return the cutoffs asked for; by default three cells and a quarter of the longest side.
 
-    Raises DataError where the two leave nothing between them.
+    Raises DataError for an L-filter that is not longer than the S-filter.
     """
     across = max(cells.present.shape) * cells.pitch
     shortest = max(s_filter or 0.0, _LEAST_CELLS * cells.pitch)
     longest = l_filter or _DEFAULT_L * across
     if l_filter is not None and longest <= shortest:
-        raise DataError(
-            f"L-filter of {longest!r} m leaves nothing beside the S-filter of {shortest!r} m, as "
-            "the points allow it; give a longer --l-filter, or measure more points"
-        )
+        raise DataError("form.empty_filter_band", l_filter=longest, s_filter=shortest)
     ends = {
         name: (None if long == np.inf else long * across, max(short * across, shortest))
         for name, (long, short) in _BANDS.items()
@@ -57,14 +71,14 @@ def bands_of(
 
 @dataclass(frozen=True, eq=False)
 class _FilteredBand:
-    """One band of the cells: the map, the map under as much noise again, and what errors do."""
+    """One band of the cells: the map, the map with as much noise again, and the error effects."""
 
     values: FloatArray
     noisier: FloatArray
     effects: FloatArray
 
     def figure(self, of: Callable[[FloatArray], float]) -> UncertainValue:
-        """Return a figure of the values, its uncertainty from noise and from every effect."""
+        """Return a figure of the values with its uncertainty from noise and all effects."""
         value = of(self.values)
         noise = (of(self.noisier) - value) / (np.sqrt(2) - 1)
         shares = [(of(self.values + e) - of(self.values - e)) / 2 for e in self.effects]
@@ -74,7 +88,7 @@ class _FilteredBand:
 def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, UncertainValue]:
     """Return Sa, Sq, Sz [m], Ssk, Sku [1] of the S-L surface, rms by band [m], slopes [1].
 
-    formless: the same cells after the F-operation, of which the L-filter leaves the fine part
+    formless: the same cells after the F-operation
     """
     surface = _band(formless, bands.l_filter, bands.s_filter)
     found = {name: surface.figure(of) for name, of in _PARAMETERS.items()}
@@ -84,7 +98,7 @@ def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, Un
 
 
 def slopes_without_second_order(rest: GridCells, bands: Bands) -> dict[str, UncertainValue]:
-    """Return the rms slope [1] of cells whose second order was taken off."""
+    """Return the rms slope [1] of cells without their second order."""
     return {"slope_rms_without_second_order": _slope_figures(rest, bands)["slope_rms"]}
 
 
@@ -99,9 +113,9 @@ def _slope_figures(cells: GridCells, bands: Bands) -> dict[str, UncertainValue]:
 
 
 def _band(cells: GridCells, long: float | None, short: float, whole: bool = False) -> _FilteredBand:
-    """Return what has wavelengths from ``short`` to ``long``: present cells, or whole images.
+    """Return the wavelengths from ``short`` to ``long``, of present cells or as ``whole`` images.
 
-    The L-filter takes its share of what the S-filter left (ISO 25178-2), not of the cells.
+    The L-filter acts on the result of the S-filter (ISO 25178-2).
     """
     more = np.random.default_rng(_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
     images = np.concatenate([[cells.mean, more], cells.effects])
@@ -135,57 +149,41 @@ def _rms_about_zero(values: FloatArray) -> float:
 
 
 def _slopes(image: FloatArray, cells: GridCells) -> FloatArray:
-    """Return the slopes (k,) over two cells where all neighbours are there; of a row, along it."""
+    """Return slopes (k,) over two cells with all neighbours present, along a row if there is one."""
     ways = [axis for axis, size in enumerate(image.shape) if size > 1]
     inside = cells.present.copy()
     square = np.zeros(image.shape)
     for axis in ways:
         before, after = (np.roll(image, way, axis) for way in (1, -1))
         square += (after - before) ** 2
-        # What is rolled in from the other side is no neighbour.
+        # Values rolled in from the opposite side are no neighbours.
         there = np.pad(cells.present, [(1, 1) if n == axis else (0, 0) for n in (0, 1)])
         size = image.shape[axis]
         inside &= there.take(range(size), axis) & there.take(range(2, size + 2), axis)
     return np.asarray(np.sqrt(square[inside]) / (2 * cells.pitch)) if ways else np.empty(0)
 
 
-# Power spectral density of a map: areal, over radial frequency, and over direction.
-#
-# ``S(f_x, f_y) = dx dy |FFT(w z)|² / Σ w²``, two-sided, in m⁴, with the window ``w`` of the cells
-# that are there: its sum over all frequencies times df_x df_y is the mean square of the map under
-# that window (Parseval). Over radial frequency it is the content of each ring of width Δf by that
-# ring's area, so that ``Σ 2π f S(f) Δf`` is the mean square in the band of those rings, which ends
-# where not all directions are there any more; over direction, the mean square per radian of half a
-# turn, whose integral is the whole.
-
-# Of half a turn, five degrees each: the other half is the same.
-_SECTORS = 36
-# A cell of frequency may lie in two rings: by its parts across and along.
-_PARTS = 3
-# Any, but one: the same points have the same figures.
-_NOISE_SEED_POWER_DENSITY = 22
-
-
 @dataclass(frozen=True, eq=False)
 class UncertainCurve:
-    """A function on the points where it was taken, and its standard uncertainty, each (k,)."""
+    """Values of a function at positions, and their standard uncertainty, each (k,)."""
 
     position: FloatArray
     value: FloatArray
     uncertainty: FloatArray
 
     def entry(self) -> dict[str, list[float]]:
-        """Return what a result file says of it."""
+        """Return the JSON values for result files."""
         names = ("position", "value", "uncertainty")
         return {name: getattr(self, name).tolist() for name in names}
 
 
 @dataclass(frozen=True, eq=False)
 class PowerDensity:
-    """areal: S (r, c) [m⁴] over frequencies x (c,) and y (r,) [1/m];  mean_square: under w [m²]
+    """Power spectral density of a map: areal, over radial frequency, and over direction.
 
+    areal: S (r, c) [m⁴] over frequencies x (c,) and y (r,) [1/m];  mean_square: under w [m²]
     radial: S over radial frequency [1/m], [m⁴];  azimuthal: over direction from x [rad], [m²/rad]
-    band: of the radial one, from and to [1/m];  mean_square_in_band: under w [m²]
+    band: of the radial density, from and to [1/m];  mean_square_in_band: under w [m²]
     """
 
     x: FloatArray
@@ -198,9 +196,9 @@ class PowerDensity:
     mean_square_in_band: float
 
     def coarse(self, most: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return x (c,), y (r,), S (r, c) of whole blocks, at most ``most`` of them each way.
+        """Return x (c,), y (r,), S (r, c) averaged over blocks, at most ``most`` in each direction.
 
-        In rising order of frequency; what is left over at the highest frequencies is left out.
+        In rising order of frequency; an incomplete block at the highest frequencies is left out.
         """
         across, along = (-(-len(values) // most) for values in (self.x, self.y))
         columns, rows = (
@@ -213,16 +211,14 @@ class PowerDensity:
 
 
 def power_density(cells: GridCells) -> PowerDensity:
-    """Return the densities of a map; their uncertainty is from the scatter of the periodogram.
+    """Return the densities of a map, with their uncertainty from the scatter of the periodogram.
 
-    A mean over k independent cells of frequency is uncertain by its k-th root, and noise of the
-    points counts as content: its own density is added to the uncertainty.
+    A mean over k independent frequencies has a relative uncertainty of 1/√k. The density of the
+    noise of the points is not subtracted, but added to the uncertainty.
     """
     window = _window(cells)
     areal, mean_square = _areal(cells, cells.mean, window)
-    noise = (
-        np.random.default_rng(_NOISE_SEED_POWER_DENSITY).normal(size=cells.mean.shape) * cells.noise
-    )
+    noise = np.random.default_rng(_DENSITY_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
     of_noise, _ = _areal(cells, noise, window)
     y, x = (np.asarray(np.fft.fftfreq(size, cells.pitch), np.float64) for size in cells.mean.shape)
     radial, step = _over_frequency(x, y, areal, of_noise)
@@ -241,7 +237,7 @@ def _window(cells: GridCells) -> FloatArray:
 
 def _areal(cells: GridCells, image: FloatArray, window: FloatArray) -> tuple[FloatArray, float]:
     square = float(np.sum(window**2))
-    # The mean under the window is no content, and would leak into the lowest frequencies.
+    # The mean under the window would leak into the lowest frequencies.
     level = float(np.sum(window * image) / np.sum(window))
     tapered = window * (image - level)
     spectrum = np.abs(np.fft.fft2(tapered)) ** 2
@@ -261,14 +257,14 @@ def _over_frequency(
     """Return S over radial frequency, and the width of its rings [1/m]."""
     steps = _steps(x, y)
     cell, step = steps[0] * steps[1], max(steps)
-    # Beyond the Nyquist frequency of an axis not all directions are there.
+    # Beyond the Nyquist frequency of an axis some directions are missing.
     last = max(int(min(np.abs(x).max(), np.abs(y).max()) / step - 0.5), 1)
     content, of_noise = np.zeros((2, last + 1))
     parts = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
     for across in parts * steps[0]:
         for along in parts * steps[1]:
             frequency = np.hypot((x + across)[np.newaxis], (y + along)[:, np.newaxis]).ravel()
-            # The cell about zero is empty, for the mean is no content.
+            # The cell about zero is empty, because the mean was removed.
             ring = np.maximum(np.rint(frequency / step).astype(np.int64), 1)
             inside = ring <= last
             for total, values in ((content, areal), (of_noise, noise)):
@@ -276,7 +272,7 @@ def _over_frequency(
     position = np.asarray(step * np.arange(1, last + 1), np.float64)
     area = 2 * np.pi * position * step
     value, floor = (total[1:] * cell / _PARTS**2 / area for total in (content, of_noise))
-    # Of a real map each frequency stands twice.
+    # The spectrum of a real map holds each frequency twice.
     independent = np.maximum(area / cell / 2, 1.0)
     return UncertainCurve(position, value, np.hypot(value / np.sqrt(independent), floor)), step
 
@@ -297,23 +293,13 @@ def _over_direction(
     return UncertainCurve(directions, content, np.asarray(np.hypot(scatter, of_noise)))
 
 
-# Profiles of a map: along x, y and 45°, over the radius, and around.
-
-# Shares of the radius: half the width of a line's band, and the length of its stretches.
-_HALF_WIDTH, _SPACING = 1 / 100, 1 / 100
-# Around, the outer third of the radius is averaged over each of so many degrees.
-_OUTER, _DEGREES = 2 / 3, 2.0
-# Rings are as narrow as the turns of the scan allow, but for a tenth of the radius.
-_RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
-
 Averaging = Callable[[FloatArray], Profile]
 
 
 def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     """Return the mean deviations [m] over x, y, the diagonal, radius [m], and angle [rad].
 
-    Uncertainties are from the points' noise and from all sources of error. A profile that no point
-    is near to is left out.
+    Uncertainties are from noise and all error sources. A profile without points is left out.
     """
     x, y = map_.x - disc.x, map_.y - disc.y
     band = {"half_width": _HALF_WIDTH * disc.radius, "spacing": _SPACING * disc.radius}
@@ -329,7 +315,7 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
 
 
 def _ring(x: FloatArray, y: FloatArray, radius: float) -> float:
-    """Return the least width of rings [m] most of which were seen all around."""
+    """Return the least width of rings [m] of which most contain points."""
     reach = np.hypot(x, y)
     extent = float(reach.max() - reach.min())
     for width in np.array(_RINGS) * radius:

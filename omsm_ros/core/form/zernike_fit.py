@@ -1,9 +1,8 @@
-"""Zernike polynomials of scattered points, with their covariance.
+"""Fit Zernike polynomials to scattered points, with their covariance.
 
-Normal equations in portions that stay in the processor's cache, solved by Cholesky once they are
-found well conditioned: an equilibrated Gram matrix of condition κ costs κ times the rounding of a
-float, so that 10⁶ leaves ten digits. Where the points cover too little of the disc to
-separate the terms, those of highest order are left out, and are not evaluated.
+Normal equations, gathered in portions that fit the processor's cache, are solved by Cholesky: an
+equilibrated Gram matrix of condition 10⁶ leaves ten digits. Where the points cover too little of
+the disc to separate the terms, the highest orders are left out.
 """
 
 from __future__ import annotations
@@ -19,24 +18,35 @@ from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 from omsm_ros.errors import DataError
 
-# Where does a path come past its own neighbourhood again: turns of a spiral, lines of a raster?
-
-# Of the span, on either side of its middle: what jitters there has not passed it.
+# Half-width of the band about the middle in which positions do not count as crossed, over the span.
 _NEAR_MIDDLE = 0.05
-# Points in no order pass the middle every fourth point.
+# Least points of a pass and passes of a path; points in random order cross every fourth point.
 _LEAST_POINTS, _LEAST_PASSES = 16, 8
+# Points at a time: 37 terms of them fit a cache of 2.5 MB; all at once take three times as long.
+CHUNK = 8192
+# Largest condition number of the Gram matrix, which leaves ten digits.
+_WORST_CONDITION = 1e6
+# Successive points whose errors may be correlated, on paths without passes.
+_GROUP, _LEAST_GROUPS = 128, 4
+# Order of differences over passes: of a wave of sixteen passes 1/400 remains, of noise all.
+_DIFFERENCES = 4
+# Sums over groups with a smaller share of the variance of single points are rounding.
+_ROUNDING = 1e-12
+# Terms of the series 1 / (1 − h) in the share h, about a tenth, of a group in the fit.
+_FOLLOWED = 2
 
 
 def passes(x: FloatArray, y: FloatArray) -> IntArray | None:
-    """Return where each pass of the path x, y (n,) begins, (g,), the first at zero.
+    """Return the first point of each pass of the path x, y (n,), (g,), beginning with zero.
 
-    A pass is from one upward crossing of the middle to the next, along the axis that has more of
-    them. None for fewer than eight, or points that follow no path.
+    A pass is a turn of a spiral or two lines of a raster: from one upward crossing of the middle to
+    the next, along the axis that has more of them. None for fewer than eight passes, or points that
+    follow no path.
     """
     crossed = max(_crossings(x), _crossings(y), key=len)
     if len(crossed) < 2:
         return None
-    # From the first point on, so that no pass but the last is a part of one.
+    # The passes begin with the first point, so that only the last is incomplete.
     begins = np.append(crossed, 2 * crossed[-1] - crossed[-2]) - crossed[0]
     begins = begins[begins < len(x)]
     enough = len(begins) >= _LEAST_PASSES and len(x) >= _LEAST_POINTS * len(begins)
@@ -44,36 +54,21 @@ def passes(x: FloatArray, y: FloatArray) -> IntArray | None:
 
 
 def _crossings(position: FloatArray) -> IntArray:
-    """Return the points (g,) at which ``position`` (n,) has come from below to above its middle."""
+    """Return the points (g,) at which ``position`` (n,) crosses its middle upwards."""
     low, high = float(position.min()), float(position.max())
     middle, near = (low + high) / 2, _NEAR_MIDDLE * (high - low)
-    off_middle = np.flatnonzero(np.abs(position - middle) > near)
-    above = position[off_middle] > middle
-    return np.asarray(off_middle[1:][above[1:] & ~above[:-1]], np.int64)
-
-
-# Points at a time: 37 terms of them stay in a cache of 2.5 MB; all at once take thrice as long.
-CHUNK = 8192
-# Ten digits are left, more than any of them is worth.
-_WORST_CONDITION = 1e6
-# Consecutive points whose errors may hang together, where they follow no path with passes.
-_GROUP, _LEAST_GROUPS = 128, 4
-# Of sums over passes: a wave of sixteen passes leaves a four-hundredth, noise all of itself.
-_DIFFERENCES = 4
-# Of the variance of single points: sums over groups that cancel to less scatter by rounding alone.
-_ROUNDING = 1e-12
-# Terms of the series 1 / (1 − h) in the share h that a group has of the fit, some tenth.
-_FOLLOWED = 2
+    outside = np.flatnonzero(np.abs(position - middle) > near)
+    above = position[outside] > middle
+    return np.asarray(outside[1:][above[1:] & ~above[:-1]], np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class ZernikeFit:
     """Coefficients (k,) [m] of ``terms``, each one at the rim of ``disc``.
 
-    covariance: from the scatter of the points about the fit, and form that they do not resolve
-        (k, k) [m²]
+    covariance: from scatter about the fit and form that the path does not resolve (k, k) [m²]
     left_out: terms that the points do not separate
-    effects: coefficients of the further deviations (k, e) [m]
+    effects: coefficients of the error effects (k, e) [m]
     """
 
     disc: Aperture
@@ -85,7 +80,7 @@ class ZernikeFit:
 
     @property
     def uncertainty(self) -> FloatArray:
-        """Standard uncertainty of each coefficient (k,) [m], by scatter and all effects."""
+        """Standard uncertainty of each coefficient (k,) [m], from scatter and all effects."""
         variance = np.diag(self.covariance) + np.sum(self.effects**2, axis=1)
         return np.asarray(np.sqrt(variance), np.float64)
 
@@ -111,17 +106,18 @@ def fit_zernikes(
 ) -> ZernikeFit:
     """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
 
-    weights: the area of each point (n,); None: every point alike
-    effects: further deviations (e, n) [m] whose coefficients (k, e) are wanted of the same fit
+    weights: area of each point (n,), None for equal weights
+    effects: of errors on the deviations (e, n) [m], fitted in the same way
 
-    The covariance holds errors that hang together over a pass of the path, and form between passes
-    that they do not resolve. Raises DataError for fewer points than terms, or points that determine
-    no term.
+    The covariance includes errors that are correlated over a pass of the path. Raises DataError
+    for fewer than two points a term, or points that determine no term.
     """
     if len(x) < max(2 * len(terms), 8):
         raise DataError(
-            f"{len(x)} points for {len(terms)} Zernike terms, expected {max(2 * len(terms), 8)} or "
-            "more; measure more points or ask for fewer terms"
+            "form.few_points_for_terms",
+            points=len(x),
+            terms=len(terms),
+            least=max(2 * len(terms), 8),
         )
     more = np.empty((0, len(x))) if effects is None else effects
     values = np.concatenate([deviation[np.newaxis], more])
@@ -166,7 +162,7 @@ def _normal_equations(
 
 
 def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex]) -> list[int]:
-    """Return the places of the terms up to the highest order that is well conditioned."""
+    """Return the indices of the terms up to the highest order that is well conditioned."""
     for order in range(max(t.n for t in terms), -1, -1):
         kept = [k for k, t in enumerate(terms) if t.n <= order]
         own = np.diag(gram)[kept]
@@ -175,7 +171,7 @@ def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex]) -> list[int]:
             values = np.linalg.eigvalsh(gram[np.ix_(kept, kept)] * np.outer(scale, scale))
             if values[0] > 0 and values[-1] / values[0] < _WORST_CONDITION:
                 return kept
-    raise DataError("the points determine no Zernike term; check the aperture and the weights")
+    raise DataError("form.no_term")
 
 
 def _scores(
@@ -190,22 +186,21 @@ def _scores(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (k, k) of columns times residual, by groups and by single points.
 
-    Groups are passes of the path. Form that the terms do not describe is no error where the path
-    is close enough for it: then sums over passes follow a smooth course, and only what departs
-    from it counts, by fourth differences (of systematic samples: K. Wolter, Introduction to
-    Variance Estimation, 2007, ch. 8). Form between passes that none resolves departs, a whole
-    pass long. Without passes, groups are of successive points, whose errors may hang together.
+    Groups are passes of the path. Where the path resolves form that the terms do not describe, the
+    sums over passes vary smoothly, and their fourth differences show the errors alone (systematic
+    samples: K. Wolter, Introduction to Variance Estimation, 2007, ch. 8). Without passes, groups
+    are successive points with correlated errors.
 
-    inverse: of the Gram matrix (k, k). The fit follows each group's errors by the group's share of
-    that matrix, so that its residuals are too small; they are taken as the fit to all other groups
-    leaves them (delete-a-group jackknife; R. Bell, D. McCaffrey, Surv. Methodol. 28, 169).
+    inverse: of the Gram matrix (k, k). The fit follows the errors of each group in part; the
+    residuals are therefore those from the fit to all other groups (delete-a-group jackknife;
+    R. Bell, D. McCaffrey, Surv. Methodol. 28, 169).
     """
     begins, differences = _groups(x, y, len(terms))
     ends = np.append(begins[1:], len(x))
     sums, single = np.empty((len(terms), len(begins))), np.zeros((len(terms), len(terms)))
     first = 0
     while first < len(begins):
-        # Whole groups, as many as stay in the cache.
+        # A portion holds as many whole groups as fit the cache.
         last = max(int(np.searchsorted(ends, begins[first] + CHUNK, "right")), first + 1)
         chunk, groups = slice(begins[first], ends[last - 1]), slice(first, last)
         columns = zernike_values(*disc.scaled(x[chunk], y[chunk]), terms)
@@ -219,14 +214,14 @@ def _scores(
         first = last
     scatter = np.diff(sums, differences, axis=1) / np.sqrt(comb(2 * differences, differences))
     count = max(scatter.shape[1], 2)
-    # The sum over all groups is zero: where they are taken as they are, one of them is not free.
+    # The sum over all groups is zero, which takes one degree of freedom without differences.
     free = count if differences else count - 1
     dof = max(1 - len(terms) / len(x), 1e-3)
     return scatter @ scatter.T * len(begins) / free / dof, single / dof
 
 
 def _uncorrelated_residual(residual: FloatArray) -> FloatArray:
-    """Return what neighbours of a path do not share of the ``residual`` (n,), as large as noise."""
+    """Return the noise in the ``residual`` (n,) along a path, from its second differences."""
     if len(residual) < 3:
         return residual
     rough = np.diff(residual, 2) / np.sqrt(6)
@@ -234,9 +229,9 @@ def _uncorrelated_residual(residual: FloatArray) -> FloatArray:
 
 
 def _groups(x: FloatArray, y: FloatArray, terms: int) -> tuple[IntArray, int]:
-    """Return where groups of points begin (g,), and how often sums over them are to be differenced.
+    """Return the first points of the groups (g,), and the order of differences over their sums.
 
-    terms: how many are fitted
+    terms: number of fitted terms
     """
     begins = passes(x, y)
     if begins is not None:
@@ -252,7 +247,7 @@ def _group_sums(
     inverse: FloatArray,
     sizes: IntArray,
 ) -> FloatArray:
-    """Return sums of ``products`` (k, n) over groups (k, g), as the fit to all others leaves them.
+    """Return sums of ``products`` (k, n) over groups (k, g), for the fit to all other groups.
 
     sizes: points of each group (g,)
     """
@@ -267,9 +262,9 @@ def _group_sums(
 
 
 def _with_variance_floor(covariance: FloatArray, floor: FloatArray) -> FloatArray:
-    """Return the covariance (k, k), no variance below that of the ``floor``.
+    """Return the covariance (k, k) with its variances raised to those of ``floor``.
 
-    Few groups lie at the rim: by chance they may state far too little.
+    Few groups lie at the rim, where the estimate from groups may be too small by chance.
     """
     own, least = np.diag(covariance), np.diag(floor)
     scatters = own > _ROUNDING * least

@@ -1,1 +1,1 @@
-"""How does the part sit, and the probe beside the spindle? A known shape fitted to points."""
+"""Register measured points on their nominal surface; align the probe on a reference sphere."""

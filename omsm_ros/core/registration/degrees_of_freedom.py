@@ -1,7 +1,7 @@
-"""Which freedoms of its pose does a surface determine?
+"""Select the degrees of freedom of a pose that the points determine; bound the pose error.
 
-A freedom is taken up if it changes the deviation in a way that those before it do not. A sphere
-that is turned about its axis stays what it is; moved sideways it does what a tilt does.
+A degree of freedom is fitted if it changes the deviation in a way that the preceding ones do not.
+A sphere that turns about its axis stays the same; a lateral shift of it acts like a tilt.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from omsm_ros.core.registration.placement import (
     placed,
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.readable import quantity
+from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 AUTO = "auto"
 HELD = "freedoms held"
-"""Name of the source of error that a freedom is which was held."""
+"""Name of the error source for degrees of freedom that are held at their nominal value."""
 RIGID = DEGREES_OF_FREEDOM[:6]
 MOVES = ("x", "y", "clocking")
-"""Freedoms that a chuck settles; piston, tip and tilt no part comes without."""
-# Odds that a part was moved, at which it is said to be: strong evidence. Less may be its form.
-_CLEARLY_DETERMINED = 20.0
+"""Degrees of freedom that a chuck may hold at zero; piston, tip and tilt always vary."""
+# Odds from which a move of the part counts as strong evidence (Kass and Raftery, 1995).
+_STRONG_ODDS = 20.0
+# Form below a nanometre is not resolved.
 _LEAST_FORM_M = NANOMETRE_M
 
 
 def typical_range(dof: str) -> float:
-    """Return how far a freedom may be off on a part that was put on its chuck by hand [m], [rad].
+    """Return the largest plausible offset of a manually mounted part [m], [rad] or [1/m].
 
-    One that a nanometre of form would move further than this is not determined by the surface.
+    A degree of freedom that a nanometre of form would move by more is not determined.
     """
     if dof == "power":
         return 1.0
@@ -50,133 +50,130 @@ def typical_range(dof: str) -> float:
 
 
 class DegreesOfFreedom(NamedTuple):
-    """What is fitted, in the order of its columns, and why something else is not.
+    """Degrees of freedom that are fitted, in the order of their columns, and why others are not.
 
     refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest_dof`
     """
 
     fitted: tuple[str, ...]
-    refused: dict[str, str]
-    held: dict[str, str]
+    refused: dict[str, Notice]
+    held: dict[str, Notice]
 
-    def without(self, name: str, reason: str) -> DegreesOfFreedom:
-        """Return the freedoms with one of them held."""
+    def without(self, name: str, reason: Notice) -> DegreesOfFreedom:
+        """Return these with ``name`` held for a ``reason``."""
         left = tuple(n for n in self.fitted if n != name)
         return DegreesOfFreedom(left, self.refused, {**self.held, name: reason})
 
 
 def parse_dofs(text: str) -> tuple[str, ...]:
-    """Return the freedoms of 'auto' or of a list such as 'piston,tip,tilt'.
+    """Return the names in 'auto' or in a list such as 'piston,tip,tilt'.
 
-    Raises ConfigurationError for a name that is no freedom, or stands twice.
+    Raises ConfigurationError for an unknown or repeated name.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
     known = [AUTO, *DEGREES_OF_FREEDOM]
     for name in names:
-        if name not in known or names.count(name) > 1:
-            why = "is unknown" if name not in known else "stands twice"
-            raise ConfigurationError(f"freedom {name!r} {why}, expected a list of {known}")
+        if name not in known:
+            raise ConfigurationError("registration.unknown_freedom", name=name, known=known)
+        if names.count(name) > 1:
+            raise ConfigurationError("registration.repeated_freedom", name=name)
     if not names:
-        raise ConfigurationError(f"no freedom is named, expected a list of {known}")
+        raise ConfigurationError("registration.no_freedom", known=known)
     return tuple(names)
 
 
 def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> DegreesOfFreedom:
-    """Return which of the freedoms ``asked`` for are determined.
+    """Return which of the degrees of freedom ``asked`` for the surface determines.
 
-    asked: of :data:`DEGREES_OF_FREEDOM`, or "auto", alone or beside "power": the rigid ones that are
-    gram: sums of products (7, 7) of the columns of all freedoms over ``points``
+    asked: names, or "auto" for all rigid ones that are determined, alone or with "power"
+    gram: sums of products (7, 7) of the columns of all degrees of freedom over ``points``
 
-    Raises DataError for a freedom that was named and is not determined.
+    Raises DataError if one that was named is not determined.
     """
     automatic = AUTO in asked
     wanted = [n for n in DEGREES_OF_FREEDOM if n in asked or (automatic and n in RIGID)]
     fitted: list[str] = []
-    refused: dict[str, str] = {}
+    refused: dict[str, Notice] = {}
     for name in wanted:
         reason = _undetermined(name, fitted, gram / points)
-        if not reason:
+        if reason is None:
             fitted.append(name)
         elif automatic and name not in asked:
             refused[name] = reason
         else:
-            raise DataError(f"{name} cannot be fitted: {reason}; leave it out of the fit")
+            raise DataError("registration.not_determined", name=name, reason=reason)
     return DegreesOfFreedom(tuple(fitted), refused, {})
 
 
 def weakest_dof(
     names: Sequence[str], values: FloatArray, covariance: FloatArray, gram: FloatArray
-) -> tuple[str, str] | None:
-    """Return which move had better be held at its nominal value, and why; None if none had.
+) -> tuple[str, Notice] | None:
+    """Return the least supported move and the reason to hold it at its nominal value, or None.
 
-    One that takes away hardly more form than its uncertainty leaves open says nothing of the part:
-    the odds that it moved, against one that sits as it should, are the density of its place at
-    zero before the fit over that after it (J. Dickey, Ann. Math. Stat. 42, 204).
+    The odds that the part was moved, against a part at its nominal place, are the ratio of the
+    prior to the posterior density at zero (Savage-Dickey ratio; J. Dickey, Ann. Math. Stat. 42,
+    204).
 
-    values: of ``names`` (p,) as they were found;  covariance: of these (p, p)
-    gram: mean products of what they do to the deviation (p, p)
+    values: of ``names`` (p,) as fitted;  covariance: of ``values`` (p, p)
+    gram: mean products of the columns (p, p)
     """
     spread = np.sqrt(np.diag(covariance))
     scale = np.sqrt(np.diag(gram))
     inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=1e-14, hermitian=True)
-    # The part of its column that no other freedom has.
+    # Size of the part of each column that is independent of the other columns.
     own = scale / np.sqrt(np.maximum(np.diag(inverse), 1.0))
     found = [
         ((values[k] / spread[k]) ** 2 / 2 - np.log(typical_range(name) / spread[k]), k)
         for k, name in enumerate(names)
         if name in MOVES and own[k] * spread[k] > _LEAST_FORM_M
     ]
-    if not found or min(found)[0] > np.log(_CLEARLY_DETERMINED):
+    if not found or min(found)[0] > np.log(_STRONG_ODDS):
         return None
     k = min(found)[1]
-    unit = "rad" if names[k] == "clocking" else "m"
-    return names[k], (
-        f"form looks like it here: the points determine it to {quantity(spread[k], unit, 2)} only, "
-        f"which is {quantity(own[k] * spread[k], 'm', 2)} rms of form, and do not show that the "
-        f"part was moved ({quantity(values[k], unit, 2)} was found); what that opens widens every "
-        "figure"
+    angle = names[k] == "clocking"
+    return names[k], Notice(
+        "registration.held_angle" if angle else "registration.held_length",
+        uncertainty=spread[k],
+        form=own[k] * spread[k],
+        value=values[k],
     )
 
 
-def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> str:
-    """Return why a freedom is not determined beside those ``before`` it, empty if it is."""
+def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> Notice | None:
+    """Return why ``name`` is not determined in a fit with those ``before`` it, None if it is."""
     places, own = [DEGREES_OF_FREEDOM.index(n) for n in before], DEGREES_OF_FREEDOM.index(name)
     alone = float(np.sqrt(gram[own, own]))
     if alone * typical_range(name) < _LEAST_FORM_M:
-        return "the surface stays as it is when it is moved so"
+        return Notice("registration.surface_unchanged")
     scale = np.sqrt(np.diag(gram))[places]
     shared = gram[places, own] / scale / alone
     normal = gram[np.ix_(places, places)] / np.outer(scale, scale)
     share = np.linalg.lstsq(normal, shared, rcond=1e-14)[0] if places else shared
     left = alone * np.sqrt(max(1 - float(shared @ share), 0.0))
-    # Beneath this share of the column the difference is rounding.
+    # A difference below 1e-6 of the column is rounding.
     if left > 1e-6 * alone and left * typical_range(name) >= _LEAST_FORM_M:
-        return ""
+        return None
     same = [n for n, s in zip(before, share, strict=True) if abs(s) > 0.05]
-    return f"on this surface it does what {' and '.join(same)} do" if len(same) > 1 else (
-        f"on this surface it does what {''.join(same)} does"
-    )  # fmt: skip
-
-
-# How well is it known how the part sits, and what does that do to its form?
+    return Notice("registration.same_effect", others=same)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Registration:
-    """How the part sits, and how well that is known.
+    """Pose of a part with its uncertainty.
 
-    surface: the nominal;  placement: of the part;  dofs: what was fitted, and what could not be
-    from_source: standard uncertainty of each (p,) by where it comes from
-    pose_effects: steps of the freedoms (p, p), each of an independent part of the pose's own error
-    taken: mean products of how much of each form is likely to have made (p, p), at most one
-    held_effects: steps of those that are held (h, h), as far as the points bound them
-    moved: by how much each systematic source, off by its uncertainty, moves the freedoms, and
-        then by how much what is held does (p, s + 2h)
-    spread: standard uncertainty of each freedom that was asked for [m], [rad] or [1/m]
-    correlated_moves: by freedom that no points determine: what it does to each of the fitted, in the first
-        and second order (2,), where it is off by as much as it may be
+    surface: nominal;  placement: of the part;  dofs: fitted, refused and held
+    from_source: standard uncertainty of each fitted value (p,) by error source
+    pose_effects: steps (p, p), one row for each independent part of the pose error
+    taken: mean products (p, p) of the share of each row that form probably caused, at most one
+    held_effects: steps (h, h) of the held degrees of freedom within the bounds of the points
+    moved: steps (p, s + 2h) for one standard uncertainty of each systematic source, and then for
+        the held degrees of freedom in first and second order
+    spread: standard uncertainty of each degree of freedom asked for [m], [rad] or [1/m]
+    correlated_moves: for each undetermined degree of freedom at its largest plausible offset: the effect
+        on each fitted one, in first and second order (2,)
     limit: deviation from the smooth form beyond which a point is an outlier [m]
-    disc: the aperture, or what holds all points;  form: the smooth form in its basis (k,) [m rms]
+    disc: the aperture, or a disc that holds all points
+    form: coefficients of the smooth form in ``basis`` (k,) [m rms]
     noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
     """
 
@@ -198,14 +195,14 @@ class Registration:
     before: float
 
     def uncertainty(self, dof: str) -> float | None:
-        """Return the standard uncertainty of a freedom, None if nobody asked for it."""
+        """Return the standard uncertainty of a degree of freedom, None if it was not asked for."""
         return self.spread.get(dof)
 
     def effects(self, points: Placed, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return what the pose (p, n) and the sources (s + 2h, n) may do to the deviations [m].
+        """Return the effects of pose errors (p, n) and sources (s + 2h, n) on the deviations [m].
 
-        systematic: effects on the heights (s, n), which the pose then follows. The last 2h of the
-        sources are the freedoms that were held.
+        systematic: effects of the sources on the heights (s, n); the fitted pose follows them. The
+        last 2h sources are the held degrees of freedom.
         """
         columns = dof_columns(self.placement, points, self.dofs.fitted)
         names = tuple(self.dofs.held)
@@ -214,10 +211,10 @@ class Registration:
         return self.pose_effects @ columns, sources + self.moved.T @ columns
 
     def undetermined_displacements(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return how far (r, 2, n) [m] places x, y (n,) [m] of the part may lie beside where found.
+        """Return the possible lateral shift (r, 2, n) [m] of places x, y (n,) [m] on the part.
 
-        For each of r freedoms that no points determine, off by as much as it may be; the others
-        follow, and the points stay on the surface.
+        One for each of the r undetermined degrees of freedom at its largest plausible offset; the
+        fitted ones follow, so that the points stay on the surface.
         """
         fitted = self.dofs.fitted
         steps = [
@@ -231,11 +228,11 @@ class Registration:
         return np.array(ways).reshape(-1, 2, len(x))
 
     def displaced(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the same (e, 2, n) [m] for each row of :meth:`effects`, one below the other."""
+        """Return the lateral shift (e, 2, n) [m] of x, y for each row of :meth:`effects`."""
         fitted, held = self.dofs.fitted, tuple(self.dofs.held)
         own = np.zeros((len(self.pose_effects) + self.moved.shape[1], len(fitted) + len(held)))
         own[:, : len(fitted)] = np.concatenate([self.pose_effects, self.moved.T])
-        # Of what is held, the second order moves no place.
+        # The second order of a held degree of freedom shifts no place.
         first = len(own) - 2 * len(held)
         own[first::2, len(fitted) :] = self.held_effects
         return np.array([self._moved((*fitted, *held), step, x, y) for step in own])
@@ -243,7 +240,7 @@ class Registration:
     def _moved(
         self, names: Sequence[str], step: Sequence[float] | FloatArray, x: FloatArray, y: FloatArray
     ) -> FloatArray:
-        """Return where places x, y of the part come to lie by a step of its freedoms (2, n) [m]."""
+        """Return the shift (2, n) [m] of places x, y of the part for a ``step`` of its pose."""
         pose = self.placement.pose
         places = np.stack([x, y, np.nan_to_num(self.surface.height(x, y))])
         there = pose.rotation @ places + pose.origin[:, np.newaxis]
@@ -253,10 +250,7 @@ class Registration:
 
     @property
     def moves(self) -> IntArray:
-        """Return which rows of :meth:`effects`, one below the other, are moves of the part.
-
-        Those of the pose, and of what was held its first order.
-        """
+        """Return which rows of :meth:`effects` are moves of the part, to first order."""
         fitted, sources = self.moved.shape
         first = fitted + sources - 2 * len(self.held_effects)
         held = np.arange(first, fitted + sources, 2)
@@ -271,9 +265,9 @@ class Registration:
 def held_dof_effects(
     surface: Surface, at: Placement, points: Placed, names: Sequence[str], steps: FloatArray
 ) -> FloatArray:
-    """Return what ``steps`` (h, h) of freedoms that were held do to the deviations (2h, n) [m].
+    """Return the effects (2h, n) [m] of ``steps`` (h, h) of held degrees of freedom.
 
-    Of each the first and the second order: what is held may be off by tenths of a millimetre.
+    In first and second order, because a held value may be off by tenths of a millimetre.
     """
     there = points.from_origin + at.pose.origin[:, np.newaxis]
     portion = PointBatch(there[0], there[1], there[2], np.empty((0, len(points.x))))
@@ -283,16 +277,16 @@ def held_dof_effects(
             placed(surface, at.moved(names, side * step), portion).deviation for side in (1, -1)
         )
         rows[2 * k], rows[2 * k + 1] = (high - low) / 2, (high + low) / 2 - points.deviation
-    # At the rim a step may leave the surface.
+    # At the rim a step may leave the surface, where the effect is not defined.
     return np.nan_to_num(rows, copy=False)
 
 
 class OpenUncertainty(NamedTuple):
-    """What is not in the covariance of the fit.
+    """Pose errors that the covariance of the fit does not contain.
 
-    unknown: by freedom that no surface determines: what it does to each of the others, in first
+    unknown: for each undetermined degree of freedom: its effect on each of the others, in first
         and second order
-    held: mean products of what was held, value and covariance together (h, h)
+    held: mean products of the held values, estimate and covariance together (h, h)
     """
 
     unknown: dict[str, dict[str, FloatArray]]
@@ -300,7 +294,7 @@ class OpenUncertainty(NamedTuple):
 
     @classmethod
     def of(cls, unknown: dict[str, dict[str, FloatArray]]) -> OpenUncertainty:
-        """Return what is open where nothing is held."""
+        """Return the pose errors where nothing is held."""
         return cls(unknown, np.empty((0, 0)))
 
     def by_source(
@@ -310,10 +304,10 @@ class OpenUncertainty(NamedTuple):
         sources: Sequence[str],
         moved: FloatArray,
     ) -> dict[str, FloatArray]:
-        """Return the standard uncertainties (p,) of the fitted ``names`` by where they come from.
+        """Return the standard uncertainties (p,) of the fitted ``names`` by error source.
 
-        covariance: by noise and form (p, p);  moved: by each of the ``sources`` (p, s), of which
-            several may have one name
+        covariance: from noise and form (p, p)
+        moved: from each of the ``sources`` (p, s), of which several may have one name
         """
         found = {"noise and form": np.sqrt(np.diag(covariance))}
         for k, name in enumerate(sources):
@@ -323,7 +317,7 @@ class OpenUncertainty(NamedTuple):
         return found
 
     def spread(self, dofs: DegreesOfFreedom, by_source: dict[str, FloatArray]) -> dict[str, float]:
-        """Return the standard uncertainty of each freedom that was asked for."""
+        """Return the standard uncertainty of each degree of freedom that was asked for."""
         held = np.sqrt(np.diag(self.held))
         fitted = np.sqrt(np.sum([s**2 for s in by_source.values()], axis=0))
         found = dict(zip(dofs.fitted, map(float, fitted), strict=True))
@@ -334,14 +328,14 @@ class OpenUncertainty(NamedTuple):
 
 
 def root_of(covariance: FloatArray) -> FloatArray:
-    """Return rows (p, p) whose outer products add up to the covariance."""
+    """Return rows (p, p) whose outer products add up to ``covariance``."""
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray((np.sqrt(np.maximum(values, 0.0)) * vectors).T * scale, np.float64)
 
 
 def shares_of(rows: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return mean products (p, p) of amounts of ``rows`` (p, p) that make up the covariance."""
+    """Return mean products (p, p) of the multiples of ``rows`` that add up to ``covariance``."""
     scale = np.linalg.norm(rows, axis=0)
     amounts = np.linalg.pinv((rows / scale).T, rcond=1e-9)
     return np.asarray(amounts @ (covariance / np.outer(scale, scale)) @ amounts.T, np.float64)

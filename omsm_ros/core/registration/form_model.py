@@ -1,19 +1,16 @@
-"""A fit beside which the part may have form errors that nobody knows.
+"""Estimate the pose of a part together with its unknown form error.
 
-A part is never what it should be. Its form error of low order looks, in part, like a part that sits
-elsewhere: on an off-axis paraboloid 10 µm of shift make what 100 nm of astigmatism make. Least
-squares would call all of it shift, and state a hundredth of its error. Here the data are
+Form error of low order looks, in part, like a shifted part: on an off-axis paraboloid a shift of
+10 µm has the effect of 100 nm of astigmatism. Least squares would attribute all of it to the shift
+and understate the uncertainty by a factor of a hundred. The model is
 
     d = J δ + Z c + noise,   c_k ~ N(0, σ_g²)
 
-J the freedoms of the fit, within what a part may be off by that was put on by hand, and Z
-polynomials of orders 2 to 8, whose sizes σ_g, one for each order, are found from the data
-themselves by restricted maximum likelihood (D. MacKay, Neural Comput. 4, 415; the fixed point of
-its eq. 4.9). Form falls with order: no order
-may have less than a higher one, and a size found from few terms may be that of a lucky part: it is
-taken as large as six of seven parts would have it. So a shift is read off those orders in which
-this part is good, and its uncertainty holds what the others may have. Dust is what lies far from
-any sum of the columns.
+with J the columns of the pose, whose prior is the offset of a manually mounted part, and Z
+polynomials of orders 2 to 8. Restricted maximum likelihood gives the standard deviation σ_g of
+each order (D. MacKay, Neural Comput. 4, 415; fixed point of its eq. 4.9). No order may have a
+smaller σ_g than a higher order. A σ_g from few terms may be small by chance, so its upper
+one-sided 85 % bound is used. Points far from any sum of the columns are outliers (dust).
 """
 
 from __future__ import annotations
@@ -30,59 +27,59 @@ from omsm_ros.core.surface.zernike_terms import ZernikeIndex, rms_of, terms_up_t
 from omsm_ros.errors import DataError
 
 HIGHEST_ORDER = 8
-NOT_SETTLED = (
-    "the pose does not settle: on these points it and the part's form look alike; check the "
-    "surface's parameters, the sign of its radii and the units of the cloud, or hold what need not "
-    "be fitted, as --fit piston,tip,tilt"
-)
+NOT_SETTLED = "registration.form_like_pose"
+"""Code of the error of a fit that does not converge."""
 _TERMS: tuple[ZernikeIndex, ...] = terms_up_to(HIGHEST_ORDER)
 _SCALE = np.array([1 / rms_of(term) for term in _TERMS])
-# Of its size: a term of which less is new on these points is left out.
+# A term with a smaller independent share on these points is left out.
 _LEAST_NEW = 1e-4
-# A turned part has rings of their own size: symmetric terms from the fourth order on are apart.
+# Turning makes rings, so rotationally symmetric terms from the fourth order on have their own σ.
 _RINGS = HIGHEST_ORDER + 1
 _ORDERS = np.array([term.n for term in _TERMS])
 _GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
-# Of the products of all terms over the area: one where it is a disc. One whose rim is missing over
-# a hundredth of the radius has two.
+# Condition number of the products of all terms: 1 on a disc, 2 on a disc whose rim is missing over
+# a hundredth of the radius.
 _NEARLY_A_DISC = 10.0
-# Of the variances. A part settles in 8 to 40 turns.
+# Relative change of the variances at convergence; parts need 8 to 40 iterations.
 _TURNS, _SETTLED = 300, 1e-3
-# Sizes of optical figure errors fall with the second to fourth power of their order.
+# Amplitudes of optical figure errors fall with the second to fourth power of their order.
 _STEEPEST = 4
-# Beneath a picometre a form error is of no interest, and a variance of zero has no inverse; nor
-# beneath a tenth of the variance that noise leaves of a term, for nothing could show it.
+# Lower bounds of σ_g: a picometre, so that the variance has an inverse, and a tenth of the
+# variance that noise leaves of a term, below which data cannot show it.
 _LEAST_M = 1e-12
 _LEAST_SHARE = 0.1
-# No measurement knows a term better, however many points it has; and beyond it what separates form
-# from pose, a billionth of their products, drowns in rounding.
+# Lower bound of the uncertainty of a term, however many points there are; a smaller one would let
+# rounding decide between form and pose.
 _BEST_KNOWN_M = 1e-11
-# Ten times what is left after a plain fit: most of the form may have gone into the pose.
+# Upper bound of σ_g² over the mean square left after a plain fit, which may have taken most of the
+# form for pose.
 _MOST_SHARE = 100.0
-# Of the normal distribution at 15 %. With it 95 % bands held the truth in 93 to 100 % of simulated
-# parts with spectra from n⁻² to n⁻⁶, or with single terms; with 20 %, in 90 to 100 %.
+# Quantile of the normal distribution at 15 %. With it 95 % bands held the truth in 93 to 100 % of
+# simulated parts with spectra from n⁻² to n⁻⁶ or with single terms; with 20 %, in 90 to 100 %.
 _QUANTILE = 1.0364
-# Of one in a million points of Gaussian noise; texture has shorter tails.
+# One in a million points of Gaussian noise lies beyond it; texture has shorter tails.
 OUTLIER_SIGMAS = 5.0
-# What more than one point of twenty does is the part, with a fifth to spare.
+# A deviation that more than 5 % of the points reach is part of the form; the factor is a margin.
 _MOST_DUST, _BEYOND_COMMON = 0.05, 1.2
-# Beneath it nothing is dust: a nominal surface against itself leaves rounding.
+# Rounding of a nominal surface against itself is no outlier.
 LEAST_LIMIT_M = 1e-12
-# The first fit has dust in it, the second hardly any.
+# The second fit is already nearly free of dust.
 _DUST_PASSES = 3
-# Of a full step, so that thirty of them still arrive.
+# Least share of a step, so that thirty steps still converge.
 _LEAST_RELAXED = 0.1
 
-# Consecutive points whose errors may hang together.
+# Consecutive points whose errors may be correlated.
 GROUP = 128
 
 
 @dataclass(frozen=True, eq=False)
 class FormBasis:
-    """Polynomials of orders 2 to 8: on a disc Zernike's, on a strip, a ring or a square those that
-    are orthonormal over it, and to piston and tilts, made of Zernike's in their order.
+    """Polynomials of orders 2 to 8, orthonormal over the area and to piston and tilts.
 
-    disc: they are made on;  mix: of all Zernike terms up to order 8 (k, 45);  group: order (k,)
+    On a disc these are Zernike's; elsewhere they are made of Zernike's in their order.
+
+    disc: of the Zernike terms;  mix: of all terms up to order 8 (k, 45)
+    group: order of each, or the group of rings (k,)
     """
 
     disc: Aperture
@@ -91,9 +88,9 @@ class FormBasis:
 
     @classmethod
     def over(cls, x: FloatArray, y: FloatArray, area: FloatArray, disc: Aperture) -> FormBasis:
-        """Return those of the area that points at x, y [m] stand for, each (n,).
+        """Return the basis on the ``area`` (n,) that points at x, y (n,) [m] stand for.
 
-        Raises DataError for points at so few places that no form could show.
+        Raises DataError for points at too few places to show any form.
         """
         values = _zernikes(disc, x, y)
         gram = (values * (area / area.sum())) @ values.T
@@ -103,7 +100,7 @@ class FormBasis:
         groups: list[int] = []
         for place in range(len(_TERMS)):
             row = np.eye(len(_TERMS))[place]
-            for _ in range(2):  # once more takes away what rounding has left
+            for _ in range(2):  # the second pass removes rounding errors of the first
                 for other in rows:
                     row = row - (other @ gram @ row) * other
             new = float(row @ gram @ row)
@@ -112,16 +109,14 @@ class FormBasis:
                 groups.append(int(_GROUPS[place]))
         form = np.array(groups) >= 2
         if not np.any(form):
-            raise DataError(
-                "the points lie at so few places that no form shows; measure across the part"
-            )
+            raise DataError("registration.no_form")
         return cls(disc, np.array(rows)[form], np.array(groups)[form])
 
     def __len__(self) -> int:
         return len(self.group)
 
     def columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the polynomials (k, n) at x, y (n,) [m], each of rms one over the area."""
+        """Return the polynomials (k, n) at x, y (n,) [m], each with an rms of one over the area."""
         return np.asarray(self.mix @ _zernikes(self.disc, x, y), np.float64)
 
 
@@ -131,12 +126,12 @@ def _zernikes(disc: Aperture, x: FloatArray, y: FloatArray) -> FloatArray:
 
 @dataclass(eq=False)
 class FormNormalEquations:
-    """Of columns with each other, with the deviation and with ``sources`` systematic effects.
+    """Products of columns with each other, the deviation and ``sources`` systematic effects.
 
-    points: how many came;  square, total: sums of their squared residuals and deviations [m²]
+    points: number added;  square, total: sums of squared residuals and deviations [m²]
     gram: (columns, columns + 1 + sources)
-    scores: of each column, the sum over groups of 128 successive points of the squared sum of its
-        products with the residual, which shows errors that hang together
+    scores: for each column, the sum over groups of 128 successive points of the squared sum of its
+        products with the residual, which shows correlated errors
     """
 
     columns: int
@@ -153,7 +148,7 @@ class FormNormalEquations:
 
     def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
             residual: FloatArray) -> None:  # fmt: skip
-        """Take in the next points: columns (q, n), the others (n,), (s, n), (n,)."""
+        """Add points: columns (q, n), deviation (n,), systematic (s, n), residual (n,)."""
         right = np.concatenate([columns, deviation[np.newaxis], systematic])
         self.gram += columns @ right.T
         self.points += len(deviation)
@@ -165,8 +160,11 @@ class FormNormalEquations:
 
 
 class Estimate(NamedTuple):
-    """step: δ (p,) in the unit of the columns;  form: c (k,) [m rms];  covariance: of both
-    sizes: σ_g of each term (k,) [m];  likely: covariance of the step where no size is bad luck
+    """Estimate of pose and form.
+
+    step: δ (p,) in the unit of the columns;  form: c (k,) [m rms];  covariance: of both
+    sizes: σ_g of each term (k,) [m], at its upper bound;  noise: variance of one point [m²]
+    likely: covariance of the step with the most likely σ_g
     """
 
     step: FloatArray
@@ -178,7 +176,7 @@ class Estimate(NamedTuple):
 
     @property
     def length(self) -> float:
-        """Return how long the step is, in its own standard uncertainty."""
+        """Return the Mahalanobis length of the step."""
         free = len(self.step)
         spread = np.sqrt(np.diag(self.covariance)[:free])
         shared = self.covariance[:free, :free] / np.outer(spread, spread)
@@ -199,9 +197,9 @@ def estimate(
 
     gram: (p + k, p + k);  moments: columns times data (p + k,) [m]
     variance: of the noise of one point, as it averages out [m²]
-    largest: mean square of the data [m²], which bounds what form there may be
+    largest: mean square of the data [m²], which bounds the form
     group: of each column of Z (k,): its order, or that of rings
-    expected: where the freedoms stand, and standard deviation of where parts do, about zero (p,)
+    expected: value of the pose, and standard deviation of its prior about zero, both (p,)
     """
     dofs = len(gram) - len(group)
     scale = np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
@@ -247,17 +245,17 @@ def _inverse(normal: FloatArray, sizes: FloatArray, dofs: int) -> FloatArray:
         inverse = np.linalg.inv(full * np.outer(root, root)) * np.outer(root, root)
     except np.linalg.LinAlgError as err:
         raise DataError(NOT_SETTLED) from err
-    # Where pose and form are all but one, rounding leaves variances below zero.
+    # Where pose and form are nearly the same, rounding leaves variances below zero.
     if not np.all(np.diag(inverse) > 0):
         raise DataError(NOT_SETTLED)
     return np.asarray((inverse + inverse.T) / 2, np.float64)
 
 
 def _variance_upper_factor(unknown: FloatArray, group: IntArray) -> FloatArray:
-    """Return by how much each variance (k,) may be larger than it was found, in one of seven parts.
+    """Return the ratio of the upper 85 % bound of each variance (k,) to its estimate.
 
-    unknown: share of each term that the data leave open (k,). The factor is ν/χ²(ν, 15 %), by
-    Wilson and Hilferty's approximation, for the ν terms that a group's size was found from.
+    unknown: share of each term that the data leave open (k,). The ratio is ν/χ²(ν, 15 %), by
+    Wilson and Hilferty's approximation, for the ν terms that determine the variance of a group.
     """
     factor = np.ones_like(unknown)
     for each in np.unique(group):
@@ -268,7 +266,7 @@ def _variance_upper_factor(unknown: FloatArray, group: IntArray) -> FloatArray:
 
 
 def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntArray) -> FloatArray:
-    """Return the variance of each term (k,) by its group, none below that of a higher one.
+    """Return the variance of each term (k,) by group, none below that of a higher order.
 
     unknown: share of each term that the data leave open (k,)
     """
@@ -286,10 +284,9 @@ def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntA
 
 
 def _monotone_variances(sizes: FloatArray, group: IntArray) -> FloatArray:
-    """Return the variances (k,), none falling steeper with order than parts do.
+    """Return the variances (k,) with their fall over order limited to ``n**-_STEEPEST``.
 
-    A shift of an asphere is coma and nothing else: what coma there may be cannot be read off
-    trefoil alone.
+    A shift of an asphere looks like coma, so trefoil alone must not bound the coma.
     """
     held, below = sizes.copy(), 0.0
     for each in range(2, HIGHEST_ORDER + 1):
@@ -302,19 +299,19 @@ def _monotone_variances(sizes: FloatArray, group: IntArray) -> FloatArray:
 
 
 def outlier_limit(residual: FloatArray) -> float:
-    """Return the distance [m] from the smooth form beyond which a point is dust.
+    """Return the distance [m] from the smooth form beyond which a point is an outlier.
 
-    Dust is rare: what more than one point of twenty does, steps or a coarse reading, is the part.
+    Outliers are rare: steps or a coarse resolution affect more than 5 % of the points.
     """
     common = float(np.quantile(np.abs(residual), 1 - _MOST_DUST))
     return max(OUTLIER_SIGMAS * statistics.spread(residual), _BEYOND_COMMON * common, LEAST_LIMIT_M)
 
 
 def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[FloatArray, float]:
-    """Return the sum (q,) of ``columns`` (q, n) that is most like, and how far from it is dust [m].
+    """Return the coefficients (q,) of the fit of ``columns`` (q, n), and the outlier limit [m].
 
-    Without bounds on any column: what the pose leaves after a step that was not small, or a form
-    that is not known yet, is neither noise nor dust.
+    The fit is free of any prior, because the residual of a large step or of an unknown form is
+    neither noise nor an outlier.
     """
     scale = np.sqrt(np.mean(columns**2, axis=1))
     scale[scale == 0] = 1.0
@@ -333,10 +330,10 @@ def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[Float
 
 
 def relaxation_factor(share: float, last: FloatArray, step: FloatArray) -> float:
-    """Return the share of a ``step`` (p,) to take, after ``share`` of the one before it.
+    """Return the share of a ``step`` (p,) to take, after ``share`` of the ``last`` one.
 
-    Where form and pose look alike, a whole step overshoots: what form there may be follows the
-    pose (Aitken's relaxation; B. Irons, R. Tuck, Int. J. Numer. Meth. Eng. 1, 275).
+    Where form and pose look alike a whole step overshoots, because the form follows the pose
+    (Aitken's relaxation; B. Irons, R. Tuck, Int. J. Numer. Meth. Eng. 1, 275).
     """
     change = last - step
     square = float(change @ change)

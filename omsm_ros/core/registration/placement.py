@@ -1,8 +1,7 @@
-"""Deviation of points from a surface in a pose, and how it changes with the pose.
+"""Deviation of points from a surface in a pose, and its derivatives by the pose.
 
-The deviation is the distance from the surface along its normal, positive where the part stands
-higher than it should. Its derivative by the pose is exact: the normal times how the point moves in
-the part's frame.
+The deviation is the distance from the surface along its normal, positive where the part is too
+high. Its derivative by the pose is the normal times the motion of the point in the part's frame.
 """
 
 from __future__ import annotations
@@ -19,14 +18,13 @@ from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.posed import Pose
 from omsm_ros.errors import DataError, SurfaceError
-from omsm_ros.readable import quantity
 
-# Four for each column of the fit beside form are the least.
+# Four points for each of the 49 columns of pose and form.
 LEAST_POINTS = 200
-# Below a nanometre there are atoms, and no form.
+# A cloud of a nanometre has a wrong unit.
 _LEAST_EXTENT_M = 1e-9
 DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
-"""What a fit may move: a pose's six, and the curvature [1/m] by which the part is bent more."""
+"""Degrees of freedom of a fit: the six of a pose, and an additional curvature [1/m]."""
 
 _SHIFTS = {"x": 0, "y": 1, "piston": 2}
 _TURNS = {"tip": 0, "tilt": 1, "clocking": 2}
@@ -35,8 +33,8 @@ _TURNS = {"tip": 0, "tilt": 1, "clocking": 2}
 class PointBatch(NamedTuple):
     """Successive points of a scan in the machine's frame, each (n,) [m].
 
-    systematic: (k, n) [m]: by how much each of k sources of systematic error, off by its standard
-        uncertainty, would shift the heights; the sources are independent of each other
+    systematic: effect (k, n) [m] of one standard uncertainty of each of k independent sources of
+        systematic error on the heights
     """
 
     x: FloatArray
@@ -46,7 +44,7 @@ class PointBatch(NamedTuple):
 
 
 PointBatches: TypeAlias = Callable[[], Iterable[PointBatch]]
-"""Reads all points from the start, portion by portion; called once for each pass."""
+"""Function that reads all points from the start, portion by portion; called once per pass."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +56,9 @@ class Aperture:
     y: float = 0.0
 
     def holds(self, x: FloatArray, y: FloatArray) -> BoolArray:
-        """Return where points lie within it, of their shape."""
+        """Return which points lie within the aperture, of their shape."""
         square = (x - self.x) ** 2 + (y - self.y) ** 2
-        # A rim at exactly the radius is within it, whatever the rounding of a float32.
+        # Points on the rim are inside although float32 rounds them.
         return np.asarray(square <= (self.radius * (1 + 1e-6)) ** 2)
 
     def scaled(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -70,29 +68,26 @@ class Aperture:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A part's pose, and the curvature that it has beyond its nominal surface [1/m]."""
+    """Pose of a part, and its curvature in excess of the nominal surface, ``power`` [1/m]."""
 
     pose: Pose = field(default_factory=Pose)
     power: float = 0.0
 
     def moved(self, dofs: Sequence[str], step: FloatArray) -> Placement:
-        """Return the placement after a ``step`` (p,) of its ``dofs``.
+        """Return the placement after a ``step`` (p,) of the degrees of freedom ``dofs``.
 
-        Raises DataError where no part of the machine could sit: a fit strayed.
+        Raises DataError for a pose outside the machine: the fit diverged.
         """
         changes = dict(zip(dofs, map(float, step), strict=True))
         power = self.power + changes.pop("power", 0.0)
         try:
             pose = replace(self.pose, **{k: getattr(self.pose, k) + v for k, v in changes.items()})
         except SurfaceError as err:
-            raise DataError(
-                "no pose brings the points onto the nominal surface; check its parameters, the "
-                "sign of its radii and the units of the cloud, or fit fewer freedoms"
-            ) from err
+            raise DataError("registration.no_pose") from err
         return Placement(pose, power)
 
     def value(self, dof: str) -> float:
-        """Return the value of one freedom [m], [rad] or [1/m]."""
+        """Return the value of one degree of freedom [m], [rad] or [1/m]."""
         return self.power if dof == "power" else float(getattr(self.pose, dof))
 
 
@@ -100,7 +95,7 @@ class Placed(NamedTuple):
     """Points in the frame of the part.
 
     x, y: [m], (n,);  deviation: along the normal [m], (n,);  normal: of the surface there (3, n)
-    from_origin: of the part, in the machine's frame [m], (3, n)
+    from_origin: vector from the part's origin, in the machine's frame [m], (3, n)
     """
 
     x: FloatArray
@@ -117,8 +112,8 @@ class Placed(NamedTuple):
 def placed(surface: Surface, placement: Placement, portion: PointBatch) -> Placed:
     """Return the points in the part's frame, NaN where the surface has no height.
 
-    The foot of a point is first sought along the normal under it, then measured from its tangent
-    plane: exact but for the square of deviation times curvature.
+    The foot of each point is estimated along the normal below it; the deviation is the distance
+    from the tangent plane there, exact to first order in deviation times curvature.
     """
     pose = placement.pose
     away = np.stack([portion.x, portion.y, portion.height]) - pose.origin[:, np.newaxis]
@@ -143,7 +138,7 @@ def _slopes(
 
 
 def dof_columns(placement: Placement, points: Placed, dofs: Sequence[str]) -> FloatArray:
-    """Return the derivatives (p, n) of the deviation by each freedom."""
+    """Return the derivatives (p, n) of the deviation by each degree of freedom."""
     rates, rotation = placement.pose.rotation_rates(), placement.pose.rotation
     columns = np.empty((len(dofs), len(points.x)))
     for row, name in enumerate(dofs):
@@ -164,38 +159,29 @@ def selection(portions: PointBatches, most: int) -> PointBatch:
         kept.add(np.stack([portion.x, portion.y, portion.height], axis=1))
         count += len(portion.x)
     if not count:
-        raise DataError("0 points: there is nothing to register; check the cloud")
+        raise DataError("registration.no_points")
     x, y, height = kept.rows().T
     return PointBatch(x, y, height, np.empty((0, len(x))))
 
 
 def inside_aperture(points: Placed, aperture: Aperture | None) -> Placed:
-    """Return the points with a deviation that lie within the aperture.
+    """Return the points that have a deviation and lie within the aperture.
 
-    Raises DataError for too few of them, or for points closer together than any part is large.
+    Raises DataError for too few points, or an extent below a nanometre.
     """
     good = np.isfinite(points.deviation)
     if aperture is not None:
         good &= aperture.holds(points.x, points.y)
     if (count := int(np.sum(good))) < LEAST_POINTS:
-        raise DataError(
-            f"{count} points lie on the nominal surface, expected {LEAST_POINTS} or more; "
-            "check its parameters, the aperture and the units of the cloud"
-        )
+        raise DataError("registration.few_points", count=count, least=LEAST_POINTS)
     extent = max(float(np.ptp(v[good])) for v in (points.x, points.y))
     if extent < _LEAST_EXTENT_M:
-        raise DataError(
-            f"the points lie within {quantity(extent, 'm')} of each other; measure across the "
-            "part, or check the units of the cloud"
-        )
+        raise DataError("registration.small_extent", extent=extent)
     return points.part(good)
 
 
 def centred_aperture(points: Placed) -> Aperture:
-    """Return the disc about the part's origin that holds all points.
-
-    About their middle where the origin lies outside of them.
-    """
+    """Return the disc that holds all points, about the origin or else their middle."""
     ends = [(float(v.min()), float(v.max())) for v in (points.x, points.y)]
     inside = all(low < 0 < high for low, high in ends)
     x, y = (0.0, 0.0) if inside else ((low + high) / 2 for low, high in ends)

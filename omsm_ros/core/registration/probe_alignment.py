@@ -1,10 +1,8 @@
-"""Where does the probe pass the spindle axis, and how does its beam lean?
+"""Align the probe with the spindle axis from a scan of a reference sphere.
 
-From a scan of a reference sphere. A probe that passes the axis at a distance measures a
-sphere as something else: off by e along the feed it sees a cusp or a dimple at the centre,
-off across the feed a flattened one. A beam that leans by β over the distance d looks d β
-aside. Both are found by fitting the sphere to the points that the corrector would deliver
-with the corrected geometry.
+An offset of the probe along the feed shows as a cusp or a dimple at the centre of the sphere, an
+offset across the feed as a flat centre. A beam inclined by β measures d β to the side at a
+distance d. Offset and inclination are fitted so that the corrected points lie on the sphere.
 """
 
 from __future__ import annotations
@@ -21,34 +19,33 @@ from omsm_ros.core.streams.blocks import AxisBlock, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.linear_algebra import least_squares, unit_columns
-from omsm_ros.readable import measured, quantity
 from omsm_ros.units import MICROMETRE_M
 
 _OfUnknown = Callable[[FloatArray], FloatArray]
 _COLUMNS = ("x", "y", "z", "b", "c", "distance")
-# Ten groups of consecutive points, whose scatter is then known to a quarter.
+# Ten groups of consecutive points, from which a standard deviation is known to 25 %.
 _MIN_POINTS = 1000
-# Thinned evenly to so many: time and memory of the fit stay bounded.
+# More points are thinned evenly, to bound time and memory of the fit.
 _MAX_POINTS = 60_000
 # Consecutive points within which residuals may be correlated: 0.1 s at 1 kHz.
 _GROUP_POINTS = 100
-# Unknowns are fitted in these units: micrometres for lengths, milliradians for slopes.
+# Unit of slopes in the fit, a milliradian; lengths are in micrometres.
 _SLOPE_UNIT = 1e-3
-# A certified radius is known to better; one that is off by more is another's, or a slip of the pen.
+# Certified radii are known to better; a larger deviation is a wrong sphere or a wrong entry.
 _RADIUS_KNOWN = 2e-4
-# No five standard deviations are chance.
+# A deviation of five standard uncertainties is no chance.
 _CERTAIN = 5.0
-# With less than this a slope of the beam moves no point by a nanometre.
+# Over a shorter range of distance an inclined beam shifts no point by a nanometre.
 _USEFUL_DISTANCE_M = 2e-6
-# Singular values below this part of the largest are rounding.
+# Singular values below this share of the largest are rounding.
 _SINGULAR = 1e-13
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SphereScan:
-    """A scan of a sphere before kinematics, each array (n,).
+    """Samples of a sphere before kinematics, each array (n,).
 
-    x, y: slides [m];  z: H(z) [m];  b, c: [rad];  distance: true, growing with height [m]
+    x, y: slides [m];  z: H(z) [m];  b, c: [rad];  distance: corrected, growing with height [m]
     """
 
     x: FloatArray
@@ -61,13 +58,12 @@ class SphereScan:
 
 @dataclass(frozen=True)
 class Alignment:
-    """Geometry found, and how well.
+    """Geometry of the probe with its uncertainty.
 
     uncertainty: standard uncertainties of centre_x, centre_y [m], beam_x, beam_y [1]
-    sphere: centre in the workpiece frame and radius [m]; convex if its centre lies below
-    residual: rms left [m];  scatter: of a point about its neighbours [m], what noise alone leaves
-    beam_found: False where the distance hardly varied
-    used: points fitted
+    sphere: centre in the workpiece frame and radius [m]
+    residual: rms [m];  scatter: of a point about its neighbours, the residual of noise alone [m]
+    beam_found: False where the distance hardly varied;  used: number of points fitted
     """
 
     geometry: Geometry
@@ -80,9 +76,9 @@ class Alignment:
 
 
 class SphereScanReader:
-    """The scan behind corrected points that come in portions, in bounded memory.
+    """Collects the scan behind corrected points that come in portions, in bounded memory.
 
-    points: how many came; of them no more than are fitted are kept, evenly chosen
+    points: number received, of which an even selection is kept
     """
 
     def __init__(self) -> None:
@@ -91,11 +87,11 @@ class SphereScanReader:
         self._kept = EvenSelection(_MAX_POINTS)
 
     def add_axes(self, block: AxisBlock) -> None:
-        """Take in the next axis block, before the points that come of it."""
+        """Add an axis block, before the points that are computed from it."""
         self._axes.append(block)
 
     def add(self, points: SurfacePoints) -> None:
-        """Take in the next points, corrected with no geometry and no lateral lag."""
+        """Add points that were corrected without geometry and without latency."""
         if not len(points):
             return
         scan = sphere_scan_of(points, self._axes)
@@ -105,15 +101,15 @@ class SphereScanReader:
         self._axes = [b for b in self._axes if b.end > last]
 
     def scan(self) -> SphereScan:
-        """Return the points kept."""
+        """Return the kept points."""
         rows = self._kept.rows().reshape(-1, len(_COLUMNS))
         return SphereScan(**dict(zip(_COLUMNS, rows.T, strict=True)))
 
 
 def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
-    """Return the scan behind points that were corrected with no geometry and no lateral lag.
+    """Return the scan behind points that were corrected without geometry and without latency.
 
-    axes: the blocks of that one scan. Raises DataError for a point that is in none of them.
+    axes: the blocks of that scan. Raises DataError for a point that is in none of them.
     """
     counts = np.concatenate([b.first_sample + np.arange(len(b)) for b in axes])
     order = np.argsort(counts, kind="stable")
@@ -121,10 +117,7 @@ def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereSc
     place = order[index]
     strange = np.flatnonzero(counts[place] != points.sample)
     if len(strange):
-        raise DataError(
-            f"sample {int(points.sample[strange[0]])!r} is in none of the axis blocks; "
-            "give the blocks of the scan that was corrected"
-        )
+        raise DataError("registration.foreign_sample", sample=int(points.sample[strange[0]]))
     x, y, z, b, c = (
         np.concatenate([getattr(block, name) for block in axes])[place] for name in "xyzbc"
     )
@@ -133,13 +126,12 @@ def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereSc
 
 
 def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None = None) -> Alignment:
-    """Fit spindle centre and lean of the beam to a scan of a sphere.
+    """Fit the spindle centre and the inclination of the beam to a scan of a sphere.
 
-    radius: of the sphere [m], certified; negative for a convex one
-    geometry: what is known already: the probe's place; its centre and beam are the start
+    radius: certified radius [m], negative for a convex sphere
+    geometry: the known place of the probe, and the start of centre and beam
 
-    Raises DataError for a scan that is too short, does not look like a sphere, or looks like one of
-    another radius.
+    Raises DataError for a scan that is too short, or does not fit a sphere of this radius.
     """
     scan = _thinned(scan)
     start = geometry or Geometry()
@@ -161,7 +153,7 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
     residual = _rms(found)
     deviations = _standard_uncertainties(found.jac, found.fun)
     if not known:
-        # By what a radius that is hardly right moves them.
+        # The effect of the deviation of the radius adds to the uncertainty.
         deviations = np.hypot(deviations, found.x - free.x[:-1])
     aligned = _with(start, found.x)
     in_si = np.append(deviations[:2] * MICROMETRE_M, (deviations[5:] * _SLOPE_UNIT))
@@ -181,19 +173,13 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
 def _fitted(
     radius: float, misfit: _OfUnknown, jacobian: _OfUnknown, first: FloatArray
 ) -> optimize.OptimizeResult:
-    left = "its centre strays out of the machine"
     try:
         found = optimize.least_squares(misfit, first, jac=jacobian, method="lm", x_scale="jac")
-    except ConfigurationError:  # no geometry has it there
-        pass
-    else:
-        if found.success and _rms(found) <= 0.01 * abs(radius):
-            return found
-        left = f"{quantity(_rms(found), 'm')} rms are left"
-    raise DataError(
-        f"the scan does not fit a sphere of radius {quantity(radius, 'm')}: {left}; "
-        "check the radius and its sign, and that the scan covers the sphere"
-    )
+    except ConfigurationError as err:  # the centre leaves the range of a geometry
+        raise DataError("registration.sphere_outside_machine", radius=radius) from err
+    if not found.success or _rms(found) > 0.01 * abs(radius):
+        raise DataError("registration.no_sphere", radius=radius, residual=_rms(found))
+    return found
 
 
 def _rms(found: optimize.OptimizeResult) -> float:
@@ -202,18 +188,15 @@ def _rms(found: optimize.OptimizeResult) -> float:
 
 
 def _checked_radius(free: optimize.OptimizeResult, radius: float) -> bool:
-    """Return whether the radius that fits best, last of what is found, is the one that is given.
+    """Return whether the fitted radius, the last unknown, agrees with ``radius``.
 
-    Raises DataError where it is so far off that the centre found would be no centre.
+    Raises DataError for a deviation that would make the fitted centre wrong.
     """
     fits = float(free.x[-1]) * MICROMETRE_M
     spread = float(_standard_uncertainties(free.jac, free.fun)[-1]) * MICROMETRE_M
     off = abs(fits - radius)
     if off > max(_CERTAIN * spread, _RADIUS_KNOWN * abs(radius)):
-        raise DataError(
-            f"the scan is of a sphere of radius {measured(fits, spread, 'm')} (k = 1), not "
-            f"{quantity(radius, 'm', 6)}; check the radius, or the scale of Z"
-        )
+        raise DataError("registration.other_radius", fitted=fits, uncertainty=spread, radius=radius)
     return off <= 2 * spread
 
 
@@ -247,8 +230,8 @@ def _misfit(scan: SphereScan, radius: float, geometry: Geometry, unknown: FloatA
 def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> FloatArray:
     """Return the derivatives of :func:`_misfit` (n, 5 or 7).
 
-    Analytic in the centres: on a sphere that runs true, an offset across the feed shows in
-    second order only, and the rounding of differences would pass for knowledge of it.
+    Analytic in the centres, because on a centred sphere an offset across the feed has a
+    second-order effect only, which finite differences would hide in their rounding.
     """
     slides = (scan.x, scan.y, scan.z)
     points = workpiece_points(_with(geometry, unknown), slides, scan.b, scan.c, scan.distance)
@@ -257,7 +240,7 @@ def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> Floa
     cosine, sine = np.cos(scan.c), np.sin(scan.c)
     columns = [y * sine - x * cosine, -x * sine - y * cosine, -x, -y, -z]
     for k in range(5, len(unknown)):
-        # The reach of the beam is all but linear in its lean: a difference over a milliradian.
+        # The end of the beam is nearly linear in its inclination: a difference over a milliradian.
         step = np.zeros_like(unknown)
         step[k] = 0.5
         ends = [
@@ -273,7 +256,7 @@ def _jacobian(scan: SphereScan, geometry: Geometry, unknown: FloatArray) -> Floa
 
 
 def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool) -> FloatArray:
-    """Return the sphere's centre one radius off the lowest or highest of a fitted paraboloid."""
+    """Return start values: the centre lies one radius from the vertex of a fitted paraboloid."""
     points = workpiece_points(geometry, (scan.x, scan.y, scan.z), scan.b, scan.c, scan.distance)
     ones = np.ones(len(points.x))
     terms = np.stack([ones, points.x, points.y, points.x**2 + points.y**2], axis=1)
@@ -285,23 +268,19 @@ def _first_guess(scan: SphereScan, radius: float, geometry: Geometry, beam: bool
 
 
 def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the standard uncertainties, residuals taken as correlated within groups of points."""
-    # Through the singular values of scaled columns: the normal equations would square the
-    # condition number, and with it lose what is barely known.
+    """Return standard uncertainties for residuals that are correlated within groups of points."""
+    # Singular values of scaled columns, because normal equations square the condition number.
     unit, scale = unit_columns(jacobian)
     _, values, rows = np.linalg.svd(unit, full_matrices=False)
     if values[-1] <= _SINGULAR * values[0]:
-        raise DataError(
-            "the scan does not show where the spindle's centre lies: the probe hardly moved over "
-            "the sphere; scan across it while the spindle turns"
-        )
+        raise DataError("registration.centre_not_determined")
     root = rows.T / values / scale[:, np.newaxis]
     inverse = root @ root.T
     edges = np.arange(0, len(residual), _GROUP_POINTS)
     scores = np.add.reduceat(jacobian * residual[:, np.newaxis], edges, axis=0)
     correction = len(scores) / (len(scores) - 1)
     covariance = inverse @ (correction * scores.T @ scores) @ inverse
-    with np.errstate(invalid="ignore"):  # what the scan does not show may round below zero
+    with np.errstate(invalid="ignore"):  # an undetermined variance may round below zero
         return np.asarray(np.sqrt(np.diag(covariance)), np.float64)
 
 
@@ -310,8 +289,10 @@ def _thinned(scan: SphereScan) -> SphereScan:
     good = np.all([np.isfinite(getattr(scan, name)) for name in _COLUMNS], axis=0)
     if np.count_nonzero(good) < _MIN_POINTS:
         raise DataError(
-            f"scan of {int(np.count_nonzero(good))} finite points of {samples}, "
-            f"expected {_MIN_POINTS} or more"
+            "registration.short_sphere_scan",
+            finite=int(np.count_nonzero(good)),
+            samples=samples,
+            least=_MIN_POINTS,
         )
     used = np.flatnonzero(good)[:: -(-samples // _MAX_POINTS)]
     return SphereScan(**{name: getattr(scan, name)[used] for name in _COLUMNS})

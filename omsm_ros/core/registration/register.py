@@ -1,9 +1,9 @@
-"""How does the part sit? The pose in which scattered points lie best on their nominal surface.
+"""Fit the pose in which scattered points lie best on their nominal surface.
 
-Gauss–Newton with exact derivatives on an even selection of the points until the pose stands, then
-one pass over all of them; sums of products of the columns are all that is kept, so memory does not
-grow with the scan. Beside the pose the fit allows for the part's own form error, see
-:mod:`omsm_ros.core.registration.form_model`; dust lies far from that smooth form and is left out.
+Gauss-Newton with exact derivatives on an even selection of the points until the pose converges,
+then one pass over all points. Only sums of products are kept, so memory does not grow with the
+scan. The fit includes the part's form error, see :mod:`omsm_ros.core.registration.form_model`;
+points far from the smooth form (dust) are left out.
 """
 
 from __future__ import annotations
@@ -58,11 +58,10 @@ from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
 
-# The pose of least squares, from which the fit beside form begins.
-
-# With the refinement that follows it took 12 to 36 on spheres and off-axis paraboloids with form.
+# With the refinement that follows, spheres and off-axis paraboloids with form took 12 to 36
+# iterations.
 _MOST_TURNS = 30
-# A pose stands when its last step moved no point by more than this share of their spread.
+# A pose has converged when its last step moved the points by less than this share of their spread.
 SHARE_OF_SPREAD, _SETTLED_M = 1e-2, 1e-10
 
 
@@ -73,12 +72,12 @@ def coarse_placement(
     aperture: Aperture | None,
     at: Placement,
 ) -> Placement:
-    """Return the placement of least squares, points far from the others left out."""
+    """Return the least-squares placement without outliers, the start of the fit with form."""
     for turn in range(_MOST_TURNS):
         points = inside_aperture(placed(surface, at, chosen), aperture)
         if turn and len(points.x):
             middle = points.deviation - np.median(points.deviation)
-            # Generous: what is left here is still the pose.
+            # The limit is wide, because the pose still contributes to the spread.
             points = points.part(
                 np.abs(middle) <= max(8 * statistics.spread(middle), LEAST_LIMIT_M)
             )
@@ -94,27 +93,23 @@ def coarse_placement(
             [typical_range(n) for n in names] * scale,
         )
         at = at.moved(names, step / scale)
-        # The refinement that follows converges from far more.
         settled = max(SHARE_OF_SPREAD * statistics.spread(points.deviation), _SETTLED_M)
-        # Of all freedoms together: what x does a tilt may undo.
+        # The joint effect counts: a tilt may cancel a shift.
         moved = float(np.sqrt(np.mean((step @ columns) ** 2)))
         if turn > 1 and moved < settled:
             return at
-    raise DataError(
-        "the points do not settle on the nominal surface; check its parameters, the sign of its "
-        "radii and the units of the cloud, or fit fewer freedoms"
-    )
+    raise DataError("registration.not_converged")
 
 
 def _bounded_step(
     columns: FloatArray, deviation: FloatArray, at: FloatArray, widest_: FloatArray
 ) -> FloatArray:
-    """Return the step (p,) along ``columns`` (p, n) that explains ``deviation`` (n,) best.
+    """Return the regularised least-squares step (p,) along ``columns`` (p, n).
 
-    What no step explains, the form, is of one kind over the whole part, and says nothing of a
-    freedom that does less than it: such a one stays within what a part may be off by.
+    The residual, mostly form, is correlated over the part. A degree of freedom with a smaller
+    effect than the residual is therefore held near zero, within its plausible offset.
 
-    at: where the freedoms stand;  widest_: how far they may be off;  both (p,) as steps are
+    at: present values;  widest_: plausible offsets;  both (p,), in the unit of the step
     """
     free = np.linalg.lstsq(columns.T, deviation, rcond=1e-12)[0]
     form = float(np.sqrt(np.mean((deviation - free @ columns) ** 2)))
@@ -124,14 +119,13 @@ def _bounded_step(
     return np.asarray(found[0], np.float64)
 
 
-# Points at a time: 7 freedoms and 42 polynomials of each are 6 MB.
+# Points at a time: 49 columns of them are 6 MB.
 CHUNK = 16_384
 _MOST_SELECTED, _MOST_REFINED = 40_000, 30
 # Points without errors, for seven unknowns.
 _ENOUGH_FOR_A_CURVE = 2000
-# A pose stands too when its last step moved it by this share of what is unknown of it: where form
-# and pose look alike, the sizes of form that are found go to and fro by a thousandth, and the pose
-# with them by twentieths of its uncertainty.
+# A pose has converged too when its last step is below this share of its uncertainty: where form
+# and pose look alike, the estimate oscillates by a twentieth of it.
 _SHARE_OF_UNCERTAINTY = 0.1
 
 
@@ -144,14 +138,14 @@ def register(
     aperture: Aperture | None = None,
     even: bool = False,
 ) -> Registration:
-    """Fit the freedoms ``asked`` for, or "auto", of a part whose nominal is ``surface``.
+    """Fit the degrees of freedom ``asked`` for, or "auto", of a part to its nominal ``surface``.
 
-    portions: reads the points, whose ``systematic`` rows are named by ``sources``
-    aperture: of the part, beyond which points do not count; None for all of them
-    even: the points are those of an evenly spaced grid
+    portions: reads the points;  sources: names of their ``systematic`` rows
+    aperture: of the part, beyond which points are ignored; None for all points
+    even: the points form an evenly spaced grid
 
-    Raises DataError for too few points, a freedom that the surface does not determine, or a fit
-    that does not converge.
+    Raises DataError for too few points, a degree of freedom that the surface does not determine,
+    or a fit that does not converge.
     """
     chosen = selection(portions, _MOST_SELECTED)
     start = Placement()
@@ -159,7 +153,7 @@ def register(
     try:
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     except DataError:
-        # Where the part was left askew, a turn of half a degree may pass for one that shows.
+        # On a tilted part an undetermined rotation may seem to be determined; seat it first.
         seated = coarse_placement(surface, chosen, DEGREES_OF_FREEDOM[:3], aperture, start)
         dofs = _determined(surface, chosen, asked, aperture, seated)
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
@@ -181,15 +175,17 @@ def _determined(
     aperture: Aperture | None,
     at: Placement,
 ) -> DegreesOfFreedom:
-    """Return which freedoms the surface determines where the part is ``at``."""
+    """Return which degrees of freedom the surface determines where the part is ``at``."""
     points = inside_aperture(placed(surface, at, chosen), aperture)
     columns = dof_columns(at, points, DEGREES_OF_FREEDOM)
     return determined_dofs(asked, columns @ columns.T, len(points.x))
 
 
 class _PlacementState(NamedTuple):
-    """at: the placement that stands;  like: what sum of columns is most like there (q,)
-    limit: of dust [m];  found, sums: by the selected points
+    """Converged fit of the selected points.
+
+    at: placement;  like: coefficients of the free fit there (q,);  limit: of outliers [m]
+    found, sums: estimate and its normal equations
     """
 
     at: Placement
@@ -206,7 +202,7 @@ def _useful(
     asked: Sequence[str],
     open_: OpenUncertainty,
 ) -> tuple[_Fit, _PlacementState, OpenUncertainty]:
-    """Hold, of what nobody asked for by name, what the points do not determine well enough."""
+    """Hold the moves that were not asked for by name and that the points hardly determine."""
     names, at = fit.names, stand.at
     values = np.array([at.value(name) for name in names])
     covariance = stand.found.covariance[: len(names), : len(names)]
@@ -232,10 +228,7 @@ def _useful(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """What stays the same over the passes.
-
-    plain: the placement of least squares
-    """
+    """Fixed inputs of the passes;  plain: the least-squares placement."""
 
     surface: Surface
     dofs: DegreesOfFreedom
@@ -251,11 +244,11 @@ class _Fit:
         return FormNormalEquations(len(self.names) + len(self.basis), sources)
 
     def unknown(self, at: Placement, chosen: PointBatch) -> dict[str, dict[str, FloatArray]]:
-        """Return what each freedom that the surface does not determine does to the others (2,).
+        """Return the effect (2,) of each undetermined degree of freedom on each fitted one.
 
-        They follow it along a curve: a surface without errors, in the pose found, is fitted once
-        more where the freedom is off by as much as it may be to either side. Half the difference
-        of the two, and their mean, are the first and second order.
+        A surface without errors is fitted again with the undetermined one at its largest plausible
+        offset to either side. Half the difference and the mean of both are the first and second
+        order.
         """
         every = max(len(chosen.x) // _ENOUGH_FOR_A_CURVE, 1)
         few = PointBatch(*(v[..., ::every] for v in chosen))
@@ -283,7 +276,7 @@ class _Fit:
         held_effects: FloatArray,
         sums: FormNormalEquations,
     ) -> None:
-        """Add a portion's points to ``sums``, residuals from what is most like them."""
+        """Add the points of a ``portion`` to ``sums``, with residuals from the free fit."""
         at, like, limit = stand.at, stand.like, stand.limit
         for begin in range(0, len(portion.x), CHUNK):
             part = PointBatch(*(v[..., begin : begin + CHUNK] for v in portion))
@@ -306,7 +299,7 @@ class _Fit:
         free = len(self.names)
         variance = sums.square / max(sums.points - sums.columns, 1)
         own = np.diag(sums.gram)[free:]
-        # Errors that hang together average out more slowly: so much more of them is left.
+        # Correlated errors average out more slowly, by this factor of their variance.
         together = float(np.mean(sums.scores[free:] / own)) / variance if variance > 0 else 1.0
         square = sums.gram[:, : sums.columns]
         moments, largest = sums.gram[:, sums.columns], sums.total / max(sums.points, 1)
@@ -315,19 +308,16 @@ class _Fit:
         return found, variance
 
     def expected(self, at: Placement) -> tuple[FloatArray, FloatArray]:
-        """Return where the freedoms stand and how far a part may be off in them, both (p,).
+        """Return the values of the pose and the standard deviations of their priors, both (p,).
 
-        One that lies plainly further off than a part that was put on by hand was moved so.
+        A larger offset in the least-squares fit widens the prior.
         """
         first = [abs(self.plain.value(n)) for n in self.names]
         value = np.array([at.value(n) for n in self.names])
         return value, np.maximum([typical_range(n) for n in self.names], first)
 
     def refine(self, at: Placement, chosen: PointBatch) -> _PlacementState:
-        """Return the placement that stands.
-
-        Raises DataError if none does.
-        """
+        """Return the converged fit; raise DataError if there is none."""
         share, last = 1.0, np.zeros(len(self.names))
         for turn in range(_MOST_REFINED):
             points = inside_aperture(placed(self.surface, at, chosen), self.aperture)
@@ -343,7 +333,7 @@ class _Fit:
             own = np.sqrt(np.diag(sums.gram)[: len(self.names)] / sums.points)
             step = found.step * own
             settled = max(SHARE_OF_SPREAD * statistics.spread(residual), LEAST_LIMIT_M)
-            # Of all freedoms together: what x does a tilt may undo.
+            # The joint effect counts: a tilt may cancel a shift.
             gram = sums.gram[: len(step), : len(step)]
             square = float(found.step @ gram @ found.step) / sums.points
             still = square < settled**2 or found.length < _SHARE_OF_UNCERTAINTY
@@ -363,7 +353,7 @@ def _over_all(
     sources: Sequence[str],
     open_: OpenUncertainty,
 ) -> Registration:
-    """Return the registration by all points, from one pass over them at a pose that stands."""
+    """Return the registration from one pass over all points at the converged pose."""
     free, held = len(fit.names), root_of(open_.held)
     sums = fit.new_sums(len(sources) + 2 * len(held))
     square = points = 0.0
@@ -374,7 +364,7 @@ def _over_all(
         points += float(np.sum(np.isfinite(before)))
     found, variance = fit.solved(stand.at, sums)
     gain = found.covariance[:free] / found.noise
-    # A source that is off by its standard uncertainty moves the pose by one of these columns.
+    # Each column is the step of the pose for one standard uncertainty of a source.
     moved = gain @ sums.gram[:, sums.columns + 1 :]
     covariance = found.covariance[:free, :free]
     by_source = open_.by_source(fit.names, covariance, (*sources, *[HELD] * 2 * len(held)), moved)

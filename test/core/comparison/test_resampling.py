@@ -116,17 +116,17 @@ def test_a_profile_and_a_handful_of_points_are_no_surface():
         on_grid(MeasuredPoints(x=x, y=0 * x, height=x), 100)
     rng = np.random.default_rng(0)
     few = MeasuredPoints(x=rng.random(5), y=rng.random(5), height=rng.random(5))
-    with pytest.raises(DataError, match="too few for a surface"):
+    with pytest.raises(DataError, match="expected 9 or more for a surface"):
         LocalQuadratic(few, 0.2)
 
 
 def test_a_spacing_of_a_wrong_unit_is_refused():
-    with pytest.raises(DataError, match="widen it"):
+    with pytest.raises(DataError, match="widen 'spacing'"):
         on_grid(_points(paraboloid), 200, spacing=1e-9)
 
 
 def test_a_spacing_finer_than_the_points_that_leaves_no_height_is_refused():
     rng = np.random.default_rng(0)
     x, y = rng.uniform(-1e-3, 1e-3, (2, 500))
-    with pytest.raises(DataError, match=r"spacing of 1\.00 µm is finer .* widen it"):
+    with pytest.raises(DataError, match=r"spacing of 1\.00 µm is finer .* widen 'spacing'"):
         on_grid(MeasuredPoints(x=x, y=y, height=0 * x), 200, spacing=1e-6)

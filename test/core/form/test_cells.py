@@ -88,7 +88,7 @@ def test_bands_are_what_was_asked_for_where_the_cells_allow_it():
     assert bands_of(cells, 1e-3, 8e-3).l_filter == 8e-3
     assert bands_of(cells, 1e-3, 8e-3).s_filter == 1e-3
     assert bands_of(cells, 1e-9).s_filter == 3 * cells.pitch
-    with pytest.raises(DataError, match="leaves nothing beside the S-filter"):
+    with pytest.raises(DataError, match="is not longer than the S-filter"):
         bands_of(cells, 8e-3, 8e-3)
 
 

@@ -217,5 +217,5 @@ def test_more_places_than_a_controller_takes_are_refused_by_their_number():
 
 
 def test_a_feed_in_a_wrong_unit_makes_no_turn_and_is_refused():
-    with pytest.raises(ConfigurationError, match=r"100 mm a turn .* makes not one turn"):
+    with pytest.raises(ConfigurationError, match=r"100 mm a turn .* makes less than one turn"):
         spiral_offsets(plane(), 0.1, 360)

@@ -94,7 +94,7 @@ def test_a_basis_spans_every_polynomial_of_the_orders_it_is_of(kind):
 
 def test_points_at_one_place_show_no_form():
     nowhere = np.full(300, 1e-3)
-    with pytest.raises(DataError, match="few places that no form shows; measure across the part"):
+    with pytest.raises(DataError, match="few places to show any form; measure across the part"):
         FormBasis.over(nowhere, nowhere, np.ones(300), DISC)
 
 

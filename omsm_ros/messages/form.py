@@ -1,0 +1,30 @@
+"""Sentences of form: Zernike terms, filters, offsets of the next cut."""
+
+TEMPLATES: dict[str, str] = {
+    "form.few_points_for_terms": (
+        "{points} points for {terms} Zernike terms, expected {least} or more; measure more points "
+        "or ask for fewer terms"
+    ),
+    "form.no_term": "the points determine no Zernike term; check the aperture and the weights",
+    "form.no_usable_point": "no point can be used: {counts}; check aperture and surface",
+    "form.empty_filter_band": (
+        "L-filter of {l_filter!r} m is not longer than the S-filter of {s_filter!r} m that the "
+        "points allow; give a longer {opt.l_filter}, or measure more points"
+    ),
+    "form.low_pass_too_short": (
+        "low-pass of {low_pass!r} m is finer than the points resolve, expected {least!r} m or "
+        "more; measure more points, or compensate less"
+    ),
+    "form.one_row": (
+        "the points lie within one row of cells of {pitch!r} m, so that nothing is known across "
+        "it; measure more tracks"
+    ),
+    "form.spiral_below_one_turn": (
+        "spiral of {feed:m} a turn from a rim of {rim:m} makes less than one turn; take a narrower "
+        "feed"
+    ),
+    "form.spiral_too_long": (
+        "spiral of {feed:m} a turn with {per_turn} places of each makes {lines:count} lines, at "
+        "most {most:count}; take a wider feed"
+    ),
+}
