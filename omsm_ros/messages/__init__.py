@@ -15,6 +15,8 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 | ``{n:count}`` | number of things, ``290 011`` |
 | ``{factor:plain/2}`` | number without unit, to 2 digits |
 | ``{names:list}`` | items separated by commas |
+| ``{names:and}`` | items joined by "and" |
+| ``{name:figure}``, ``{term:zernike}`` | figure of form by its field, Zernike term ``(n, m)`` |
 | ``{source:words}`` | name with spaces instead of underscores |
 | ``{opt.dwell}`` | ``--dwell``, ``parameter 'dwell'`` or ``'dwell'``, for the audience |
 
@@ -26,7 +28,7 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import string
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from functools import lru_cache
 from typing import Any
@@ -73,6 +75,18 @@ class _Options:
         return f"parameter {name!r}" if audience == NODE else repr(name)
 
 
+_WITH_DIGITS: dict[str, Callable[..., str]] = {"%": readable.percent, "plain": readable.plain}
+_WRITERS: dict[str, Callable[[Any], str]] = {
+    "chance": readable.p_value_text,
+    "count": readable.count,
+    "list": lambda items: ", ".join(map(str, items)) or "none",
+    "and": lambda items: " and ".join(map(str, items)),
+    "words": lambda name: str(name).replace("_", " "),
+    "figure": readable.figure,
+    "zernike": lambda term: readable.zernike(*term),
+}
+
+
 class _Formatter(string.Formatter):
     """Format numbers as :mod:`omsm_ros.readable` writes them where the format names a unit."""
 
@@ -85,16 +99,8 @@ class _Formatter(string.Formatter):
         more = (int(digits),) if digits else ()
         if kind in _UNITS:
             return readable.quantity(value, kind, *more)
-        if kind == "%":
-            return readable.percent(value, *more)
-        if kind == "plain":
-            return readable.plain(value, *more)
-        if kind == "chance":
-            return readable.p_value_text(value)
-        if kind == "count":
-            return readable.count(value)
-        if kind == "list":
-            return ", ".join(map(str, value)) or "none"
-        if kind == "words":
-            return str(value).replace("_", " ")
+        if kind in _WITH_DIGITS:
+            return _WITH_DIGITS[kind](value, *more)
+        if kind in _WRITERS:
+            return _WRITERS[kind](value)
         return str(super().format_field(value, format_spec))

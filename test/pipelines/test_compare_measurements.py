@@ -149,7 +149,7 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
     pair = (str(results["slow"]), str(results["fast"]))
     assert main(["difference", *pair, "--out", str(tmp_path / "d")]) == DONE
     text = capsys.readouterr().out
-    for expected in ("verdict", "agree", "nobody states the drift", "E_n of rms", "nm"):
+    for expected in ("verdict", "agree", "no drift is stated", "E_n of rms", "nm"):
         assert expected in text
 
 

@@ -149,7 +149,7 @@ def _rms_about_zero(values: FloatArray) -> float:
 
 
 def _slopes(image: FloatArray, cells: GridCells) -> FloatArray:
-    """Return slopes (k,) over two cells with all neighbours present, along a row if there is one."""
+    """Return slopes (k,) over two cells with all neighbours present; of one row, along it."""
     ways = [axis for axis, size in enumerate(image.shape) if size > 1]
     inside = cells.present.copy()
     square = np.zeros(image.shape)

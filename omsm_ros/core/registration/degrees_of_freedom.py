@@ -169,8 +169,8 @@ class Registration:
     moved: steps (p, s + 2h) for one standard uncertainty of each systematic source, and then for
         the held degrees of freedom in first and second order
     spread: standard uncertainty of each degree of freedom asked for [m], [rad] or [1/m]
-    correlated_moves: for each undetermined degree of freedom at its largest plausible offset: the effect
-        on each fitted one, in first and second order (2,)
+    correlated_moves: for each undetermined degree of freedom at its largest plausible offset: the
+        effect on each fitted one, in first and second order (2,)
     limit: deviation from the smooth form beyond which a point is an outlier [m]
     disc: the aperture, or a disc that holds all points
     form: coefficients of the smooth form in ``basis`` (k,) [m rms]

@@ -98,17 +98,17 @@ def test_one_term_and_all_together_make_the_verdict(score, probability, verdict)
 def test_the_term_that_differs_is_named_with_its_size_and_what_explains_it():
     found = judged(terms=terms({(2, 2): 2.0, (4, 0): 1.4}))
     assert str(found.reasons[0]) == (
-        "astigmatism Z(2, 2) differs by 10.0 nm where 5.00 nm are explained: E_n = 2.00"
+        "astigmatism Z(2, 2) differs by 10.0 nm, expanded uncertainty 5.00 nm: E_n = 2.00"
     )
     found = judged(terms=terms({(5, -3): -3.0}))
-    assert found.reasons[0].startswith("Z(5, -3) differs by -15.0 nm")
+    assert str(found.reasons[0]).startswith("Z(5, -3) differs by -15.0 nm")
 
 
 def test_the_joint_test_is_reported_where_it_decides():
     found = judged(probability=1e-3)
     assert found.verdict == DIFFER
     assert len(found.reasons) == 1
-    assert found.reasons[0].startswith("all terms together: p = 0.001")
+    assert str(found.reasons[0]).startswith("all terms together: p = 0.001")
 
 
 @pytest.mark.parametrize(("farthest", "verdict"), [(4.9, AGREE), (5.1, DIFFER)])
@@ -130,7 +130,7 @@ def test_a_figure_alone_makes_no_difference_but_a_doubt():
     # Beside a term that differs it is told, too.
     found = judged(figures=figures, terms=terms({(2, 2): 2.0}))
     assert found.verdict == DIFFER
-    assert found.reasons[-1].endswith(": E_n = 2.00")
+    assert str(found.reasons[-1]).endswith(": E_n = 2.00")
 
 
 def test_a_figure_that_was_not_evaluated_says_nothing():
