@@ -1,9 +1,15 @@
-"""Linear least squares whose columns may have any units: each is scaled to unit length first."""
+"""Linear algebra of small problems: scaled least squares, and the threads of BLAS.
+
+Columns may have any units: each is scaled to unit length first.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from importlib.machinery import PathFinder
 from types import ModuleType
@@ -13,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-# Of columns that are factorised at a time.
+# Rows factorised at a time: half a megabyte a column.
 _ROWS = 65_536
 
 
@@ -56,13 +62,49 @@ def triangle(*parts: FloatArray) -> FloatArray:
     return np.asarray(found)
 
 
-# Two compiled functions of scipy without the packages around them.
-#
+class _OneThread:
+    """The limit of BLAS to one thread, shared by all that ask for it at the same time."""
+
+    def __init__(self) -> None:
+        self._lock, self._users = threading.Lock(), 0
+        self._limit: Any = None
+
+    def enter(self) -> None:
+        from threadpoolctl import threadpool_limits
+
+        with self._lock:
+            if self._users == 0:
+                self._limit = threadpool_limits(1, user_api="blas")
+            self._users += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._users -= 1
+            if self._users == 0:
+                self._limit.restore_original_limits()
+
+
+_one_thread = _OneThread()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let BLAS compute in one thread; also a decorator.
+
+    The order of additions in a sum depends on the number of threads, so that a search would end at
+    other bits, or at another model. Threads cost more than they gain in matrices of this size.
+    """
+    _one_thread.enter()
+    try:
+        yield
+    finally:
+        _one_thread.leave()
+
+
 # Loading ``scipy.signal`` and ``scipy.linalg`` takes longer than correcting a scan, and one
-# function
-# of each is needed. The module that holds it is loaded by its file, under its own name, so that
-# whoever imports the package later finds it there. Where scipy has moved it, the public function
-# serves: the same numbers, half a second later.
+# compiled function of each is needed. The module that holds it is loaded from its file, under its
+# own name, so that a later import of the package finds it there. Where scipy has moved it, the
+# public function is used: it gives the same numbers, half a second later.
 
 ComplexArray = NDArray[np.complex128]
 

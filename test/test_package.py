@@ -26,6 +26,7 @@ ROSDEP = {
     "control": ("control", None),
     "cobs": ("cobs", None),
     "mcap": ("mcap", None),
+    "threadpoolctl": ("threadpoolctl", None),
 }
 
 # Imported where they are used, and only there; `pip install omsm_ros[extra]` has them.

@@ -73,12 +73,12 @@ def explore(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
     order: int = 0,
     colour: float = 1.0,
-    effort: EvaluationBudget | None = None,
+    budget: EvaluationBudget | None = None,
 ) -> list[Candidate]:
     """Fit structures of rising order until two more poles in a row gain nothing.
 
     order: number of poles to go to in any case;  colour: of the noise, see :func:`information`
-    effort: of the fits; once it is spent no further order is begun
+    budget: of the fits; no further order is tried once it is exhausted
 
     Raises IdentificationError for an order that is no number of poles to try.
     """
@@ -92,8 +92,9 @@ def explore(
             fitted = fit_structure(structure, [c.fit for c in found])
             found.append(Candidate(fitted, information(fitted, colour)))
         fruitless = 0 if min(c.bic for c in found) < before else fruitless + 1
-        enough = fruitless >= 2 or (effort is not None and effort.spent)
-        if enough and poles >= order:
+        if poles < order:
+            continue
+        if fruitless >= 2 or (poles < _FREE_POLES and budget is not None and budget.stops()):
             break
     return found
 
@@ -199,17 +200,19 @@ _HALF_TAPS, _PASSES, _STOPPING_SHAPE = 24, 0.88, 9.0
 class StartingPoints:
     """Propose nonlinear parameters ψ for the structures of one problem.
 
-    pure_delay: the fit of a delay alone
+    pure_delay: the fit of a delay alone;  budget: counts the evaluations, if given
     """
 
     problem: Problem
     pure_delay: Fit
+    budget: EvaluationBudget | None = None
 
     def of(self, structure: Structure, smaller: Sequence[Fit]) -> list[FloatArray]:
         """Return ψ of ``structure``, given the fits made so far."""
         if self.coarser is not None and structure.poles:
             coarse = self.coarser
-            return [fit(coarse.problem, structure, coarse.of(structure, smaller)).nonlinear]
+            starts = coarse.of(structure, smaller)
+            return [fit(coarse.problem, structure, starts, budget=self.budget).nonlinear]
         scaled = ScaledStructure(structure, self.problem.rate)
         delay = float(self.pure_delay.nonlinear[-1]) if self.pure_delay.structure.delay else 0.0
         if structure.poles == 0:

@@ -14,7 +14,6 @@ from math import comb
 import numpy as np
 from scipy import fft
 
-from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Edge, Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
@@ -235,13 +234,11 @@ def correct_errors_in_variables(
     if share is None:
         return None
     errors_in_variables = fft.irfft(share[band] * fft.rfft(noise), len(noise))
-    # It is fitted from the start; what was tried with the noise in it counts no more.
     return replace(
         problem,
         input=problem.input - errors_in_variables,
         noise=left,
         errors_in_variables=errors_in_variables,
-        effort=EvaluationBudget(),
     )
 
 

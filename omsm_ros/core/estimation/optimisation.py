@@ -20,37 +20,55 @@ _SMALLEST_STEP = 1e-9
 _LONGEST_STEP = 3.0
 # Of what one parameter gains by chance.
 _CONVERGED = 1e-4
-# Of 270 disturbed step tests those that were accepted had at most 1200 before their last round,
-# and half of them fewer than 250 in all; 1500 of 20 s at 1 kHz take five to eight seconds.
-_ENOUGH = 1500
-# Samples compared: as many comparisons of 20 s at 1 kHz, and some with all of a long record, of
-# which most are compared in fewer samples.
-_ENOUGH_SAMPLES, _ENOUGH_OF_ALL = 30_000_000, 300
+# Of 270 disturbed step tests all that were accepted needed at most 1200 evaluations before their
+# last round, half of them fewer than 250; 1500 of 20 s at 1 kHz take five to eight seconds.
+_MOST_EVALUATIONS = 1500
+# As much work as 1500 evaluations of 20 s at 1 kHz, and 300 with all samples of a long record,
+# most of whose evaluations use fewer samples.
+_MOST_SAMPLES, _MOST_FULL_EVALUATIONS = 30_000_000, 300
 
 
 @dataclass(eq=False)
 class EvaluationBudget:
-    """How often a record was compared with a model, in all the problems that were made of it.
+    """Count the evaluations of a model search and limit them: counted work, never elapsed time.
 
-    comparisons: with all of its samples, or half of them
-    samples: compared in all, of those with fewer too;  longest: most of them at a time
+    most_evaluations: of all samples of the record, or at least half of them
+    most_samples: samples of all evaluations together, beside ``most_full_evaluations`` of the
+        longest record
+    evaluations, samples, longest: used so far; longest is the most samples of one evaluation
+    incomplete: a search was cut short because the budget was exhausted
     """
 
-    comparisons: int = 0
+    most_evaluations: int = _MOST_EVALUATIONS
+    most_samples: int = _MOST_SAMPLES
+    most_full_evaluations: int = _MOST_FULL_EVALUATIONS
+    evaluations: int = 0
     samples: int = 0
     longest: int = 0
+    incomplete: bool = False
 
     def count(self, samples: int) -> None:
-        """Count a comparison of so many ``samples``."""
+        """Count an evaluation of ``samples`` samples."""
         self.longest = max(self.longest, samples)
         self.samples += samples
-        self.comparisons += 2 * samples > self.longest
+        self.evaluations += 2 * samples > self.longest
 
     @property
-    def spent(self) -> bool:
-        """Whether no further order and no further departure is to be begun."""
-        most = _ENOUGH_SAMPLES + _ENOUGH_OF_ALL * self.longest
-        return self.comparisons > _ENOUGH or self.samples > most
+    def exhausted(self) -> bool:
+        """Return True if no further order and no further model error is to be tried."""
+        most = self.most_samples + self.most_full_evaluations * self.longest
+        return self.evaluations > self.most_evaluations or self.samples > most
+
+    def stops(self) -> bool:
+        """Return ``exhausted``, and note that the search is incomplete where it is."""
+        self.incomplete |= self.exhausted
+        return self.exhausted
+
+    def renewed(self) -> EvaluationBudget:
+        """Return a budget of the same limits with nothing used."""
+        return EvaluationBudget(
+            self.most_evaluations, self.most_samples, self.most_full_evaluations
+        )
 
 
 @dataclass(frozen=True, eq=False)

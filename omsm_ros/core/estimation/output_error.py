@@ -12,7 +12,7 @@ Pereyra 1973, with Kaufman's simplification of the derivative).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -106,7 +106,6 @@ class Problem:
     plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
     shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
     errors_in_variables: what was taken out of the input, (n,) [m], see ``encoder_noise``; or None
-    effort: what was tried of this problem, and of those made of it
     """
 
     input: FloatArray
@@ -120,7 +119,6 @@ class Problem:
     plateau: IntArray | None = None
     shared: float = 0.0
     errors_in_variables: FloatArray | None = None
-    effort: EvaluationBudget = field(default_factory=EvaluationBudget)
 
     @cached_property
     def closed_length(self) -> int:
@@ -179,6 +177,11 @@ class Problem:
     def _target(self) -> FloatArray:
         return self.output[self.used]
 
+    @property
+    def compared(self) -> int:
+        """Return the number of samples that model and data are compared at."""
+        return len(self._places)
+
     @cached_property
     def _places(self) -> IntArray:
         return np.flatnonzero(self.used)
@@ -199,7 +202,6 @@ class Problem:
 
     def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
-        self.effort.count(len(self._places))
         structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
         moved = self._moved(structure, lag)
         # Column after column in memory, as LAPACK has it: numpy's takes five times as long.
@@ -362,15 +364,20 @@ def fit(
     structure: Structure,
     starts: Sequence[FloatArray],
     evaluations: int = _FINISH_EVALUATIONS,
+    *,
+    budget: EvaluationBudget | None = None,
 ) -> Fit:
-    """Try ``starts``, each a ψ, for some evaluations; return the minimum of the best of them.
+    """Improve each of ``starts``, ψ, by a few evaluations; return the minimum of the best of them.
 
-    evaluations: to that minimum, at most
+    evaluations: most iterations to that minimum
+    budget: counts the evaluations, if given
     """
     scaled = problem.parametrised(structure)
     box = scaled.bounds()
 
     def project(nonlinear: FloatArray) -> Projection:
+        if budget is not None:
+            budget.count(problem.compared)
         return problem.project(scaled, nonlinear)
 
     best, least = None, np.inf

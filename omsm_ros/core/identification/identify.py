@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import wraps
+from functools import partial, wraps
 from itertools import chain
 from typing import ParamSpec
 
@@ -34,6 +34,7 @@ from omsm_ros.core.calibration.calibration import (
 )
 from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.model_order import Candidate
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
 from omsm_ros.core.estimation.steps import Edge, find_steps
@@ -41,7 +42,7 @@ from omsm_ros.core.identification.checks import CHECKS, RANGE_CHECKS
 from omsm_ros.core.identification.covariance_terms import consistency, reference_delay
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_choice import ChosenModel, model_from_start
-from omsm_ros.core.identification.model_error_search import search_model_errors
+from omsm_ros.core.identification.model_error_search import completeness, search_model_errors
 from omsm_ros.core.identification.response_uncertainty import (
     alternative_modes,
     inflate_to_free_choice,
@@ -64,7 +65,7 @@ from omsm_ros.core.model_errors.families import DRIFT
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
-from omsm_ros.linear_algebra import unit_columns
+from omsm_ros.linear_algebra import one_blas_thread, unit_columns
 from omsm_ros.quantities import MASS
 from omsm_ros.readable import quantity
 
@@ -372,6 +373,7 @@ def _solvable(
     return computed
 
 
+@one_blas_thread()
 @_solvable
 def identify(
     record: MotionRecord,
@@ -380,6 +382,7 @@ def identify(
     input: str = "encoder",
     settings: Mapping[str, object] | None = None,
     recorded_ns: int | None = None,
+    budget: EvaluationBudget | None = None,
 ) -> Identification:
     """Return the calibration that ``record`` supports, with the fit behind it.
 
@@ -389,6 +392,7 @@ def identify(
     settings: what the calibration belongs to, kept as it is; with "table_mass_kg" the masses
         and springs of a response that is that of two masses are in SI, else per table mass
     recorded_ns: when the recording began [ns, ROS time], None where nobody knows
+    budget: of the model search; None for the default. A search that it cuts short is reported.
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
     did not see it, ConfigurationError for an input or a mass that cannot be. A model that can
@@ -398,7 +402,7 @@ def identify(
     prepared = prepare(record, input)
     check_axis_steps(prepared)
     searched = search_model_errors(
-        prepared, lambda prepared: _chosen(prepared, order), may_grow=not order
+        prepared, partial(_chosen, order=order), budget, may_grow=not order
     )
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
@@ -429,8 +433,10 @@ def identify(
     return Identification(calibration, prepared, best)
 
 
-def _chosen(prepared: Prepared, order: int) -> tuple[Prepared, ChosenModel]:
-    prepared, model = model_from_start(prepared, order)
+def _chosen(
+    prepared: Prepared, budget: EvaluationBudget, *, order: int
+) -> tuple[Prepared, ChosenModel]:
+    prepared, model = model_from_start(prepared, budget, order)
     check_gain(model.chosen.fit.gain, slack=_SAME_SIGNAL_CORRELATION)
     return prepared, model
 
@@ -438,4 +444,4 @@ def _chosen(prepared: Prepared, order: int) -> tuple[Prepared, ChosenModel]:
 def _findings(evidence: IdentificationEvidence) -> list[Finding]:
     """Return what is wrong, then what a right model leaves open, then how far that reaches."""
     wrong, range_ = ([check(evidence) for check in part] for part in (CHECKS, RANGE_CHECKS))
-    return [*wrong, *evidence.known.findings, *range_]
+    return [*wrong, completeness(evidence.searched), *evidence.known.findings, *range_]

@@ -16,6 +16,7 @@ from omsm_ros.core.estimation.model_order import (
     information,
 )
 from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
@@ -89,40 +90,45 @@ class ChosenModel:
     free: ChosenModel | None = None
 
 
-def choose_model(prepared: Prepared, order: int = 0) -> ChosenModel:
-    """Fit structures to the prepared problem and choose among them; ``order`` poles, or 0.
+def choose_model(
+    prepared: Prepared, budget: EvaluationBudget | None = None, order: int = 0
+) -> ChosenModel:
+    """Fit structures to the prepared problem and choose one.
 
-    The free choice is made in any case; an order that is asked for is picked beside it.
+    budget: of the evaluations; None for a budget of its own
+    order: number of poles, 0 to choose it. The free choice is made in any case.
     """
     problem = prepared.problem
-    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
-    points, before = StartingPoints(problem, lag), None
+    budget = budget or EvaluationBudget()
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
+    points, before = StartingPoints(problem, lag, budget), None
     if points.coarser is not None:
-        model = _chosen_on_subset(prepared, points.coarser, lag, order)
+        model = _chosen_on_subset(prepared, points.coarser, lag, budget, order)
         before = model.chosen.fit
-        if (
-            problem.effort.spent
-            or follows_beyond(problem, before, points.coarser.problem) > _NO_FURTHER_GAIN
-        ):
+        if follows_beyond(problem, before, points.coarser.problem) > _NO_FURTHER_GAIN:
+            return model
+        if budget.stops():
             return model
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
-        return fit(problem, structure, points.of(structure, smaller))
+        return fit(problem, structure, points.of(structure, smaller), budget=budget)
 
     colour = noise_colour(problem, lag, prepared.steps)
-    found = _model(problem, explore(fit_structure, order, colour, problem.effort), order)
-    return found if before is None else keep_better(problem, found, before)
+    found = _model(problem, explore(fit_structure, order, colour, budget), order)
+    return found if before is None else keep_better(problem, found, before, budget)
 
 
-def keep_better(problem: Problem, found: ChosenModel, before: Fit) -> ChosenModel:
-    """Return ``found``, or with the structure of ``before`` where that describes more.
+def keep_better(
+    problem: Problem, found: ChosenModel, before: Fit, budget: EvaluationBudget
+) -> ChosenModel:
+    """Return ``found``, or the structure of ``before`` where ``found`` was cut short and is worse.
 
-    before: fitted to the problem as it was. When so much was tried that no further order is begun,
-        its structure may not be among those of ``found``.
+    before: fitted to the problem as it was. Where the budget is exhausted, its structure may not be
+        among those tried for ``found``.
     """
-    if not problem.effort.spent:
+    if not budget.exhausted:
         return found
-    again = fit(problem, before.structure, [before.nonlinear])
+    again = fit(problem, before.structure, [before.nonlinear], budget=budget)
     candidate = Candidate(again, information(again))
     better = candidate.bic < information(found.chosen.fit)
     if not better or not _identifiable(problem, [candidate]):
@@ -130,7 +136,7 @@ def keep_better(problem: Problem, found: ChosenModel, before: Fit) -> ChosenMode
     return replace(found, chosen=candidate, candidates=[*found.candidates, candidate])
 
 
-def rechosen(problem: Problem, before: ChosenModel) -> ChosenModel | None:
+def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:
     """Return ``before``, which was chosen while the problem was another, fitted to it as it is.
 
     None where the change lets some candidates describe more than others: then a structure that
@@ -149,7 +155,7 @@ def rechosen(problem: Problem, before: ChosenModel) -> ChosenModel | None:
     if max(changes) - min(changes) > _ALIKE_BIC:
         return None
     fitted, nonlinear = before.chosen.fit, before.chosen.fit.nonlinear
-    again = fit(problem, fitted.structure, [nonlinear])
+    again = fit(problem, fitted.structure, [nonlinear], budget=budget)
     chosen = Candidate(again, before.chosen.bic + information(again) - information(fitted))
     others = [c for c in candidates if c.fit.structure != fitted.structure]
     return replace(before, chosen=chosen, candidates=[*others, chosen])
@@ -165,7 +171,7 @@ def _model(problem: Problem, explored: Sequence[Candidate], order: int) -> Chose
 
 
 def _chosen_on_subset(
-    prepared: Prepared, points: StartingPoints, lag: Fit, order: int
+    prepared: Prepared, points: StartingPoints, lag: Fit, budget: EvaluationBudget, order: int
 ) -> ChosenModel:
     """Explore structures at the samples of ``points``; fit to all those that may be chosen.
 
@@ -175,13 +181,14 @@ def _chosen_on_subset(
     problem, coarse = prepared.problem, points.problem
     every = round(coarse.period / problem.period)
     steps = replace(prepared.steps, moving=prepared.steps.moving[::every])
-    fewer = replace(points, pure_delay=fit(coarse, lag.structure, [lag.nonlinear]))
+    delay = fit(coarse, lag.structure, [lag.nonlinear], budget=budget)
+    fewer = replace(points, pure_delay=delay)
 
     def fit_structure(structure: Structure, smaller: Sequence[Fit]) -> Fit:
-        return fit(coarse, structure, fewer.of(structure, smaller))
+        return fit(coarse, structure, fewer.of(structure, smaller), budget=budget)
 
     colour = noise_colour(coarse, fewer.pure_delay, steps)
-    found = explore(fit_structure, order, colour, coarse.effort)
+    found = explore(fit_structure, order, colour, budget)
     best = min(c.bic for c in found)
     price = noise_colour(problem, lag, prepared.steps)
 
@@ -190,7 +197,7 @@ def _chosen_on_subset(
 
     explored = [
         candidate(
-            fit(problem, c.fit.structure, [c.fit.nonlinear], _NEARLY_EVALUATIONS)
+            fit(problem, c.fit.structure, [c.fit.nonlinear], _NEARLY_EVALUATIONS, budget=budget)
             if c.bic < best + _MAY_BE_CHOSEN_BIC
             else evaluated(problem, c.fit.structure, c.fit.nonlinear)
         )
@@ -203,7 +210,7 @@ def _chosen_on_subset(
         if chosen <= finished:
             return model
         explored = [
-            candidate(fit(problem, c.fit.structure, [c.fit.nonlinear]))
+            candidate(fit(problem, c.fit.structure, [c.fit.nonlinear], budget=budget))
             if c.fit.structure in chosen - finished
             else c
             for c in explored
@@ -217,15 +224,18 @@ def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence
     return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
 
 
-def model_from_start(prepared: Prepared, order: int = 0) -> tuple[Prepared, ChosenModel]:
+def model_from_start(
+    prepared: Prepared, budget: EvaluationBudget | None = None, order: int = 0
+) -> tuple[Prepared, ChosenModel]:
     """Choose a model, with the initial-condition response fitted where the record begins in it.
 
     Returns the problem as it was fitted, and the model.
     """
-    model = choose_model(prepared, order)
+    budget = budget or EvaluationBudget()
+    model = choose_model(prepared, budget, order)
     colour = noise_colour(prepared.problem, model.chosen.fit, prepared.steps)
     at_rest = not prepared.steps.moving[0]
     if not has_initial_response(prepared.problem, model.chosen.fit, colour, at_rest=at_rest):
         return prepared, model
     prepared = replace(prepared, problem=replace(prepared.problem, fits_initial_condition=True))
-    return prepared, choose_model(prepared, order)
+    return prepared, choose_model(prepared, budget, order)

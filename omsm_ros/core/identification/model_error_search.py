@@ -13,10 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.model_order import Candidate, information
 from omsm_ros.core.estimation.model_order import choose as choose_candidate
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.noise import correct_errors_in_variables
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
@@ -57,6 +59,12 @@ _MODE_FREQUENCY_RATIOS = (1.0, 0.97, 1.03)
 _SAME_LINE = 0.1
 
 
+_INCOMPLETE = (
+    "the search for a model was cut short: its budget of evaluations was exhausted before the "
+    "residual was free of significant model errors; another model may describe the record better"
+)
+
+
 @dataclass(frozen=True, eq=False)
 class ModelledTerm:
     """A departure with columns of its own in the background, at ``columns``."""
@@ -72,6 +80,7 @@ class SearchResult:
     nuisance_terms: departures in the background;  added_poles: those that became poles
     unmodelled: significant, but no model describes them;  diagnostics: of the last fit
     without: survey of the fit before each of ``added_poles`` was added
+    incomplete: the search was cut short, because its budget was exhausted
     """
 
     prepared: Prepared
@@ -81,19 +90,32 @@ class SearchResult:
     added_poles: Sequence[ModelErrorTerm] = ()
     unmodelled: Sequence[ScoreTest] = ()
     without: Sequence[ResidualDiagnostics] = ()
+    incomplete: bool = False
 
 
-Choose = Callable[[Prepared], tuple[Prepared, ChosenModel]]
+def completeness(searched: SearchResult) -> Finding:
+    """Return a reservation where the search was cut short."""
+    return Finding(reservations=(_INCOMPLETE,) if searched.incomplete else ())
+
+
+Choose = Callable[[Prepared, EvaluationBudget], tuple[Prepared, ChosenModel]]
 
 
 def search_model_errors(
-    prepared: Prepared, choose: Choose, *, may_grow: bool = True
+    prepared: Prepared,
+    choose: Choose,
+    budget: EvaluationBudget | None = None,
+    *,
+    may_grow: bool = True,
 ) -> SearchResult:
-    """Add departures to the problem or to the model until the residual shows no more.
+    """Add model errors to the problem or to the model until the residual shows no more.
 
-    choose: fits a prepared problem anew;  may_grow: poles may be added to the model
+    choose: fits a prepared problem anew;  budget: of all evaluations, None for the default
+    may_grow: poles may be added to the model
     """
-    prepared, nuisance_terms, model = _initial_model(prepared, choose)
+    prepared, nuisance_terms, model, budget = _initial_model(
+        prepared, choose, budget or EvaluationBudget()
+    )
     grown: list[ModelErrorTerm] = []
     without: list[ResidualDiagnostics] = []
     settled: set[str] = set()
@@ -102,7 +124,7 @@ def search_model_errors(
     diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
     for _ in range(_MOST_ROUNDS):
         shown = _without_modelled_lines(diagnostics.significant(refused | settled), modes)
-        if not shown or prepared.problem.effort.spent:
+        if not shown or budget.stops():
             break
         columns = _select_nuisance_terms(diagnostics, shown)
         again = (
@@ -113,14 +135,14 @@ def search_model_errors(
                 prepared, diagnostics, nuisance_terms, again
             )
             settled |= again
-            prepared, model = _rechoose(prepared, model, choose)
+            prepared, model = _rechoose(prepared, model, choose, budget)
         elif columns:
             prepared, added = _with_columns(prepared, columns, nuisance_terms)
             nuisance_terms += added
-            prepared, model = _rechoose(prepared, model, choose)
+            prepared, model = _rechoose(prepared, model, choose, budget)
             grown, without = [], []
         else:
-            larger = _grown(prepared, model, shown[0].term)
+            larger = _grown(prepared, model, shown[0].term, budget)
             modes += [shown[0].term.parameter] if shown[0].term.family == MODE else []
             if larger is None:
                 refused.add(shown[0].term.family)
@@ -137,50 +159,55 @@ def search_model_errors(
         grown,
         diagnostics.significant(settled),
         without,
+        incomplete=budget.incomplete,
     )
 
 
 def _initial_model(
-    prepared: Prepared, choose: Choose
-) -> tuple[Prepared, list[ModelledTerm], ChosenModel]:
-    """Return the problem and its model, beside what shows first or what its poles imitate."""
-    prepared, nuisance_terms = _with_columns(prepared, _drift(prepared))
-    prepared, model = _with_errors_in_variables(*choose(prepared), choose)
-    columns = _modelled_as_poles(prepared, model)
+    prepared: Prepared, choose: Choose, budget: EvaluationBudget
+) -> tuple[Prepared, list[ModelledTerm], ChosenModel, EvaluationBudget]:
+    """Return the problem, its first nuisance terms and its model, and the budget to go on with."""
+    prepared, nuisance_terms = _with_columns(prepared, _drift(prepared, budget))
+    prepared, model = choose(prepared, budget)
+    prepared, model, budget = _with_errors_in_variables(prepared, model, choose, budget)
+    columns = _modelled_as_poles(prepared, model, budget)
     if columns:
         prepared, added = _with_columns(prepared, columns, nuisance_terms)
         nuisance_terms += added
-        prepared, model = _rechoose(prepared, model, choose)
-    return prepared, nuisance_terms, model
+        prepared, model = _rechoose(prepared, model, choose, budget)
+    return prepared, nuisance_terms, model, budget
 
 
 def _rechoose(
-    prepared: Prepared, model: ChosenModel, choose: Choose
+    prepared: Prepared, model: ChosenModel, choose: Choose, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel]:
     """Return a problem that has changed since ``model`` was chosen, and the model chosen anew."""
-    prepared, found = choose(prepared)
-    return prepared, keep_better(prepared.problem, found, model.chosen.fit)
+    prepared, found = choose(prepared, budget)
+    return prepared, keep_better(prepared.problem, found, model.chosen.fit, budget)
 
 
 def _with_errors_in_variables(
-    prepared: Prepared, model: ChosenModel, choose: Choose
-) -> tuple[Prepared, ChosenModel]:
-    """Return both without the encoder's own noise, if that describes more."""
+    prepared: Prepared, model: ChosenModel, choose: Choose, budget: EvaluationBudget
+) -> tuple[Prepared, ChosenModel, EvaluationBudget]:
+    """Return all three with the encoder's own noise taken out, if that describes more.
+
+    The problem without it is searched anew, with a budget of its own.
+    """
     problem = correct_errors_in_variables(prepared.problem, model.chosen.fit, prepared.steps.edges)
     if problem is None:
-        return prepared, model
-    quieter = replace(prepared, problem=problem)
-    found = rechosen(problem, model)
+        return prepared, model, budget
+    quieter, own = replace(prepared, problem=problem), budget.renewed()
+    found = rechosen(problem, model, own)
     if found is None:
-        quieter, found = choose(quieter)
+        quieter, found = choose(quieter, own)
     better = information(found.chosen.fit) < information(model.chosen.fit)
-    return (quieter, found) if better else (prepared, model)
+    return (quieter, found, own) if better else (prepared, model, budget)
 
 
-def _drift(prepared: Prepared) -> list[ScoreTest]:
+def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
     """Return drift, if it shows before any model does: a model would take it for a slow pole."""
     problem = prepared.problem
-    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])])
+    lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
     diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT))
     # What does not show in fewer samples of a long record need not be looked for in all.
     if diagnostics.thinned is not None and not _detected_drift(diagnostics.thinned):
@@ -193,7 +220,9 @@ def _detected_drift(diagnostics: ResidualDiagnostics) -> list[ScoreTest]:
     return [judged for judged in shown if judged.term.family == DRIFT]
 
 
-def _modelled_as_poles(prepared: Prepared, model: ChosenModel) -> list[ScoreTest]:
+def _modelled_as_poles(
+    prepared: Prepared, model: ChosenModel, budget: EvaluationBudget
+) -> list[ScoreTest]:
     """Return departures that poles of ``model`` imitate: beside them a plain model describes more.
 
     What is not linear is not bent into poles where fewer of them and its own columns do better.
@@ -206,13 +235,13 @@ def _modelled_as_poles(prepared: Prepared, model: ChosenModel) -> list[ScoreTest
     # As above: of a long record not all are looked at where fewer do not ask for it.
     if fewer is not None:
         there = evaluated(fewer.problem, chosen.fit.structure, chosen.fit.nonlinear)
-        if not _improving_terms(prepared, fewer, there):
+        if not _improving_terms(prepared, fewer, there, budget):
             return []
-    return _improving_terms(prepared, diagnostics, chosen.fit)
+    return _improving_terms(prepared, diagnostics, chosen.fit, budget)
 
 
 def _improving_terms(
-    prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit
+    prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit, budget: EvaluationBudget
 ) -> list[ScoreTest]:
     """Return what shows, if the fit of ``diagnostics`` describes more beside it than ``chosen`` does."""
     columns = _select_nuisance_terms(diagnostics, diagnostics.significant())
@@ -220,7 +249,7 @@ def _improving_terms(
         return []
     plain, before = diagnostics.fitted, replace(prepared, problem=diagnostics.problem)
     problem = _with_columns(before, columns)[0].problem
-    nuisance_terms = fit(problem, plain.structure, [plain.nonlinear])
+    nuisance_terms = fit(problem, plain.structure, [plain.nonlinear], budget=budget)
     further = problem.background.shape[1] - diagnostics.problem.background.shape[1]
     better = information(nuisance_terms) + further * np.log(nuisance_terms.samples) < information(
         chosen
@@ -295,7 +324,7 @@ def _recomputed_columns(
 
 
 def _grown(
-    prepared: Prepared, model: ChosenModel, term: ModelErrorTerm
+    prepared: Prepared, model: ChosenModel, term: ModelErrorTerm, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel] | None:
     """Return the model with the poles of ``term``, or None where that describes nothing better."""
     if term.family not in (CREEP, MODE):
@@ -306,7 +335,7 @@ def _grown(
         # What has not died away at the end has not when a period begins anew.
         problem = replace(problem, fits_initial_condition=True)
     starts = _FASTER if term.family == CREEP else _MODE_FREQUENCY_RATIOS
-    tried = [fit_with_added_poles(problem, base, new, starts) for base in _bases(model)]
+    tried = [fit_with_added_poles(problem, base, new, starts, budget) for base in _bases(model)]
     # The chosen one may owe poles to what ``term`` describes: with it, fewer may do.
     found = [
         Candidate(fitted, information(fitted))
@@ -317,7 +346,7 @@ def _grown(
     chosen = model.chosen.fit
     if problem is not prepared.problem:
         # What rang before the record is priced on both sides.
-        chosen = fit(problem, chosen.structure, [chosen.nonlinear])
+        chosen = fit(problem, chosen.structure, [chosen.nonlinear], budget=budget)
     if best is None or best.bic >= information(chosen):
         return None
     grown = replace(model, chosen=best, candidates=[*model.candidates, best])

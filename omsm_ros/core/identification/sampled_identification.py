@@ -61,6 +61,7 @@ from omsm_ros.core.lti.frequency_response import (
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError, IdentificationError
+from omsm_ros.linear_algebra import one_blas_thread
 from omsm_ros.readable import p_value_text, percent, plain, quantity
 
 # May a sampled model be used, and between which frequencies?
@@ -182,7 +183,7 @@ def band_limited(
 
     Arguments as of :func:`~omsm_ros.core.identification.sampled_identification.identify_samples`.
     """
-    prepared, model = model_from_start(_prepared(input, output, used), order)
+    prepared, model = model_from_start(_prepared(input, output, used), order=order)
     known = response_uncertainty(prepared, model, limits)
     free = model.free or model
     if model.free is not None:
@@ -299,6 +300,7 @@ class _Known:
         return cls(discrete, frequency, discrete.band(frequency, period))
 
 
+@one_blas_thread()
 def identify_samples(
     input: FloatArray,
     output: FloatArray,

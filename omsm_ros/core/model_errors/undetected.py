@@ -16,6 +16,7 @@ from scipy import stats
 
 from omsm_ros.core.estimation.model_order import MAX_POLES
 from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, fit
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
@@ -398,7 +399,11 @@ def at_fitted_pole(term: ModelErrorTerm, fitted: Fit) -> ModelErrorTerm:
 
 
 def fit_with_added_poles(
-    problem: Problem, base: Fit, new: ComplexArray, starts: Sequence[float]
+    problem: Problem,
+    base: Fit,
+    new: ComplexArray,
+    starts: Sequence[float],
+    budget: EvaluationBudget | None = None,
 ) -> Fit | None:
     """Return the fit of ``base`` and ``new`` poles [rad/s], started at multiples of them.
 
@@ -416,4 +421,4 @@ def fit_with_added_poles(
         poles = np.concatenate([own, faster * new]) / problem.rate
         return scaled.nonlinear_of(np.asarray(poles, np.complex128), late)
 
-    return fit(problem, larger, [started(faster) for faster in starts])
+    return fit(problem, larger, [started(faster) for faster in starts], budget=budget)

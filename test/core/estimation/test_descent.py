@@ -235,39 +235,35 @@ def test_half_the_slope_and_the_curvature_are_those_of_the_sum_of_squares() -> N
     assert 2 * np.diag(curvature) == pytest.approx(bend, rel=1e-3)
 
 
-def test_effort_is_spent_at_some_time() -> None:
-    effort = EvaluationBudget()
-    assert not effort.spent
-    effort.comparisons += 100_000
-    assert effort.spent
-
-
-def compared(samples: int, times: int, effort: EvaluationBudget) -> EvaluationBudget:
+def used(samples: int, times: int, budget: EvaluationBudget) -> EvaluationBudget:
     for _ in range(times):
-        effort.count(samples)
-    return effort
+        budget.count(samples)
+    return budget
 
 
-def test_a_record_of_ten_seconds_is_compared_1500_times() -> None:
-    effort = compared(10_000, 1500, EvaluationBudget())
-    assert not effort.spent
-    assert compared(10_000, 1, effort).spent
+def test_a_budget_allows_1500_evaluations_of_ten_seconds() -> None:
+    budget = used(10_000, 1500, EvaluationBudget())
+    assert not budget.stops()
+    assert not budget.incomplete
+    assert used(10_000, 1, budget).stops()
+    assert budget.incomplete
+    assert not budget.renewed().exhausted
 
 
-def test_comparisons_with_fewer_samples_cost_what_they_take() -> None:
-    """Those of a long record: hundreds with all of it, thousands with a tenth."""
-    effort = compared(200_000, 200, EvaluationBudget())
-    assert not compared(20_000, 2000, effort).spent
-    assert effort.comparisons == 200
-    assert compared(20_000, 1000, effort).spent
+def test_evaluations_with_fewer_samples_count_their_samples() -> None:
+    """A long record: hundreds of evaluations with all of it, thousands with a tenth."""
+    budget = used(200_000, 200, EvaluationBudget())
+    assert not used(20_000, 2000, budget).exhausted
+    assert budget.evaluations == 200
+    assert used(20_000, 1000, budget).exhausted
 
 
-def test_ever_longer_records_are_compared_less_often() -> None:
+def test_longer_records_are_evaluated_less_often() -> None:
     most = []
     for samples in (20_000, 40_000, 400_000):
-        effort = EvaluationBudget()
-        while not effort.spent:
-            effort.count(samples)
-        most.append(effort.comparisons)
+        budget = EvaluationBudget()
+        while not budget.exhausted:
+            budget.count(samples)
+        most.append(budget.evaluations)
     assert most == sorted(most, reverse=True)
     assert most[-1] > 300

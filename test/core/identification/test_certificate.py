@@ -20,7 +20,7 @@ from omsm_ros.core.streams.motion_record import assemble
 def evidence(step_test):
     record, limits = assemble([step_test.axes], [step_test.distance]), ResponseLimits()
     prepared = prepare(record, "encoder")
-    model = choose_model(prepared, 1)
+    model = choose_model(prepared, order=1)
     diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
     known = response_uncertainty(prepared, model, limits)
     return IdentificationEvidence(

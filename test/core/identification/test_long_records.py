@@ -7,6 +7,7 @@ import pytest
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
 from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
@@ -41,11 +42,11 @@ def of_mode():
 
 def test_fewer_samples_choose_what_all_would(of_mode, monkeypatch):
     prepared = prepare(of_mode, "encoder")
-    found = choose_model(prepared)
-    before = prepared.problem.effort.comparisons
+    fewer, every = EvaluationBudget(), EvaluationBudget()
+    found = choose_model(prepared, fewer)
     monkeypatch.setattr(StartingPoints, "coarser", None)
-    asked = choose_model(prepared)
-    assert prepared.problem.effort.comparisons > before
+    asked = choose_model(prepared, every)
+    assert 0 < fewer.evaluations < every.evaluations
     assert found.chosen.fit.structure == asked.chosen.fit.structure
     np.testing.assert_allclose(
         found.chosen.fit.dynamics.response(LINES),

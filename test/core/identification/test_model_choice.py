@@ -1,4 +1,4 @@
-"""What is left of a choice where the problem has changed, or was compared often enough."""
+"""Test what is kept of a choice where the problem has changed or the budget is exhausted."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, 
 
 from .recorded_motions import record_of, recorded
 
-SPENT = EvaluationBudget(comparisons=10**6)
+EXHAUSTED = EvaluationBudget(evaluations=10**6)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def chosen(found):
 
 def test_where_not_all_was_tried_the_structure_before_stays(fitted):
     problem, lag, two = fitted
-    kept = keep_better(replace(problem, effort=SPENT), chosen(lag), two)
+    kept = keep_better(problem, chosen(lag), two, EXHAUSTED)
     assert kept.chosen.fit.structure == two.structure
     assert kept.chosen.fit.sum_of_squares <= two.sum_of_squares * (1 + 1e-9)
     assert kept.candidates[-1] is kept.chosen
@@ -46,9 +46,8 @@ def test_it_is_fitted_to_the_problem_as_it_is_now(fitted):
         problem,
         output=problem.output + line,
         background=np.column_stack([problem.background, line]),
-        effort=SPENT,
     )
-    kept = keep_better(changed, chosen(lag), two).chosen.fit
+    kept = keep_better(changed, chosen(lag), two, EXHAUSTED).chosen.fit
     assert kept.background[-1] == pytest.approx(1.0, abs=0.05)
     assert kept.rms == pytest.approx(two.rms, rel=0.01)
 
@@ -56,13 +55,13 @@ def test_it_is_fitted_to_the_problem_as_it_is_now(fitted):
 def test_what_describes_more_is_not_given_up(fitted):
     problem, lag, two = fitted
     found = chosen(two)
-    assert keep_better(replace(problem, effort=SPENT), found, lag) is found
+    assert keep_better(problem, found, lag, EXHAUSTED) is found
 
 
 def test_where_all_was_tried_the_choice_stands(fitted):
     problem, lag, two = fitted
     found = chosen(lag)
-    assert keep_better(replace(problem, effort=EvaluationBudget()), found, two) is found
+    assert keep_better(problem, found, two, EvaluationBudget()) is found
 
 
 def among(lag, two):
@@ -72,12 +71,12 @@ def among(lag, two):
 
 
 def test_what_all_candidates_lack_alike_leaves_the_choice(fitted):
-    """Nobody's column: each describes as much more of what is left when it is taken out."""
+    """A line that no candidate describes changes the sum of squares of all of them alike."""
     problem, _, two = fitted
     three = fit(problem, Structure(2, 1, True), [np.append(two.nonlinear, 0.01)])
     line = 3e-9 * np.sin(2 * np.pi * 40.0 * problem.period * np.arange(len(problem.used)))
     quieter = replace(problem, output=problem.output - line)
-    kept = rechosen(quieter, among(three, two))
+    kept = rechosen(quieter, among(three, two), EvaluationBudget())
     again = fit(quieter, two.structure, [two.nonlinear])
     assert kept.chosen.fit.sum_of_squares == pytest.approx(again.sum_of_squares, rel=1e-9, abs=0)
     assert kept.chosen in kept.candidates
@@ -87,16 +86,16 @@ def test_what_all_candidates_lack_alike_leaves_the_choice(fitted):
 
 
 def test_what_one_candidate_gains_more_by_asks_for_another_choice(fitted):
-    """The output of a pole more: the delay alone describes it as badly as before."""
+    """The output of one candidate without its noise: the delay alone does not improve."""
     problem, lag, two = fitted
     exact = replace(
         problem, output=problem.modelled(two) + 0.1 * (problem.output - problem.modelled(two))
     )
-    assert rechosen(exact, among(two, lag)) is None
-    assert rechosen(problem, among(two, lag)) is not None
+    assert rechosen(exact, among(two, lag), EvaluationBudget()) is None
+    assert rechosen(problem, among(two, lag), EvaluationBudget()) is not None
 
 
 def test_of_an_order_that_was_asked_for_the_free_choice_is_made_anew(fitted):
     problem, lag, two = fitted
     asked = replace(among(lag, two), free=among(lag, two))
-    assert rechosen(problem, asked) is None
+    assert rechosen(problem, asked, EvaluationBudget()) is None

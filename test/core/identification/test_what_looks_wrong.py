@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import lead
 from omsm_ros.core.identification.identify import identify
@@ -71,16 +72,19 @@ def test_a_probe_that_leads(lag, uncertainty, noises, reported):
 
 
 def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
-    """Lines of hum, each of which one more round of departures would describe."""
+    """Sixty lines of hum, more than the rounds of the search describe."""
     rng = np.random.default_rng(3)
     time = np.arange(round(StepTest().duration / 1e-3)) * 1e-3
     z = StepTest().positions(time).z
     hum = sum(2e-7 * np.sin(2 * np.pi * f * time + f) for f in np.linspace(3, 480, 60))
     seen = signal.lfilter([0.2], [1, -0.8], z) + hum + rng.normal(0, 1e-8, len(z))
-    found = identify(MotionRecord.from_arrays(1e-3, z, 40e-6 - seen))
-    assert found.calibration.certificate["verdict"] == "rejected"
-    # 1500, and what was begun by then.
-    assert 1000 < found.prepared.problem.effort.comparisons < 2200
+    budget = EvaluationBudget()
+    found = identify(MotionRecord.from_arrays(1e-3, z, 40e-6 - seen), budget=budget)
+    certificate = found.calibration.certificate
+    assert certificate["verdict"] == "rejected"
+    assert any("cut short" in text for text in certificate["reservations"])
+    # 1500, and those of the fit that was begun by then.
+    assert 1000 < budget.evaluations < 2200
 
 
 @pytest.mark.parametrize("name", ["Creep", "crep", "backlash"])
