@@ -23,7 +23,8 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
 from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder
 from omsm_ros.instruments.chrocodile.telegram import ENCODERS_AT_START, Layout
 from omsm_ros.instruments.emulator_factory import emulated, line_for
-from omsm_ros.instruments.factory import defaults, make_device
+from omsm_ros.instruments.factory import make_device
+from omsm_ros.instruments.parameters import defaults
 from omsm_ros.instruments.six_channel.protocol import FRAME, FrameDecoder, encode_frames
 
 QUICK_S, FULL_S = 20.0, 300.0

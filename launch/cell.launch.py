@@ -111,11 +111,11 @@ def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str,
     port = tcp if known.tcp else serial
     played = {"device": device, "link": port}
     driver = {"device": device, "port": port, **known.driver}
-    if known.companion is None:
+    if known.second is None:
         return played, driver, {}
-    second = tcp if known.companion.tcp else f"{serial}_beside"
+    second = tcp if known.second.tcp else f"{serial}_beside"
     played["link_beside"] = second
-    return played, driver, {known.companion.node: {"port": second, **known.companion.driver}}
+    return played, driver, {known.second.node: {"port": second, **known.second.driver}}
 
 
 def rviz(namespace: str) -> Node:

@@ -10,10 +10,10 @@ import yaml
 
 import omsm_ros
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
-from omsm_ros.instruments import factory
-from omsm_ros.instruments import factory as sensor_factory
+from omsm_ros.instruments import parameters as factory
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.topics import POINTS_TOPIC, TOPIC_TYPES
+from omsm_ros.nodes import start
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 NO_PARAMETERS = {"paper_mirror", "disturbances", "limits"}
@@ -23,8 +23,8 @@ NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PAR
 TABLES = {
     "confocal_driver": factory.PARAMETERS,
     "axis_driver": factory.AXIS_PARAMETERS,
-    "reference_driver": sensor_factory.REFERENCE_PARAMETERS,
-    "accelerometer_driver": sensor_factory.ACCELEROMETER_PARAMETERS,
+    "reference_driver": factory.REFERENCE_PARAMETERS,
+    "accelerometer_driver": factory.ACCELEROMETER_PARAMETERS,
 }
 FRAMES = {
     "confocal_driver": ["machine_frame", "probe_frame"],
@@ -36,7 +36,7 @@ FRAMES = {
 
 def _parameters(node):
     pytest.importorskip("rclpy", reason="ROS 2 is not installed")
-    module = importlib.import_module(f"omsm_ros.nodes.{node}_node")
+    module = importlib.import_module(f"omsm_ros.nodes.{start.NODES[node].split(':')[0]}")
     return TABLES.get(node) or getattr(module, "PARAMETERS", ())
 
 
@@ -83,7 +83,7 @@ def test_a_default_is_still_a_text_when_it_is_read_again(node):
 
 
 def test_every_node_with_parameters_has_its_yaml():
-    nodes = {p.stem.removesuffix("_node") for p in (ROOT / "omsm_ros/nodes").glob("*_node.py")}
+    nodes = set(start.NODES) - {"replay"}
     assert {node for node in nodes if list(_declared(node))} == set(NODES)
 
 
@@ -96,7 +96,7 @@ def test_shipped_surface_is_the_papers():
 def test_every_node_can_be_started_by_its_name():
     listed = (ROOT / "setup.py").read_text().split("NODES =")[1].split("\n)\n")[0]
     named = set(re.findall(r'"(\w+)"', listed))
-    nodes = {p.stem.removesuffix("_node") for p in (ROOT / "omsm_ros/nodes").glob("*_node.py")}
+    nodes = set(start.NODES) - {"replay"}
     assert named == nodes
 
 

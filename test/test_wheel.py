@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 import omsm_ros
+from omsm_ros.nodes import start
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
 SOURCES = ("omsm_ros", "msg_defs", "config", "launch", "resource", "bootstrap")
@@ -86,11 +87,9 @@ def test_it_installs_every_command(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (points,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
         reported = archive.read(points).decode()
-    nodes = {path.stem.removesuffix("_node") for path in ROOT.glob("omsm_ros/nodes/*_node.py")}
     assert set(re.findall(r"^(\w+) = ", reported, re.MULTILINE)) == {
         "omsm",
-        "replay",  # the player, under the name that others know
-        *nodes,
+        *start.NODES,
     }
 
 

@@ -19,7 +19,7 @@ from omsm_ros.core.streams.blocks import (
 from omsm_ros.core.streams.statistics import spread
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
-from omsm_ros.instruments.six_channel.protocol import AXES, AxisScaling
+from omsm_ros.instruments.scaling import AXES, AxisScaling
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
 # Device time → host time, by a line through all arrivals of the last half minute.

@@ -20,12 +20,9 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, Status
 from omsm_ros.errors import DeviceError
+from omsm_ros.instruments.scaling import AXES, AxisScaling
 from omsm_ros.twin.cell import Recording
 from omsm_ros.units import NANOSECONDS_PER_S, PPM
-
-# What an emulated device measures: the twin's recordings, or samples that hold their number.
-
-AXES = ("x", "y", "z", "b", "c")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +94,17 @@ class NumberedSource:
         )
 
 
+# The encoders of an emulated cell. One turn is 2^28 counts: 32 bits hold 16 whole turns, so
+# nothing is lost when they wrap.
+_LINEAR = AxisScaling(counts_per_unit=1e10, wrap=2**32)
+_ROTARY = AxisScaling(counts_per_unit=2**28 / (2 * np.pi), wrap=2**32)
+AXIS_SCALING = (_LINEAR, _LINEAR, _LINEAR, _ROTARY, _ROTARY)
+
 # Samples are written this often; shorter costs processor time, longer bunches arrivals.
 WRITE_INTERVAL_S = 0.005
 # Bounds memory and the response to a stop, however fast the time lapse.
 _MAX_SAMPLES = 2000
+_NOISE_BYTES = 20
 
 
 class InstrumentLink(Protocol):
@@ -141,6 +145,8 @@ class InstrumentFaults:
     merge: samples are kept and sent together this long after [s]
     rate: how much faster than set it measures, without saying so [1]
     drift: of its clock [ppm]
+    noise_rate, flip_rate, drop_rate: probability, for each sample, of random bytes before it, of
+        one inverted bit in it, of its loss [1]
     """
 
     lose: int = 0
@@ -155,6 +161,9 @@ class InstrumentFaults:
     merge: float = 0.0
     rate: float = 1.0
     drift: float = 0.0
+    noise_rate: float = 0.0
+    flip_rate: float = 0.0
+    drop_rate: float = 0.0
 
 
 class Instrument:
@@ -366,13 +375,31 @@ class Instrument:
     def _spoil(self, packed: list[bytes], first: int, counters: np.ndarray) -> list[bytes]:
         """Lose, double and damage what was packed."""
         pieces: list[bytes] = []
+        dropped, noisy, flipped = (
+            self._struck(rate, len(packed))
+            for rate in (self.faults.drop_rate, self.faults.noise_rate, self.faults.flip_rate)
+        )
         for i, piece in enumerate(packed):
-            if piece and _use(self.faults, "lose", 1):
+            if piece and (dropped[i] or _use(self.faults, "lose", 1)):
                 continue
             if self.keep_truth:
                 self.truth.append((first + i, int(counters[i])))
+            if piece and flipped[i]:
+                piece = self._with_a_flipped_bit(piece)
+            if piece and noisy[i]:
+                piece = self._random.bytes(_NOISE_BYTES) + piece
             pieces += [piece] * (1 + _use(self.faults, "duplicate", 1))
         return pieces
+
+    def _struck(self, rate: float, count: int) -> NDArray[np.bool_]:
+        # Nothing is drawn without a fault, so that each fault alone repeats with its seed.
+        struck: NDArray[np.bool_] = np.zeros(count, np.bool_)
+        return np.less(self._random.random(count), rate) if rate else struck
+
+    def _with_a_flipped_bit(self, piece: bytes) -> bytes:
+        damaged = bytearray(piece)
+        damaged[self._random.integers(len(piece))] ^= 1 << int(self._random.integers(8))
+        return bytes(damaged)
 
     def _send(self, pieces: Iterable[bytes], now: float, stop: threading.Event | None) -> None:
         wire = b"".join(pieces)

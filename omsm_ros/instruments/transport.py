@@ -6,19 +6,18 @@ anew.
 
 from __future__ import annotations
 
-import ctypes
+import re
 import socket
 import termios
 import time
-from typing import Any, Protocol
-from urllib.parse import SplitResult, parse_qs, urlsplit
+from collections.abc import Callable
+from typing import Protocol
+from urllib.parse import SplitResult, urlsplit
 
-import numpy as np
 import serial
 from serial.tools import list_ports
 
-from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.six_channel.protocol import BODY_SIZE, FRAME, encode_frames
+from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
 
 # Addresses of devices as URLs: ``daq://Dev1/ai0?range=10``.
 
@@ -29,150 +28,6 @@ def parts_of(address: str) -> SplitResult:
         return urlsplit(address)
     except ValueError as err:
         raise ConfigurationError(f"address {address!r} cannot be read: {err}") from err
-
-
-# A TwinCAT PLC's ring buffer over Beckhoff ADS, delivered as the six-channel stream.
-#
-# Reading variables one by one is neither synchronous with the trigger nor fast enough, so the PLC
-# writes each sample, with its trigger counter, into a ring, and the whole ring is read at once:
-# ADS answers between two cycles of the PLC, so what comes belongs together. In structured text,
-# packed to one byte::
-#
-#     TYPE OmsmSample : STRUCT
-#         sequence : UDINT; device_time : ULINT; distance : DINT; status : USINT;
-#         counts : ARRAY[0..4] OF LINT;
-#     END_STRUCT END_TYPE
-#     TYPE OmsmRing : STRUCT
-#         written : ULINT;                       (* samples so far *)
-#         samples : ARRAY[0..999] OF OmsmSample; (* sample n lies at n MOD 1000 *)
-#     END_STRUCT END_TYPE
-#
-# Tried against pyads' own test server; untried on hardware.
-
-DEFAULT_PORT = 851
-DEFAULT_SYMBOL = "GVL.omsm"
-DEFAULT_SAMPLES = 1000
-
-_WRITTEN = np.dtype("<u8")
-# At 1 kHz twenty samples at a time; a ring of a thousand lasts a second.
-_POLL_S = 0.02
-_MOST_SAMPLES = 200_000
-
-
-class AdsRing:
-    """Transport that reads ``ads://host[:port][/AMS.net.id][?symbol=GVL.omsm&samples=1000]``.
-
-    Without a net id it is the host's address with ``.1.1``, as TwinCAT sets it. The PLC must have
-    a route to this computer. Samples that were overwritten before they were read are a gap of the
-    trigger counter.
-    """
-
-    def __init__(self, address: str) -> None:
-        """Raise ConfigurationError for an address that is none."""
-        parts = parts_of(address)
-        query = parse_qs(parts.query)
-        samples = query.get("samples", [str(DEFAULT_SAMPLES)])[0]
-        usable = samples.isdecimal() and 0 < int(samples[:9]) <= _MOST_SAMPLES
-        known = set(query) <= {"symbol", "samples"}
-        if parts.scheme != "ads" or not parts.hostname or not known or not usable:
-            raise ConfigurationError(
-                f"address {address!r}, expected ads://host:851/1.2.3.4.1.1?symbol={DEFAULT_SYMBOL}"
-                f"&samples={DEFAULT_SAMPLES}, with at most {_MOST_SAMPLES} samples"
-            )
-        self.name = address
-        self._host = parts.hostname
-        self._net_id = parts.path.strip("/") or f"{self._host}.1.1"
-        try:
-            self._port = parts.port or DEFAULT_PORT
-        except ValueError as err:
-            raise ConfigurationError(f"address {address!r}: {err}") from err
-        self._symbol = query.get("symbol", [DEFAULT_SYMBOL])[0]
-        self._capacity = int(samples)
-        self._size = _WRITTEN.itemsize + self._capacity * BODY_SIZE
-        self._plc: Any = None
-        self._taken = 0
-
-    def open(self) -> None:
-        """Connect and begin with the next sample; raises DeviceError."""
-        self.close()
-        pyads = _pyads()
-        try:
-            self._plc = pyads.Connection(self._net_id, self._port, self._host)
-            self._plc.open()
-            self._taken = self._written(self._snapshot())
-        except (pyads.ADSError, OSError, ValueError, TypeError) as err:
-            self.close()
-            raise DeviceError(
-                f"{self.name} does not answer: {err}; check address, net id, and the PLC's route "
-                "to this computer"
-            ) from err
-        except DeviceError:
-            self.close()
-            raise
-
-    def read(self, timeout: float) -> bytes:
-        """Return new samples as frames of the six-channel stream, b"" if none came in time."""
-        if self._plc is None:
-            raise DeviceError(f"{self.name} is not open")
-        deadline = time.monotonic() + timeout
-        while not (data := self._new()):
-            left = deadline - time.monotonic()
-            if left <= 0:
-                return b""
-            time.sleep(min(_POLL_S, left))
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Raise DeviceError: nothing is written into a PLC."""
-        raise DeviceError(f"{self.name} is only read")
-
-    def close(self) -> None:
-        """Disconnect; does nothing when not connected."""
-        if self._plc is not None:
-            plc, self._plc = self._plc, None
-            try:
-                plc.close()
-            except Exception:  # whatever state it was in, it is let go
-                return
-
-    def _new(self) -> bytes:
-        raw = self._snapshot()
-        written = self._written(raw)
-        if written < self._taken:  # the PLC was restarted and counts anew
-            self._taken = 0
-        count = min(written - self._taken, self._capacity)
-        if not count:
-            return b""
-        ring = np.frombuffer(raw, np.uint8, offset=_WRITTEN.itemsize).reshape(-1, BODY_SIZE)
-        places = np.arange(written - count, written) % self._capacity
-        self._taken = written
-        frames = np.zeros((count, FRAME.itemsize), np.uint8)
-        frames[:, :BODY_SIZE] = ring[places]
-        return encode_frames(frames.reshape(-1).view(FRAME))
-
-    def _snapshot(self) -> bytes:
-        pyads = _pyads()
-        try:
-            found = self._plc.read_by_name(self._symbol, ctypes.c_ubyte * self._size)
-        except (pyads.ADSError, OSError, RuntimeError) as err:
-            raise DeviceError(
-                f"{self.name} gives no {self._symbol!r} of {self._size} bytes: {err}; check the "
-                f"PLC, the network, and that its ring has {self._capacity} samples, packed to one "
-                "byte"
-            ) from err
-        return bytes(found)
-
-    @staticmethod
-    def _written(raw: bytes) -> int:
-        return int(np.frombuffer(raw, _WRITTEN, 1)[0])
-
-
-def _pyads() -> Any:
-    try:
-        import pyads
-    except ImportError as err:
-        raise DeviceError("ADS needs pyads: pip install pyads") from err
-    return pyads
 
 
 DEFAULT_BAUD_RATE = 921_600
@@ -214,6 +69,14 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Disconnect; does nothing when not connected."""
+
+
+# How long a command port waits for more of an answer at a time [s].
+_ANSWER_POLL_S = 0.05
+# A greeting is over when nothing came for the first, and ends after the second at the latest [s].
+_QUIET_S, _GREETING_S = 0.1, 1.0
+# Bounds the memory of an answer without its end.
+_MAX_ANSWER_BYTES = 65_536
 
 
 class SerialTransport:
@@ -342,6 +205,57 @@ class TcpTransport:
         )
 
 
+class CommandPort:
+    """Asks a device that ends every answer with a prompt; connected only while it is asked."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        prompt: bytes,
+        patience: float,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """prompt: a regular expression for what ends an answer;  patience: for an answer [s]."""
+        self._transport = transport
+        self._prompt = re.compile(prompt)
+        self._patience = patience
+        self._monotonic = monotonic
+
+    def __enter__(self) -> CommandPort:
+        """Connect, and let the device finish its greeting, which may end with a prompt, too."""
+        self._transport.open()
+        deadline = self._monotonic() + _GREETING_S
+        while self._transport.read(_QUIET_S) and self._monotonic() < deadline:
+            pass
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._transport.close()
+
+    def ask(self, text: str, end: str, sign: bytes = b"") -> str:
+        """Return the answer to ``text``, its echo and prompt included; DeviceTimeoutError if none.
+
+        sign: a regular expression for what every answer to it holds; a prompt before it is a
+        late one, of something else. Without it in all the time, the last prompt counts.
+        """
+        self._transport.write((text + end).encode())
+        said, deadline = b"", self._monotonic() + self._patience
+        while not self._complete(said, sign):
+            said = (said + self._transport.read(_ANSWER_POLL_S))[-_MAX_ANSWER_BYTES:]
+            if self._monotonic() > deadline:
+                if self._complete(said, b""):
+                    break
+                raise DeviceTimeoutError(
+                    f"{self._transport.name} did not answer {text!r} (it said {said[-32:]!r}); "
+                    "check that the controller's command port is open and no other client uses it"
+                )
+        return said.decode("latin-1")
+
+    def _complete(self, said: bytes, sign: bytes) -> bool:
+        begun = re.search(sign, said)
+        return begun is not None and self._prompt.search(said, begun.end()) is not None
+
+
 def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport:
     """Return the transport that ``address`` names.
 
@@ -356,7 +270,7 @@ def transport_for(address: str, baud_rate: int = DEFAULT_BAUD_RATE) -> Transport
             raise ConfigurationError(f"address {address!r}, expected tcp://host:port")
         return TcpTransport(host.strip("[]"), int(port))
     if address.startswith(ADS_SCHEME):
-        # few have a PLC to read
+        from omsm_ros.instruments.six_channel.device import AdsRing
 
         return AdsRing(address)
     if address.startswith(_SERIAL_SCHEME):

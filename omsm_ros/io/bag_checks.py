@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from binascii import crc32
 from bisect import bisect_left
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
+from itertools import accumulate
 from operator import itemgetter
 from os import SEEK_CUR, SEEK_END, fstat
 from pathlib import Path
@@ -19,9 +20,10 @@ from types import SimpleNamespace
 from typing import IO, Any, TypeAlias
 
 from lz4.frame import LZ4FrameDecompressor
-from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import Reader, ReaderError, storage_mcap, storage_sqlite3
 from rosbags.rosbag2 import reader as bag_folder
+from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import McapReader, decompress
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -29,6 +31,7 @@ from rosbags.typesys.store import Typestore
 
 from omsm_ros.errors import BagError
 from omsm_ros.io.files import exception_text, open_regular
+from omsm_ros.io.json_and_yaml import has_aliases
 from omsm_ros.quantities import shown
 
 # rosbag2 writes chunks of less than a megabyte, Foxglove of four.
@@ -37,6 +40,10 @@ MAX_MESSAGE_BYTES = 128 * 1024**2
 # The footer with its places and checksum, and the magic bytes (mcap.dev/spec, "Footer (op=0x02)").
 _RECORD_HEAD_BYTES, _CHECKED_END_BYTES, _END_BYTES = 9, 25, 37
 _MAX_METADATA_BYTES = 4 * 1024**2
+# A profile has 400 characters; a topic of a hundred publishers has a hundred of them.
+_LONGEST_QOS = 100_000
+# Chunks that overlap in time are held until their messages are in order; recorders overlap by one.
+_MAX_HELD_BYTES = 1024**3
 # What ROS 2 brings along are 100 lines a topic on the average; a second takes 25 000.
 _MOST_DEFINITION_LINES, _LONGEST_DEFINITION = 50_000, 50_000
 _ADDRESS_ERRORS = frozenset("%?#")
@@ -88,12 +95,33 @@ def check_files(path: Path) -> None:
         if part.suffix == ".db3" and set(str(part)) & _ADDRESS_ERRORS:
             # rosbags makes an address of the path, and would read what lies elsewhere.
             raise BagError(f"bag {str(part)!r} has one of '%?#' in its path; rename it")
-    metadata = path / "metadata.yaml"
-    if metadata.is_file() and metadata.stat().st_size > _MAX_METADATA_BYTES:
+    _check_metadata(path / "metadata.yaml")
+
+
+def _check_metadata(path: Path) -> None:
+    """Raise BagError for a description of a folder that is too long, or not plain YAML."""
+    if not path.is_file():
+        return
+    with open_regular(path, BagError, "bag") as stream:
+        text = stream.read(_MAX_METADATA_BYTES + 1)
+    if len(text) > _MAX_METADATA_BYTES:
         raise BagError(
-            f"bag {str(path)!r} has metadata of more than {_MAX_METADATA_BYTES} "
+            f"bag {str(path.parent)!r} has metadata of more than {_MAX_METADATA_BYTES} "
             "bytes; record it again, in fewer files"
         )
+    if has_aliases(text):
+        raise BagError(
+            f"bag {str(path.parent)!r} has aliases or anchors in its metadata.yaml, which rosbag2 "
+            "never writes; make it anew with 'ros2 bag reindex'"
+        )
+
+
+def _plain_qos(described: Any) -> list[Qos]:
+    """Return the quality of service that a bag states of a topic; ReaderError if it has aliases."""
+    text = described if isinstance(described, str) else ""
+    if len(text) > _LONGEST_QOS or has_aliases(text.encode("utf-8", "replace")):
+        raise ReaderError("a topic states its quality of service in no way that rosbag2 does")
+    return parse_qos(described)
 
 
 def check_index(path: Path, reader: Reader) -> None:
@@ -109,6 +137,21 @@ def check_index(path: Path, reader: Reader) -> None:
                 f"the largest of {largest} bytes, expected each once and at most "
                 f"{MAX_CHUNK_BYTES} bytes; write it again with smaller chunks"
             )
+        if chunks:
+            total = sum(chunk.uncompressed_size for chunk in chunks)
+            check_unpacked(path, part.path.stat().st_size, total)
+            if (together := _held_together(chunks)) > _MAX_HELD_BYTES:
+                raise BagError(
+                    f"bag {str(path)!r} has chunks of {together} bytes that cover the same time, "
+                    f"at most {_MAX_HELD_BYTES} are held at once; write it again in order of time"
+                )
+
+
+def _held_together(chunks: Sequence[Any]) -> int:
+    """Return the most bytes of chunks whose times overlap, which a reader holds at once."""
+    edges = [(c.message_start_time, 0, c.uncompressed_size) for c in chunks]
+    edges += [(c.message_end_time, 1, -c.uncompressed_size) for c in chunks]
+    return max(accumulate(size for _, _, size in sorted(edges)))
 
 
 def check_checksums(path: Path) -> None:
@@ -197,8 +240,11 @@ def _lz4(data: bytes, size: int) -> bytes:
 
 
 def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: bool) -> bytes:
-    if size > MAX_CHUNK_BYTES:
-        raise ReaderError(f"a chunk claims {size} bytes, at most {MAX_CHUNK_BYTES} are accepted")
+    most = min(MAX_CHUNK_BYTES, _MOST_PACKED * len(data) + _ALWAYS_UNPACKED_BYTES)
+    if exactly and size > most:
+        raise ReaderError(
+            f"a chunk of {len(data)} bytes claims {size} when unpacked, at most {most} are accepted"
+        )
     raw = decompress(data, max_length=size + 1)
     if len(raw) > size or (exactly and len(raw) < size):
         raise ReaderError(f"a chunk claims {size} bytes and does not unpack to that many")
@@ -238,6 +284,9 @@ storage_sqlite3.apsw.connection_hooks.append(_check_tables)
 # rosbags unpacks whatever comes out, and looks at its size afterwards.
 storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
 bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)
+# Nested aliases of a few bytes unfold to gigabytes as soon as a message shows them.
+for _module in (bag_folder, storage_mcap, storage_sqlite3):
+    _module.parse_qos = _plain_qos
 
 
 # Messages of an indexed MCAP file, a chunk at a time.

@@ -195,22 +195,3 @@ def since(path: Path) -> int:
         raise CalibrationError(
             f"no calibration at {str(path)[:200]!r}: {exception_text(err)}"
         ) from err
-
-
-def resolved_within(path: Path, folders: str) -> Path:
-    """Return ``path`` resolved; CalibrationError unless it lies below one of ``folders``.
-
-    folders: separated by ":", as in PATH; "~" is the home folder, "." the working directory;
-        empty = anywhere
-    """
-    try:
-        resolved = path.expanduser().resolve()
-        allowed = [Path(each).expanduser().resolve() for each in folders.split(":") if each]
-    except (OSError, ValueError, RuntimeError) as err:
-        raise CalibrationError(f"no calibration at {str(path)[:200]!r}; check the path") from err
-    if allowed and not any(resolved.is_relative_to(folder) for folder in allowed):
-        raise CalibrationError(
-            f"{str(path)[:200]!r} lies outside the folders that calibrations are loaded from, "
-            f"{folders!r}; put it there, or start with another calibration_folders"
-        )
-    return resolved

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from omsm_ros.errors import FileError, shortened
+from omsm_ros.errors import FileError, OmsmError, shortened
 from omsm_ros.io import json_and_yaml
 
 CLOUD, SUMMARY, REPORT = "cloud.ply", "summary.json", "report.html"
@@ -67,6 +67,26 @@ def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[byte
             "or a pipe; give a file"
         )
     return os.fdopen(descriptor, "rb")
+
+
+def resolved_within(path: Path, folders: str, error: type[OmsmError], what: str) -> Path:
+    """Return ``path`` resolved; ``error`` unless it lies below one of ``folders``.
+
+    folders: separated by ":", as in PATH; "~" is the home folder, "." the working directory;
+        empty = anywhere
+    what: is read there: "calibration" or "bag"; the parameter ``<what>_folders`` names the folders
+    """
+    try:
+        resolved = path.expanduser().resolve()
+        allowed = [Path(each).expanduser().resolve() for each in folders.split(":") if each]
+    except (OSError, ValueError, RuntimeError) as err:
+        raise error(f"no {what} at {str(path)[:200]!r}; check the path") from err
+    if allowed and not any(resolved.is_relative_to(folder) for folder in allowed):
+        raise error(
+            f"{str(path)[:200]!r} lies outside the folders that a {what} is read from, "
+            f"{folders!r}; put it there, or start with another {what}_folders"
+        )
+    return resolved
 
 
 def exception_text(err: Exception) -> str:

@@ -192,6 +192,17 @@ def mapping_of(text: str, error: type[OmsmError], what: str) -> dict[str, Any]:
     return content
 
 
+def has_aliases(text: bytes) -> bool:
+    """Return whether a YAML text has aliases or anchors; one that is no YAML has none."""
+    if b"&" not in text and b"*" not in text:
+        return False
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # fifty times as fast, where it is
+    try:
+        return any(getattr(event, "anchor", None) is not None for event in yaml.parse(text, loader))
+    except (yaml.YAMLError, ValueError):
+        return False
+
+
 def begins_as_mapping(text: bytes) -> bool:
     """Whether a YAML text of any kind begins with a name and its value; the rest is not read."""
     begin = yaml.StreamStartEvent, yaml.DocumentStartEvent

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from importlib import resources
 from typing import Any
-from urllib.parse import SplitResult, parse_qs, quote, urlsplit
+from urllib.parse import SplitResult, parse_qs, urlsplit
 
 import matplotlib
 import numpy as np
@@ -117,8 +117,8 @@ class LiveServer:
         """
         if host not in LOOPBACK and len(token) < 16:
             raise ConfigurationError(
-                f"viewer on {host!r} can be seen from other computers: give a token of at least 16 "
-                "characters, or host 127.0.0.1"
+                f"viewer on {host!r} can be seen from other computers: give a token_file with a "
+                "token of at least 16 characters, or host 127.0.0.1"
             )
         if len(token) > _LONGEST_TOKEN:
             raise ConfigurationError(
@@ -132,14 +132,12 @@ class LiveServer:
 
     @property
     def address(self) -> str:
-        """Return where a browser finds the page; empty while nobody listens."""
+        """Return the address of the page, without the token; empty while nobody listens."""
         if self._server is None:
             return ""
         port = self._server.socket.getsockname()[1]
         host = f"[{self._host}]" if ":" in self._host else self._host
-        return f"http://{host}:{port}/" + (
-            f"?token={quote(self._token, '')}" if self._token else ""
-        )
+        return f"http://{host}:{port}/"
 
     def start(self) -> None:
         """Listen; ConfigurationError if the port is taken."""

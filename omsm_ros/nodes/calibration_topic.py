@@ -43,6 +43,7 @@ class CalibrationTopic:
         self.refused = ""
         self._node, self._take = node, take
         self._repeated_ns = 0
+        self._published: tuple[str, int] | None = None  # id and stamp of the last message
         self._messages = message_mapping.ros_messages()
         # Both are made without a check for rivals: here more than one may speak.
         self._publisher = topics.publish_on(
@@ -58,13 +59,22 @@ class CalibrationTopic:
         return max(self._now_ns(), self.since_ns + 1)
 
     def announce(self, calibration: Calibration, since_ns: int) -> None:
-        """Say that ``calibration`` is in force since ``since_ns`` [ns]."""
+        """Publish that ``calibration`` is in force since ``since_ns`` [ns].
+
+        A stamp ahead of this node's clock, as of a file dated tomorrow or under simulated time,
+        is published as now: the other nodes would count it as now too, and answer for ever.
+        """
+        since_ns = self._plausible(since_ns)
         self.calibration, self.since_ns, self.refused = calibration, since_ns, ""
+        self._published = calibration.id, since_ns
         message = message_mapping.calibration_message(self._messages, calibration, since_ns)
         self._publisher.publish(message)
 
     def _on_message(self, message: Any, _: topics.MessageInfo) -> None:
-        since_ns = self._plausible(message_mapping.stamp_of(message))
+        stamp_ns = message_mapping.stamp_of(message)
+        if (message.id, stamp_ns) == self._published:  # its own message
+            return
+        since_ns = self._plausible(stamp_ns)
         known = self.calibration
         if known is not None and since_ns <= self.since_ns:
             return

@@ -16,13 +16,14 @@ from omsm_ros import quantities
 from omsm_ros.core.calibration.calibration import REJECTED, Calibration, settings_with, verdict_of
 from omsm_ros.core.streams.motion_record import BlockBuffer, MotionRecord, assemble
 from omsm_ros.core.streams.stamps import RecentIncrease, check_period
-from omsm_ros.errors import ConfigurationError, FileError, OmsmError, one_line
+from omsm_ros.errors import BagError, ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder
+from omsm_ros.io.files import resolved_within
 from omsm_ros.io.folders import exclusive_lock
 from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
-from omsm_ros.nodes.correction_parameters import TRIGGER, trigger_of
+from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
@@ -43,6 +44,7 @@ PARAMETERS = (
     Parameter("report", "", "folder for the certificate of each identification; empty = none"),
     Parameter("settings", "", "JSON object of what the calibration belongs to"),
     Parameter("catalogue", "", "file or URL of the database to write it down in; empty = none"),
+    BAG_FOLDERS,
     *TRIGGER,
 )
 _STREAMS = {"axes": AxisBlock, "confocal": DistanceBlock, "reference": DistanceBlock}
@@ -142,7 +144,8 @@ class CalibratorNode(ManagedNode):
 
     async def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
         try:
-            identified = await self._aside.do(self._work(request))
+            bag = self._bag(request.bag)
+            identified = await self._aside.do(self._work(request, bag))
             calibration = identified.calibration
             since_ns = self._topic.decided()
             response.calibration = message_mapping.calibration_message(
@@ -150,9 +153,9 @@ class CalibratorNode(ManagedNode):
             )
             response.success, self._last = self._judge(calibration, since_ns)
             if response.success and self.values["catalogue"]:
-                self._last += await self._aside.do(partial(self._noted, request.bag, calibration))
+                self._last += await self._aside.do(partial(self._noted, bag, calibration))
             if self.values["report"]:
-                said = await self._aside.do(partial(self._certified, request.bag, identified))
+                said = await self._aside.do(partial(self._certified, bag, identified))
                 self._last += said
         except OmsmError as err:
             response.success, self._last = False, f"identification failed: {one_line(err)}"
@@ -171,43 +174,49 @@ class CalibratorNode(ManagedNode):
         self._topic.announce(calibration, since_ns)
         return True, f"{verdict}; {calibration.id[:12]} {kept}"
 
-    def _noted(self, bag: str, calibration: Calibration) -> str:
+    def _bag(self, given: str) -> Path | None:
+        """Return the bag that a request names, None for the live recording."""
+        if not given:
+            return None
+        return resolved_within(Path(given), self.values["bag_folders"], BagError, "bag")
+
+    def _noted(self, bag: Path | None, calibration: Calibration) -> str:
         """Write it into the catalogue and say so; a database that fails undoes no calibration."""
         # The database's library is an optional package.
         from omsm_ros.pipelines.history import keep_calibration
 
-        source = Path(bag) if bag else None
         warnings = record_in_catalogue(
             self.values["catalogue"],
-            lambda: keep_calibration(self.values["catalogue"], calibration, self._file, source),
+            lambda: keep_calibration(self.values["catalogue"], calibration, self._file, bag),
         )
         return f"; {'; '.join(warnings)}" if warnings else "; written into the catalogue"
 
-    def _certified(self, bag: str, identified: Identification) -> str:
+    def _certified(self, bag: Path | None, identified: Identification) -> str:
         """Write the certificate and say so; a full disk does not undo a calibration."""
         # Drawing takes a second to import; most calibrators do without.
         from omsm_ros.pipelines.identify import write_certificate
 
         folder = Path(self.values["report"])
         try:
-            page = write_certificate(folder, identified, source=Path(bag).name or "live recording")
+            source = bag.name if bag else "live recording"
+            page = write_certificate(folder, identified, source=source)
         except OmsmError as err:
             return f"; no certificate: {err}"
         return f"; certificate in {page}"
 
-    def _work(self, request: Identify.Request):  # type: ignore[no-untyped-def]
+    def _work(self, request: Identify.Request, bag: Path | None):  # type: ignore[no-untyped-def]
         """Return what is to be done beside the samples; what it needs of them is taken now."""
         duration = quantities.DURATION.checked(request.duration)
         order = quantities.ORDER.checked(request.order)
-        if request.bag:
-            motion = partial(self._motion_of_bag, Path(request.bag), duration)
+        if bag:
+            motion = partial(self._motion_of_bag, bag, duration)
         else:
             motion = partial(
                 self._live_motion, *(self._buffers[topic].recent(duration) for topic in _STREAMS)
             )
         stated, source = self._settings, request.input or "encoder"
-        if request.bag:
-            settings_reader = partial(_reported_settings_of_bag, Path(request.bag), stated)
+        if bag:
+            settings_reader = partial(_reported_settings_of_bag, bag, stated)
         else:
             now_ns = int(self.get_clock().now().nanoseconds)
             settings_reader = partial(_reported_settings_live, stated, self._probe, now_ns)

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.emulator import InstrumentLink
+from omsm_ros.instruments.emulator import InstrumentLink, StreamFaults
 from omsm_ros.instruments.emulator_factory import (
     EMULATED,
     AccelerationFeed,
@@ -22,7 +22,6 @@ from omsm_ros.instruments.emulator_factory import (
     line_for,
     player_for,
 )
-from omsm_ros.instruments.six_channel.emulator import StreamFaults
 from omsm_ros.io import message_mapping
 from omsm_ros.io.disturbance_file import load_disturbances
 from omsm_ros.io.folders import exclusive_lock, runtime_folder
@@ -86,18 +85,17 @@ class CellEmulatorNode(ManagedNode):
         self._scenario = Scenario(**{p.name: values[p.name] for p in _SCENARIO})
         file = values["disturbances"]
         self._disturbances = load_disturbances(file) if file else NOTHING
-        companion = emulated(values["device"]).companion
-        if companion and companion.node == "reference_driver" and not self._disturbances.reference:
+        second = emulated(values["device"]).second
+        if second and second.node == "reference_driver" and not self._disturbances.reference:
             self._disturbances = replace(self._disturbances, reference=ReferenceSensor())
-        faults = StreamFaults(
-            seed=values["seed"],
-            **{p.name.removeprefix("fault_"): values[p.name] for p in _FAULTS},
-        )
+        rates = {f"{p.name.removeprefix('fault_')}_rate": values[p.name] for p in _FAULTS}
         self._link = values["link"] or str(runtime_folder(self.get_namespace()) / "cell")
         if not self._link.startswith("tcp://"):
             undo.enter_context(exclusive_lock(Path(self._link)))
         line = undo.enter_context(line_for(self._link))
-        self._player = player_for(values["device"], line, self._serve_companion(undo), faults)
+        self._player = player_for(
+            values["device"], line, self._second_line(undo), StreamFaults(**rates), values["seed"]
+        )
         undo.callback(self._player.close)
         for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
@@ -107,13 +105,13 @@ class CellEmulatorNode(ManagedNode):
         self._feed: AccelerationFeed | None = None
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
 
-    def _serve_companion(self, undo: ExitStack) -> InstrumentLink | None:
+    def _second_line(self, undo: ExitStack) -> InstrumentLink | None:
         """Return the port of the second device, None where the cell has one device."""
         device = self.values["device"]
-        if (companion := emulated(device).companion) is None:
+        if (second := emulated(device).second) is None:
             return None
         link = self.values["link_beside"]
-        if companion.tcp and not link:
+        if second.tcp and not link:
             raise ConfigurationError(f"device {device!r} needs a link_beside: tcp://127.0.0.1:PORT")
         link = link or f"{self._link}_beside"
         if not link.startswith("tcp://"):

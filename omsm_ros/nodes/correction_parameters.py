@@ -41,6 +41,12 @@ TRIGGER = (
         quantities.STAMP_TOLERANCE,
     ),
 )
+BAG_FOLDERS = Parameter(
+    "bag_folders",
+    "~:.:/tmp",
+    "what a service may read bags from, separated by ':'; ~ = home, . = where the node was "
+    "started; empty = any folder",
+)
 PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
     Parameter(
@@ -49,6 +55,7 @@ PARAMETERS = (
         "what load_calibration may read from, separated by ':'; ~ = home, . = where the node was "
         "started; empty = any folder",
     ),
+    BAG_FOLDERS,
     Parameter("follow_calibrator", True, "take what appears on the topic calibration"),
     Parameter("settings", "", "JSON object of how the cell is set now; empty = not compared"),
     Parameter("override", False, "use a calibration that does not belong; every cloud says so"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import ExitStack
 from functools import partial
@@ -25,14 +26,15 @@ from omsm_ros.core.correction.counter_offset import LiveOffset
 from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
-from omsm_ros.core.streams.blocks import consecutive
+from omsm_ros.core.streams.blocks import Account, StreamAccount, consecutive
 from omsm_ros.core.streams.continuity import LoadMeter
 from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
 from omsm_ros.core.streams.trigger_slips import TriggerSlip
-from omsm_ros.errors import OmsmError
+from omsm_ros.errors import BagError, CalibrationError, OmsmError
 from omsm_ros.io import message_mapping
-from omsm_ros.io.calibration_file import load_calibration, load_for_others, resolved_within, since
+from omsm_ros.io.calibration_file import load_calibration, load_for_others, since
 from omsm_ros.io.descriptions import load_surface
+from omsm_ros.io.files import resolved_within
 from omsm_ros.nodes import topics
 from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
@@ -42,8 +44,6 @@ from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.pipelines.measure import live_traffic_light, with_sources
-
-# What the corrector says of itself: starved, refusing, losing, behind, or correcting.
 
 # Without a block for so long, and for as long as several last, the motion has paused [s].
 PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
@@ -81,6 +81,15 @@ class CorrectionState:
         self._recent = RecentIncrease()
         self._oldest_ns = 0
         self._resumes = 0.0
+        self._ended = Account()
+
+    def keep(self, account: Account) -> None:
+        """Add the account of a correction that has ended to those before it."""
+        self._ended = _sum_of(self._ended, account)
+
+    def account(self, corrector: Corrector) -> Account:
+        """Return the account of all corrections since the node was configured."""
+        return _sum_of(self._ended, corrector.account)
 
     def heard(self, stream: str, first: int, samples: int, period: float, now: float) -> None:
         """Note a block, whatever becomes of it; first: its trigger number;  now: [s]."""
@@ -143,7 +152,7 @@ class CorrectionState:
     def _account(self, report: Report, corrector: Corrector) -> dict[str, float]:
         """Enter every count of the account; return those that may mean trouble."""
         watched: dict[str, float] = {}
-        for stream, account in corrector.account.as_dict().items():
+        for stream, account in self.account(corrector).as_dict().items():
             counts: dict[str, int] = {**account}  # type: ignore[dict-item]
             counted: dict[str, int] = counts.pop("counted")  # type: ignore[assignment]
             missing = counts.pop("missing")
@@ -181,6 +190,25 @@ class CorrectionState:
                 report.add(STALE, f"no sample of {stream} for {silent:.0f} s")
 
 
+def _sum_of(one: Account, other: Account) -> Account:
+    return Account(
+        **{
+            stream: _sum_of_stream(getattr(one, stream), getattr(other, stream))
+            for stream in _STREAMS_CORRECTION_STATE
+        }
+    )
+
+
+def _sum_of_stream(one: StreamAccount, other: StreamAccount) -> StreamAccount:
+    return StreamAccount(
+        received=one.received + other.received,
+        corrected=one.corrected + other.corrected,
+        pending=one.pending + other.pending,
+        counted=dict(Counter(one.counted) + Counter(other.counted)),
+        missing=one.missing + other.missing,
+    )
+
+
 def _add_motion(report: Report, slip: TriggerSlip, motion: LiveOffset) -> None:
     """Enter what a motion before a fixed target said of the counts, and hold the stamps to it."""
     offset = motion.established
@@ -198,16 +226,13 @@ def _add_motion(report: Report, slip: TriggerSlip, motion: LiveOffset) -> None:
         report.add(ERROR, "but the motion says that equal counts are one trigger: a link is late")
 
 
-# Where the frames stand to each other with every axis at zero, on ``/tf_static``.
-#
-# The machine's frame has its origin where the probe finds a surface at distance zero. The probe
-# stands there and looks along its beam; the workpiece's origin lies on the spindle's axis.
-
-
-def broadcast_frames(
+def publish_frames(
     node: Node, undo: ExitStack, geometry: Geometry, names: Mapping[str, Any]
 ) -> None:
-    """Publish machine → probe and machine → workpiece, latched.
+    """Publish machine → probe and machine → workpiece with every axis at zero, latched.
+
+    The machine's origin is where the probe finds a surface at distance zero. The probe stands
+    there and looks along its beam; the workpiece's origin lies on the spindle's axis.
 
     names: of the frames, machine_frame, probe_frame, workpiece_frame
     """
@@ -263,7 +288,7 @@ class CorrectorNode(ManagedNode):
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
         )
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
-        broadcast_frames(self, undo, self._options.geometry, self.values)
+        publish_frames(self, undo, self._options.geometry, self.values)
         self._aside = BackgroundWorker(self, undo)
         self._aside.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
         self._aside.serve(undo, PredictError, "~/predict_error", self._on_predict)
@@ -302,8 +327,8 @@ class CorrectorNode(ManagedNode):
         corrector = Corrector(
             calibration, with_sources(self._options, calibration, self._sources, self._nominal)
         )
-        # Nothing is refused from here on: the calibration in force is one, wholly.
-        self._publish_rest()
+        # Nothing is refused from here on: the new calibration is in force as a whole.
+        self._end_correction()
         # A viewer that waits for the usual frame shows nothing until somebody has seen why.
         self._frame = self.values["workpiece_frame"] + (_OVERRIDDEN if reasons else "")
         for reason in reasons:
@@ -328,20 +353,29 @@ class CorrectorNode(ManagedNode):
         try:
             self._use(known)
         except OmsmError as err:
-            self._publish_rest()
-            self._corrector, self._foreign = None, str(err)
+            self._end_correction()
+            self._foreign = str(err)
             self.get_logger().error(self._foreign)
 
     def _publish_rest(self) -> None:
         if self._corrector is not None:
             self._publish(self._corrector.finish())
-            self.get_logger().info(f"samples so far: {self._corrector.account.as_dict()}")
+            account = self._state.account(self._corrector)
+            self.get_logger().info(f"samples so far: {account.as_dict()}")
+
+    def _end_correction(self) -> None:
+        """Publish what the correction so far still holds, and keep its counts."""
+        self._publish_rest()
+        if self._corrector is not None:
+            self._state.keep(self._corrector.account)
+            self._corrector = None
 
     async def _on_load(
         self, request: LoadCalibration.Request, response: LoadCalibration.Response
     ) -> None:
         response.id = self._in_force_id()
-        path = resolved_within(Path(request.path), self.values["calibration_folders"])
+        folders = self.values["calibration_folders"]
+        path = resolved_within(Path(request.path), folders, CalibrationError, "calibration")
         calibration = await self._aside.do(partial(load_for_others, path))
         self._put_in_force(calibration, self._topic.decided())
         response.success, response.message = True, "in use"
@@ -356,15 +390,11 @@ class CorrectorNode(ManagedNode):
     ) -> None:
         # What cannot be predicted is no error of zero.
         response.peak_to_valley = response.rms = response.outside_band_fraction = float("nan")
-        prediction = await self._aside.do(
-            partial(
-                _prediction,
-                self._topic.calibration,
-                request.bag,
-                request.z,
-                request.sample_period,
-            )
-        )
+        bag = request.bag
+        if bag:
+            bag = str(resolved_within(Path(bag), self.values["bag_folders"], BagError, "bag"))
+        known, period = self._topic.calibration, request.sample_period
+        prediction = await self._aside.do(partial(_prediction, known, bag, request.z, period))
         response.peak_to_valley = prediction.peak_to_valley
         response.rms = prediction.rms
         response.outside_band_fraction = prediction.outside_band_fraction

@@ -1,4 +1,7 @@
-"""What every driver node does: a thread reads the device, its blocks are published."""
+"""Driver nodes: of probe, axes, reference sensor and accelerometer.
+
+A thread reads the device, and its blocks are published; no fault of the line ends the node.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,37 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
-from omsm_msgs.msg import AxisBlock, DistanceBlock
+from omsm_msgs.msg import AccelerationBlock, AxisBlock, DistanceBlock
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
+from std_srvs.srv import Trigger
 
 from omsm_ros.core.calibration.calibration import PROBE
 from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.blocks import BlockPair
+from omsm_ros.instruments.factory import (
+    make_accelerometer,
+    make_axes,
+    make_device,
+    make_reference,
+)
+from omsm_ros.instruments.parameters import (
+    ACCELEROMETER_PARAMETERS,
+    AXIS_PARAMETERS,
+    PARAMETERS,
+    REFERENCE_PARAMETERS,
+)
 from omsm_ros.instruments.reader import DeviceReader, State
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.io import json_and_yaml, message_mapping
+from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
 from omsm_ros.nodes.managed import ManagedNode
+from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
@@ -28,6 +48,9 @@ _FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w
 _SILENCE_S = 2.0
 _SILENCE_SAMPLES = 5
 _END_S = 5.0
+# A dark reference takes some three seconds; more if the device is slow to answer.
+_DARK_REFERENCE_S = 30.0
+_ACCELERATION = "acceleration"
 
 
 class DriverNode(ManagedNode):
@@ -121,7 +144,7 @@ class DriverNode(ManagedNode):
         values: dict[str, object] = {**self._device.identity, "state": self._reader.state.value}
         values |= counts | {"connections": self._reader.connections}
         values["rate_hz"] = round(self._flow.rate, 3)
-        for topic, publisher in self._both():
+        for topic, publisher in self._outputs_by_topic():
             values[f"{topic}_subscribers"] = publisher.get_subscription_count()
         report = Report(f"reading at {self._flow.rate:.6g} Hz", values)
         if self._reader.trouble:
@@ -130,7 +153,7 @@ class DriverNode(ManagedNode):
         self._add_silence(report, now)
         return report
 
-    def _both(self) -> list[tuple[str, Publisher]]:
+    def _outputs_by_topic(self) -> list[tuple[str, Publisher]]:
         both = ((self._axes_topic, self._axes), (self._distance_topic, self._distance))
         return [(topic, publisher) for topic, publisher in both if topic and publisher]
 
@@ -149,3 +172,83 @@ class DriverNode(ManagedNode):
             report.add(STALE, "connected, but no sample has come yet")
         elif silent > patience:
             report.add(STALE, f"no sample for {silent:.0f} s")
+
+
+class ConfocalDriverNode(DriverNode):
+    """Reads a probe, with its encoders if it has some, and publishes distance and axes."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "confocal_driver",
+            PARAMETERS,
+            make_device,
+            axes="axes",
+            distance="confocal",
+            settings="probe_settings",
+        )
+
+    def configure(self, undo: ExitStack) -> None:
+        """Make the device, which nobody touches yet, and answer requests."""
+        super().configure(undo)
+        self._aside = BackgroundWorker(self, undo)
+        self._aside.serve(undo, Trigger, "~/dark_reference", self._on_dark_reference)
+
+    async def _on_dark_reference(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> None:
+        take = getattr(self._device, "dark_reference", None)
+        if take is None:
+            raise ConfigurationError(
+                f"device {self.values['device']!r} takes no dark reference by command; take "
+                "it as the device's manual says"
+            )
+        await self._aside.do(partial(self._reader.ask, take, _DARK_REFERENCE_S))
+        response.success, response.message = True, "dark reference taken; identify anew"
+
+
+class AxisDriverNode(DriverNode):
+    """Reads the axes where the probe does not carry them, and publishes them."""
+
+    def __init__(self) -> None:
+        super().__init__("axis_driver", AXIS_PARAMETERS, make_axes, axes="axes")
+
+
+class ReferenceDriverNode(DriverNode):
+    """Reads the reference sensor and publishes its distance."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "reference_driver", REFERENCE_PARAMETERS, make_reference, distance="reference"
+        )
+
+
+class AccelerometerDriverNode(DriverNode):
+    """Samples a three-axis accelerometer and publishes its blocks."""
+
+    def __init__(self) -> None:
+        frame = Parameter("accelerometer_frame", "probe", "frame of the acceleration")
+        parameters = (*ACCELEROMETER_PARAMETERS, frame)
+        super().__init__("accelerometer_driver", parameters, make_accelerometer)
+        self._acceleration: Publisher | None = None
+
+    def configure(self, undo: ExitStack) -> None:
+        """Make the device, which nobody touches yet, and the topic."""
+        super().configure(undo)
+        self._acceleration = self.publish_on(undo, AccelerationBlock, _ACCELERATION)
+
+    def _publish(self, blocks: Sequence[Any]) -> None:
+        if self._acceleration is None:
+            return
+        frame = self.values["accelerometer_frame"]
+        for block in blocks:
+            message = message_mapping.acceleration_message(self._messages, block, frame)
+            self._acceleration.publish(message)
+
+    def _outputs_by_topic(self) -> list[tuple[str, Publisher]]:
+        return [(_ACCELERATION, self._acceleration)] if self._acceleration is not None else []
+
+
+confocal_driver = partial(run, ConfocalDriverNode)
+axis_driver = partial(run, AxisDriverNode)
+reference_driver = partial(run, ReferenceDriverNode)
+accelerometer_driver = partial(run, AccelerometerDriverNode)

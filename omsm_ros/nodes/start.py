@@ -32,7 +32,15 @@ _MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # memory and mode, and not
 _PUBLICATION_MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 _BAD_INPUT = 2
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
-_OTHER_NAMES = {"replay": "player"}
+_OF_ITS_OWN = ("corrector", "calibrator", "vibration_monitor", "recorder", "player", "viewer",
+               "cell_emulator", "cell_demo")  # fmt: skip
+_DRIVERS = ("confocal_driver", "axis_driver", "reference_driver", "accelerometer_driver")
+NODES = {
+    **{name: f"{name}_node:main" for name in _OF_ITS_OWN},
+    **{name: f"driver:{name}" for name in _DRIVERS},
+    "replay": "player_node:main",
+}
+"""The commands, and the ``module:function`` that runs each."""
 _NO_ROS = (
     "ROS 2 Jazzy is not in this Python: source /opt/ros/jazzy/setup.bash, or '. ./env.sh' after "
     "'make setup' in a checkout; the offline commands (omsm) need none"
@@ -47,6 +55,8 @@ _NEEDED = {"rclpy": _NO_ROS, "omsm_msgs": _NO_MESSAGES}
 def main() -> None:
     """Run the node that the command is named for."""
     name = Path(sys.argv[0]).stem
+    if name not in NODES:
+        sys.exit(f"no node {name!r}, expected one of {sorted(NODES)}")
     _check_open_files(name)
     with exit_on_signal_while_loading(ENDING):
         use_single_malloc_arena(ENDING)  # first, for the process may begin again
@@ -59,8 +69,9 @@ def main() -> None:
             except ImportError as err:
                 print(f"{name}: {err}: {remedy}", file=sys.stderr)
                 sys.exit(_BAD_INPUT)
-        node = importlib.import_module(f"omsm_ros.nodes.{_OTHER_NAMES.get(name, name)}_node")
-    node.main()
+        module, _, function = NODES[name].partition(":")
+        node = importlib.import_module(f"omsm_ros.nodes.{module}")
+    getattr(node, function)()
 
 
 def _check_open_files(name: str) -> None:

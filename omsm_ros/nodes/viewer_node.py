@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,10 @@ from omsm_msgs.msg import AccelerationBlock, Calibration
 from sensor_msgs.msg import PointCloud2
 
 from omsm_ros import quantities
-from omsm_ros.errors import OmsmError
+from omsm_ros.errors import ConfigurationError, FileError, OmsmError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.descriptions import load_surface
+from omsm_ros.io.files import read_text
 from omsm_ros.live_page.live_view import LiveView
 from omsm_ros.live_page.server import LiveServer, render
 from omsm_ros.nodes.diagnostics import Report
@@ -25,9 +28,15 @@ from omsm_ros.quantities import Parameter
 PARAMETERS = (
     Parameter("host", "127.0.0.1", "to listen on; another than loopback needs a token"),
     Parameter("port", 8080, "of the page", quantities.TCP_PORT),
-    Parameter("token", "", "that must stand in the address behind ?token=; empty = none"),
+    Parameter(
+        "token_file",
+        "",
+        "file with the token that must stand in the address behind ?token=; only its owner may "
+        "read it; empty = none",
+    ),
     Parameter("nominal", "", "SURFACE.yaml that heights are compared with; empty = none"),
 )
+_MAX_TOKEN_BYTES = 1000
 _LEVELS = {
     DiagnosticStatus.OK: "OK",
     DiagnosticStatus.WARN: "WARN",
@@ -53,23 +62,29 @@ class ViewerNode(ManagedNode):
             render(f"Cell {where}"),
             self.values["host"],
             self.values["port"],
-            self.values["token"],
+            load_token(self.values["token_file"]) if self.values["token_file"] else "",
         )
 
     def activate(self, undo: ExitStack) -> None:
         """Serve the page, and begin to listen."""
         self._server.start()
         undo.callback(self._server.stop)
-        self.get_logger().info(f"look at {self._server.address}")
+        self.get_logger().info(f"look at {self._shown}")
         listen(self, undo, PointCloud2, "points", self._on_points)
         listen(self, undo, AccelerationBlock, "acceleration", self._on_acceleration)
         listen(self, undo, Calibration, "calibration", self._on_calibration, LATCHED_QOS)
         heard = self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         undo.callback(self.destroy_subscription, heard)
 
+    @property
+    def _shown(self) -> str:
+        """Return the address for logs and diagnostics, which everybody on the network can read."""
+        hint = "?token=…" if self.values["token_file"] else ""
+        return f"{self._server.address}{hint}"
+
     def report(self) -> Report:
         """Return where the page is, and what it could not show."""
-        return Report(f"look at {self._server.address}", {"refused_messages": self._refused})
+        return Report(f"look at {self._shown}", {"refused_messages": self._refused})
 
     def _on_points(self, message: Any, info: MessageInfo) -> None:
         try:
@@ -103,6 +118,24 @@ class ViewerNode(ManagedNode):
                     self._view.add_state(status.name, level, status.message, values)
                 except OmsmError as err:
                     self._warn(str(err))
+
+
+def load_token(path: str) -> str:
+    """Return the token in a file of one line.
+
+    Raises ConfigurationError for a file that others may read, or that holds no token.
+    """
+    text = read_text(path, _MAX_TOKEN_BYTES, FileError, "token file").strip()
+    if os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise ConfigurationError(
+            f"token file {path!r} can be read by other users of this computer: chmod 600 {path}"
+        )
+    if not text or len(text.split()) > 1:
+        raise ConfigurationError(
+            f"token file {path!r} holds no token; make one: (umask 077; openssl rand -hex 16 > "
+            f"{path})"
+        )
+    return text
 
 
 def main() -> None:

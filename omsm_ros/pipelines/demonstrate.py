@@ -126,9 +126,9 @@ class Demonstration:
     @property
     def companion_link(self) -> str:
         """The emulated port of the second device; empty without one."""
-        if (companion := emulated(self.device).companion) is None:
+        if (second := emulated(self.device).second) is None:
             return ""
-        return _tcp_link() if companion.tcp else f"{self.link}_beside"
+        return _tcp_link() if second.tcp else f"{self.link}_beside"
 
     @property
     def step_test_samples(self) -> int:
@@ -159,10 +159,10 @@ class Demonstration:
 
     def companion_parameters(self) -> tuple[str, dict[str, object]] | None:
         """Return the node that reads the second device, and its ROS parameters; None without."""
-        if (companion := emulated(self.device).companion) is None:
+        if (second := emulated(self.device).second) is None:
             return None
         fixed = {"port": self.companion_link, "sample_period": self.sample_period}
-        return companion.node, fixed | companion.driver
+        return second.node, fixed | second.driver
 
     def settings(self) -> dict[str, object]:
         """Return what the calibration will belong to."""

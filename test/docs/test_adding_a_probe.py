@@ -17,19 +17,21 @@ def test_the_page_runs_from_top_to_bottom():
 
 
 def test_every_name_the_page_points_at_exists():
-    from omsm_ros.instruments.emulator_factory import EMULATED
-    from omsm_ros.instruments.factory import DEVICES, PARAMETERS
-    from omsm_ros.instruments.trace import ReplayTransport
+    from wire_trace import ReplayTransport
 
-    assert DEVICES
+    from omsm_ros.instruments.emulator_factory import EMULATED
+    from omsm_ros.instruments.parameters import PARAMETERS
+    from omsm_ros.instruments.registry import PROBES
+
+    assert PROBES
     assert PARAMETERS
     assert EMULATED
     assert ReplayTransport.name == "trace"
 
 
 def test_every_device_stands_in_the_table():
-    from omsm_ros.instruments.factory import DEVICES
+    from omsm_ros.instruments.registry import PROBES
 
     table = (PAGE.parent / "devices.md").read_text(encoding="utf-8")
-    for name in DEVICES:
+    for name in PROBES:
         assert f"| `{name}` |" in table

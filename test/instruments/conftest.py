@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loopback import Loopback
 
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.streams.blocks import Status
@@ -16,7 +17,6 @@ from omsm_ros.core.surface.nominal import OffAxisParaboloid
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.emulator import Instrument
-from omsm_ros.instruments.loopback import Loopback
 from omsm_ros.instruments.reader import BACK_OFF_S
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.twin.cell import Cell, Recording, record

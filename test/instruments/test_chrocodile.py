@@ -11,10 +11,12 @@ import pytest
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
-from omsm_ros.instruments.chrocodile.device import ChrocodileDevice, ChrocodileSettings
-from omsm_ros.instruments.chrocodile.emulator import AXIS_SCALING, ChrocodileEmulator
-from omsm_ros.instruments.chrocodile.telegram import Layout, ProbeReading
-from omsm_ros.instruments.emulator import Instrument
+from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
+from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
+from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator
+from omsm_ros.instruments.chrocodile.telegram import Layout
+from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
+from omsm_ros.instruments.scaling import ProbeReading
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 

@@ -10,9 +10,9 @@ import pytest
 
 from omsm_ros.errors import DeviceError, DeviceTimeoutError
 from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
-from omsm_ros.instruments.chrocodile.emulator import AXIS_SCALING, ChrocodilePacketEmulator
+from omsm_ros.instruments.chrocodile.emulator import ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.emulator import Instrument
+from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 

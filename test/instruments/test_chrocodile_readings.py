@@ -13,12 +13,13 @@ from omsm_ros.instruments.chrocodile.telegram import (
     SATURATED,
     TRIGGER_DELAYED,
     TRIGGER_LOST,
-    ProbeReading,
     check_selection,
     counts_of,
     distance_of,
     first_of,
+    unit_of,
 )
+from omsm_ros.instruments.scaling import ProbeReading
 
 STARTS = np.array([[0, 100, -7, 5_000, 2**31 - 10], [50, 90, -7, 5_001, 2**31 + 30]])
 TRAVEL = np.array([[8, -8, 0, 3, 40], [20, -6, 0, 1, -60]])
@@ -86,7 +87,7 @@ def test_each_distance_signal_has_its_unit(signal, raw, metres):
     np.testing.assert_allclose(distance, metres, rtol=1e-12)
     assert np.isnan(intensity).all()
     assert status.tolist() == [Status.OK, Status.OK]
-    step = ProbeReading(full_scale=SCA_M).unit(int(signal[1:]))
+    step = unit_of(int(signal[1:]), SCA_M)
     np.testing.assert_allclose(metres / raw.astype(float), step, rtol=1e-12)
 
 

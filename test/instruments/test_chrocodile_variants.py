@@ -7,13 +7,11 @@ from typing import Any
 
 import pytest
 
-from omsm_ros.instruments.chrocodile.device import ChrocodileDevice, ChrocodileSettings
-from omsm_ros.instruments.chrocodile.emulator import (
-    AXIS_SCALING,
-    ChrocodileEmulator,
-    ChrocodilePacketEmulator,
-)
+from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
+from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
+from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
+from omsm_ros.instruments.emulator import AXIS_SCALING
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 BOTH = [

@@ -6,16 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loopback import SimulatedClock
 
 from omsm_ros.instruments.emulator import Instrument
-from omsm_ros.instruments.loopback import SimulatedClock
+from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.device import (
     CsvSettings,
     CsvStreamDevice,
     GenericStreamDevice,
 )
 from omsm_ros.instruments.six_channel.emulator import CsvStreamEmulator
-from omsm_ros.instruments.six_channel.protocol import AxisScaling, StreamScaling
+from omsm_ros.instruments.six_channel.protocol import StreamScaling
 
 from .scripted_stream import Script
 

@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
 
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.instruments import parameters
+from omsm_ros.instruments.chrocodile import device as chrocodile
+from omsm_ros.instruments.chrocodile.telegram import LATCHES
 from omsm_ros.instruments.emulator_factory import EMULATED, emulated
 from omsm_ros.instruments.factory import (
-    AXIS_PARAMETERS,
-    DEVICES,
-    PARAMETERS,
-    REFERENCE_PARAMETERS,
-    command_transport,
-    defaults,
+    make_accelerometer,
     make_axes,
     make_device,
     make_reference,
 )
+from omsm_ros.instruments.parameters import (
+    ACCELEROMETER_PARAMETERS,
+    AXIS_PARAMETERS,
+    PARAMETERS,
+    REFERENCE_PARAMETERS,
+    command_transport,
+    defaults,
+)
+from omsm_ros.instruments.registry import ACCELEROMETERS, PROBES, REFERENCES, Model, loaded
+from omsm_ros.instruments.six_channel.protocol import COLUMNS
 
 # What a device measures with must be stated; the emulated one's scales will do.
 STATED = emulated("six_channel").driver
 
 
-@pytest.mark.parametrize("name", DEVICES)
+@pytest.mark.parametrize("name", PROBES)
 def test_every_device_is_made_from_the_defaults(name: str) -> None:
     device = make_device(defaults() | STATED | {"device": name, "port": "tcp://device.invalid:1"})
     assert device.statistics.decoded == 0
@@ -32,15 +42,51 @@ def test_every_device_is_made_from_the_defaults(name: str) -> None:
 
 
 def test_every_emulated_device_has_its_driver() -> None:
-    # The reference is beside a probe of the table.
-    assert set(EMULATED) == {*DEVICES, "capancdt"}
+    assert set(EMULATED) == {*PROBES, "capancdt"}
     names = {parameter.name for parameter in PARAMETERS}
     # A probe without encoders is no whole cell.
-    companion = EMULATED["confocaldt"].companion
-    assert companion is not None
-    assert companion.node == "axis_driver"
-    for each in EMULATED.values():
-        assert set(each.driver) <= names
+    second = emulated("confocaldt").second
+    assert second is not None
+    assert second.node == "axis_driver"
+    for name in EMULATED:
+        assert set(emulated(name).driver) <= names
+
+
+@pytest.mark.parametrize(
+    "model", [*PROBES.values(), *REFERENCES.values(), *ACCELEROMETERS.values()]
+)
+def test_every_place_in_the_table_of_models_exists(model: Model) -> None:
+    assert callable(loaded(model.driver))
+    if model.emulator:
+        assert callable(loaded(model.emulator).make)
+
+
+def test_the_words_of_the_parameters_are_those_of_the_device() -> None:
+    """The table of parameters is read without loading a device."""
+    assert tuple(chrocodile.TRIGGERS) == parameters.TRIGGERS
+    assert tuple(chrocodile.FORMATS) == parameters.FORMATS
+    assert tuple(LATCHES) == parameters.LATCHES
+    assert defaults()["columns"].split() == list(COLUMNS)
+
+
+def test_no_device_is_loaded_before_it_is_asked_for() -> None:
+    look = "; ".join(
+        (
+            "import sys",
+            "from omsm_ros.instruments import emulator_factory, factory",
+            "print([m for m in sys.modules if m.startswith('omsm_ros.instruments.')"
+            " and m.endswith(('device', 'emulator')) and m.count('.') > 2])",
+        )
+    )
+    done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_an_accelerometer_is_made_from_its_defaults() -> None:
+    values = defaults(ACCELEROMETER_PARAMETERS) | {"port": "synthetic://"}
+    assert make_accelerometer(values).counts()["decoded"] == 0
+    with pytest.raises(ConfigurationError, match="device 'ruler'"):
+        make_accelerometer(values | {"device": "ruler"})
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,9 @@ from hypothesis import strategies as st
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.counting import Counting, SequenceTracker
+from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings, samples_of
-from omsm_ros.instruments.six_channel.protocol import (
-    AxisScaling,
-    ProbeScaling,
-    StreamScaling,
-    encode_frames,
-)
+from omsm_ros.instruments.six_channel.protocol import ProbeScaling, StreamScaling, encode_frames
 
 from .scripted_stream import AT_ONCE, NEVER, Script, frames_of, run, spans
 

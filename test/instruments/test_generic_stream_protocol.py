@@ -13,11 +13,11 @@ from hypothesis.extra import numpy as npst
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.protocol import (
     ENCODED_SIZE,
     FRAME,
     SEGMENT_SIZE,
-    AxisScaling,
     FrameArray,
     FrameDecoder,
     ProbeScaling,

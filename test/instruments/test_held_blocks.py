@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.instruments.micro_epsilon.device import CapaNcdtDevice, CapaNcdtSettings
+from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.protocol import MeasurementBlock, encode_block
 
 from .scripted_stream import Script

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
-from omsm_ros.instruments.chrocodile.emulator import AXIS_SCALING
-from omsm_ros.instruments.emulator import Instrument
+from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
+from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.device import (
-    CapaNcdtDevice,
-    CapaNcdtSettings,
     ConfocalDtDevice,
     ConfocalDtEthernetDevice,
     ConfocalDtSettings,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import DeviceError
-from omsm_ros.instruments.chrocodile.emulator import AXIS_SCALING
+from omsm_ros.instruments.emulator import AXIS_SCALING
 from omsm_ros.instruments.micro_epsilon.device import (
     ConfocalDtDevice,
     ConfocalDtEthernetDevice,

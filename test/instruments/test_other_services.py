@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import DeviceError, NoSamplesError
-from omsm_ros.instruments.chrocodile.device import Chrocodile, ChrocodileDevice, ChrocodileSettings
+from omsm_ros.instruments.chrocodile.device import Chrocodile, ChrocodileSettings
+from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
 from omsm_ros.instruments.chrocodile.packet_protocol import PacketCommand, encode_command
 from omsm_ros.instruments.micro_epsilon.device import ConfocalDtDevice, ConfocalDtSettings

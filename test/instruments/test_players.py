@@ -13,17 +13,16 @@ import pytest
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockPair
-from omsm_ros.instruments.emulator_factory import EMULATED, emulated, line_for, player_for
-from omsm_ros.instruments.factory import (
-    AXIS_PARAMETERS,
-    REFERENCE_PARAMETERS,
-    defaults,
-    make_axes,
-    make_device,
-    make_reference,
+from omsm_ros.instruments.emulator_factory import (
+    EMULATED,
+    InstrumentPlayer,
+    emulated,
+    line_for,
+    player_for,
 )
+from omsm_ros.instruments.factory import make_axes, make_device, make_reference
+from omsm_ros.instruments.parameters import AXIS_PARAMETERS, REFERENCE_PARAMETERS, defaults
 from omsm_ros.instruments.reader import DeviceReader
-from omsm_ros.instruments.six_channel.emulator import StreamFaults
 from omsm_ros.twin.cell import Recording
 
 SOON = 20.0
@@ -36,7 +35,7 @@ def play(name: str, link: str, recording: Recording, lapse: float = 20.0) -> lis
     got: list[BlockPair] = []
     stop = threading.Event()
     with line_for(link) as line:
-        player = emulated(name).player(line, StreamFaults())
+        player = InstrumentPlayer(emulated(name).make, line)
         values = defaults() | {"device": name, "port": line.path} | emulated(name).driver
         device = make_device(values)
         reader = DeviceReader(device, got.extend)
@@ -66,7 +65,7 @@ def wait(done: object, reader: DeviceReader) -> None:
 def test_the_twins_motion_comes_out(
     name: str, where: str, tmp_path: Path, step_test: Recording
 ) -> None:
-    if where == "pty" and EMULATED[name].tcp:
+    if where == "pty" and emulated(name).tcp:
         pytest.skip("speaks TCP only")
     link = str(tmp_path / "probe") if where == "pty" else "tcp://127.0.0.1:0"
     blocks = play(name, link, step_test)
@@ -93,23 +92,23 @@ def test_the_twins_motion_comes_out(
             np.testing.assert_allclose(found, expected, rtol=0, atol=half_count * 1.001)
 
 
-@pytest.mark.parametrize("name", [name for name in EMULATED if EMULATED[name].companion])
-def test_the_companion_device_measures_the_same_motion(
+@pytest.mark.parametrize("name", [name for name in EMULATED if emulated(name).second])
+def test_the_second_device_measures_the_same_motion(
     name: str, tmp_path: Path, step_test: Recording
 ) -> None:
-    companion = emulated(name).companion
-    assert companion is not None
+    second = emulated(name).second
+    assert second is not None
     far = replace(step_test.distance, distance=0.5 * step_test.axes.z)
     recording = replace(step_test, reference=far)
-    axes_wanted = companion.node == "axis_driver"
+    axes_wanted = second.node == "axis_driver"
     make = make_axes if axes_wanted else make_reference
     parameters = AXIS_PARAMETERS if axes_wanted else REFERENCE_PARAMETERS
-    second = "tcp://127.0.0.1:0" if companion.tcp else str(tmp_path / "second")
+    link = "tcp://127.0.0.1:0" if second.tcp else str(tmp_path / "second")
     got: list[BlockPair] = []
     stop = threading.Event()
-    with line_for(str(tmp_path / "first")) as line, line_for(second) as other:
-        player = player_for(name, line, other, StreamFaults())
-        values = {p.name: p.default for p in parameters} | {"port": other.path} | companion.driver
+    with line_for(str(tmp_path / "first")) as line, line_for(link) as other:
+        player = player_for(name, line, other)
+        values = {p.name: p.default for p in parameters} | {"port": other.path} | second.driver
         device = make(values)
         reader = DeviceReader(device, got.extend)
         thread = threading.Thread(target=reader.run, args=(stop,))

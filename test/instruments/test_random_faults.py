@@ -9,18 +9,13 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.instruments.chrocodile.device import ChrocodileDevice, ChrocodileSettings
-from omsm_ros.instruments.chrocodile.emulator import (
-    AXIS_SCALING,
-    ChrocodileEmulator,
-    ChrocodilePacketEmulator,
-)
+from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
+from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
+from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.chrocodile.telegram import ProbeReading
-from omsm_ros.instruments.emulator import Instrument
+from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
+from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.device import (
-    CapaNcdtDevice,
-    CapaNcdtSettings,
     ConfocalDtDevice,
     ConfocalDtEthernetDevice,
     ConfocalDtSettings,
@@ -31,6 +26,7 @@ from omsm_ros.instruments.micro_epsilon.emulator import (
     ConfocalDtSerialEmulator,
 )
 from omsm_ros.instruments.reader import BACK_OFF_S
+from omsm_ros.instruments.scaling import ProbeReading
 from omsm_ros.instruments.six_channel.device import CsvSettings, CsvStreamDevice
 from omsm_ros.instruments.six_channel.emulator import CsvStreamEmulator
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from loopback import Loopback
 
-from omsm_ros.instruments import transport
-from omsm_ros.instruments.emulator import AXES, Instrument, Measured
-from omsm_ros.instruments.loopback import Loopback
-from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
+from omsm_ros.instruments.emulator import Instrument, Measured
+from omsm_ros.instruments.scaling import AXES
+from omsm_ros.instruments.six_channel.device import AdsRing, GenericStreamDevice, StreamSettings
+from omsm_ros.instruments.six_channel.emulator import SixChannelEmulator
 from omsm_ros.instruments.six_channel.protocol import (
     FRAME,
     FrameArray,
     StreamScaling,
-    encode_frames,
 )
 
 from .conftest import Bench
@@ -46,16 +46,6 @@ def frames_of(measured: Measured, counters: np.ndarray, times_ns: np.ndarray) ->
     for i, (name, axis) in enumerate(zip(AXES, SCALING.axes, strict=True)):
         frames["counts"][:, i] = axis.counts(measured.axes[name])
     return frames
-
-
-class SixChannels(Instrument):
-    """Sends a frame a trigger."""
-
-    counter_range = 2**32
-
-    def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
-        frames = frames_of(measured, counters, times_ns)
-        return [encode_frames(frame[np.newaxis]) for frame in frames]
 
 
 class Ring:
@@ -116,7 +106,7 @@ class Plc(Instrument):
         return [record.tobytes() for record in records]
 
 
-class SimulatedRing(transport.AdsRing):
+class SimulatedRing(AdsRing):
     """The driver's side, on simulated time."""
 
     def __init__(self, loop: Loopback) -> None:
@@ -140,14 +130,16 @@ def ring_bench(monkeypatch: pytest.MonkeyPatch) -> Any:
             open=loop.open, close=loop.close, read_by_name=ring.read_by_name
         )
         fake = SimpleNamespace(Connection=lambda *_: connected, ADSError=OSError)
-        monkeypatch.setattr(transport, "_pyads", lambda: fake)
+        monkeypatch.setattr("omsm_ros.instruments.six_channel.device._pyads", lambda: fake)
         driver = device(SimulatedRing(loop), settings, loop.clock.nanoseconds, loop.clock)
         return Bench(loop, emulator(ring, clock=loop.clock), driver)
 
     return make
 
 
-STREAM = Kind(SixChannels, GenericStreamDevice, StreamSettings(), checked=True, modulus=2**32)
+STREAM = Kind(
+    SixChannelEmulator, GenericStreamDevice, StreamSettings(), checked=True, modulus=2**32
+)
 PLC = Kind(Plc, GenericStreamDevice, StreamSettings(), checked=True, modulus=2**32)
 
 

@@ -7,8 +7,9 @@ import pytest
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
-from omsm_ros.instruments.six_channel.protocol import AxisScaling, StreamScaling, encode_frames
+from omsm_ros.instruments.six_channel.protocol import StreamScaling, encode_frames
 
 from .scripted_stream import MS, NEVER, Script, assert_consistent, frames_of, run, spans
 

@@ -7,17 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from loopback import Loopback
+from wire_trace import Event, ReplayTransport, read_trace
 
 from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.chrocodile.device import ChrocodileDevice, ChrocodileSettings
-from omsm_ros.instruments.chrocodile.emulator import (
-    AXIS_SCALING,
-    ChrocodileEmulator,
-    ChrocodilePacketEmulator,
-)
+from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
+from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
+from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.loopback import Loopback
-from omsm_ros.instruments.trace import Event, ReplayTransport, TracedTransport, read_trace
+from omsm_ros.instruments.emulator import AXIS_SCALING
+from omsm_ros.instruments.trace import TracedTransport
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 

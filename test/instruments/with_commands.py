@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from omsm_ros.instruments.loopback import Loopback
+from loopback import Loopback
 
 
 class WithCommands:

@@ -9,6 +9,8 @@ from time import process_time
 
 import numpy as np
 import pytest
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -216,6 +218,76 @@ def test_a_frame_that_unpacks_to_gigabytes_stops_at_what_it_claims(compression):
     assert peak < 4e6
     with pytest.raises(Exception, match="at most"):
         bag_checks.storage_mcap.decompress(bomb, compression, 2**40, 0)
+
+
+NESTED_ALIASES = "&a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join([f'*{before}'] * 9)}]\n"
+    for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+def test_metadata_with_aliases_is_refused_at_once(tmp_path, message):
+    """A few hundred bytes that unfold to gigabytes as soon as an error shows them."""
+    folder = foreign_bag(tmp_path / "bag", [message], plugin=StoragePlugin.SQLITE3)
+    metadata = folder / "metadata.yaml"
+    text = metadata.read_text()
+    assert "compression_format: ''" in text
+    bomb = text.replace("compression_format: ''", "compression_format: *i")
+    metadata.write_text(f"a: {NESTED_ALIASES}{bomb}")
+    start = process_time()
+    for read in (records, ForeignBag):
+        with pytest.raises(BagError, match="aliases or anchors"):
+            read(folder)
+    assert process_time() - start < 1.0
+
+
+@pytest.mark.parametrize("stated", [f"a: {NESTED_ALIASES}", "- history: 1\n" * 20_000])
+def test_a_quality_of_service_with_aliases_or_without_end_is_refused(stated):
+    start = process_time()
+    with pytest.raises(Exception, match="quality of service") as refused:
+        bag_checks.storage_mcap.parse_qos(stated)
+    assert refused.type is bag_checks.ReaderError
+    assert process_time() - start < 1.0
+    assert bag_checks.storage_mcap.parse_qos("[]") == []
+
+
+def packed_chunks(path, chunks, size, compression):
+    """An MCAP file with an index, its chunks full of zeros that all cover the same time."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, chunk_size=size, compression=compression)
+        writer.start("ros2")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/text", "cdr", schema)
+        for number in range(chunks):
+            writer.add_message(channel, 1 + number % 2, bytes(size), 1)
+        writer.finish()
+
+
+@pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])
+def test_chunks_that_unpack_to_gigabytes_are_refused_before_they_are_unpacked(
+    tmp_path, compression
+):
+    """Nothing is unpacked: 30 chunks of 128 MB would be held together."""
+    import tracemalloc
+
+    path = tmp_path / "bomb.mcap"
+    packed_chunks(path, 8, 8 * 1024**2, compression)
+    tracemalloc.start()
+    with pytest.raises(BagError, match="unpacks to 100 times its"):
+        records(path)
+    assert tracemalloc.get_traced_memory()[1] < 8e6
+    tracemalloc.stop()
+
+
+def test_chunks_that_cover_the_same_time_are_held_up_to_a_bound(tmp_path, monkeypatch):
+    path = tmp_path / "overlap.mcap"
+    packed_chunks(path, 5, 1_000_000, CompressionType.NONE)
+    monkeypatch.setattr(bag_checks, "_MAX_HELD_BYTES", 2_500_000)
+    with pytest.raises(BagError, match="cover the same time"):
+        records(path)
+    monkeypatch.undo()
+    with pytest.raises(BagError, match="has no topic"):
+        records(path)
 
 
 @pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])

@@ -137,6 +137,39 @@ def test_what_is_decided_now_is_newer_than_all_before(cell, two):
     assert cell.topic.decided() == STARTED_NS + 7 * SECOND
 
 
+def spoken(cells, turns=20):
+    """Let each cell hear all that every cell says, and return how many messages there were."""
+    heard = 0
+    for _ in range(turns):
+        said = [message for cell in cells for message in cell.node.messages(TOPIC)]
+        for message in said[heard:]:
+            for cell in cells:
+                cell.topic._on_message(message, {})
+        heard = len(said)
+    return sum(len(cell.node.messages(TOPIC)) for cell in cells)
+
+
+@pytest.mark.parametrize("now_ns", [0, STARTED_NS], ids=["simulated time stands", "real time"])
+@pytest.mark.parametrize("ahead_ns", [SECOND // 2, 86_400 * SECOND])
+def test_a_node_does_not_answer_itself_whatever_the_date_of_its_calibration(two, now_ns, ahead_ns):
+    cell = Cell()
+    cell.node.now_ns = now_ns
+    cell.topic.announce(two[0], STARTED_NS + ahead_ns)
+    assert spoken([cell]) == 1
+    assert cell.topic.calibration is two[0]
+
+
+@pytest.mark.parametrize("clocks", [(0, 0), (STARTED_NS, STARTED_NS), (0, STARTED_NS)])
+def test_nodes_with_two_calibrations_of_tomorrow_fall_silent(two, clocks):
+    cells = [Cell(), Cell(), Cell()]
+    for cell, now_ns in zip(cells, (*clocks, clocks[0]), strict=True):
+        cell.node.now_ns = now_ns
+    for cell, calibration in zip(cells, two, strict=False):
+        cell.topic.announce(calibration, STARTED_NS + 86_400 * SECOND)
+    assert spoken(cells) <= 9
+    assert all(cell.topic.calibration is not None for cell in cells)
+
+
 def test_a_message_that_is_none_is_refused_in_one_line(cell, two):
     message = message_mapping.calibration_message(cell.made, two[0], STARTED_NS)
     message.sample_period = -1.0

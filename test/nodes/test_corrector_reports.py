@@ -180,3 +180,21 @@ def test_the_oldest_of_what_was_taken_tells_how_late_it_was():
     report = state.report(corrector, now, 0.0)
     assert report.values["latency_max_ms"] == 3500.0
     assert "falls behind" not in report.text  # since the last report nobody waited
+
+
+def test_counts_go_on_where_a_new_calibration_begins_a_new_correction():
+    first, state, now = corrected()
+    before = state.report(first, now, 0.0).values["axes_received"]
+    first.finish()
+    state.keep(first.account)
+    second = Corrector(CALIBRATION, CorrectionOptions())
+    assert state.report(second, now, 0.0).values["axes_received"] == before > 0
+    for block in blocks(2000):
+        (second.push_axes if isinstance(block, AxisBlock) else second.push_distance)(block)
+    second.finish()
+    values = state.report(second, now, 0.0).values
+    assert values["axes_received"] == before + BLOCK
+    account = state.account(second)
+    for stream in (account.axes, account.distance):
+        counted = stream.corrected + stream.pending + sum(stream.counted.values())
+        assert counted == stream.received == before + BLOCK

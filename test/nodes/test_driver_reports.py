@@ -32,7 +32,10 @@ class Driver(SimpleNamespace):
     """A DriverNode's own methods on what they need, without a node of ROS."""
 
     report, _publish = DriverNode.report, DriverNode._publish
-    _publish_settings, _both = DriverNode._publish_settings, DriverNode._both
+    _publish_settings, _outputs_by_topic = (
+        DriverNode._publish_settings,
+        DriverNode._outputs_by_topic,
+    )
     _add_faults, _add_silence = DriverNode._add_faults, DriverNode._add_silence
     hardware_id = DriverNode.hardware_id
 
@@ -141,7 +144,7 @@ def test_a_driver_of_axes_alone_passes_over_distances(driver):
     driver._distance_topic = driver._distance = None
     driver._publish([pair()])
     assert len(driver._axes) == 1
-    assert [topic for topic, _ in driver._both()] == ["axes"]
+    assert [topic for topic, _ in driver._outputs_by_topic()] == ["axes"]
 
 
 def test_settings_are_reported_once_before_the_first_block_and_again_when_they_change(driver):

@@ -16,7 +16,7 @@ from std_srvs.srv import SetBool, Trigger
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.corrector_node import broadcast_frames
+from omsm_ros.nodes.corrector_node import publish_frames
 from omsm_ros.nodes.running import PacedService, refuse, serve, settings_of
 
 from .fake_node import FakeNode
@@ -206,7 +206,7 @@ def test_frames_are_broadcast_from_the_machine_to_probe_and_workpiece(monkeypatc
     monkeypatch.setitem(__import__("sys").modules, "tf2_msgs.msg", fake)
     node = FakeNode()
     names = {"machine_frame": "mill", "probe_frame": "needle", "workpiece_frame": "part"}
-    broadcast_frames(node, ExitStack(), Geometry(centre_x=3e-3, centre_y=-2e-3, beam_x=0.1), names)
+    publish_frames(node, ExitStack(), Geometry(centre_x=3e-3, centre_y=-2e-3, beam_x=0.1), names)
     (said,) = node.messages("/tf_static")
     placed = {each.child_frame_id: each for each in said.transforms}
     assert {each.header.frame_id for each in said.transforms} == {"mill"}
@@ -221,6 +221,6 @@ def test_frames_are_broadcast_from_the_machine_to_probe_and_workpiece(monkeypatc
 def test_without_the_messages_of_tf_that_is_said_and_nothing_else(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "tf2_msgs", None)
     node = FakeNode()
-    broadcast_frames(node, ExitStack(), Geometry(), {})
+    publish_frames(node, ExitStack(), Geometry(), {})
     assert node.published == []
     assert node.logged == [("info", "tf2_msgs is not installed: no transforms are published")]

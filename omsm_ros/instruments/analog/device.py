@@ -13,6 +13,7 @@ import numpy as np
 from omsm_ros.core.streams.blocks import AccelerationBlock, Block, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockPair, DeviceClock
+from omsm_ros.instruments.parameters import NowNs, Values, block_settings
 from omsm_ros.instruments.transport import parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -363,3 +364,23 @@ class AnalogReference(AnalogDevice):
         distance = np.where(outside, np.nan, self._polarity * (reading - self._zero))
         status = np.where(outside, Status.OUT_OF_RANGE, Status.OK).astype(np.uint8)
         return BlockPair(None, DistanceBlock(**common, distance=distance, status=status))
+
+
+def make_accelerometer(values: Values, now_ns: NowNs) -> Accelerometer:
+    """Return the accelerometer that ``values`` describe."""
+    settings = AnalogSettings(**block_settings(values))
+    sensitivity = values["sensitivity"] / STANDARD_GRAVITY
+    return Accelerometer(analog_input(values["port"], 3), settings, sensitivity, now_ns=now_ns)
+
+
+def make_reference(values: Values, now_ns: NowNs) -> AnalogReference:
+    """Return the displacement sensor that ``values`` describe."""
+    return AnalogReference(
+        analog_input(values["port"], 1),
+        AnalogSettings(**block_settings(values)),
+        sensitivity=values["sensitivity"],
+        full_scale=values["probe.full_scale"],
+        polarity=values["probe.polarity"],
+        zero=values["probe.zero"],
+        now_ns=now_ns,
+    )

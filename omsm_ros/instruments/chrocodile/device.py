@@ -7,27 +7,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import IntArray
 from omsm_ros.errors import (
     ConfigurationError,
     DeviceError,
     DeviceTimeoutError,
     NoSamplesError,
-    ProtocolError,
 )
 from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockPair, BlockSettings, Channels, wrapping
 from omsm_ros.instruments.chrocodile.protocol import (
     QUERY,
     Answer,
-    BinaryDecoder,
-    DollarStream,
-    LineDecoder,
-    command,
 )
 from omsm_ros.instruments.chrocodile.telegram import (
     DISTANCE,
@@ -40,18 +34,22 @@ from omsm_ros.instruments.chrocodile.telegram import (
     SYNC,
     TRIGGER_DELAYED,
     TRIGGER_LOST,
-    Layout,
-    ProbeReading,
     Records,
     check_selection,
     counts_of,
     distance_of,
 )
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
-from omsm_ros.instruments.six_channel.protocol import AxisScaling
+from omsm_ros.instruments.parameters import (
+    Values,
+    axes_of,
+    block_settings,
+    probe_reading_of,
+)
+from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Transport
-from omsm_ros.units import MICROMETRE_M, NANOSECONDS_PER_S
+from omsm_ros.units import MICROMETRE_M
 
 TRIGGERS = {"free_run": "CTN", "each": "TRE", "once": "TRG", "window": "TRW"}
 FORMATS = {"binary": "BIN", "ascii": "ASC"}
@@ -357,123 +355,39 @@ def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bo
     return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=within)
 
 
-# A CHRocodile in the dollar protocol, over a serial line or TCP.
+def settings_from(values: Values) -> ChrocodileSettings:
+    """Return the settings that parameters describe; ConfigurationError for those that cannot be."""
+    return ChrocodileSettings(
+        **block_settings(values),
+        signals=_numbers("signals", values["signals"]),
+        axes=tuple(axes_of(values).values()) if values["encoders"] else None,
+        encoders=_encoders(values["encoders"] or "XYZUV"),
+        latch=values["latch"],
+        trigger=values["trigger"],
+        format=values["format"],
+        lamp=_unless_negative(values["lamp"]),
+        averaging=_unless_negative(values["averaging"]),
+        threshold=_unless_negative(values["threshold"]),
+        head=_unless_negative(values["sensor_head"]),
+        probe=probe_reading_of(values),
+    )
 
-_TIME_RANGE = 2**32
-# Start bit, eight data bits, stop bit.
-_BITS_PER_BYTE = 10
+
+def _numbers(name: str, text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(word) for word in text.replace(",", " ").split())
+    except ValueError as err:
+        raise ConfigurationError(f"{name} {text!r}, expected numbers, like '83 256 257'") from err
 
 
-class ChrocodileDevice(Chrocodile):
-    """Reads telegrams, in the layout that the device describes."""
+def _encoders(text: str) -> tuple[int, ...]:
+    letters = "XYZUV"
+    if sorted(text.upper()) != sorted(letters):
+        raise ConfigurationError(
+            f"encoders {text!r}, expected the letters {letters} in the order of X, Y, Z, B, C"
+        )
+    return tuple(letters.index(letter) for letter in text.upper())
 
-    usual = (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY)
 
-    def __init__(
-        self,
-        transport: Transport,
-        settings: ChrocodileSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        super().__init__(transport, settings, now_ns, monotonic)
-        self._stream = DollarStream()
-        self._early: list[Records] = []
-        self._raw_time: int | None = None
-        self._device_ns = 0
-        self._time_at = 0.0
-
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        decoder = self._stream.decoder
-        return super().counts() | (asdict(decoder.statistics) if decoder is not None else {})
-
-    def _begin(self) -> None:
-        self._stream.start()
-        self._early.clear()
-        self._ask("STO")
-        if self._unheard:
-            # Somebody may have set another sync sequence; its bytes follow the command at once.
-            self._exchange(b"$SSQ" + self._wanted.sync + b"\r")
-
-    def _finish(self) -> None:
-        self._ask(FORMATS[self._wanted.format])
-        layout = self._layout()
-        self._check_line(layout)
-        binary = self._wanted.format == "binary"
-        self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
-        self._ask("STA")
-
-    def _layout(self) -> Layout:
-        """Return the layout that the device describes, or the table's where it does not."""
-        answer = self._ask("DTF")
-        try:
-            layout = Layout.described(answer.text, self._wanted.sync)
-        except ProtocolError:
-            layout = Layout.of(self._selection, self._wanted.sync)
-        if missing := set(self._selection) - set(layout.signals):
-            raise DeviceError(
-                f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
-                f"sends {layout.signals!r} ($DTF {answer.text!r}); choose signals that it has"
-            )
-        self._signals = layout.signals
-        return layout
-
-    def _check_line(self, layout: Layout) -> None:
-        baud_rate = getattr(self._transport, "baud_rate", None)
-        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
-        if baud_rate is not None and needed > baud_rate:
-            raise DeviceError(
-                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
-                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
-            )
-
-    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
-        """Return the answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
-        return self._exchange(command(name, *arguments), patience)
-
-    def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
-        self._stream.expect(wire)
-        self._transport.write(wire)
-        deadline = self._monotonic() + (patience or self._wanted.patience)
-        unanswered = partial(self._unanswered, wire.decode("latin-1").strip())
-        while True:
-            data = self._read_answer(self._stream.last_outside, unanswered)
-            self._early += self._stream.feed(data)
-            if not data:
-                self._stream.settle_answer()
-            answer = self._stream.take_answer()
-            if answer is not None:
-                return answer
-            if self._monotonic() > deadline:
-                raise unanswered(self._stream.last_outside)
-
-    def _decode(self, data: bytes) -> Samples:
-        early, self._early = self._early, []
-        return self._converted(early + self._stream.feed(data))
-
-    def _ahead(self) -> float:
-        """A telegram counts when the next one has begun, so it had come a sample before."""
-        decoder = self._stream.decoder
-        binary = isinstance(decoder, BinaryDecoder)
-        return float(binary and decoder is not None and decoder.statistics.bytes_pending > 0)
-
-    def _rest(self) -> Samples:
-        return self._converted(self._stream.settle())
-
-    def _convert(self, records: Records) -> Samples:
-        samples = super()._convert(records)
-        if START_TIME in self._signals:
-            samples["time"] = self._unwrap(records[str(START_TIME)].astype(np.int64))
-        return samples
-
-    def _unwrap(self, raw: IntArray) -> IntArray:
-        """Return device time [ns] that does not wrap; turns in a silence by the host's clock."""
-        now = self._monotonic()
-        previous = self._raw_time if self._raw_time is not None else int(raw[0])
-        steps = np.diff(raw, prepend=previous) % _TIME_RANGE
-        missing_samples = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
-        steps[0] += max(0, round(missing_samples / _TIME_RANGE)) * _TIME_RANGE
-        times: IntArray = self._device_ns + np.cumsum(steps)
-        self._raw_time, self._device_ns, self._time_at = int(raw[-1]), int(times[-1]), now
-        return times
+def _unless_negative(value: Any) -> Any:
+    return None if value < 0 else value

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -50,21 +51,17 @@ from omsm_ros.instruments.chrocodile.telegram import (
     START_TIME,
     SYNC,
     Layout,
-    ProbeReading,
     Records,
+    unit_of,
 )
-from omsm_ros.instruments.emulator import AXES, Instrument, InstrumentLink, Measured, Source
-from omsm_ros.instruments.six_channel.protocol import AxisScaling
+from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument, InstrumentLink, Measured, Source
+from omsm_ros.instruments.emulator_factory import OWN_ENCODERS, TWIN_READING, Emulated
+from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
 from omsm_ros.units import MICROMETRE_M
 
 # The device measures in whole steps of this [s], so rates are rounded.
 _EXPOSURE_STEP_S = 1e-7
 _VERSION = "CHRocodile 2 emulated"
-
-# One turn is 2^28 counts: 32 bits hold 16 whole turns, so nothing is lost when they wrap.
-LINEAR = AxisScaling(counts_per_unit=1e10, wrap=2**32)
-ROTARY = AxisScaling(counts_per_unit=2**28 / (2 * np.pi), wrap=2**32)
-AXIS_SCALING = (LINEAR, LINEAR, LINEAR, ROTARY, ROTARY)
 
 
 class ChrocodileEmulator(Instrument):
@@ -176,7 +173,7 @@ class ChrocodileEmulator(Instrument):
     ) -> np.ndarray:
         nothing = measured.status == Status.NO_TARGET
         if number in (DISTANCE, DISTANCE_NM, DISTANCE_16):
-            raw = self._probe.raw(measured.distance) / self._probe.unit(number)
+            raw = self._probe.raw(measured.distance) / unit_of(number, self._probe.full_scale)
             sent = np.where(nothing | np.isnan(raw), 0.0, raw)
             return sent if number == DISTANCE else np.clip(np.rint(sent), -(2**31), 2**31 - 1)
         if number in (INTENSITY, INTENSITY_16):
@@ -287,3 +284,8 @@ def _number(word: str) -> Value:
 
 def _text(value: Value) -> str:
     return value if isinstance(value, str) else f"{value:.9g}"
+
+
+_DRIVER = {"encoders": "XYZUV"} | OWN_ENCODERS
+DOLLAR = Emulated(partial(ChrocodileEmulator, probe=TWIN_READING), _DRIVER)
+PACKET = Emulated(partial(ChrocodilePacketEmulator, probe=TWIN_READING), _DRIVER, tcp=True)

@@ -10,7 +10,12 @@ from functools import partial
 import numpy as np
 
 from omsm_ros.errors import DeviceError, DeviceTimeoutError
-from omsm_ros.instruments.chrocodile.device import Chrocodile, ChrocodileSettings, RefusedError
+from omsm_ros.instruments.chrocodile.device import (
+    Chrocodile,
+    ChrocodileSettings,
+    RefusedError,
+    settings_from,
+)
 from omsm_ros.instruments.chrocodile.packet_protocol import (
     CONFIGURED,
     DATA_BODY,
@@ -27,6 +32,7 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
 )
 from omsm_ros.instruments.chrocodile.protocol import Answer
 from omsm_ros.instruments.counting import SAMPLE, Samples
+from omsm_ros.instruments.parameters import NowNs, Values
 from omsm_ros.instruments.transport import Transport
 
 _TICKETS = 2**16
@@ -164,3 +170,8 @@ class ChrocodilePacketDevice(Chrocodile):
 
 def _value(argument: str | float) -> Value:
     return argument if isinstance(argument, str | int) else float(argument)
+
+
+def make(values: Values, transport: Transport, now_ns: NowNs) -> ChrocodilePacketDevice:
+    """Return the device that ``values`` describe."""
+    return ChrocodilePacketDevice(transport, settings_from(values), now_ns)

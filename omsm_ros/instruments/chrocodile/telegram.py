@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
 from omsm_ros.errors import ConfigurationError, ProtocolError
+from omsm_ros.instruments.scaling import ProbeReading
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 Records: TypeAlias = NDArray[np.void]
@@ -197,43 +198,10 @@ def check_selection(signals: Sequence[int], encoders: Sequence[int]) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class ProbeReading:
-    """``distance = polarity · (reading - zero)``.
-
-    full_scale: measuring range, of which 16-bit distances are parts [m] (`$SCA`)
-    zero: reading that is distance zero [m]
-    polarity: +1 if the reading falls as the probe nears the target; -1 if it grows
-    intensity_full_scale: reading that is intensity 1
-    """
-
-    full_scale: float = 100 * MICROMETRE_M
-    zero: float = 0.0
-    polarity: int = 1
-    intensity_full_scale: float = 100.0
-
-    def __post_init__(self) -> None:
-        for name in ("full_scale", "intensity_full_scale"):
-            value = getattr(self, name)
-            if not 0 < value < np.inf:
-                raise ConfigurationError(f"{name} {value!r}, expected a positive finite number")
-        if self.polarity not in (1, -1):
-            raise ConfigurationError(f"polarity {self.polarity!r}, expected 1 or -1")
-        if not np.isfinite(self.zero):
-            raise ConfigurationError(f"zero {self.zero!r} m, expected a finite number")
-
-    def unit(self, signal: int) -> float:
-        """Return the step of a distance signal [m]."""
-        sixteen = self.full_scale / 2**15
-        return {DISTANCE: MICROMETRE_M, DISTANCE_NM: NANOMETRE_M, DISTANCE_16: sixteen}[signal]
-
-    def distance(self, raw: FloatArray) -> FloatArray:
-        """Return the distance [m] of a reading [m]."""
-        return self.polarity * (raw - self.zero)
-
-    def raw(self, distance: FloatArray) -> FloatArray:
-        """Return the reading [m] at a distance [m]."""
-        return self.zero + self.polarity * distance
+def unit_of(signal: int, full_scale: float) -> float:
+    """Return the step of a distance signal [m] of a probe with the range ``full_scale`` [m]."""
+    sixteen = full_scale / 2**15
+    return {DISTANCE: MICROMETRE_M, DISTANCE_NM: NANOMETRE_M, DISTANCE_16: sixteen}[signal]
 
 
 def first_of(choice: Sequence[int], signals: Sequence[int]) -> int | None:
@@ -252,7 +220,7 @@ def distance_of(
     number = first_of(DISTANCES, signals)
     if number is None:
         raise ConfigurationError(f"signals {signals!r} hold no distance of {DISTANCES!r}")
-    raw = records[str(number)].astype(np.float64) * probe.unit(number)
+    raw = records[str(number)].astype(np.float64) * unit_of(number, probe.full_scale)
     intensity = np.full(len(records), np.nan, np.float32)
     nothing = raw == 0
     light = first_of(INTENSITIES, signals)

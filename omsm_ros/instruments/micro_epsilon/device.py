@@ -17,25 +17,33 @@ import numpy as np
 from omsm_ros.core.streams.blocks import IntArray, Status
 from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
 from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels, wrapping
-from omsm_ros.instruments.chrocodile.telegram import ProbeReading
-from omsm_ros.instruments.command_port import CommandPort
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
 from omsm_ros.instruments.micro_epsilon.protocol import (
     FIRST_ERROR,
+    HEADERS,
     INTENSITY_FULL,
     INTENSITY_MASK,
     VALUE_BITS,
+    Block,
+    BlockDecoder,
     PlausibleValueFilter,
     SerialDecoder,
-    channel_dtype,
     confocal_dtype,
     distance_of,
     intensity_leads,
 )
-from omsm_ros.instruments.six_channel.protocol import AXES, AxisScaling
-from omsm_ros.instruments.stream import COUNTER_RANGE, BlockStreamDevice, StreamDevice
-from omsm_ros.instruments.transport import Transport
-from omsm_ros.units import MICROMETRE_M, MICROSECOND_S, NANOMETRE_M
+from omsm_ros.instruments.parameters import (
+    NowNs,
+    Values,
+    axes_of,
+    block_settings,
+    command_transport,
+    probe_reading_of,
+)
+from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
+from omsm_ros.instruments.stream import UNREADABLE_S, StreamDevice
+from omsm_ros.instruments.transport import CommandPort, Transport
+from omsm_ros.units import NANOMETRE_M
 
 SERIAL_VALUES = ("distance", "intensity", "counter")
 # A value of the frame that is passed over.
@@ -43,6 +51,117 @@ SKIPPED_VALUES = "-"
 # Of every answer to GETINFO; a controller that does not know it says so.
 _INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
+
+
+COUNTER_RANGE = 2**32
+# Begins the blocks of controllers whose heads do not say what the frames hold.
+_UNDESCRIBED = b"DATA"
+
+
+class BlockStreamDevice(StreamDevice):
+    """Decodes blocks, and talks to the controller where there is a command port.
+
+    A model fills in ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
+    (commands), and says what ends an answer (a regular expression).
+    """
+
+    prompt: bytes = b""
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: BlockSettings,
+        channels: Channels,
+        *,
+        kind: str,
+        period: float,
+        patience: float,
+        commands: Transport | None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """kind: of :class:`BlockDecoder`;  period: of a controller that runs freely [s], else 0
+        patience: for an answer [s];  commands: the controller's port 23; None = leave it as it is
+        """
+        counting = Counting(COUNTER_RANGE, timed=False, period=period)
+        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+        self._decoder = BlockDecoder(kind, self._frame)
+        self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
+        self._unread, self._undescribed = 0, False
+        self._commands, self._answers_within = commands, patience
+        self._identity: dict[str, str] = {}
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        return super().counts() | asdict(self._decoder.statistics)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Return what the controller reported of itself."""
+        return self._identity
+
+    def _prepare(self) -> None:
+        self._decoder.reset()
+        self._unread, self._undescribed = 0, False
+        if self._commands is None:
+            return
+        within = self._answers_within
+        with CommandPort(self._commands, self.prompt, within, self._monotonic) as port:
+            self._identity = self._set_up(port)
+
+    def _decode(self, data: bytes) -> Samples:
+        samples = self._converted(self._decoder.feed(data))
+        self._unread = 0 if len(samples) else self._unread + len(data)
+        self._undescribed = not len(samples) and (self._undescribed or _UNDESCRIBED in data)
+        return samples
+
+    def _ahead(self) -> float:
+        """A block counts when the next one has begun, of which frames have come, too."""
+        waiting = self._decoder.statistics.bytes_pending - self._head_bytes
+        return max(waiting, 0) / self._frame_bytes
+
+    def _rest(self) -> Samples:
+        return self._converted(self._decoder.settle())
+
+    def _converted(self, blocks: list[Block]) -> Samples:
+        parts = []
+        for block in blocks:
+            self._identity = {
+                "order": str(block.order), "serial": str(block.serial), **self._identity,
+            }  # fmt: skip
+            self._frame_bytes = block.frames.shape[1]
+            frames = block.frames.reshape(-1).view(self._frame(block.kind))
+            counter = (block.counter + np.arange(len(frames))) % COUNTER_RANGE
+            try:
+                parts.append(self._samples_of(frames, counter))
+            except DeviceError:
+                self._decoder.reset()  # what waits is no better
+                raise
+        return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
+
+    def _listen_in(self, silent: float) -> None:
+        if silent > UNREADABLE_S and self._undescribed:
+            raise NoSamplesError(
+                f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not say "
+                "what they hold; read this controller over RS-422 (device: confocaldt)"
+            )
+        self._check_understood(silent, self._unread)
+
+    # What a model fills in.
+
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        """Return the fields of a frame, by the flags in the block's head."""
+        raise NotImplementedError
+
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
+        """Return the samples of the frames (n,) of a block, with their ``counter`` (n,)."""
+        raise NotImplementedError
+
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        """Set what was asked for, and return what the controller reports of itself."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -278,112 +397,33 @@ def _info(said: str) -> dict[str, str]:
     return {key.strip().lower(): value.strip() for key, value in pairs}
 
 
-# A Micro-Epsilon capaNCDT 62xx, a digital capacitive reference: data over TCP, commands beside.
-#
-# Untried on hardware. A controller that is switched off and on leaves its old connection open
-# and silent, so silence alone makes the driver connect anew.
-
-PROMPT = rb"OK *[\r\n]|\$WRONG|\$UNKNOWN"
-# A channel's 24 bits are its measuring range.
-FULL_SCALE = 0xFFFFFF
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CapaNcdtSettings(BlockSettings):
-    """How the controller is read.
-
-    probe: ``full_scale`` is the channel's measuring range [m]
-    channel: of the controller, from 1
-    triggered: samples come with a trigger from outside, not continuously
-    patience: for an answer, and for samples of a controller that runs freely [s]
-    """
-
-    probe: ProbeReading = field(default_factory=lambda: ProbeReading(full_scale=250 * MICROMETRE_M))
-    channel: int = 1
-    triggered: bool = False
-    patience: float = 2.0
-
-    def __post_init__(self) -> None:
-        BlockSettings.__post_init__(self)
-        if not 1 <= self.channel <= 8:
-            raise ConfigurationError(f"channel {self.channel!r}, expected 1 to 8")
+def make_serial(values: Values, transport: Transport, now_ns: NowNs) -> ConfocalDtDevice:
+    """Return the device that ``values`` describe, over RS-422."""
+    settings = ConfocalDtSettings(
+        **block_settings(values),
+        probe=probe_reading_of(values),
+        values=tuple(values["signals"].replace(",", " ").split()) or ("distance",),
+        trigger=values["trigger"],
+    )
+    return ConfocalDtDevice(transport, settings, now_ns)
 
 
-class CapaNcdtDevice(BlockStreamDevice):
-    """Reads one channel, and sets the sample time where there is a command port."""
+def make_ethernet(values: Values, transport: Transport, now_ns: NowNs) -> ConfocalDtEthernetDevice:
+    """Return the device that ``values`` describe, over Ethernet."""
+    wired = values["encoders"].lower()
+    settings = ConfocalDtSettings(
+        **block_settings(values),
+        probe=probe_reading_of(values),
+        axes=tuple(axes_of(values, wired).values()) if wired else None,
+        wired=_wired(values["encoders"]),
+        trigger=values["trigger"],
+    )
+    commands = command_transport(values["port"], values["command_port"])
+    return ConfocalDtEthernetDevice(transport, settings, now_ns, commands=commands)
 
-    prompt = PROMPT
 
-    def __init__(
-        self,
-        transport: Transport,
-        settings: CapaNcdtSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
-        commands: Transport | None = None,
-    ) -> None:
-        """commands: the controller's port 23; None = leave it as it is set."""
-        settings = settings or CapaNcdtSettings()
-        free = not settings.triggered
-        super().__init__(
-            transport,
-            replace(settings, free_running=free),
-            Channels(timed=False),
-            kind="capacitive",
-            period=settings.sample_period if free else 0.0,
-            patience=settings.patience,
-            commands=commands,
-            now_ns=now_ns,
-            monotonic=monotonic,
-        )
-        self._wanted = settings
-
-    def _set_up(self, port: CommandPort) -> dict[str, str]:
-        identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
-        self._set_sample_time(port)
-        return identity
-
-    def _set_sample_time(self, port: CommandPort) -> None:
-        """Set the next sample time that the controller has, which it reports."""
-        wanted = self._wanted.sample_period / MICROSECOND_S
-        said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
-        found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
-        if found is None:
-            raise DeviceError(
-                f"{self._transport.name} did not take a sample time of {wanted:.0f} µs: {said!r}; "
-                "choose another sample_period"
-            )
-        if abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
-            raise DeviceError(
-                f"{self._transport.name}: {wanted:.0f} µs were asked for, the controller samples "
-                f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
-            )
-        port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
-
-    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
-        return channel_dtype(kind[0])
-
-    def _samples_of(
-        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
-    ) -> Samples:
-        name = f"channel {self._wanted.channel}"
-        if name not in (frames.dtype.names or ()):
-            raise DeviceError(
-                f"{self._transport.name} has no {name}, only {frames.dtype.names!r}; set channel"
-            )
-        value = frames[name].astype(np.float64)
-        samples = np.zeros(len(frames), SAMPLE)
-        samples["counter"] = counter
-        raw = value * (self._wanted.probe.full_scale / FULL_SCALE)
-        samples["distance"] = self._wanted.probe.distance(raw)
-        samples["intensity"] = np.nan
-        outside = (value <= 0) | (value >= FULL_SCALE)  # at its stops, it tells no distance
-        samples["status"] = np.where(outside, Status.OUT_OF_RANGE, Status.OK)
-        return samples
-
-    def _listen_in(self, silent: float) -> None:
-        super()._listen_in(silent)
-        if not self._wanted.triggered and silent > self._wanted.patience:
-            raise NoSamplesError(
-                f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
-            )
+def _wired(text: str) -> tuple[int, ...]:
+    letters = "XYZBC"
+    if len(set(text.upper())) < len(text) or set(text.upper()) - set(letters):
+        raise ConfigurationError(f"encoders {text!r}, expected some of the letters {letters}")
+    return tuple(letters.index(letter) for letter in text.upper())

@@ -12,12 +12,25 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import Status
-from omsm_ros.instruments.chrocodile.telegram import ProbeReading
-from omsm_ros.instruments.emulator import AXES, Instrument, InstrumentLink, Measured, Source
+from omsm_ros.instruments.emulator import (
+    AXIS_SCALING,
+    Instrument,
+    InstrumentLink,
+    Measured,
+    Source,
+)
+from omsm_ros.instruments.emulator_factory import (
+    OWN_ENCODERS,
+    TWIN_READING,
+    Emulated,
+    SecondDevice,
+    reference_in,
+)
 from omsm_ros.instruments.micro_epsilon.protocol import (
     VALUE_BITS,
     MeasurementBlock,
@@ -26,7 +39,9 @@ from omsm_ros.instruments.micro_epsilon.protocol import (
     encode_frames,
     values_of,
 )
-from omsm_ros.instruments.six_channel.protocol import AxisScaling
+from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
+from omsm_ros.instruments.six_channel.emulator import SCALES, SixChannelEmulator
+from omsm_ros.twin.sensors import ReferenceSensor
 from omsm_ros.units import MICROSECOND_S, NANOMETRE_M
 
 # Frames in a block: what fits comfortably into a TCP packet.
@@ -188,3 +203,37 @@ def _blocks(
         block = MeasurementBlock(_ORDER, _SERIAL, kind, int(counters[start]), raw[start:end])
         pieces[start] = encode_block(form, block)
     return pieces
+
+
+SERIAL = Emulated(
+    partial(ConfocalDtSerialEmulator, probe=TWIN_READING, width=3),
+    {
+        "signals": "distance intensity counter",
+        "trigger": "each",
+        "probe.zero": TWIN_READING.zero,
+    },
+    # RS-422 carries the distance alone, so the axes come from a device of their own.
+    second=SecondDevice("axis_driver", SixChannelEmulator, {"device": "six_channel"} | SCALES),
+    baud_rate=691_200,
+)
+# Y and B stand still in the twin's motions: three encoders are enough.
+ETHERNET = Emulated(
+    partial(ConfocalDtEmulator, probe=TWIN_READING, axes=AXIS_SCALING),
+    OWN_ENCODERS | {"encoders": "XZC"},
+    tcp=True,
+)
+# The capacitive reference, with the six-channel stream as the probe.
+_CAPACITIVE_READING = ProbeReading(
+    full_scale=2 * ReferenceSensor().half_range_m, zero=ReferenceSensor().half_range_m
+)
+CAPACITIVE = Emulated(
+    SixChannelEmulator,
+    {"device": "six_channel"} | SCALES,
+    second=SecondDevice(
+        "reference_driver",
+        partial(CapaNcdtEmulator, probe=_CAPACITIVE_READING),
+        {"device": "capancdt", "triggered": True, "probe.zero": _CAPACITIVE_READING.zero},
+        reference_in,
+        tcp=True,
+    ),
+)

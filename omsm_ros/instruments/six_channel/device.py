@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+from urllib.parse import parse_qs
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import Status
+from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockSettings, Channels
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
+from omsm_ros.instruments.parameters import NowNs, Values, axes_of, block_settings
+from omsm_ros.instruments.scaling import AXES, AxisScaling
 from omsm_ros.instruments.six_channel.protocol import (
-    AXIS_COLUMNS,
+    BODY_SIZE,
     COLUMNS,
-    AxisScaling,
+    FRAME,
     CsvDecoder,
     DecoderStatistics,
     FrameArray,
     FrameDecoder,
+    ProbeScaling,
     StreamScaling,
+    encode_frames,
     known_status,
 )
 from omsm_ros.instruments.stream import StreamDevice
-from omsm_ros.instruments.transport import Transport
+from omsm_ros.instruments.transport import Transport, parts_of
 from omsm_ros.units import NANOMETRE_M
 
 _SEQUENCE_RANGE = 2**32
@@ -133,7 +141,7 @@ class CsvStreamDevice(StreamDevice):
         self._unread = 0
         self._columns, self._probe = settings.columns, settings.scaling.probe
         timed = "device_time" in settings.columns
-        has_axes = bool(set(AXIS_COLUMNS) & set(settings.columns))
+        has_axes = bool(set(AXES) & set(settings.columns))
         axes = tuple(map(_in_parts, settings.scaling.axes)) if has_axes else None
         channels = Channels("distance" in settings.columns, axes, timed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
@@ -165,7 +173,7 @@ class CsvStreamDevice(StreamDevice):
             beyond = good & (abs(samples["distance"]) > self._probe.full_scale)
             known = np.where(beyond, Status.OUT_OF_RANGE, known)
             samples["status"] = np.where(good & ~measured, Status.NO_TARGET, known)
-        for index, name in enumerate(AXIS_COLUMNS):
+        for index, name in enumerate(AXES):
             if name in self._columns:
                 samples["counts"][:, index] = np.rint(rows[name] * _PARTS).astype(np.int64)
         return samples
@@ -177,3 +185,176 @@ class CsvStreamDevice(StreamDevice):
 def _in_parts(axis: AxisScaling) -> AxisScaling:
     """Return the same axis, counted in parts of a count."""
     return replace(axis, counts_per_unit=axis.counts_per_unit * _PARTS, wrap=axis.wrap * _PARTS)
+
+
+def _stream_settings(values: Values) -> dict[str, Any]:
+    """Return the settings of a sender that cannot be asked whether it pauses or is gone.
+
+    A serial line is never half open, so only a TCP connection is made anew.
+    """
+    renew = values["renew"] if values["port"].startswith("tcp://") else 0.0
+    return block_settings(values) | {"renew": renew}
+
+
+def _probe_scaling(values: Values) -> ProbeScaling:
+    return ProbeScaling(full_scale=values["probe.full_scale"], polarity=values["probe.polarity"])
+
+
+def make_binary(values: Values, transport: Transport, now_ns: NowNs) -> GenericStreamDevice:
+    """Return the device that ``values`` describe."""
+    scaling = StreamScaling(**axes_of(values), probe=_probe_scaling(values))
+    settings = StreamSettings(**_stream_settings(values), scaling=scaling)
+    return GenericStreamDevice(transport, settings, now_ns)
+
+
+def make_text(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice:
+    """Return the device that ``values`` describe."""
+    columns = tuple(values["columns"].replace(",", " ").split())
+    read = [axis for axis in AXES if axis in columns]
+    scaling = StreamScaling(**axes_of(values, read), probe=_probe_scaling(values))
+    settings = CsvSettings(**_stream_settings(values), columns=columns, scaling=scaling)
+    return CsvStreamDevice(transport, settings, now_ns)
+
+
+# A TwinCAT PLC's ring buffer over Beckhoff ADS, delivered as the six-channel stream.
+#
+# Reading variables one by one is neither synchronous with the trigger nor fast enough, so the PLC
+# writes each sample, with its trigger counter, into a ring, and the whole ring is read at once:
+# ADS answers between two cycles of the PLC, so what comes belongs together. In structured text,
+# packed to one byte::
+#
+#     TYPE OmsmSample : STRUCT
+#         sequence : UDINT; device_time : ULINT; distance : DINT; status : USINT;
+#         counts : ARRAY[0..4] OF LINT;
+#     END_STRUCT END_TYPE
+#     TYPE OmsmRing : STRUCT
+#         written : ULINT;                       (* samples so far *)
+#         samples : ARRAY[0..999] OF OmsmSample; (* sample n lies at n MOD 1000 *)
+#     END_STRUCT END_TYPE
+#
+# Tried against pyads' own test server; untried on hardware.
+
+_DEFAULT_PORT = 851
+_DEFAULT_SYMBOL = "GVL.omsm"
+_DEFAULT_SAMPLES = 1000
+
+_WRITTEN = np.dtype("<u8")
+# At 1 kHz twenty samples at a time; a ring of a thousand lasts a second.
+_POLL_S = 0.02
+_MOST_SAMPLES = 200_000
+
+
+class AdsRing:
+    """Transport that reads ``ads://host[:port][/AMS.net.id][?symbol=GVL.omsm&samples=1000]``.
+
+    Without a net id it is the host's address with ``.1.1``, as TwinCAT sets it. The PLC must have
+    a route to this computer. Samples that were overwritten before they were read are a gap of the
+    trigger counter.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Raise ConfigurationError for an address that is none."""
+        parts = parts_of(address)
+        query = parse_qs(parts.query)
+        samples = query.get("samples", [str(_DEFAULT_SAMPLES)])[0]
+        usable = samples.isdecimal() and 0 < int(samples[:9]) <= _MOST_SAMPLES
+        known = set(query) <= {"symbol", "samples"}
+        if parts.scheme != "ads" or not parts.hostname or not known or not usable:
+            raise ConfigurationError(
+                f"address {address!r}, expected ads://host:851/1.2.3.4.1.1?symbol={_DEFAULT_SYMBOL}"
+                f"&samples={_DEFAULT_SAMPLES}, with at most {_MOST_SAMPLES} samples"
+            )
+        self.name = address
+        self._host = parts.hostname
+        self._net_id = parts.path.strip("/") or f"{self._host}.1.1"
+        try:
+            self._port = parts.port or _DEFAULT_PORT
+        except ValueError as err:
+            raise ConfigurationError(f"address {address!r}: {err}") from err
+        self._symbol = query.get("symbol", [_DEFAULT_SYMBOL])[0]
+        self._capacity = int(samples)
+        self._size = _WRITTEN.itemsize + self._capacity * BODY_SIZE
+        self._plc: Any = None
+        self._taken = 0
+
+    def open(self) -> None:
+        """Connect and begin with the next sample; raises DeviceError."""
+        self.close()
+        pyads = _pyads()
+        try:
+            self._plc = pyads.Connection(self._net_id, self._port, self._host)
+            self._plc.open()
+            self._taken = self._written(self._snapshot())
+        except (pyads.ADSError, OSError, ValueError, TypeError) as err:
+            self.close()
+            raise DeviceError(
+                f"{self.name} does not answer: {err}; check address, net id, and the PLC's route "
+                "to this computer"
+            ) from err
+        except DeviceError:
+            self.close()
+            raise
+
+    def read(self, timeout: float) -> bytes:
+        """Return new samples as frames of the six-channel stream, b"" if none came in time."""
+        if self._plc is None:
+            raise DeviceError(f"{self.name} is not open")
+        deadline = time.monotonic() + timeout
+        while not (data := self._new()):
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return b""
+            time.sleep(min(_POLL_S, left))
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Raise DeviceError: nothing is written into a PLC."""
+        raise DeviceError(f"{self.name} is only read")
+
+    def close(self) -> None:
+        """Disconnect; does nothing when not connected."""
+        if self._plc is not None:
+            plc, self._plc = self._plc, None
+            try:
+                plc.close()
+            except Exception:  # whatever state it was in, it is let go
+                return
+
+    def _new(self) -> bytes:
+        raw = self._snapshot()
+        written = self._written(raw)
+        if written < self._taken:  # the PLC was restarted and counts anew
+            self._taken = 0
+        count = min(written - self._taken, self._capacity)
+        if not count:
+            return b""
+        ring = np.frombuffer(raw, np.uint8, offset=_WRITTEN.itemsize).reshape(-1, BODY_SIZE)
+        places = np.arange(written - count, written) % self._capacity
+        self._taken = written
+        frames = np.zeros((count, FRAME.itemsize), np.uint8)
+        frames[:, :BODY_SIZE] = ring[places]
+        return encode_frames(frames.reshape(-1).view(FRAME))
+
+    def _snapshot(self) -> bytes:
+        pyads = _pyads()
+        try:
+            found = self._plc.read_by_name(self._symbol, ctypes.c_ubyte * self._size)
+        except (pyads.ADSError, OSError, RuntimeError) as err:
+            raise DeviceError(
+                f"{self.name} gives no {self._symbol!r} of {self._size} bytes: {err}; check the "
+                f"PLC, the network, and that its ring has {self._capacity} samples, packed to one "
+                "byte"
+            ) from err
+        return bytes(found)
+
+    @staticmethod
+    def _written(raw: bytes) -> int:
+        return int(np.frombuffer(raw, _WRITTEN, 1)[0])
+
+
+def _pyads() -> Any:
+    try:
+        import pyads
+    except ImportError as err:
+        raise DeviceError("ADS needs pyads: pip install pyads") from err
+    return pyads

@@ -12,17 +12,16 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from cobs import cobs
 from numpy.typing import NDArray
 
-from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.core.streams.blocks import FloatArray, Status
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.instruments.scaling import AXES, AxisScaling, check_sign, whole_counts
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
-
-AXES = ("x", "y", "z", "b", "c")
 
 FRAME = np.dtype(
     [
@@ -126,58 +125,6 @@ class FrameDecoder:
         return body
 
 
-def _check_sign(name: str, sign: int) -> None:
-    if sign not in (1, -1):
-        raise ConfigurationError(f"{name} {sign!r}, expected 1 or -1")
-
-
-def _integers(name: str, values: FloatArray, kind: type[np.signedinteger[Any]]) -> FloatArray:
-    lowest = float(np.iinfo(kind).min)
-    outside = ~((values >= lowest) & (values < -lowest))  # also true for NaN
-    if outside.any():
-        raise DataError(
-            f"{name} of {float(values[outside][0])!r} counts does not fit {kind.__name__}"
-        )
-    return values
-
-
-@dataclass(frozen=True, slots=True)
-class AxisScaling:
-    """``value = offset + sign · counts / counts_per_unit``.
-
-    counts_per_unit: counts per metre or per radian;  sign: +1 or -1
-    offset: position at count zero [m or rad]
-    wrap: counts after which the encoder starts again at zero; 0 = it never does
-    """
-
-    counts_per_unit: float
-    sign: int = 1
-    offset: float = 0.0
-    wrap: int = 0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.counts_per_unit < np.inf:
-            raise ConfigurationError(
-                f"counts_per_unit {self.counts_per_unit!r}, expected a positive finite number; "
-                "use sign to turn an axis round"
-            )
-        _check_sign("sign", self.sign)
-        if not np.isfinite(self.offset):
-            raise ConfigurationError(f"offset {self.offset!r}, expected a finite number")
-        if self.wrap < 0:
-            raise ConfigurationError(f"wrap {self.wrap!r} counts, expected 0 (never) or more")
-
-    def values(self, counts: IntArray) -> FloatArray:
-        """Return the positions [m or rad] of unwrapped ``counts`` (n,)."""
-        return self.offset + counts / (self.sign * self.counts_per_unit)
-
-    def counts(self, values: FloatArray) -> IntArray:
-        """Return what the encoder reports at ``values`` [m or rad] (n,), in whole counts."""
-        scaled = np.rint((values - self.offset) * (self.sign * self.counts_per_unit))
-        whole = _integers("axis position", scaled, np.int64).astype(np.int64)
-        return whole % self.wrap if self.wrap else whole
-
-
 @dataclass(frozen=True, slots=True)
 class ProbeScaling:
     """How the probe's int32 [nm] becomes a distance.
@@ -194,7 +141,7 @@ class ProbeScaling:
     def __post_init__(self) -> None:
         if not self.full_scale > 0:
             raise ConfigurationError(f"full_scale {self.full_scale!r} m is not positive")
-        _check_sign("polarity", self.polarity)
+        check_sign("polarity", self.polarity)
         limits = np.iinfo(np.int32)
         if not limits.min <= self.invalid <= limits.max:
             raise ConfigurationError(f"invalid {self.invalid!r} nm does not fit an int32")
@@ -217,7 +164,7 @@ class ProbeScaling:
         """Return what the device sends for ``distance`` [m] (n,); NaN is sent as ``invalid``."""
         scaled = np.rint(distance * (self.polarity / NANOMETRE_M))
         sent = np.where(np.isnan(distance), self.invalid, scaled)
-        return _integers("probe distance", sent, np.int32).astype(np.int32)
+        return whole_counts("probe distance", sent, np.int32).astype(np.int32)
 
 
 def known_status(frames: FrameArray) -> NDArray[np.bool_]:
@@ -253,8 +200,7 @@ class StreamScaling:
 # have any; distance is in nanometres, time in nanoseconds. Lines end with LF, CR or both. One that
 # holds anything else, or another number of columns, is no sample.
 
-AXIS_COLUMNS = ("x", "y", "z", "b", "c")
-COLUMNS = ("sequence", "device_time", "distance", "status", *AXIS_COLUMNS)
+COLUMNS = ("sequence", "device_time", "distance", "status", *AXES)
 SKIPPED = "-"
 _WHOLE = ("sequence", "device_time", "status")
 # A longer line is none.
@@ -267,7 +213,7 @@ _SEPARATOR = re.compile(rb"[,;\s]+")
 # A line whose numbers cannot be what they are called is none: counts that no counter reaches,
 # times of centuries, positions of hundreds of metres in tenths of a nanometre.
 _RANGES = {"sequence": (0, 2**52), "device_time": (-(2**62), 2**62)}
-_RANGES |= dict.fromkeys(AXIS_COLUMNS, (-(2**40), 2**40))
+_RANGES |= dict.fromkeys(AXES, (-(2**40), 2**40))
 _OTHER_RANGE = (-(2**62), 2**62)
 
 
@@ -279,7 +225,7 @@ def check_columns(columns: Sequence[str]) -> None:
     named = [name for name in columns if name != SKIPPED]
     if set(named) - set(COLUMNS) or len(set(named)) < len(named):
         raise ConfigurationError(f"columns {columns!r}, expected {COLUMNS!r}, each at most once")
-    if "sequence" not in named or not {"distance", *AXIS_COLUMNS} & set(named):
+    if "sequence" not in named or not {"distance", *AXES} & set(named):
         raise ConfigurationError(f"columns {columns!r} need a sequence, and distance or axes")
 
 

@@ -1,0 +1,163 @@
+"""A CHRocodile in the dollar protocol, over a serial line or TCP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import IntArray
+from omsm_ros.errors import DeviceError, ProtocolError
+from omsm_ros.instruments.chrocodile.device import (
+    FORMATS,
+    Chrocodile,
+    ChrocodileSettings,
+    settings_from,
+)
+from omsm_ros.instruments.chrocodile.protocol import (
+    Answer,
+    BinaryDecoder,
+    DollarStream,
+    LineDecoder,
+    command,
+)
+from omsm_ros.instruments.chrocodile.telegram import (
+    DISTANCE,
+    FLAGS,
+    INTENSITY,
+    SAMPLE_COUNTER,
+    START_TIME,
+    Layout,
+    Records,
+)
+from omsm_ros.instruments.counting import Samples
+from omsm_ros.instruments.parameters import NowNs, Values
+from omsm_ros.instruments.transport import Transport
+from omsm_ros.units import NANOSECONDS_PER_S
+
+_TIME_RANGE = 2**32
+# Start bit, eight data bits, stop bit.
+_BITS_PER_BYTE = 10
+
+
+class ChrocodileDevice(Chrocodile):
+    """Reads telegrams, in the layout that the device describes."""
+
+    usual = (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY)
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: ChrocodileSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__(transport, settings, now_ns, monotonic)
+        self._stream = DollarStream()
+        self._early: list[Records] = []
+        self._raw_time: int | None = None
+        self._device_ns = 0
+        self._time_at = 0.0
+
+    def counts(self) -> dict[str, float]:
+        """Return all statistics by name, those of the protocol included."""
+        decoder = self._stream.decoder
+        return super().counts() | (asdict(decoder.statistics) if decoder is not None else {})
+
+    def _begin(self) -> None:
+        self._stream.start()
+        self._early.clear()
+        self._ask("STO")
+        if self._unheard:
+            # Somebody may have set another sync sequence; its bytes follow the command at once.
+            self._exchange(b"$SSQ" + self._wanted.sync + b"\r")
+
+    def _finish(self) -> None:
+        self._ask(FORMATS[self._wanted.format])
+        layout = self._layout()
+        self._check_line(layout)
+        binary = self._wanted.format == "binary"
+        self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
+        self._ask("STA")
+
+    def _layout(self) -> Layout:
+        """Return the layout that the device describes, or the table's where it does not."""
+        answer = self._ask("DTF")
+        try:
+            layout = Layout.described(answer.text, self._wanted.sync)
+        except ProtocolError:
+            layout = Layout.of(self._selection, self._wanted.sync)
+        if missing := set(self._selection) - set(layout.signals):
+            raise DeviceError(
+                f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
+                f"sends {layout.signals!r} ($DTF {answer.text!r}); choose signals that it has"
+            )
+        self._signals = layout.signals
+        return layout
+
+    def _check_line(self, layout: Layout) -> None:
+        baud_rate = getattr(self._transport, "baud_rate", None)
+        needed = layout.length * _BITS_PER_BYTE / self._wanted.sample_period
+        if baud_rate is not None and needed > baud_rate:
+            raise DeviceError(
+                f"{self._transport.name}: {layout.length} bytes a sample need {needed:.0f} bit/s, "
+                f"the line has {baud_rate}; raise the baud rate or select fewer signals"
+            )
+
+    def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
+        """Return the answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
+        return self._exchange(command(name, *arguments), patience)
+
+    def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
+        self._stream.expect(wire)
+        self._transport.write(wire)
+        deadline = self._monotonic() + (patience or self._wanted.patience)
+        unanswered = partial(self._unanswered, wire.decode("latin-1").strip())
+        while True:
+            data = self._read_answer(self._stream.last_outside, unanswered)
+            self._early += self._stream.feed(data)
+            if not data:
+                self._stream.settle_answer()
+            answer = self._stream.take_answer()
+            if answer is not None:
+                return answer
+            if self._monotonic() > deadline:
+                raise unanswered(self._stream.last_outside)
+
+    def _decode(self, data: bytes) -> Samples:
+        early, self._early = self._early, []
+        return self._converted(early + self._stream.feed(data))
+
+    def _ahead(self) -> float:
+        """A telegram counts when the next one has begun, so it had come a sample before."""
+        decoder = self._stream.decoder
+        binary = isinstance(decoder, BinaryDecoder)
+        return float(binary and decoder is not None and decoder.statistics.bytes_pending > 0)
+
+    def _rest(self) -> Samples:
+        return self._converted(self._stream.settle())
+
+    def _convert(self, records: Records) -> Samples:
+        samples = super()._convert(records)
+        if START_TIME in self._signals:
+            samples["time"] = self._unwrap(records[str(START_TIME)].astype(np.int64))
+        return samples
+
+    def _unwrap(self, raw: IntArray) -> IntArray:
+        """Return device time [ns] that does not wrap; turns in a silence by the host's clock."""
+        now = self._monotonic()
+        previous = self._raw_time if self._raw_time is not None else int(raw[0])
+        steps = np.diff(raw, prepend=previous) % _TIME_RANGE
+        undetected = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
+        steps[0] += max(0, round(undetected / _TIME_RANGE)) * _TIME_RANGE
+        times: IntArray = self._device_ns + np.cumsum(steps)
+        self._raw_time, self._device_ns, self._time_at = int(raw[-1]), int(times[-1]), now
+        return times
+
+
+def make(values: Values, transport: Transport, now_ns: NowNs) -> ChrocodileDevice:
+    """Return the device that ``values`` describe."""
+    return ChrocodileDevice(transport, settings_from(values), now_ns)

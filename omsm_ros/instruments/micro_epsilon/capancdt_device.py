@@ -1,0 +1,147 @@
+"""Micro-Epsilon capaNCDT 62xx, a digital capacitive reference: data and commands over TCP.
+
+Untried on hardware. A controller that is switched off and on leaves its old connection open
+and silent, so silence alone makes the driver connect anew.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import Status
+from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
+from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels
+from omsm_ros.instruments.counting import SAMPLE, Samples
+from omsm_ros.instruments.micro_epsilon.device import BlockStreamDevice
+from omsm_ros.instruments.micro_epsilon.protocol import channel_dtype
+from omsm_ros.instruments.parameters import NowNs, Values, block_settings, command_transport
+from omsm_ros.instruments.scaling import ProbeReading
+from omsm_ros.instruments.transport import CommandPort, Transport, transport_for
+from omsm_ros.units import MICROMETRE_M, MICROSECOND_S
+
+PROMPT = rb"OK *[\r\n]|\$WRONG|\$UNKNOWN"
+# A channel's 24 bits are its measuring range.
+FULL_SCALE = 0xFFFFFF
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CapaNcdtSettings(BlockSettings):
+    """How the controller is read.
+
+    probe: ``full_scale`` is the channel's measuring range [m]
+    channel: of the controller, from 1
+    triggered: samples come with a trigger from outside, not continuously
+    patience: for an answer, and for samples of a controller that runs freely [s]
+    """
+
+    probe: ProbeReading = field(default_factory=lambda: ProbeReading(full_scale=250 * MICROMETRE_M))
+    channel: int = 1
+    triggered: bool = False
+    patience: float = 2.0
+
+    def __post_init__(self) -> None:
+        BlockSettings.__post_init__(self)
+        if not 1 <= self.channel <= 8:
+            raise ConfigurationError(f"channel {self.channel!r}, expected 1 to 8")
+
+
+class CapaNcdtDevice(BlockStreamDevice):
+    """Reads one channel, and sets the sample time where there is a command port."""
+
+    prompt = PROMPT
+
+    def __init__(
+        self,
+        transport: Transport,
+        settings: CapaNcdtSettings | None = None,
+        now_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+        commands: Transport | None = None,
+    ) -> None:
+        """commands: the controller's port 23; None = leave it as it is set."""
+        settings = settings or CapaNcdtSettings()
+        free = not settings.triggered
+        super().__init__(
+            transport,
+            replace(settings, free_running=free),
+            Channels(timed=False),
+            kind="capacitive",
+            period=settings.sample_period if free else 0.0,
+            patience=settings.patience,
+            commands=commands,
+            now_ns=now_ns,
+            monotonic=monotonic,
+        )
+        self._wanted = settings
+
+    def _set_up(self, port: CommandPort) -> dict[str, str]:
+        identity = {"model": port.ask("$VER", "\r", rb"\$VER").strip()}
+        self._set_sample_time(port)
+        return identity
+
+    def _set_sample_time(self, port: CommandPort) -> None:
+        """Set the next sample time that the controller has, which it reports."""
+        wanted = self._wanted.sample_period / MICROSECOND_S
+        said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
+        found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
+        if found is None:
+            raise DeviceError(
+                f"{self._transport.name} did not take a sample time of {wanted:.0f} µs: {said!r}; "
+                "choose another sample_period"
+            )
+        if abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
+            raise DeviceError(
+                f"{self._transport.name}: {wanted:.0f} µs were asked for, the controller samples "
+                f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
+            )
+        port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
+
+    def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
+        return channel_dtype(kind[0])
+
+    def _samples_of(
+        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
+    ) -> Samples:
+        name = f"channel {self._wanted.channel}"
+        if name not in (frames.dtype.names or ()):
+            raise DeviceError(
+                f"{self._transport.name} has no {name}, only {frames.dtype.names!r}; set channel"
+            )
+        value = frames[name].astype(np.float64)
+        samples = np.zeros(len(frames), SAMPLE)
+        samples["counter"] = counter
+        raw = value * (self._wanted.probe.full_scale / FULL_SCALE)
+        samples["distance"] = self._wanted.probe.distance(raw)
+        samples["intensity"] = np.nan
+        outside = (value <= 0) | (value >= FULL_SCALE)  # at its stops, it tells no distance
+        samples["status"] = np.where(outside, Status.OUT_OF_RANGE, Status.OK)
+        return samples
+
+    def _listen_in(self, silent: float) -> None:
+        super()._listen_in(silent)
+        if not self._wanted.triggered and silent > self._wanted.patience:
+            raise NoSamplesError(
+                f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
+            )
+
+
+def make(values: Values, now_ns: NowNs) -> CapaNcdtDevice:
+    """Return the device that ``values`` describe."""
+    probe = ProbeReading(
+        full_scale=values["probe.full_scale"],
+        zero=values["probe.zero"],
+        polarity=values["probe.polarity"],
+    )
+    settings = CapaNcdtSettings(
+        **block_settings(values),
+        probe=probe,
+        channel=values["channel"],
+        triggered=values["triggered"],
+    )
+    commands = command_transport(values["port"], values["command_port"])
+    return CapaNcdtDevice(transport_for(values["port"]), settings, now_ns, commands=commands)

@@ -1,0 +1,102 @@
+"""Counts of encoders and readings of probes, to and from metres and radians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.units import MICROMETRE_M
+
+AXES = ("x", "y", "z", "b", "c")
+
+
+def check_sign(name: str, sign: int) -> None:
+    """Raise ConfigurationError, which calls the sign ``name``, unless it is +1 or -1."""
+    if sign not in (1, -1):
+        raise ConfigurationError(f"{name} {sign!r}, expected 1 or -1")
+
+
+def whole_counts(name: str, values: FloatArray, kind: type[np.signedinteger[Any]]) -> FloatArray:
+    """Return ``values`` (n,); DataError, which calls them ``name``, if they do not fit ``kind``."""
+    lowest = float(np.iinfo(kind).min)
+    outside = ~((values >= lowest) & (values < -lowest))  # also true for NaN
+    if outside.any():
+        raise DataError(
+            f"{name} of {float(values[outside][0])!r} counts does not fit {kind.__name__}"
+        )
+    return values
+
+
+@dataclass(frozen=True, slots=True)
+class AxisScaling:
+    """``value = offset + sign · counts / counts_per_unit``.
+
+    counts_per_unit: counts per metre or per radian;  sign: +1 or -1
+    offset: position at count zero [m or rad]
+    wrap: counts after which the encoder starts again at zero; 0 = it never does
+    """
+
+    counts_per_unit: float
+    sign: int = 1
+    offset: float = 0.0
+    wrap: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.counts_per_unit < np.inf:
+            raise ConfigurationError(
+                f"counts_per_unit {self.counts_per_unit!r}, expected a positive finite number; "
+                "use sign to turn an axis round"
+            )
+        check_sign("sign", self.sign)
+        if not np.isfinite(self.offset):
+            raise ConfigurationError(f"offset {self.offset!r}, expected a finite number")
+        if self.wrap < 0:
+            raise ConfigurationError(f"wrap {self.wrap!r} counts, expected 0 (never) or more")
+
+    def values(self, counts: IntArray) -> FloatArray:
+        """Return the positions [m or rad] of unwrapped ``counts`` (n,)."""
+        return self.offset + counts / (self.sign * self.counts_per_unit)
+
+    def counts(self, values: FloatArray) -> IntArray:
+        """Return what the encoder reports at ``values`` [m or rad] (n,), in whole counts."""
+        scaled = np.rint((values - self.offset) * (self.sign * self.counts_per_unit))
+        whole = whole_counts("axis position", scaled, np.int64).astype(np.int64)
+        return whole % self.wrap if self.wrap else whole
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeReading:
+    """``distance = polarity · (reading - zero)``.
+
+    full_scale: measuring range, of which 16-bit distances are parts [m] (`$SCA`)
+    zero: reading that is distance zero [m]
+    polarity: +1 if the reading falls as the probe nears the target; -1 if it grows
+    intensity_full_scale: reading that is intensity 1
+    """
+
+    full_scale: float = 100 * MICROMETRE_M
+    zero: float = 0.0
+    polarity: int = 1
+    intensity_full_scale: float = 100.0
+
+    def __post_init__(self) -> None:
+        for name in ("full_scale", "intensity_full_scale"):
+            value = getattr(self, name)
+            if not 0 < value < np.inf:
+                raise ConfigurationError(f"{name} {value!r}, expected a positive finite number")
+        if self.polarity not in (1, -1):
+            raise ConfigurationError(f"polarity {self.polarity!r}, expected 1 or -1")
+        if not np.isfinite(self.zero):
+            raise ConfigurationError(f"zero {self.zero!r} m, expected a finite number")
+
+    def distance(self, raw: FloatArray) -> FloatArray:
+        """Return the distance [m] of a reading [m]."""
+        return self.polarity * (raw - self.zero)
+
+    def raw(self, distance: FloatArray) -> FloatArray:
+        """Return the reading [m] at a distance [m]."""
+        return self.zero + self.polarity * distance
