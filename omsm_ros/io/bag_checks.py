@@ -67,7 +67,8 @@ def bag_errors(path: Path, remedy: str) -> Iterator[None]:
         raise
     except Exception as err:
         raise BagError(
-            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {exception_text(err)}; {remedy}"
+            f"bag {str(path)!r} cannot be read: {type(err).__name__}: {exception_text(err)}; "
+            f"{remedy}"
         ) from err
 
 

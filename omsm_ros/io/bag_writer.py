@@ -210,8 +210,8 @@ class BagWriter:
         except OSError as err:
             self._failed = True
             raise BagError(
-                f"recording ended, {str(self.path)!r} takes no more: {exception_text(err)}; it is readable "
-                f"and holds the first {self._kept} messages, the last {self._taken - self._kept} "
+                f"recording ended, {str(self.path)!r} takes no more: {exception_text(err)}; it is "
+                f"readable and holds the first {self._kept} messages, the last {self._taken - self._kept} "
                 "are lost; make room and record anew"
             ) from err
 
@@ -300,7 +300,8 @@ def _exists(path: Path) -> BagError:
 
 def _not_writable(path: Path, err: Exception) -> BagError:
     return BagError(
-        f"cannot write {str(path)!r}: {exception_text(err)}; check the folder, its rights and its room"
+        f"cannot write {str(path)!r}: {exception_text(err)}; check the folder, its rights and its "
+        "room"
     )
 
 

@@ -180,7 +180,8 @@ class CalibrationFolder:
         except OSError as err:
             part.unlink(missing_ok=True)
             raise FileError(
-                f"cannot link {str(self.link)!r} to {target.name!r}: {exception_text(err)}; check the folder"
+                f"cannot link {str(self.link)!r} to {target.name!r}: {exception_text(err)}; check "
+                "the folder"
             ) from err
 
 

@@ -41,7 +41,8 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
             return raw.decode("utf-8")
     except (OSError, UnicodeDecodeError) as err:
         raise error(
-            f"{what} {str(path)!r} cannot be read as text: {exception_text(err)}; give a text in UTF-8"
+            f"{what} {str(path)!r} cannot be read as text: {exception_text(err)}; give a text in "
+            "UTF-8"
         ) from err
     raise error(
         f"{what} {str(path)!r} has more than {limit} bytes, the most that is accepted; "
@@ -120,7 +121,8 @@ def atomic_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
         if isinstance(err, ValueError) and part is not None:
             raise
         raise FileError(
-            f"cannot write {str(target)!r}: {exception_text(err)}; check the folder, its rights and its room"
+            f"cannot write {str(target)!r}: {exception_text(err)}; check the folder, its rights "
+            "and its room"
         ) from err
     finally:
         if part is not None:

@@ -84,8 +84,8 @@ def _refusal(path: Path | str, err: Exception) -> FileError:
     if isinstance(err, FileError):
         return err
     return FileError(
-        f"cannot write results into {str(path)!r}: {exception_text(err)}; check the folder, its rights and "
-        "its room"
+        f"cannot write results into {str(path)!r}: {exception_text(err)}; check the folder, its "
+        "rights and its room"
     )
 
 

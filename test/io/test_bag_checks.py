@@ -195,7 +195,7 @@ def test_a_name_longer_than_names_are_is_refused(tmp_path):
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_a_bad_frame_is_damage(compression):
-    with pytest.raises(Exception, match=r".") as caught, bag_checks.translated("x", "remedy"):
+    with pytest.raises(Exception, match=r".") as caught, bag_checks.bag_errors("x", "remedy"):
         bag_checks.storage_mcap.decompress(b"no frame at all", compression, 100, 0)
     assert caught.type is BagError
 

@@ -144,7 +144,7 @@ def listening(waiting):
 
 
 def test_all_that_wait_are_taken_in_one_round_and_counted(monkeypatch):
-    monkeypatch.setattr(topics, "_taken", topics.Counter())
+    monkeypatch.setattr(topics, "_processed", topics.Counter())
     made, order = listening(2)
     made.callback("first", {})
     assert order == ["first", 1, 0, "after"]

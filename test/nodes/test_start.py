@@ -97,7 +97,7 @@ def test_a_node_without_ros_or_messages_names_what_to_do(monkeypatch, capsys, pa
         if name == package:
             raise ImportError(f"No module named {name!r}")
 
-    for name in ("share_one_pool", "end_with_launch", "set_up_fast_dds"):
+    for name in ("use_single_malloc_arena", "end_with_launch", "set_up_fast_dds"):
         monkeypatch.setattr(start, name, lambda *_: None)
     monkeypatch.setattr(start.importlib, "import_module", absent)
     monkeypatch.setattr(start.sys, "argv", ["calibrator"])

@@ -58,7 +58,8 @@ def made(now):
         return Monitor(
             _running=RunningSpectrum(options), _alarm=Alarm(LIMIT_M, 0.7), _refused="",
             _blocks_refused=0, _lately=RecentIncrease(),
-            _flow=SampleFlow(), _block=0.0, _calibration=None, _task_result=0, reported=reported, logged=[],
+            _flow=SampleFlow(), _block=0.0, _calibration=None, _task_result=0,
+            reported=reported, logged=[],
             values={"mount": mount}, now=now, sent=0,
             _publisher=SimpleNamespace(publish=lambda m: reported.append(json.loads(m.data))),
         )  # fmt: skip
