@@ -21,7 +21,7 @@ class Stepping(Protocol):
         """Do what is due now."""
 
 
-class Clock:
+class SimulatedClock:
     """Simulated time [s] and [ns]."""
 
     def __init__(self, start: float = 1000.0) -> None:
@@ -47,11 +47,11 @@ class Loopback:
 
     def __init__(
         self,
-        clock: Clock | None = None,
+        clock: SimulatedClock | None = None,
         portion: int = 1 << 20,
         interval: float = WRITE_INTERVAL_S,
     ) -> None:
-        self.clock = clock or Clock()
+        self.clock = clock or SimulatedClock()
         self.portion = portion
         self._interval = interval
         self.instrument: Stepping | None = None

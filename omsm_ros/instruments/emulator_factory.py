@@ -11,8 +11,8 @@ from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.emulator import (
     AXIS_SCALING,
-    Faults,
     Instrument,
+    InstrumentFaults,
     InstrumentLink,
     RecordingSource,
 )
@@ -126,11 +126,11 @@ class InstrumentPlayer:
         self,
         make: Callable[..., Instrument],
         line: InstrumentLink,
-        faults: Faults | None = None,
+        faults: InstrumentFaults | None = None,
         seed: int = 1,
     ) -> None:
         self._instrument = make(line, triggered=True, seed=seed)
-        self._instrument.faults = faults or Faults()
+        self._instrument.faults = faults or InstrumentFaults()
         self._stop = threading.Event()
         serve, stop = self._instrument.serve, self._stop
         self._thread = threading.Thread(target=serve, args=(stop,), daemon=True)
@@ -188,7 +188,7 @@ def player_for(
     device: str,
     line: InstrumentLink,
     second: InstrumentLink | None = None,
-    faults: Faults | None = None,
+    faults: InstrumentFaults | None = None,
     seed: int = 1,
 ) -> Player:
     """Return what plays motions on ``line``, and on the line of the ``second`` device, if any."""

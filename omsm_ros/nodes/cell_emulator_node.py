@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.emulator import Faults, InstrumentLink
+from omsm_ros.instruments.emulator import InstrumentFaults, InstrumentLink
 from omsm_ros.instruments.emulator_factory import (
     EMULATED,
     AccelerationFeed,
@@ -94,7 +94,11 @@ class CellEmulatorNode(ManagedNode):
             undo.enter_context(exclusive_lock(Path(self._link)))
         line = undo.enter_context(line_for(self._link))
         self._player = player_for(
-            values["device"], line, self._second_line(undo), Faults(**rates), values["seed"]
+            values["device"],
+            line,
+            self._second_line(undo),
+            InstrumentFaults(**rates),
+            values["seed"],
         )
         undo.callback(self._player.close)
         for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loopback import Clock
+from loopback import SimulatedClock
 
-from omsm_ros.instruments.emulator import Faults, RecordingSource
+from omsm_ros.instruments.emulator import InstrumentFaults, RecordingSource
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
 from omsm_ros.instruments.six_channel.emulator import SixChannelEmulator
 from omsm_ros.instruments.six_channel.protocol import FrameDecoder
@@ -49,9 +49,9 @@ def played(
     recording: Recording, lapse: float = 1.0, seed: int = 1, **rates: float
 ) -> tuple[Sink, list[tuple[float, int]]]:
     """Play a motion on simulated time: the line, and how many samples were sent by when [s]."""
-    sink, clock = Sink(), Clock()
+    sink, clock = Sink(), SimulatedClock()
     emulator = SixChannelEmulator(sink, triggered=True, clock=clock, seed=seed)
-    emulator.faults = Faults(**rates)  # type: ignore[arg-type]
+    emulator.faults = InstrumentFaults(**rates)  # type: ignore[arg-type]
     begin, moments = clock.now, []
     emulator.play(RecordingSource(recording), lapse)
     while emulator.playing:
@@ -99,7 +99,7 @@ def test_faults_repeat_with_their_seed(recording: Recording) -> None:
 
 def test_every_sample_is_delivered_or_lost_with_all_faults(bench: Callable[..., Any]) -> None:
     made = bench(SixChannelEmulator, GenericStreamDevice, StreamSettings())
-    made.instrument.faults = Faults(noise_rate=0.02, flip_rate=0.02, drop_rate=0.02)
+    made.instrument.faults = InstrumentFaults(noise_rate=0.02, flip_rate=0.02, drop_rate=0.02)
     made.run(5.0)
     made.end()
     found = made.device.statistics

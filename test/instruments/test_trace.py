@@ -88,7 +88,7 @@ def test_every_connection_is_in_the_trace(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("place", ["/dev/full", "/nonexistent/wire.trace", "/", "wire\0trace"])
+@pytest.mark.parametrize("place", ["/dev/full", "/dev/null/wire.trace", "/", "wire\0trace"])
 def test_an_unwritable_trace_is_reported_with_the_remedy_and_the_port_is_closed(
     place: str,
 ) -> None:

@@ -24,8 +24,8 @@ from omsm_ros.instruments.micro_epsilon.protocol import (
     INTENSITY_FULL,
     INTENSITY_MASK,
     VALUE_BITS,
-    Block,
     BlockDecoder,
+    MeasurementBlock,
     PlausibleValueFilter,
     SerialDecoder,
     confocal_dtype,
@@ -123,7 +123,7 @@ class BlockStreamDevice(StreamDevice):
     def _rest(self) -> Samples:
         return self._converted(self._decoder.settle())
 
-    def _converted(self, blocks: list[Block]) -> Samples:
+    def _converted(self, blocks: list[MeasurementBlock]) -> Samples:
         parts = []
         for block in blocks:
             self._identity = {
