@@ -130,9 +130,7 @@ def _corrected(calibration: Calibration, made: Recording) -> tuple[SurfacePoints
     corrector.push_distance(made.distance)
     points = join_points([corrector.finish()])
     trace = corrector.trace.points().with_slopes(PAPER_MIRROR)
-    budget = scan_budget(
-        calibration, sources, corrector.budget, geometry, stated(), trace, corrector.trace.seen
-    )
+    budget = scan_budget(calibration, sources, corrector.budget, geometry, stated(), trace)
     return points, scan_fields(budget.fields, corrector.trace.every, budget.bounds)
 
 

@@ -35,6 +35,7 @@ from omsm_ros.errors import (
     too_many_open_files,
 )
 from omsm_ros.io import json_and_yaml
+from omsm_ros.messages import COMMAND, written_for
 from omsm_ros.pipelines.progress import refresh_in_thread, tick
 from omsm_ros.quantities import shown
 
@@ -289,6 +290,7 @@ def _demo(args: argparse.Namespace) -> int:
     return subprocess.call([*command, *(["--json"] if args.json else [])])
 
 
+@written_for(COMMAND)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)

@@ -28,18 +28,28 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import string
-from collections.abc import Callable, Mapping
-from contextvars import ContextVar
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
 from omsm_ros import readable
 
 COMMAND, NODE, PYTHON = "command", "node", "python"
-AUDIENCE: ContextVar[str] = ContextVar("audience", default=PYTHON)
-"""For whom sentences are made; commands and nodes set it when they start."""
+_audience = PYTHON
 
 _UNITS = {"m", "s", "Hz", "rad", "m/s", "m/s²", "ppm", "K", "°C", "rpm", "kg", "samples/s"}
+
+
+@contextmanager
+def written_for(audience: str) -> Iterator[None]:
+    """Write sentences for ``audience`` (COMMAND, NODE or PYTHON) in the whole process meanwhile."""
+    global _audience
+    before, _audience = _audience, audience
+    try:
+        yield
+    finally:
+        _audience = before
 
 
 def sentence(code: str, values: Mapping[str, Any]) -> str:
@@ -69,10 +79,9 @@ class _Options:
     """Write the name of an option for the audience: ``opt.dwell`` → ``--dwell``."""
 
     def __getattr__(self, name: str) -> str:
-        audience = AUDIENCE.get()
-        if audience == COMMAND:
+        if _audience == COMMAND:
             return "--" + name.replace("_", "-")
-        return f"parameter {name!r}" if audience == NODE else repr(name)
+        return f"parameter {name!r}" if _audience == NODE else repr(name)
 
 
 _WITH_DIGITS: dict[str, Callable[..., str]] = {"%": readable.percent, "plain": readable.plain}

@@ -14,8 +14,9 @@ from std_msgs.msg import String
 
 from omsm_ros import quantities
 from omsm_ros.core.calibration.calibration import REJECTED, Calibration, settings_with, verdict_of
+from omsm_ros.core.streams.monitoring import RecentIncrease
 from omsm_ros.core.streams.motion_record import BlockBuffer, MotionRecord, assemble
-from omsm_ros.core.streams.stamps import RecentIncrease, check_period
+from omsm_ros.core.streams.stamps import check_period
 from omsm_ros.errors import BagError, ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder

@@ -27,8 +27,7 @@ from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.core.streams.blocks import Account, StreamAccount, consecutive
-from omsm_ros.core.streams.continuity import LoadMeter
-from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.monitoring import LoadMeter, RecentIncrease, SampleFlow
 from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.errors import BagError, CalibrationError, OmsmError
 from omsm_ros.io import message_mapping
@@ -60,7 +59,7 @@ def light_values(light: TrafficLight) -> dict[str, object]:
     """Return the light as values of a report: no fault of the node's, so no level of it."""
     return {
         "light": light.level,
-        "light_word": light.word,
+        "light_word": str(light.word),
         "light_reasons": "; ".join(map(str, light.reasons)),
     }
 

@@ -18,7 +18,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from omsm_ros.core.calibration.calibration import PROBE
-from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.factory import (

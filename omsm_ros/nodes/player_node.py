@@ -23,7 +23,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
-from omsm_ros.core.streams.stamps import Playback
+from omsm_ros.core.streams.monitoring import Playback
 from omsm_ros.errors import BagError, ConfigurationError, DataError, OmsmError
 from omsm_ros.io import json_and_yaml, topics
 from omsm_ros.io.bags import BagReader

@@ -71,7 +71,9 @@ def main() -> None:
                 sys.exit(_BAD_INPUT)
         module, _, function = NODES[name].partition(":")
         node = importlib.import_module(f"omsm_ros.nodes.{module}")
-    getattr(node, function)()
+        messages = importlib.import_module("omsm_ros.messages")
+    with messages.written_for(messages.NODE):
+        getattr(node, function)()
 
 
 def _check_open_files(name: str) -> None:

@@ -19,7 +19,7 @@ from omsm_ros.core.ripple.accelerometer import (
     MonitorOptions,
     RunningSpectrum,
 )
-from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.io import json_and_yaml, message_mapping
 from omsm_ros.io.calibration_file import load_calibration

@@ -30,6 +30,7 @@ from omsm_ros.core.correction.systematic import (
 from omsm_ros.core.correction.uncertainty import with_lateral_uncertainty
 from omsm_ros.core.kinematics.kinematics import PitchCurve, Surface
 from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
+from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import (
     Account,
     AxisBlock,
@@ -37,12 +38,11 @@ from omsm_ros.core.streams.blocks import (
     FloatArray,
     RejectionReason,
 )
-from omsm_ros.core.streams.stamps import axes_at_probe
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.core.streams.trigger_slips import CommonTrigger, TriggerSlip
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
-from omsm_ros.errors import BagError, ConfigurationError
+from omsm_ros.errors import BagError, ConfigurationError, Notice
 from omsm_ros.io import bags
 from omsm_ros.io.results import PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
@@ -401,7 +401,7 @@ class _Findings:
 
     def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
         """Return what counters and stamps say against the scan; not of axes joined by stamps."""
-        found = [*self._distance.faults("distance")]
+        found: list[Notice | str] = [*self._distance.faults("distance")]
         if self._by_counter:
             skew = counter_skew(self._axes, self._distance)
             found = [*self._axes.faults("axes"), *found]
@@ -414,7 +414,7 @@ class _Findings:
             found += skew_fault(skew, scan.sample_period, scan.trigger)
             samples = scan.account.distance.counted.get("slipped", 0)
             found += [f"{samples} samples were not corrected: {scan.slip}"] * bool(samples)
-        return (*found, *self._beyond(scan.options.pitch))
+        return (*map(str, found), *self._beyond(scan.options.pitch))
 
     def _beyond(self, pitch: PitchCurve | None) -> Iterator[str]:
         """Yield where Z went beyond what was measured of its pitch."""

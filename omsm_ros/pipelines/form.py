@@ -223,7 +223,7 @@ def form_facts(
 
 def _mismatch_text(form: FormResult, nominal: Surface) -> list[str]:
     x, y = form.map.x, form.map.y
-    return mismatch_text(x, y, nominal.height(x, y) + form.map.deviation, nominal)
+    return [*map(str, mismatch_text(x, y, nominal.height(x, y) + form.map.deviation, nominal))]
 
 
 def _counts(form: FormResult, missing: int) -> dict[str, int]:

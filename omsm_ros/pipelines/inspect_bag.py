@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
+from omsm_ros.errors import Notice
 from omsm_ros.io import bags
 from omsm_ros.io.topics import relative
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -77,7 +78,7 @@ def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspecti
         ]
         vibration = _vibration(bag.vibration())
     streams = [_inspect(t, watches.get(t.role)) for t in topics]
-    return Inspection(streams, [*faults, *_faults(watches)], vibration)
+    return Inspection(streams, [*faults, *map(str, _faults(watches))], vibration)
 
 
 def _vibration(levels: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
@@ -106,7 +107,7 @@ def _largest(levels: Iterable[Sequence[float]]) -> list[float]:
     return [float(max(band)) for band in zip(*levels, strict=True)]
 
 
-def _faults(watches: dict[str, StreamWatch]) -> Iterator[str]:
+def _faults(watches: dict[str, StreamWatch]) -> Iterator[Notice]:
     for topic, watch in watches.items():
         yield from watch.faults(relative(topic))
     axes, distance = watches.get(bags.AXES_TOPIC), watches.get(bags.DISTANCE_TOPIC)

@@ -110,7 +110,6 @@ class Judgement:
             options.geometry,
             self.stated,
             trace.with_slopes(options.surface) if len(trace) else trace,
-            done.trace.seen,
         )
         if self.out is not None and len(trace) and resolves_per_turn_waves(trace):
             kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
@@ -257,7 +256,7 @@ def _mismatch_text(done: Correction, nominal: Surface | None) -> list[str]:
     if nominal is None:
         return []
     x, y = (done.points[name].astype(np.float64) for name in "xy")
-    return mismatch_text(x, y, done.points["height"], nominal)
+    return [*map(str, mismatch_text(x, y, done.points["height"], nominal))]
 
 
 def _publish(

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
-from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.instruments.reader import State
 from omsm_ros.io import message_mapping
 from omsm_ros.nodes import driver as driving

@@ -17,7 +17,7 @@ from omsm_ros.core.ripple.accelerometer import (
     RunningSpectrum,
 )
 from omsm_ros.core.streams.blocks import AccelerationBlock
-from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import message_mapping
 from omsm_ros.nodes import vibration_monitor_node as module

@@ -75,7 +75,7 @@ def test_points_that_a_program_wrote_twice_count_once(tmp_path):
     measured = open_measurement(tmp_path / "a.xyz")
     (_, _, heights), _ = joined(measured)
     assert heights.tolist() == [z for _, _, z in rows]
-    assert any("3 points stand there again" in note for note in measured.notes)
+    assert any("3 points are exact duplicates" in note for note in measured.notes)
     assert measured.missing == 1
     assert not measured.even
 

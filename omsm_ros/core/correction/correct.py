@@ -1,9 +1,9 @@
-"""What is the surface's height, free of the machine's dynamics?
+"""Correction of a scan for the dynamics of the machine.
 
-``height = H(z) + polarity · distance / static_gain`` (Eq. 10, 13), with H the discretised G_m
-run over the encoder's stream. The probe's dropouts cost their own points only. A stream may
-be cut into blocks anywhere and the two be interleaved anyhow: the points are the same to
-the last bit, live and offline.
+``height = H(z) + polarity · distance / static_gain`` (Eq. 10, 13), where H is the discretised G_m,
+run over the encoder's stream. A lost reading of the probe costs only its own point. The points do
+not depend on how the streams are cut into blocks and interleaved, to the last bit, so that live
+and offline agree.
 """
 
 from __future__ import annotations
@@ -55,21 +55,21 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionOptions:
-    """How to correct.
+    """Options of the correction.
 
     polarity: 1 if the distance falls when z rises, -1 for a probe mounted the other way
     static_gain: probe travel per encoder travel [1]; None takes the calibration's
     accept_other_rate: correct data of another sample period than the calibration's
-    max_pending: how long a sample waits for its partner [s]; the newest block always may
-    sources: other uncertainties; None takes what the calibration's certificate states
-    lateral_lag: how late the probe's reading is [s], by which X, Y, B and C are delayed too;
-        None takes the latency that the calibration's certificate states
-    geometry: where the probe sits and looks
-    systematic: what else is uncertain of the whole scan; into each point's uncertainty goes what
-        can be known of it there: what shifts points laterally, only with a ``surface``
+    max_pending: time that a sample waits for its partner [s]; the newest block always waits
+    sources: uncertainties of single points; None takes those of the calibration's certificate
+    lateral_lag: latency of the probe [s], by which X, Y, B and C are delayed; None takes that of
+        the calibration's certificate
+    geometry: of the probe
+    systematic: sources of the whole scan that are added to the uncertainty of each point; those
+        that need slopes only with a ``surface``
     surface: nominal, for its slopes
-    pitch: of Z, measured; over the geometry's Abbe arm it is taken off the encoder
-    trigger: what is stated of the counters of the two streams
+    pitch: measured curve of Z, by which the encoder is corrected over the Abbe arm
+    trigger: statement about the counters of the two streams
     """
 
     polarity: int = 1
@@ -86,7 +86,7 @@ class CorrectionOptions:
 
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
-            raise ConfigurationError(f"polarity {self.polarity!r}, expected 1 or -1")
+            raise ConfigurationError("correction.polarity", polarity=self.polarity)
         if self.static_gain is not None:
             GAIN.checked(self.static_gain, ConfigurationError, "static_gain")
         if self.lateral_lag is not None:
@@ -95,14 +95,13 @@ class CorrectionOptions:
 
 
 class Corrector:
-    """Turns axis and distance blocks into surface points, in the order of their triggers.
+    """Corrects axis and distance blocks to surface points, in the order of their triggers.
 
-    trace: some of the points, evenly chosen, for what acts on the whole scan
+    Push the blocks of both streams in the order of their arrival. Samples that wait longer than
+    ``max_pending`` for their partner are dropped, so that memory is bounded.
 
-    Push the two streams about as they came: what waits longer than ``max_pending`` for its
-    partner is given up, so that memory stays bounded. Each may also come as one block.
-
-    most_waiting: samples that may wait, for files, which know no time; None = ``max_pending``
+    most_waiting: number of samples that may wait, for files; None takes ``max_pending``
+    trace: evenly spaced points for the systematic errors of the whole scan
     """
 
     def __init__(
@@ -131,9 +130,9 @@ class Corrector:
         self.trace = ScanTrace()
 
     def push_axes(self, *blocks: AxisBlock) -> None:
-        """Filter the encoder's samples of a block, or of several that follow on, at once.
+        """Filter the encoder samples of one block or of several consecutive ones.
 
-        Raises CalibrationError for a sample period the calibration does not hold for.
+        Raises CalibrationError for a sample period for which the calibration does not hold.
         """
         block = joined(blocks)
         motion = self._filter_for(block)
@@ -144,9 +143,9 @@ class Corrector:
             self._pairing.axes.limit(self._most_pending(block))
 
     def push_distance(self, *blocks: DistanceBlock) -> None:
-        """Queue the probe's readings of a block, or of several that follow on, at once.
+        """Queue the readings of one block or of several consecutive ones.
 
-        Raises CalibrationError for a sample period the calibration does not hold for.
+        Raises CalibrationError for a sample period for which the calibration does not hold.
         """
         block = joined(blocks)
         self._filter_for(block)
@@ -168,11 +167,11 @@ class Corrector:
         return points
 
     def settle(self) -> None:
-        """Correct the pairs that wait for stamps to come, for both streams have paused."""
+        """Correct the pairs that wait for further stamps, because both streams have paused."""
         self._correct(self._pairing.end())
 
     def finish(self) -> SurfacePoints | None:
-        """End both streams and take what is left; what comes later begins a new session."""
+        """End both streams and return the remaining points; later blocks begin a new session."""
         if self._motion is not None:
             for run in self._motion.end():
                 self._pairing.axes.push(run)
@@ -186,7 +185,7 @@ class Corrector:
 
     @property
     def account(self) -> Account:
-        """Where every sample received so far has gone."""
+        """Account of every sample received so far."""
         warming = self._motion.pending if self._motion else 0
         axes, distance = self._pairing.axes, self._pairing.distance
         return Account(
@@ -198,23 +197,23 @@ class Corrector:
     def stamp_skew(self) -> float | None:
         """Time of the axes minus time of the distance for the newest common trigger [s].
 
-        Large or drifting, it is a sign of devices that count different triggers.
+        If it is large or drifts, the devices count different triggers.
         """
         return self._pairing.stamp_skew
 
     @property
     def held(self) -> int:
-        """Pairs that wait for stamps to show that their equal counts are one trigger [samples]."""
+        """Number of pairs that wait for a verdict on their counters."""
         return self._pairing.axes.held
 
     @property
     def slips(self) -> TriggerSlipDetector:
-        """Whether the two counters have slipped against each other, and by how much."""
+        """Verdicts on slips between the two counters."""
         return self._pairing.watch
 
     @property
     def budget(self) -> dict[str, float]:
-        """Standard uncertainty of the heights by its source [m], root mean square of all points."""
+        """Standard uncertainty of the heights by source [m], rms over all points."""
         points = max(self._axes.tally.corrected, 1)
         return {name: float(np.sqrt(sum_ / points)) for name, sum_ in self._variance.items()}
 
@@ -223,20 +222,14 @@ class Corrector:
         if self._motion is None or self._period is None:
             self._motion = self._begin(period)
         elif abs(period - self._period) > SAME_PERIOD * self._period:
-            raise CalibrationError(
-                f"sample period {period!r} s after blocks of {self._period!r} s; "
-                "both streams must keep one sample period"
-            )
+            raise CalibrationError("correction.period_changed", period=period, before=self._period)
         return self._motion
 
     def _begin(self, period: float) -> MotionFilter:
         expected = self._calibration.sample_period
         same = abs(period - expected) <= SAME_PERIOD * expected
         if not (same or self._options.accept_other_rate):
-            raise CalibrationError(
-                f"sample period {period!r} s, but the calibration was identified at "
-                f"{expected!r} s; identify at this rate or accept another rate explicitly"
-            )
+            raise CalibrationError("correction.other_rate", period=period, calibrated=expected)
         self._period = period
         known = self._calibration
         lag = lateral_lag(known, self._options)
@@ -287,7 +280,7 @@ class Corrector:
         )
 
     def _dynamics_variances(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
-        """Return the variances of H(z) [m²], (n,), by the step test's noise and by hidden terms."""
+        """Return the variances of H(z) [m²], (n,), from noise and from undetected model error."""
         noise, undetected = np.zeros((2, len(points)))
         for row, may_be_undetected in zip(points.dynamics, points.undetected, strict=True):
             total = undetected if may_be_undetected else noise
@@ -318,7 +311,7 @@ class Corrector:
 
 
 def _as_slice(chosen: BoolArray) -> BoolArray | slice:
-    """Return ``chosen`` (n,), as a slice where it is one: then nothing is copied."""
+    """Return ``chosen`` (n,) as a slice if it is one, so that nothing is copied."""
     first, last = int(np.argmax(chosen)), len(chosen) - int(np.argmax(chosen[::-1]))
     return slice(first, last) if np.sum(chosen) == last - first else chosen
 

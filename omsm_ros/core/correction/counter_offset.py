@@ -1,10 +1,12 @@
-"""By how much do the trigger counts of two devices differ? What the motion itself says.
+"""Offset between the trigger counts of two devices from a motion before a fixed target.
 
-Before a fixed target the distance is ``d = a + b n - g z``, and only at the right offset does the
-distance at one count answer to Z at the other. The offset of the least residual is searched among
-whole samples; what is left of it, a fraction, is fitted there: ``d = a + b n - g (z + δ ż T)``. A
-probe or a structure that is late looks like a part of a sample, so the lag must be small against
-one, or known.
+Before a fixed target the distance at count n is ``d = a + b n - g z``, if z is taken at the right
+count. The whole number of samples with the least residual is searched first; then the remaining
+fraction δ of a sample is fitted: ``d = a + b n - g (z + δ ż T)``. A lag of probe or structure looks
+like a fraction of a sample, so it must be known, or much shorter than one.
+
+Stamps show a slip only beyond half a sample and the delay of the links, and a constant delay of a
+link looks like a slip. The motion distinguishes both, see :class:`LiveOffset`.
 """
 
 from __future__ import annotations
@@ -20,24 +22,35 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import DataError
 
-# Before a fixed target g is 1 to some per cent; a followed surface gives anything.
+# Range of g before a fixed target; it has any value while the probe follows a surface.
 _GAIN = (0.8, 1.25)
-# The residual elsewhere must be so many times that at the offset: a motion that repeats itself,
-# or hardly moves, fits at several.
+# Least ratio of the residual elsewhere to that at the offset; a periodic or small motion fits at
+# several offsets.
 _CONTRAST = 1.5
-# Offsets nearer than this are the flank of one minimum; the fit judges them [samples].
+# Width of the minimum, within which the fit decides [samples].
 _FLANK = 3
+# Samples from which the correlation of the residuals can be estimated.
 _LEAST_SAMPLES = 200
-# The whole number is sure if the fraction and three of its uncertainties leave room to the next.
-_ROOM, _SURE = 0.5, 3.0
+# The whole number is certain if fraction and three standard uncertainties stay below one half.
+_ROOM, _COVERAGE = 0.5, 3.0
+# Span of the newest motion that is judged [s], and its most samples.
+_SPAN_S, _MOST_SAMPLES = 4.0, 16_384
+# Range of the search: the longest delay of a link [s].
+_SEARCH_S = 0.25
+# Relative tolerance of the static gain. A surface that moves with Z some samples later would look
+# like an offset, but with another gain than a fixed target.
+_SAME_GAIN = 0.01
+# Time between two results that must agree, so that they rest on different motion [s].
+_APART_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class CounterOffset:
-    """samples: added to the distance's count, it gives the axes' count
+    """Offset of two counters.
 
-    fraction: of a sample that the fit leaves, after the known lag;  uncertainty: of it (k = 1)
-    gain: by how much the distance falls as Z rises
+    samples: added to the distance's count, it gives the axes' count
+    fraction: of a sample, left by the fit after the known lag;  uncertainty: of it, k = 1
+    gain: decrease of the distance per rise of Z [1]
     """
 
     samples: int
@@ -57,18 +70,16 @@ def counter_offset(
 ) -> CounterOffset:
     """Return the offset of two counters from a motion before a fixed target.
 
-    z, distance: at equal counts [m], (n,);  ok: where the distance is one, (n,)
+    z, distance: at equal counts [m], (n,);  ok: True where the distance is valid, (n,)
     most: the largest offset that is searched [samples]
-    lag, lag_uncertainty: of the distance behind Z, as far as it is known [samples]
+    lag, lag_uncertainty: known lag of the distance behind Z [samples]
 
-    Raises DataError where the motion does not say which offset it is, with the reason.
+    Raises DataError, with the reason, if the motion does not determine the offset.
     """
-    if np.count_nonzero(ok) < max(_LEAST_SAMPLES, 4 * most):
-        raise DataError(
-            f"{np.count_nonzero(ok)} samples with a distance do not determine an offset of up to "
-            f"{most} samples; record {max(_LEAST_SAMPLES, 4 * most)} or more before a fixed target"
-        )
-    # Beyond the flank of any minimum, so that there is an elsewhere.
+    valid, least = int(np.count_nonzero(ok)), max(_LEAST_SAMPLES, 4 * most)
+    if valid < least:
+        raise DataError("correction.few_samples", samples=valid, most=most, least=least)
+    # Wider than a minimum, so that there are other offsets to compare with.
     reach = max(most, _FLANK + 1)
     residual = _residuals(_level(z), np.where(ok, _level(distance, ok), 0.0), ok, reach)
     best = reach - most + int(np.argmin(residual[reach - most : reach + most + 1]))
@@ -76,9 +87,7 @@ def counter_offset(
     contrast = float(elsewhere.min() / max(residual[best], np.finfo(float).tiny))
     if contrast < _CONTRAST:
         raise DataError(
-            f"the motion fits at several offsets (least residual elsewhere {contrast:.3g} times "
-            f"that at {best - reach} samples, {_CONTRAST} asked for); move Z unevenly by many "
-            "times the noise before a fixed target, or state counter_offset"
+            "correction.several_offsets", ratio=contrast, samples=best - reach, least=_CONTRAST
         )
     return _refined(z, distance, ok, best - reach, lag, lag_uncertainty)
 
@@ -89,12 +98,12 @@ def _level(values: FloatArray, ok: NDArray[np.bool_] | None = None) -> FloatArra
 
 
 def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -> FloatArray:
-    """Return the share of the distance's variance that Z leaves, by offset -most … most."""
+    """Return the share of the distance's variance not explained by Z, for offsets -most … most."""
     weight = ok.astype(np.float64)
     size = 1 << (len(z) + most).bit_length()
     wanted = np.arange(-most, most + 1)
 
-    # As scipy.signal.correlate does, for which a live node would have to load all of scipy.signal.
+    # Like scipy.signal.correlate, but without loading scipy.signal in a live node.
     def lagged(a: FloatArray, b: FloatArray) -> FloatArray:
         product = np.fft.rfft(a, size) * np.conj(np.fft.rfft(b, size))
         return np.asarray(np.fft.irfft(product, size)[wanted])
@@ -108,7 +117,7 @@ def _residuals(z: FloatArray, d: FloatArray, ok: NDArray[np.bool_], most: int) -
 
 
 def _between(residual: FloatArray) -> FloatArray:
-    """Return the least residual within a sample of each offset (n,), the vertex of a parabola."""
+    """Return the least residual near each offset (n,), from a parabola through three offsets."""
     before, here, after = residual[:-2], residual[1:-1], residual[2:]
     bend, tilt = before - 2 * here + after, (after - before) / 2
     inside = (bend > 0) & (abs(tilt) <= bend)
@@ -124,7 +133,7 @@ def _refined(
     lag: float,
     lag_uncertainty: float,
 ) -> CounterOffset:
-    """Fit the fraction of a sample that is left at ``samples``, and judge it."""
+    """Fit the remaining fraction of a sample at ``samples``; raise DataError if not certain."""
     index = np.flatnonzero(ok)
     index = index[(index + samples >= 1) & (index + samples < len(z) - 1)]
     here = index + samples
@@ -136,57 +145,34 @@ def _refined(
     residual = distance[index] - columns / scale @ solved
     gain, moved = -solved[2] / scale[2], -solved[3] / scale[3]
     if not _GAIN[0] < abs(gain) < _GAIN[1]:
-        raise DataError(
-            f"the distance answers to Z with {gain:.3g}, before a fixed target it is 1 "
-            f"({_GAIN[0]} to {_GAIN[1]}); record a motion of Z before a fixed target, or state "
-            "counter_offset"
-        )
+        raise DataError("correction.gain", gain=float(gain), least=_GAIN[0], most=_GAIN[1])
     inverse = np.linalg.pinv((columns / scale).T @ (columns / scale))
-    # Neighbouring residuals are alike: so many samples count as one.
+    # Residuals are correlated, which reduces the number of independent samples.
     alike = _correlation_length(residual)
     spread = math.sqrt(float(residual @ residual) / max(len(here) - 4, 1) * alike * inverse[3, 3])
     uncertainty = math.hypot(spread / scale[3] / gain, lag_uncertainty)
-    # Late by ``lag``, the distance shows where Z was: the offset found is smaller by it.
+    # The distance lags Z, which reduces the offset that is found.
     found = samples + moved / gain + lag
     whole = round(found)
-    if abs(found - whole) + _SURE * uncertainty > _ROOM:
-        raise DataError(
-            f"the counters differ by {found:.2f} ± {uncertainty:.2f} samples, which is no whole "
-            "number; move Z faster before a fixed target, state the lag, or state counter_offset"
-        )
+    if abs(found - whole) + _COVERAGE * uncertainty > _ROOM:
+        raise DataError("correction.no_whole_offset", samples=float(found), uncertainty=uncertainty)
     return CounterOffset(whole, found - whole, uncertainty, float(gain))
 
 
 def _correlation_length(residual: FloatArray) -> float:
-    """Return samples (≥ 1) that count as one, of a first-order process with this correlation."""
+    """Return the number of samples (≥ 1) for one independent one, by a first-order process."""
     total = float(residual @ residual)
     near = float(residual[1:] @ residual[:-1]) / total if total > 0 else 0.0
     near = min(max(near, 0.0), 0.999)
     return (1 + near) / (1 - near)
 
 
-# Do the counts of two devices mean one trigger? What the newest motion says of it.
-#
-# Stamps show a slip only beyond half a sample and what links deliver late, and a link that is late
-# by a constant looks like one. A motion of Z before a fixed target tells both apart.
-
-# What is judged: so much of the newest motion, but no more samples [s, samples].
-_SPAN_S, _MOST_SAMPLES = 4.0, 16_384
-# Offsets are searched as far as links may be late [s].
-_SEARCH_S = 0.25
-# A surface that moves with Z, but some samples later, looks like an offset of its share of them. So
-# the distance must answer to Z as before a fixed target, to this part of the static gain.
-_SAME_GAIN = 0.01
-# Between two findings that must agree, so that one of them holds motion that the other has not [s].
-_APART_S = 1.0
-
-
 class LiveOffset:
-    """Keeps the newest samples of both streams, and what a motion established of their counts.
+    """Determines the offset of two running counters from the newest motion.
 
-    calibration: its lag is what the distance comes late by anyway
-    in_use: added to the distance's count it should give the axes' count [samples]
-    established: what has to be added besides; None until a motion told, and after a restart
+    calibration: gives the known lag of the distance
+    in_use: offset that is added to the distance's count already [samples]
+    established: further offset; None until a motion has determined it, and after a restart
     """
 
     def __init__(self, calibration: Calibration, in_use: int) -> None:
@@ -203,15 +189,14 @@ class LiveOffset:
         if isinstance(block, AxisBlock):
             anew = self._axes.add(block.first_sample, block.z, block.sample_period)
         else:
-            valid_distance = np.where(block.ok, block.distance, np.nan)
-            anew = self._distance.add(
-                block.first_sample + self.in_use, valid_distance, block.sample_period
-            )
+            reading = np.where(block.ok, block.distance, np.nan)
+            first = block.first_sample + self.in_use
+            anew = self._distance.add(first, reading, block.sample_period)
         if anew:
             self.established = self._found = None
 
     def judge(self) -> None:
-        """Look whether the newest motion tells the offset: twice the same, then it is believed."""
+        """Establish the offset if two successive motions give the same whole number."""
         period = self._axes.period
         end = min(self._axes.end, self._distance.end)
         first = max(self._axes.first, self._distance.first, end - self._axes.most)
@@ -234,9 +219,9 @@ class LiveOffset:
                 lag_uncertainty=self._lag_uncertainty / period,
             )
         except DataError:
-            return  # this motion does not tell
+            return  # this motion does not determine the offset
         if abs(abs(found.gain) - self._gain) > _SAME_GAIN * self._gain:
-            return  # it follows a surface
+            return  # the probe follows a surface
         before, self._found = self._found, (end, found.samples)
         if before is not None and before[1] == found.samples:
             self.established = found
@@ -245,7 +230,7 @@ class LiveOffset:
 class _Newest:
     """The newest samples of one stream, by count.
 
-    first, end: counts that are kept;  most: how many are [samples];  period: of them [s]
+    first, end: range of counts;  most: number of samples kept;  period: sample period [s]
     """
 
     def __init__(self) -> None:
@@ -254,11 +239,10 @@ class _Newest:
         self._parts: deque[tuple[int, FloatArray]] = deque()
 
     def add(self, first: int, values: FloatArray, period: float) -> bool:
-        """Append a block; return whether its counter began anew."""
+        """Append a block; return True if its counter was reset."""
         anew = bool(self._parts) and first < self.end
         if anew:
             self._parts.clear()
-        # Of samples further apart than the span the newest one is kept.
         self.period, self.most = period, min(max(round(_SPAN_S / period), 1), _MOST_SAMPLES)
         self._parts.append((first, values))
         self.end = first + len(values)
@@ -268,7 +252,7 @@ class _Newest:
         return anew
 
     def column(self, first: int, end: int) -> FloatArray:
-        """Return the values of counts ``first`` to ``end`` (n,), NaN where there is none."""
+        """Return the values of counts ``first`` to ``end`` (n,), NaN for missing ones."""
         made = np.full(end - first, np.nan)
         for start, values in self._parts:
             low, high = max(start, first), min(start + len(values), end)

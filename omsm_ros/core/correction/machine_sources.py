@@ -1,7 +1,7 @@
-"""What is uncertain of this machine, and who says so?
+"""Statements about the sources of uncertainty of a machine.
 
-One statement a source: its size, whether it was evaluated from data or declared, and why. Sources
-of single readings go into ``ErrorSources``; those that act on the whole scan have fields.
+A statement gives the size of a source, whether it was evaluated from data or declared, and why.
+Sources of single readings become ``ErrorSources``; those of the whole scan ``SystematicSource``.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from omsm_ros.core.correction.source_kinds import KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, covariance_parts
 from omsm_ros.core.kinematics.kinematics import Geometry
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.quantities import UNCERTAINTY, shown
 
 # From a half-width or an amplitude to a standard uncertainty (GUM, 4.3).
 DISTRIBUTIONS = {"normal": 1.0, "uniform": 1 / math.sqrt(3.0), "arcsine": 1 / math.sqrt(2.0)}
 
 POINT_SOURCES = tuple(field.name for field in fields(ErrorSources))
-# These are uncertain of each point, and of all points together.
+# Sources of single readings that are also common to all points.
 _ALSO_SYSTEMATIC = ("static_gain", "lateral_lag", "motion_error", "pitch")
 _OF_CALIBRATION = ("dynamics", "could_hide")
-# What somebody can state of single readings, and all that is independent from point to point.
+# Sources of single readings that can be stated, and all that are independent between points.
 _STATED_RANDOM = tuple(name for name in POINT_SOURCES if name not in _ALSO_SYSTEMATIC)
 RANDOM = (*_STATED_RANDOM, SCAN_SCATTER)
 SYSTEMATIC = tuple(KINDS)
@@ -35,12 +35,13 @@ NAMES = (*_STATED_RANDOM, *SYSTEMATIC)
 
 @dataclass(frozen=True, kw_only=True)
 class StatedSource:
-    """What somebody says of one source.
+    """Statement about one source.
 
-    source: one of ``NAMES`` but those that come from a calibration alone
-    value: standard uncertainty; of a uniform distribution its half-width, of an arcsine (a wave
-        of unknown phase) its amplitude
-    how: EVALUATED from data or DECLARED;  reason: in words;  parameters: of its kind
+    source: one of ``NAMES`` except those that come from a calibration alone
+    value: standard uncertainty; half-width of a uniform distribution, amplitude of an arcsine
+        distribution (a wave of unknown phase)
+    how: EVALUATED from data or DECLARED;  reason: where the value comes from
+    parameters: of its kind
     """
 
     source: str
@@ -54,7 +55,7 @@ class StatedSource:
         allowed = [name for name in NAMES if name not in _OF_CALIBRATION]
         if self.source not in allowed:
             raise ConfigurationError(
-                f"uncertainty {shown(self.source)} is unknown, expected one of {sorted(allowed)}"
+                "correction.source", source=shown(self.source), known=sorted(allowed)
             )
         for name, value, known in (
             ("how", self.how, (EVALUATED, DECLARED)),
@@ -62,24 +63,30 @@ class StatedSource:
         ):
             if value not in known:
                 raise ConfigurationError(
-                    f"{self.source}: {name} is {shown(value)}, expected one of {', '.join(known)}"
+                    "correction.choice",
+                    source=self.source,
+                    name=name,
+                    value=shown(value),
+                    known=known,
                 )
         if not self.reason.strip():
-            raise ConfigurationError(f"{self.source} needs a reason: say where the figure is from")
+            raise ConfigurationError("correction.no_reason", source=self.source)
         if self.source in POINT_SOURCES:
             ErrorSources(**{self.source: self.standard_uncertainty})
             if set(self.parameters) - {"correlation_length"}:
-                raise ConfigurationError(f"{self.source} has no parameter {[*self.parameters]}")
+                raise ConfigurationError(
+                    "correction.no_parameter", source=self.source, parameters=self.parameters
+                )
         else:
             self.systematic()
 
     @property
     def standard_uncertainty(self) -> float:
-        """In the unit of the source, k = 1."""
+        """Standard uncertainty in the unit of the source, k = 1."""
         return self.value * DISTRIBUTIONS[self.distribution]
 
     def systematic(self) -> SystematicSource:
-        """Return it as a source with fields."""
+        """Return the source with its sensitivity fields."""
         return source_of(
             self.source, self.standard_uncertainty, self.how, self.reason, self.parameters
         )
@@ -87,7 +94,7 @@ class StatedSource:
 
 @dataclass(frozen=True)
 class MachineSources:
-    """All that is stated of a machine; a name may stand more than once if it is systematic."""
+    """All statements about a machine; a systematic source may have more than one."""
 
     stated: tuple[StatedSource, ...] = ()
 
@@ -96,11 +103,11 @@ class MachineSources:
         for name in names:
             if names.count(name) > 1:
                 raise ConfigurationError(
-                    f"{name} is stated {names.count(name)} times; state it once"
+                    "correction.stated_twice", source=name, times=names.count(name)
                 )
 
     def of(self, name: str) -> tuple[StatedSource, ...]:
-        """Return what is stated of the source ``name``."""
+        """Return the statements about the source ``name``."""
         return tuple(stated for stated in self.stated if stated.source == name)
 
     def point_uncertainties(self) -> dict[str, float]:
@@ -112,7 +119,7 @@ class MachineSources:
         }
 
     def scan_sources(self) -> tuple[SystematicSource, ...]:
-        """Return the systematic sources that neither a calibration nor a point has."""
+        """Return the stated sources of the whole scan."""
         return tuple(s.systematic() for s in self.stated if s.source not in POINT_SOURCES)
 
 
@@ -132,12 +139,13 @@ def declared_sources(sizes: Mapping[str, object]) -> MachineSources:
 def whole_scan_sources(
     calibration: Calibration, points: ErrorSources, geometry: Geometry, stated: MachineSources
 ) -> tuple[SystematicSource, ...]:
-    """Return every source that acts on the whole scan: the calibration's, and what is stated."""
+    """Return all sources that act on the whole scan, of the calibration and as stated."""
     found = []
+    reason: str | Notice
     members = calibration.members if isinstance(calibration, CalibrationSet) else (calibration,)
     for name, part in zip(_OF_CALIBRATION, (0, 1), strict=True):
         if any(covariance_parts(member)[part].covariance.any() for member in members):
-            reason = "covariance of the calibration"
+            reason = Notice("correction.from_covariance")
             found.append(source_of(name, 1.0, EVALUATED, reason, {}))
     parameters: dict[str, Mapping[str, float]] = {
         "static_gain": {"gain": calibration.static_gain},
@@ -151,20 +159,22 @@ def whole_scan_sources(
 
 
 def upper_bounds(calibration: Calibration, stated: MachineSources) -> tuple[str, ...]:
-    """Return the names of the sources of which it is known how large they are at most.
+    """Return the names of the sources of which only an upper bound is known, and which may be zero.
 
-    A step test that does not show a term says how large it could be; where nothing divides the
-    lag, any part of it could be latency. Neither need be there at all.
+    These are the model error that the step test cannot detect and, without a test of the latency,
+    the lag.
     """
     open_lag = not latency_of(calibration).resolved and not stated.of("lateral_lag")
     return ("could_hide", "lateral_lag") if open_lag else ("could_hide",)
 
 
-def origin_of(name: str, calibration: Calibration, stated: MachineSources) -> tuple[str, str]:
-    """Return whether a source of single points was evaluated or declared, and why."""
+def origin_of(
+    name: str, calibration: Calibration, stated: MachineSources
+) -> tuple[str, str | Notice]:
+    """Return EVALUATED or DECLARED for a source of single points, and the reason."""
     if said := stated.of(name):
         return said[0].how, said[0].reason
     if name == "lateral_lag":
         latency = latency_of(calibration)
         return EVALUATED if latency.source != "declared" else DECLARED, latency.reason
-    return EVALUATED, "certificate of the calibration"
+    return EVALUATED, Notice("correction.from_certificate")

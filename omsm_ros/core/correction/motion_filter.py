@@ -1,8 +1,8 @@
-"""What did the probe's own motion look like, sample by sample?
+"""Motion of the probe from the encoder's stream, sample by sample.
 
-H runs over the encoder's stream alone. It starts in the steady state of the motion it finds,
-and starts anew after every interruption: a gap in the trigger count, or an axis that gives
-no number. The samples in which a wrong start would still be felt are marked as settling.
+H runs over the encoder's stream alone. It starts in the steady state of the first samples and
+restarts after every interruption: a gap in the trigger count or a lost position. The samples
+within the settling time are marked.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AngleUnwrapper, BoolArray, FloatArray, RejectionReason
 from omsm_ros.core.streams.pairing import SampleRun
 
-# The share of a wrong start that may be left in the first published point.
+# Share of a wrong initial state that may remain in the first published point.
 SETTLED = 1e-6
 _X, _Y, _Z, _B, _C = range(5)
 _LATERAL = (_X, _Y, _B, _C)
 Past = Callable[[FloatArray], FloatArray]
-# Rows of what comes out: x, y, b, c, z - H(z), H(z), rate of H(z); sensitivities follow.
+# Rows of the output: x, y, b, c, z - H(z), H(z), rate of H(z), sensitivities.
 ERROR, MOVED, RATE, SENSITIVITIES = 4, 5, 6, 7
 
 
@@ -41,12 +41,12 @@ class MotionFilters:
     """The filters that run over the axes.
 
     height: H on z;  rate: on z, the rate of H(z)
-    dynamics: F_r on z, change of H(z) per standard uncertainty of each direction r of the
-        calibration's covariance: those of its noise, then those of what could hide
-    lateral: on x, y, b, c, where the lag is latency; None where it is not
-    forgotten: samples after which the poles of G have forgotten a wrong start
-    undetected: how many of ``dynamics``, the last, are of what could hide
-    pasts: what each of ``dynamics`` takes for the past of its first samples
+    dynamics: F_r on z, change of H(z) per standard uncertainty along each direction r of the
+        calibration's covariance, those of noise first, then those of undetected model error
+    lateral: delay of x, y, b, c by the latency; None without latency
+    forgotten: samples after which a wrong initial state of G has decayed to ``SETTLED``
+    undetected: number of the last of ``dynamics`` that are of undetected model error
+    pasts: motion before the first samples that each of ``dynamics`` assumes
     """
 
     height: DigitalFilter
@@ -84,25 +84,25 @@ class MotionFilters:
         )
 
     def settling_samples(self) -> int:
-        """Return the samples until a wrong start is forgotten to ``SETTLED`` of itself."""
+        """Return the samples after which a wrong initial state has decayed to ``SETTLED``."""
         settled = self.height.settling_samples(SETTLED)
-        # A slow pole with a small share of the response is forgotten long before its decay ends.
+        # A slow pole with a small share of the response needs less time than its full decay.
         settled = min(settled, self.forgotten + 2 * len(self.height.sections))
         return max([settled, *([self.lateral.settling_samples(SETTLED)] if self.lateral else [])])
 
 
 def undetected_rows(filters: Sequence[MotionFilters]) -> BoolArray:
-    """Return which sensitivities of a :class:`MotionFilter` are of what could hide, (r,)."""
+    """Return True for the sensitivities of undetected model error of a MotionFilter, (r,)."""
     rows = [np.arange(len(f.dynamics)) >= len(f.dynamics) - f.undetected for f in filters]
-    # How members of a set differ is none of them.
+    # The differences between members of a set come last and are not model errors.
     return np.concatenate([*rows, np.zeros(len(filters) - 1, np.bool_)])
 
 
 def forgetting_samples(dynamics: TransferFunction, sample_period: float) -> int:
-    """Return the samples after which G has forgotten a wrong start to ``SETTLED`` of itself.
+    """Return the samples after which a wrong initial state of G has decayed to ``SETTLED``.
 
-    Of a millimetre that is a nanometre, a tenth of a reading's noise. Each pole p has the share
-    N(p) / Π (1 - p/p_k) of the response; they fade as exp(p t), and the sum of all counts.
+    For a millimetre that is a nanometre, a tenth of the noise of a reading. Each pole p has the
+    share N(p) / Π (1 - p/p_k) of the response and decays as exp(p t).
     """
     poles = dynamics.poles()
     if len(poles) == 0:
@@ -113,7 +113,7 @@ def forgetting_samples(dynamics: TransferFunction, sample_period: float) -> int:
         share = np.abs(polynomial.polyval(poles, dynamics.numerator) / np.prod(apart, axis=1))
     if not np.all(np.isfinite(share)):
         return 2**31
-    # The sum of n falls below the limit at the latest where each falls below an n-th of it.
+    # The sum of n parts is below the limit if each part is below an n-th of it.
     excess = np.log(np.maximum(len(poles) * share / SETTLED, 1.0))
     return int(
         np.ceil(np.max(excess / -poles.real) / sample_period + dynamics.delay / sample_period)
@@ -121,7 +121,7 @@ def forgetting_samples(dynamics: TransferFunction, sample_period: float) -> int:
 
 
 class _Bank:
-    """The filters of one calibration, running."""
+    """The running filters of one calibration."""
 
     def __init__(self, filters: MotionFilters) -> None:
         self._height = Recursion(filters.height)
@@ -147,11 +147,10 @@ class _Bank:
 
 
 class Blend:
-    """The places of several calibrations along one of the axes x, y, z, b, c.
+    """Mixes the outputs of several calibrations by the position along one axis.
 
-    Each member's filter runs over the whole stream, and their *outputs* are mixed by weights that
-    are continuous in position: no filter is ever switched, started or given coefficients that do
-    not belong to its state, so nothing bumps.
+    The filter of each member runs over the whole stream, and the *outputs* are mixed by weights
+    that are continuous in position, so that the result is continuous too.
     """
 
     def __init__(self, places: CalibrationSet) -> None:
@@ -159,11 +158,11 @@ class Blend:
         self._axis = {"x": _X, "z": _Z, "b": _B}[places.along]
 
     def blended(self, axes: FloatArray, outputs: Sequence[FloatArray]) -> FloatArray:
-        """Return H(z), its rate and its sensitivities of all, (2 + r, n).
+        """Return the mixture of H(z), its rate and its sensitivities, (2 + r, n).
 
-        What is uncertain of one member may be of all alike: their variances are mixed, not the
-        squares of their weights. Between two members a and b the response may go from one to the
-        other in any way: a uniform distribution about the mean there, ``√(w(1-w)/3) (H_a - H_b)``.
+        The errors of the members may be common, so their variances are mixed with the weights.
+        Between two members a and b the response is uncertain by a uniform distribution,
+        ``√(w(1-w)/3) (H_a - H_b)``.
         """
         weights = self._places.weights(axes[self._axis])
         moved = np.sum([w * out[:2] for w, out in zip(weights, outputs, strict=True)], axis=0)
@@ -175,15 +174,15 @@ class Blend:
         return np.concatenate([moved, *rows, between])
 
     def beyond(self, axes: FloatArray) -> BoolArray:
-        """Return where no member knows the dynamics (n,)."""
+        """Return True outside the range of the calibration set (n,)."""
         return ~self._places.covered(axes[self._axis])
 
 
 class MotionFilter:
-    """Turns runs of axis channels x, y, z, b, c into runs of
+    """Filters runs of the axis channels x, y, z, b, c.
 
-    x, y, b, c, z - H(z), H(z), the rate of H(z), and the changes of H(z) per standard
-    uncertainty of each direction of the calibration's covariance.
+    The output rows are x, y, b, c, z - H(z), H(z), the rate of H(z), and the change of H(z) per
+    standard uncertainty along each direction of the calibration's covariance.
 
     filters: of one calibration, or of each member of the set that ``blend`` mixes
     """
@@ -203,11 +202,11 @@ class MotionFilter:
 
     @property
     def pending(self) -> int:
-        """Samples that wait until there are enough to start on."""
+        """Number of samples that wait until there are enough to start the filter."""
         return sum(map(len, self._waiting))
 
     def push(self, run: SampleRun) -> list[SampleRun]:
-        """Filter a run that follows the last one or comes after a gap."""
+        """Return the filtered runs after ``run``, which follows the last one or a gap."""
         done = [] if (run.session, run.first) == self._next else self.end()
         self._next = (run.session, run.end)
         finite: BoolArray = np.all(np.isfinite(run.values), axis=0)
@@ -223,7 +222,7 @@ class MotionFilter:
         return done
 
     def end(self) -> list[SampleRun]:
-        """End the stream; return what was too short to start on, as settling."""
+        """End the stream; return runs that were too short to start the filter, as settling."""
         self._next = None
         return self._break()
 
@@ -233,7 +232,7 @@ class MotionFilter:
         return [self._unfiltered(run, RejectionReason.SETTLING) for run in short]
 
     def _unwrapped(self, run: SampleRun) -> SampleRun:
-        """Return the run with C counting on, as what delays it needs it."""
+        """Return the run with C unwrapped, so that it can be delayed."""
         c = run.values[_C]
         if (turned := self._turned.of(c)) is c:
             return run

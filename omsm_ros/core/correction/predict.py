@@ -1,10 +1,11 @@
-"""Is this motion safe to measure with, and how fast may it be run?
+"""Prediction of the dynamic error of a motion, and of the speed at which it may be run.
 
-From a planned or recorded motion: the dynamic error that it would cause, what the correction
-leaves of it, and how much faster the same path may be run. The error is that of the path in
-time, and its bound is that of the worst place, not the mean of the scan. What lies beyond the
-frequency to which the calibration is trusted counts as not corrected at all. The speed is the
-least of all limits, and the one that binds is named.
+For a planned or recorded motion: the dynamic error, the residual after the correction, and the
+speed factor at which the path stays within all limits. Residuals are the largest along the path,
+not the mean. Motion above the frequency to which the calibration is valid counts as not corrected.
+
+The residual consists of the calibration's covariance below that frequency, the whole (1 - G) z
+above it, and non-linear errors everywhere.
 """
 
 from __future__ import annotations
@@ -40,31 +41,32 @@ from omsm_ros.core.lti.discretisation import (
 from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, through
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.readable import plain, quantity
+from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.units import NANOMETRE_M
 
-# What does the correction leave of a motion, at each moment of it?
-#
-# Within the band to which the calibration is trusted its covariance; beyond it the whole
-# (1 - G) z, and everywhere what follows the motion but not linearly.
-
-# The band that counts as trusted ends between these shares of the frequency of trust.
+# The low-pass that separates the valid band falls between this share of its end and its end.
 _PASSED_SHARE = 0.8
-# A millimetre of travel through the stop band is then ten nanometres, of which 1 - G passes.
+# Attenuation of its stop band: of a millimetre of travel ten nanometres pass.
 _ATTENUATION_DB = 100.0
-# An error beyond the band is taken as its rms over so many seconds.
+# Time over which the error above the band is averaged as rms [s].
 _RUNNING_S = 0.1
+# Default accuracy for a part; a twenty-fifth of the dynamic error of 1.23 µm in the paper.
+DEFAULT_BUDGET_M = 50 * NANOMETRE_M
+DYNAMICS = "dynamics"
+"""Name of the limit that the calibration sets."""
+
+# The speed is searched on the worst stretches of this length and verified on the whole path.
+_STRETCH_SAMPLES = 8192
 
 
 class Residual:
-    """What the correction leaves of motions sampled every ``sample_period`` [s].
+    """Residual after the correction of motions sampled every ``sample_period`` [s].
 
-    Within the trusted band it is that of the calibration's covariance, and above it the whole
-    (1 - G) z, as its rms over a tenth of a second. Near the record's ends, at most a quarter of
-    it at either, the motion above the band is taken to be as large as next to them.
+    Within the valid band it follows from the calibration's covariance; above it it is the whole
+    (1 - G) z, as rms over a tenth of a second. Near the ends of the record, at most a quarter of
+    its length, the value next to them is used.
 
-    To design its filters takes as long as to run them over a stretch, so all stretches share them.
+    One instance serves many stretches, because designing the filters takes time.
     """
 
     def __init__(self, calibration: Calibration, sample_period: float) -> None:
@@ -77,9 +79,9 @@ class Residual:
         ]
 
     def variances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the variances of the residual of ``z`` (n,) [m²], each at most (n,).
+        """Return the variance of the residual of ``z`` (n,) after settling [m²], in two parts.
 
-        The first is of all but what could hide in the step test, the second of that.
+        The second part is that of undetected model error, the first that of all other sources.
         """
         noise, undetected = (self._variance(*part, z) for part in self._parts)
         known = noise + self._linear
@@ -89,7 +91,7 @@ class Residual:
         return known[settling:], undetected[settling:]
 
     def largest(self, z: FloatArray) -> float:
-        """Return the largest standard uncertainty that is left of ``z`` [m]."""
+        """Return the largest standard uncertainty of the residual of ``z`` [m]."""
         known, undetected = self.variances(z)
         return float(np.sqrt(np.max(known + undetected)))
 
@@ -116,7 +118,7 @@ def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatA
     if not half:
         return np.zeros(len(z))
     centred = z - z[0]
-    # Beyond the kernel's reach the record's ends would count as motion.
+    # Cut by the length of the kernel, where the ends of the record would count as motion.
     fast = (centred - _convolved(centred, kernel))[half:-half]
     missed = running_mean(
         (fast - through(digital, fast)) ** 2, round(_RUNNING_S / digital.sample_period)
@@ -125,9 +127,10 @@ def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatA
 
 
 def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray:
-    """Return a low-pass of linear phase that falls from 0.8 ``up_to`` to ``up_to`` [Hz].
+    """Return a linear-phase low-pass that falls from 0.8 ``up_to`` to ``up_to`` [Hz].
 
-    By Kaiser's window, 100 dB or what fits into half of ``samples``; one tap where all passes.
+    It has a Kaiser window of 100 dB, or what fits into half of ``samples``. One tap if ``up_to`` is
+    above the Nyquist frequency.
     """
     if up_to >= 0.5 / sample_period:
         return np.ones(1)
@@ -143,8 +146,8 @@ def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray
 
 
 def _convolved(values: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Return the convolution (n,), by FFT; true where the kernel lies inside the record."""
-    # In stretches of eight kernels, each with the values that reach into it (overlap and save).
+    """Return the convolution (n,) by FFT, valid where the kernel lies inside the record."""
+    # Overlap-save in stretches of eight kernels.
     reach = len(kernel) - 1
     length = min(fast_length(8 * len(kernel)), fast_length(len(values) + reach))
     step = length - reach
@@ -166,29 +169,18 @@ def running_mean(values: FloatArray, width: int) -> FloatArray:
     return np.pad(means, (before, len(values) - len(means) - before), mode="edge")
 
 
-# To be stated for the part; this is a twenty-fifth of the dynamic error in the paper of 1.23 µm.
-DEFAULT_BUDGET_M = 50 * NANOMETRE_M
-DYNAMICS = "dynamics"
-"""Name of the limit that the calibration itself sets."""
-
-# The speed is sought on the worst stretches of the path and proved on the whole of it.
-_STRETCH_SAMPLES = 8192
-
-
 @dataclass(frozen=True)
 class Prediction:
-    """What a motion does to the measurement.
+    """Predicted dynamic error and speed of a motion.
 
     peak_to_valley, rms: of the dynamic error (1 - G) z without correction [m]
-    residual: largest standard uncertainty that the correction leaves on the path [m], k = 1
-    residual_hidden: the part of it that the step test could not have shown [m], k = 1
-    outside_band_fraction: share of the mean square velocity above the trusted band [1]
-    speed_factor: how much faster the path may be run within all limits, at most 100;
-        0 if it may not be run at any speed
-    safe: no limit is exceeded;  binding: name of the limit that is reached first
-    limits: all that were evaluated, that of the dynamics first;  not_evaluated: the others
-    left_out: samples of the recording that were not judged, in words; empty if all were
-    message: the same for a reader
+    residual: largest standard uncertainty after the correction [m], k = 1
+    residual_hidden: its part from undetected model error [m], k = 1
+    outside_band_fraction: share of the mean square velocity above the valid band [1]
+    speed_factor: of the path within all limits, at most 100; 0 if it may not be run at any speed
+    safe: True if no limit is exceeded;  binding: name of the limit that is reached first
+    limits: evaluated ones, that of the dynamics first;  not_evaluated: names of the others
+    left_out, message: sentences about samples that were not judged (or empty), and all the above
     """
 
     peak_to_valley: float
@@ -217,7 +209,7 @@ def predict_error(
     budget that is not positive.
     """
     if not 0 < budget < np.inf:
-        raise ConfigurationError(f"budget {budget!r} m, expected a positive length")
+        raise ConfigurationError("correction.budget", budget=budget)
     path = replace(path, z=checked_motion(path.z))
     error = dynamic_error(calibration.dynamics, path.z, path.sample_period)
     spread = float(np.ptp(error))
@@ -228,6 +220,7 @@ def predict_error(
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
     message = _message(calibration, spread, (dynamics.value, undetected), budget, binding)
+    left_out = path.left_out
     return Prediction(
         peak_to_valley=spread,
         rms=float(np.std(error)),
@@ -239,8 +232,8 @@ def predict_error(
         binding=binding.name,
         limits=every,
         not_evaluated=tuple(missing),
-        left_out=path.left_out,
-        message="; ".join(filter(None, (message, path.left_out))),
+        left_out="" if left_out is None else str(left_out),
+        message="; ".join(str(part) for part in (message, left_out) if part is not None),
     )
 
 
@@ -250,8 +243,7 @@ def dynamic_error(dynamics: TransferFunction, z: FloatArray, sample_period: floa
     settling = max(digital.settling_samples(SETTLED), START_SAMPLES)
     if len(z) <= 2 * settling:
         raise DataError(
-            f"motion of {len(z)} samples, expected more than {2 * settling}: the filter needs "
-            f"{settling} to settle; give a longer motion"
+            "correction.short_motion", samples=len(z), least=2 * settling, settling=settling
         )
     return (z - through(digital, z))[settling:]
 
@@ -259,10 +251,7 @@ def dynamic_error(dynamics: TransferFunction, z: FloatArray, sample_period: floa
 def _dynamics_limit(
     calibration: Calibration, path: ScanPath, budget: float
 ) -> tuple[SpeedLimit, float]:
-    """Return the limit that the correction's residual sets.
-
-    With it the part of that residual, as the path is, that could hide in the step test [m].
-    """
+    """Return the limit set by the residual, and its part from undetected model error [m]."""
     z, period, allowed = path.z, path.sample_period, budget / 2
     known, undetected = Residual(calibration, period).variances(z)
     here = np.sqrt(known + undetected)
@@ -275,7 +264,7 @@ def _dynamics_limit(
 
     factor = highest_factor(worst, allowed, residual)
     if 0 < factor < FASTEST or (factor == FASTEST and residual > 0):
-        # A path of which a stretch is within the budget need not be so as a whole.
+        # The stretches are within the budget, but the whole path need not be.
         whole = Residual(calibration, period / factor).largest(z)
         factor *= min(allowed / whole, 1.0) if whole > 0 else 1.0
     limit = SpeedLimit(DYNAMICS, residual, allowed, "m", float(factor))
@@ -301,31 +290,18 @@ def _outside_fraction(calibration: Calibration, path: ScanPath) -> float:
     return float(power[frequency > calibration.valid_up_to].sum()) / total if total > 0 else 0.0
 
 
-def _undetected_share_text(calibration: Calibration, undetected: float) -> str:
-    """Return the name the part of the residual that the step test could not have shown."""
-    mostly = calibration.certificate.get("hidden_mostly")
-    if undetected == 0 or not isinstance(mostly, str):
-        return ""
-    return (
-        f"; {quantity(2 * undetected, 'm')} of it are what the step test could not have shown, "
-        f"mostly {mostly}"
-    )
+def _longer_rest(
+    calibration: Calibration, residual: float, undetected: float, budget: float
+) -> float | None:
+    """Return the rest between steps [s] at which undetected model error would fit the budget.
 
-
-def _better_calibration(
-    calibration: Calibration, residuals: tuple[float, float], budget: float
-) -> str:
-    """Say which step test would leave less: what slow motion leaves open falls with its length.
-
-    The noise of a slow term falls with the square root of the test's duration, and so does
-    the largest relaxation that it would miss.
+    None if it does not dominate. The uncertainty of a slow term falls with the square root of the
+    duration of the step test, and so does the largest relaxation that remains undetected.
     """
-    residual, undetected = residuals
     plateau = calibration.certificate.get("plateau_s")
     if type(plateau) is not float or not undetected**2 > 0.5 * residual**2:
-        return "calibrate better (longer plateaus and more steps, omsm plan steps)"
-    longer = plateau * (2 * residual / budget) ** 2
-    return f"calibrate with rests of {longer:.2g} s or more (omsm plan steps --dwell {longer:.2g})"
+        return None
+    return float(plateau * (2 * residual / budget) ** 2)
 
 
 def _message(
@@ -334,28 +310,29 @@ def _message(
     residuals: tuple[float, float],
     budget: float,
     binding: SpeedLimit,
-) -> str:
+) -> Notice:
     residual, undetected = residuals
-    verdict = "within" if 2 * residual <= budget else "beyond"
-    factor = binding.speed_factor
-    if factor == 0 and binding.name == DYNAMICS:
-        better = _better_calibration(calibration, residuals, budget)
-        advice = f"{better}: no speed of this path is within the limit of dynamics"
-    elif factor == 0:
-        advice = f"no speed of this path is within the limit of {binding.name}"
-    elif factor >= FASTEST:
-        advice = f"it may be run {FASTEST:g} times as fast, further was not tried"
-    elif factor >= 1:
-        advice = f"it may be run up to {plain(factor)} times as fast; then {binding.name} binds"
-    elif binding.name == DYNAMICS:
-        better = _better_calibration(calibration, residuals, budget)
-        advice = f"{better}, or run it at {plain(factor)} times this speed"
-    else:
-        advice = f"run it at {plain(factor)} times this speed or slower: {binding.name} binds"
-    return (
-        f"dynamic error {quantity(peak_to_valley, 'm')} peak to valley; corrected within "
-        f"{quantity(2 * residual, 'm')} (k = 2, largest on the path"
-        f"{_undetected_share_text(calibration, undetected)}), {verdict} the budget "
-        f"of {quantity(budget, 'm')}; {advice} (trusted up to "
-        f"{quantity(calibration.valid_up_to, 'Hz')})"
+    values: dict[str, object] = {"factor": binding.speed_factor, "limit": binding.name}
+    code = "faster" if binding.speed_factor >= 1 else "slower"
+    if binding.speed_factor >= FASTEST:
+        code = "fastest"
+    elif binding.speed_factor == 0:
+        code = "no_speed"
+    advice = Notice(f"correction.{code}", **values)
+    if binding.speed_factor < 1 and binding.name == DYNAMICS:
+        dwell = _longer_rest(calibration, residual, undetected, budget)
+        better = Notice("correction.better" if dwell is None else "correction.dwell", dwell=dwell)
+        advice = Notice(f"correction.{code}_dynamics", better=better, **values)
+    mostly = calibration.certificate.get("hidden_mostly")
+    undetected: Notice | str = ""
+    if undetected and isinstance(mostly, str):
+        undetected = Notice("correction.undetected_part", part=2 * undetected, mostly=mostly)
+    return Notice(
+        "correction.within" if 2 * residual <= budget else "correction.exceeded",
+        error=peak_to_valley,
+        residual=2 * residual,
+        undetected=undetected,
+        budget=budget,
+        advice=advice,
+        valid_up_to=calibration.valid_up_to,
     )

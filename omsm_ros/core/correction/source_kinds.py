@@ -1,7 +1,10 @@
-"""Which systematic errors can a machine have, and what is the sensitivity field of each?
+"""Kinds of systematic errors of a machine and their sensitivity fields.
 
-One row of ``KINDS`` is one kind. A machine's settings file states sizes by these names, whatever
-reads ``KINDS`` knows the rest: unit, further parameters, fields.
+``KINDS`` has one entry for each kind, with its quantity, parameters and fields. The settings file
+of a machine states the sizes by these names.
+
+Each field function returns the change of the heights [m] of n points per unit of the error, (k, n)
+for its k independent components or (n,) for one. Fields of lateral shifts need the slopes.
 """
 
 from __future__ import annotations
@@ -15,30 +18,26 @@ from omsm_ros import quantities
 from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.quantities import Quantity
 
-# In which independent ways may a curve vary of which only size and smoothness are known?
-#
-# Drift over time, straightness over a slide's travel, pitch over Z: nobody knows the curve, but its
-# standard deviation and how far it is correlated. By Karhunen and Loève such a curve is a sum of
-# independent components, the eigenvectors of its covariance; few of them carry nearly all of it.
-
 Kernel = Callable[[FloatArray, FloatArray], FloatArray]
+Parameters = Mapping[str, float]
 
-# Between the nodes the components are interpolated; the last of those kept has a few nodes a wave.
+# Nodes between which the components of an unknown curve are interpolated; the shortest wave of
+# those kept has a few nodes.
 _NODES = 128
-# What the components left out would add to a standard deviation: half of this, 0.5 %.
+# Share of the variance that may be left out, 0.5 % of the standard deviation.
 _LEFT_OUT = 0.01
 
 
 def random_walk(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the covariance of a walk of unit variance after one unit, zero at zero."""
+    """Return the covariance of a random walk with unit variance after one unit, zero at zero."""
     return np.minimum(start, end)
 
 
 def fading(length: float) -> Kernel:
-    """Return the covariance of a curve of unit variance that forgets itself over ``length``."""
+    """Return the covariance exp(-distance / ``length``) of a curve of unit variance."""
     return lambda start, end: np.exp(-np.abs(start - end) / length)
 
 
@@ -48,9 +47,10 @@ def smooth(length: float) -> Kernel:
 
 
 def components(kernel: Kernel, where: FloatArray) -> FloatArray:
-    """Return independent components of unit variance (k, n) of a curve at ``where`` (n,).
+    """Return independent components (k, n) of an unknown curve at ``where`` (n,).
 
-    Their squares add up to the variance of the curve, less a hundredth at most.
+    Only the covariance of the curve is known. Its Karhunen-Loève components are the eigenvectors
+    of the covariance; their squares add up to the variance of the curve, less 1 % at most.
     """
     first, last = float(np.min(where)), float(np.max(where))
     if last == first:
@@ -69,16 +69,8 @@ def components(kernel: Kernel, where: FloatArray) -> FloatArray:
     )
 
 
-# What does each systematic error do to the heights of a scan, per unit of it?
-#
-# Each function returns the changes of the heights [m] of n points per unit of the error, (k, n) for
-# its k independent components, (n,) for one. Those that shift points laterally need their slopes.
-
-Parameters = Mapping[str, float]
-
-
 def tilt(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return tilts about y and about x; that a point also goes sideways is a hundredth."""
+    """Return tilts about y and about x; the lateral shift of the points is negligible."""
     return np.stack([-p.x, p.y])
 
 
@@ -99,7 +91,7 @@ def expansion(p: ScanPoints, _: Parameters) -> FloatArray:
 
 
 def _across(p: ScanPoints, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return what a shift by x, y [m] of the machine's frame does to the heights."""
+    """Return the field of a shift by x, y [m] in the machine's frame."""
     return p.height_change_of_shift(*workpiece_xy(x, y, p.c))
 
 
@@ -114,18 +106,18 @@ def centre_y(p: ScanPoints, _: Parameters) -> FloatArray:
 
 
 def beam(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the lean of the beam along X and along Y: a shift by the distance."""
+    """Return the tilt of the beam along X and along Y, a shift proportional to the distance."""
     zero = np.zeros(len(p))
     return np.stack([_across(p, p.distance, zero), _across(p, zero, p.distance)])
 
 
 def squareness(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the angle of X to the plane of the spindle: a cone."""
+    """Return the angle of X to the plane of the spindle, which makes a cone."""
     return p.slide_x
 
 
 def parallelism(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the angle of Z to the spindle, in X and in Y: a shift by Z."""
+    """Return the angle of Z to the spindle in X and in Y, a shift proportional to Z."""
     zero = np.zeros(len(p))
     return np.stack([_across(p, p.z, zero), _across(p, zero, p.z)])
 
@@ -142,7 +134,7 @@ def straightness_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
 
 
 def _curve_components(position: FloatArray, parameters: Parameters) -> FloatArray:
-    """Return components of a curve over ``position`` (n,), smooth over half of it by default."""
+    """Return components of a smooth curve over ``position`` (n,)."""
     length = parameters.get("correlation_length", float(np.ptp(position)) / 2)
     return components(smooth(length), position)
 
@@ -153,18 +145,18 @@ def _turning(p: ScanPoints, parameters: Parameters) -> tuple[FloatArray, FloatAr
 
 
 def spindle_axial(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a wave of the height over the turn."""
+    """Return both phases of an axial motion that is periodic in the turn."""
     return np.stack(_turning(p, parameters))
 
 
 def spindle_radial(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a turning shift."""
+    """Return both phases of a rotating shift."""
     along, across = _turning(p, parameters)
     return np.stack([_across(p, along, across), _across(p, -across, along)])
 
 
 def spindle_tilt(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a turning tilt."""
+    """Return both phases of a rotating tilt."""
     along, across = _turning(p, parameters)
     return np.stack(
         [p.slide_x * along + p.slide_y * across, p.slide_y * along - p.slide_x * across]
@@ -172,7 +164,7 @@ def spindle_tilt(p: ScanPoints, parameters: Parameters) -> FloatArray:
 
 
 def encoder_scale(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the stretch of Z."""
+    """Return the scale of Z."""
     return p.z
 
 
@@ -192,22 +184,22 @@ def backlash(p: ScanPoints, _: Parameters) -> FloatArray:
 
 
 def static_gain(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return the stretch of the distance."""
+    """Return the scale of the distance."""
     return -p.distance / parameters["gain"]
 
 
 def lateral_lag(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the rate of Z: late points lie further along the path."""
+    """Return the rate of Z: delayed points lie further along the path."""
     return p.z_rate
 
 
 def dynamics(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the directions of the covariance that are of noise."""
+    """Return the directions of the covariance from noise."""
     return _rows_or_empty(p.dynamics[~p.undetected], p)
 
 
 def undetected_error(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return those that are of what the step test could not show."""
+    """Return the directions of the covariance from undetected model error."""
     return _rows_or_empty(p.dynamics[p.undetected], p)
 
 
@@ -231,7 +223,7 @@ def _periodic(position: FloatArray, period: float) -> FloatArray:
 
 
 def slope(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the slope both ways, for nobody knows in which one a beam is tilted."""
+    """Return the slope in both directions, because the direction of the error is unknown."""
     one, zero = np.ones(len(p)), np.zeros(len(p))
     return np.stack([_across(p, one, zero), _across(p, zero, one)])
 
@@ -256,12 +248,12 @@ def drift_walk(p: ScanPoints, _: Parameters) -> FloatArray:
 
 
 def drift(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return an unknown curve over time that fades."""
+    """Return an unknown, exponentially correlated curve over time."""
     return components(fading(parameters["correlation_time"]), p.time)
 
 
 def random_walk_variance(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the sum of squares of a walk."""
+    """Return the sum of squares of a random walk."""
     return p.time
 
 
@@ -284,13 +276,12 @@ def pitch_variance(p: ScanPoints, parameters: Parameters) -> FloatArray:
 class SourceKind:
     """A kind of systematic error.
 
-    says: what its standard uncertainty is of;  quantity: of that, with its unit
+    quantity: of its standard uncertainty
     fields: change of each height [m] per unit, (k, n), by the parameters
     parameters: further quantities by name;  optional: those that may be left out
-    squares: sum of the squares of the fields, (n,), where that is had with less work
+    squares: sum of the squares of the fields, (n,), where a shorter way exists
     """
 
-    says: str
     quantity: Quantity
     fields: Callable[[ScanPoints, Parameters], FloatArray]
     parameters: Mapping[str, Quantity] = field(default_factory=dict)
@@ -300,24 +291,26 @@ class SourceKind:
 
 
 def source_of(
-    name: str, value: float, origin: str, reason: str, parameters: Parameters
+    name: str, value: float, origin: str, reason: str | Notice, parameters: Parameters
 ) -> SystematicSource:
     """Return the source of kind ``name`` with standard uncertainty ``value``.
 
-    Raises ConfigurationError for values or parameters that the kind does not have.
+    Raises ConfigurationError for implausible values and for parameters that are unknown or missing.
     """
     kind = KINDS[name]
     kind.quantity.checked(value, ConfigurationError, name)
     for key, size in parameters.items():
         if key not in kind.parameters:
             raise ConfigurationError(
-                f"{name} has no parameter {key!r}, expected one of {sorted(kind.parameters)}"
+                "correction.parameter", source=name, parameter=key, known=sorted(kind.parameters)
             )
         kind.parameters[key].checked(size, ConfigurationError, f"{name}.{key}")
     for key in kind.parameters:
         if key not in parameters and key not in kind.optional:
-            unit = kind.parameters[key].unit
-            raise ConfigurationError(f"{name} needs {key} [{unit or '1'}]; state it beside value")
+            unit = kind.parameters[key].unit or "1"
+            raise ConfigurationError(
+                "correction.needs_parameter", source=name, parameter=key, unit=unit
+            )
     squares = kind.squares
     return SystematicSource(
         name=name,
@@ -339,27 +332,22 @@ _CORRELATED = {"correlation_length": quantities.PERIOD}
 _LENGTH_OPTIONAL = ("correlation_length",)
 
 KINDS: dict[str, SourceKind] = {
-    "dynamics": SourceKind("noise of the step test", _SHARE, dynamics),
-    "could_hide": SourceKind("what the step test could not show", _SHARE, undetected_error),
-    "static_gain": SourceKind(
-        "static gain of the probe", _SHARE, static_gain, {"gain": quantities.GAIN}
-    ),
-    "lateral_lag": SourceKind("latency that X and C do not share", _SECONDS, lateral_lag),
-    "lag_change": SourceKind("lag of Z since the step test", _SECONDS, lateral_lag),
-    "motion_error": SourceKind("half the backlash of Z", _METRES, backlash),
-    "tilt": SourceKind("tilt of the part, each way", _RADIANS, tilt),
-    "decentre": SourceKind("shift of the part, each way", _METRES, decentre, needs_slope=True),
-    "clocking": SourceKind("turn of the part", _RADIANS, clocking, needs_slope=True),
-    "expansion": SourceKind("thermal strain of the part", _SHARE, expansion, needs_slope=True),
-    "centre_x": SourceKind("zero of X at the spindle", _METRES, centre_x, needs_slope=True),
-    "centre_y": SourceKind("zero of Y at the spindle", _METRES, centre_y, needs_slope=True),
-    "beam": SourceKind("slope of the beam, each way", _SHARE, beam, needs_slope=True),
-    "squareness": SourceKind("angle of X to the spindle's plane", _RADIANS, squareness),
-    "parallelism": SourceKind(
-        "angle of Z to the spindle, each way", _RADIANS, parallelism, needs_slope=True
-    ),
+    "dynamics": SourceKind(_SHARE, dynamics),
+    "could_hide": SourceKind(_SHARE, undetected_error),
+    "static_gain": SourceKind(_SHARE, static_gain, {"gain": quantities.GAIN}),
+    "lateral_lag": SourceKind(_SECONDS, lateral_lag),
+    "lag_change": SourceKind(_SECONDS, lateral_lag),
+    "motion_error": SourceKind(_METRES, backlash),
+    "tilt": SourceKind(_RADIANS, tilt),
+    "decentre": SourceKind(_METRES, decentre, needs_slope=True),
+    "clocking": SourceKind(_RADIANS, clocking, needs_slope=True),
+    "expansion": SourceKind(_SHARE, expansion, needs_slope=True),
+    "centre_x": SourceKind(_METRES, centre_x, needs_slope=True),
+    "centre_y": SourceKind(_METRES, centre_y, needs_slope=True),
+    "beam": SourceKind(_SHARE, beam, needs_slope=True),
+    "squareness": SourceKind(_RADIANS, squareness),
+    "parallelism": SourceKind(_RADIANS, parallelism, needs_slope=True),
     "straightness_x": SourceKind(
-        "straightness of X towards the probe",
         _METRES,
         straightness_x,
         _CORRELATED,
@@ -367,7 +355,6 @@ KINDS: dict[str, SourceKind] = {
         squares=curve_variance,
     ),
     "straightness_z": SourceKind(
-        "straightness of Z, sideways",
         _METRES,
         straightness_z,
         _CORRELATED,
@@ -376,58 +363,41 @@ KINDS: dict[str, SourceKind] = {
         squares=lateral_curve_variance,
     ),
     "pitch": SourceKind(
-        "pitch of Z, over the Abbe arm",
         _RADIANS,
         pitch,
         {"arm": quantities.LENGTH, **_CORRELATED},
         _LENGTH_OPTIONAL,
         squares=pitch_variance,
     ),
-    "spindle_axial": SourceKind(
-        "axial motion in step with the spindle", _METRES, spindle_axial, _PER_TURN
-    ),
+    "spindle_axial": SourceKind(_METRES, spindle_axial, _PER_TURN),
     "spindle_radial": SourceKind(
-        "radial motion in step with the spindle",
         _METRES,
         spindle_radial,
         _PER_TURN,
         needs_slope=True,
     ),
-    "spindle_tilt": SourceKind("tilt in step with the spindle", _RADIANS, spindle_tilt, _PER_TURN),
-    "encoder_scale": SourceKind("scale of the Z encoder", _SHARE, encoder_scale),
-    "encoder_interpolation": SourceKind(
-        "interpolation of the Z encoder", _METRES, encoder_interpolation, _PERIOD
-    ),
+    "spindle_tilt": SourceKind(_RADIANS, spindle_tilt, _PER_TURN),
+    "encoder_scale": SourceKind(_SHARE, encoder_scale),
+    "encoder_interpolation": SourceKind(_METRES, encoder_interpolation, _PERIOD),
     "probe_linearity": SourceKind(
-        "cubic error of the probe at the end of its range",
         _METRES,
         linearity,
         {"half_range": quantities.PERIOD},
     ),
-    "probe_periodic": SourceKind(
-        "periodic error of the probe", _METRES, linearity_periodic, _PERIOD
-    ),
+    "probe_periodic": SourceKind(_METRES, linearity_periodic, _PERIOD),
     "probe_slope": SourceKind(
-        "error of the probe by the slope, each way",
         quantities.SLOPE_ERROR,
         slope,
         needs_slope=True,
     ),
     "probe_slope_square": SourceKind(
-        "error of the probe by the square of the slope",
         quantities.SLOPE_ERROR,
         slope_square,
         needs_slope=True,
     ),
-    "drift_rate": SourceKind("steady drift", quantities.RATE_UNCERTAINTY, drift_rate),
-    "drift_walk": SourceKind(
-        "drift as a random walk",
-        quantities.WALK_UNCERTAINTY,
-        drift_walk,
-        squares=random_walk_variance,
-    ),
+    "drift_rate": SourceKind(quantities.RATE_UNCERTAINTY, drift_rate),
+    "drift_walk": SourceKind(quantities.WALK_UNCERTAINTY, drift_walk, squares=random_walk_variance),
     "drift": SourceKind(
-        "drift that fades",
         _METRES,
         drift,
         {"correlation_time": quantities.CORRELATION_TIME},

@@ -1,4 +1,4 @@
-"""The layout of a surface point, the same in ``/omsm/points`` and in ``cloud.ply``."""
+"""Corrected surface points and their layout in ``/omsm/points`` and ``cloud.ply``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SurfacePoints:
     dynamic_error: (1 - G_m) X_d [m] (Eq. 5)
     uncertainty: standard uncertainty of height [m], k = 1
     intensity: 0-1, NaN where the device does not report it (float32)
-    stamp_ns: time of the first point [ns], by the axes' stamps; a number, 0 if there is none
+    stamp_ns: stamp of the first point by the axes [ns]; 0 if there is none
     """
 
     sample: IntArray
@@ -37,7 +37,7 @@ class SurfacePoints:
         return len(self.sample)
 
     def part(self, place: slice | BoolArray) -> SurfacePoints:
-        """Return the points at ``place``, without a stamp."""
+        """Return the points at ``place``, without the stamp."""
         return SurfacePoints(**{name: getattr(self, name)[place] for name in _COLUMNS})
 
 
@@ -50,7 +50,7 @@ _NO_POINTS = SurfacePoints(
 
 
 def join_points(parts: Iterable[SurfacePoints | None]) -> SurfacePoints:
-    """Return all points of ``parts`` in their order; None counts as no points."""
+    """Return all points of ``parts`` in their order; None stands for no points."""
     present = [part for part in parts if part is not None and len(part)] or [_NO_POINTS]
     columns = {name: np.concatenate([getattr(p, name) for p in present]) for name in _COLUMNS}
     return SurfacePoints(**columns, stamp_ns=present[0].stamp_ns)
@@ -68,7 +68,7 @@ CLOUD_FIELDS: tuple[tuple[str, str], ...] = (
 )
 """Name and little-endian type of each field; lengths in metres."""
 
-# Aligned as a C compiler would: viewers cast pointers into the buffer.
+# Aligned like a C struct, because viewers cast pointers into the buffer.
 POINT_DTYPE = np.dtype(list(CLOUD_FIELDS), align=True)
 """One point of a PointCloud2 message."""
 
@@ -79,7 +79,7 @@ def pack_points(points: SurfacePoints, dtype: np.dtype[np.void] = POINT_DTYPE) -
     z repeats height for viewers.
     """
     packed = np.zeros(len(points), dtype)
-    # The counter of the trigger is 64 bits wide; a cloud keeps its low half.
+    # A cloud keeps the low 32 bits of the 64-bit trigger counter.
     special = {"z": points.height, "sample": points.sample & 0xFFFFFFFF}
     for name, _ in CLOUD_FIELDS:
         packed[name] = special[name] if name in special else getattr(points, name)

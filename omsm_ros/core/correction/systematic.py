@@ -1,10 +1,13 @@
-"""Which errors act on a whole scan together, and what does each do to every height of it?
+"""Systematic errors of a scan as sensitivity fields over its points.
 
-Noise averages out over points; a tilt, a centre that is off or a calibration that is wrong does
-not. Such a source is a *sensitivity field* over the scan: the change of each height for one unit
-of the source. With the standard uncertainty ``u`` of the source, the standard uncertainty of a
-linear figure ``L`` of the heights (a mean, a Zernike coefficient) is ``u |L(field)|``; independent
-sources, and the independent components of one source, add in squares (GUM, 5.1).
+Noise averages out over points; a tilt, a wrong centre or a wrong calibration does not. Such a
+source is a *sensitivity field*: the change of each height for one unit of the source. With the
+standard uncertainty ``u`` of the source, that of a linear figure ``L`` of the heights (a mean, a
+Zernike coefficient) is ``u |L(field)|``; independent sources, and the independent components of
+one source, add in squares (GUM, 5.1).
+
+Fields are computed at points that are evenly chosen in the order of the scan, and interpolated
+between them. Components with a negligible share are left out.
 """
 
 from __future__ import annotations
@@ -23,26 +26,26 @@ from omsm_ros.core.kinematics.kinematics import (
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.quantities import MAP_SPACING
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
 
-# Without a nominal surface its slopes come from a polynomial through the points.
+# Degree of the polynomial through the points that gives the slopes without a nominal surface.
 _POLYNOMIAL_DEGREE = 6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanPoints:
-    """Points of a scan in the order of time, each array (n,): what a sensitivity field looks at.
+    """Points of a scan in the order of time, each array (n,): arguments of sensitivity fields.
 
     time: since the start [s];  x, y, height: in the workpiece frame [m]
     z: of the probe, H(z) [m];  z_rate: its rate [m/s];  c: angle of the spindle [rad]
     distance: that the probe measured, growing with height [m]
-    slope_x, slope_y: of the surface along the workpiece's x and y [1]; None where it is not known
-    dynamics: of the heights by each independent direction of the calibration's covariance, per
-        standard uncertainty [m], (r, n);  undetected: which of them are of what its step test could
-        not show (r,)
+    slope_x, slope_y: of the surface along the workpiece's x and y [1]; None if not known
+    dynamics: change of the heights per standard uncertainty along each independent direction of
+        the calibration's covariance [m], (r, n)
+    undetected: True for directions of undetected model error (r,)
     """
 
     time: FloatArray
@@ -63,23 +66,23 @@ class ScanPoints:
 
     @property
     def slide_x(self) -> FloatArray:
-        """Of the point from the spindle axis, along X of the machine [m], (n,)."""
+        """Position relative to the spindle axis along X of the machine [m], (n,)."""
         return self._slides[0]
 
     @property
     def slide_y(self) -> FloatArray:
-        """Of the point from the spindle axis, along Y of the machine [m], (n,)."""
+        """Position relative to the spindle axis along Y of the machine [m], (n,)."""
         return self._slides[1]
 
     @cached_property
     def _slides(self) -> tuple[FloatArray, FloatArray]:
-        # Few sources ask for them, and a cosine costs as much as a filter.
+        # Cached and lazy: few sources need it, and a cosine costs as much as a filter.
         return workpiece_xy(self.x, self.y, -self.c)
 
     def with_slopes(self, surface: Surface | None) -> ScanPoints:
         """Return the points with the slopes of the nominal ``surface``.
 
-        Without one they are those of a polynomial of degree 6 through the points themselves.
+        If it is None, the slopes are those of a polynomial of degree 6 through the points.
         """
         if surface is None:
             slope_x, slope_y = _polynomial_slopes(self.x, self.y, self.height)
@@ -88,28 +91,28 @@ class ScanPoints:
         return replace(self, slope_x=slope_x, slope_y=slope_y)
 
     def height_change_of_shift(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the change of height [m] at its place of points taken for ``x``, ``y`` [m] off.
+        """Return the height errors [m] of points that are reported with a shift ``x``, ``y`` [m].
 
-        A point reported at x + δ has the height of x: against the surface ``-δ ∂S/∂x``.
-        Raises DataError where the slopes are not known.
+        A point reported at x + δ has the height at x, an error of ``-δ ∂S/∂x``. Raises DataError
+        if the slopes are not known.
         """
         if self.slope_x is None or self.slope_y is None:
-            raise DataError("the slope of the surface is not known; give a nominal surface")
+            raise DataError("correction.no_slope")
         return np.asarray(-self.slope_x * x - self.slope_y * y, np.float64)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SystematicSource:
-    """A source of error that acts on the whole scan together.
+    """A source of error that is common to a whole scan.
 
     name: of the source;  unit: of its size, SI
     standard_uncertainty: of each of its independent components [unit], k = 1
     fields: change of each height [m] per unit of each component, (k, n), for ``ScanPoints``
-    origin: EVALUATED from data, or DECLARED by somebody;  reason: in words
+    origin: EVALUATED from data, or DECLARED;  reason: where the size comes from
     needs_slope: True if the fields need the slope of the surface
-    squares: sum of the squares of the fields, (n,), where that is had with less work
+    squares: sum of the squares of the fields, (n,), where a shorter way exists
 
-    Raises ConfigurationError for an uncertainty that is no finite number of zero or more.
+    Raises ConfigurationError for an uncertainty that is negative or not finite.
     """
 
     name: str
@@ -117,15 +120,17 @@ class SystematicSource:
     standard_uncertainty: float
     fields: Callable[[ScanPoints], FloatArray]
     origin: str = DECLARED
-    reason: str = ""
+    reason: str | Notice = ""
     needs_slope: bool = False
     squares: Callable[[ScanPoints], FloatArray] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.standard_uncertainty < np.inf:
             raise ConfigurationError(
-                f"{self.name}: standard uncertainty {self.standard_uncertainty!r} {self.unit}, "
-                "expected zero or more"
+                "correction.negative_uncertainty",
+                source=self.name,
+                value=self.standard_uncertainty,
+                unit=self.unit,
             )
 
     def standard_fields(self, points: ScanPoints) -> FloatArray:
@@ -144,7 +149,7 @@ def standard_fields(
 ) -> dict[str, FloatArray]:
     """Return by name the change of the heights [m] per standard uncertainty, each (k, n).
 
-    Sources of one name are one source with all their components.
+    Components of sources with the same name are concatenated.
     """
     found: dict[str, list[FloatArray]] = {}
     for source in sources:
@@ -156,7 +161,7 @@ def _polynomial_slopes(
     x: FloatArray, y: FloatArray, height: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     scale = float(max(np.max(abs(x), initial=0.0), np.max(abs(y), initial=0.0)))
-    scale = scale if scale > MAP_SPACING.low else 1.0  # all is one place, but for the last bits
+    scale = scale if scale > MAP_SPACING.low else 1.0  # all points at one place, up to rounding
     powers = [(i, j) for i in range(_POLYNOMIAL_DEGREE + 1) for j in range(i + 1)]
     u, v = (np.vander(a / scale, _POLYNOMIAL_DEGREE + 1, increasing=True) for a in (x, y))
     design = np.stack([u[:, i - j] * v[:, j] for i, j in powers], axis=1)
@@ -170,19 +175,12 @@ def _polynomial_slopes(
     return slope_x, slope_y
 
 
-# What do the systematic errors of a scan do to each of its points, however many there are?
-#
-# Sensitivity fields are had at some points, evenly chosen; between them they are interpolated in
-# the
-# order of the scan. Components that hardly count are left out, so that a figure of the heights is
-# propagated through a few fields, not through hundreds.
-
-# Of the variance of one source: half a hundredth of its standard uncertainty. Of that of all: a
-# figure may look where the largest ones do nothing, so a five-hundredth of a standard uncertainty.
+# Share of the variance that may be left out: of one source (0.5 % of its standard uncertainty), and
+# of all sources (0.2 %, because a figure may not depend on the largest sources).
 _LEFT_OUT_OF_ONE, _LEFT_OUT_OF_ALL = 1e-2, 4e-6
-# Sources of the calibration: in every scan that it corrects, each of their directions has one size.
+# Sources of the calibration, which are the same errors in every scan that it corrects.
 _OF_THE_CALIBRATION = ("dynamics", "could_hide", "lateral_lag", "static_gain")
-# With fewer points a turn what repeats twice in it would be cut off between them.
+# Interpolation between fewer points a turn would lose an error with two waves a turn.
 _LEAST_POINTS_PER_TURN = 12
 
 
@@ -190,11 +188,11 @@ _LEAST_POINTS_PER_TURN = 12
 class ScanFields:
     """Independent systematic errors of a scan.
 
-    names: of the source of each, (s,);  every: of how many points of the scan one is here
+    names: source of each component, (s,);  every: step from one point to the next in the scan
     fields: change of the heights [m] per standard uncertainty, (s, m)
     bounds: names of the sources of which only an upper bound is known
-    aligned: names of the sources whose fields are, in this order, those of the same errors in
-        every scan with the same calibration
+    aligned: names of the sources whose components are the same errors in every scan with the same
+        calibration
     """
 
     names: tuple[str, ...]
@@ -220,10 +218,7 @@ class ScanFields:
 def scan_fields(
     fields: Mapping[str, FloatArray], every: int, bounds: Collection[str] = ()
 ) -> ScanFields:
-    """Return the components that count of ``fields``, by source (k, m) [m].
-
-    bounds: names of the sources of which only an upper bound is known
-    """
+    """Return the components of ``fields``, by source (k, m) [m], that are not negligible."""
     names: list[str] = []
     rows: list[FloatArray] = []
     aligned = tuple(name for name in _OF_THE_CALIBRATION if name in fields)
@@ -234,7 +229,7 @@ def scan_fields(
     if not rows:
         return ScanFields((), np.empty((0, 0)), every)
     counts = _count(np.array(rows), _LEFT_OUT_OF_ALL)
-    # To be found again in another scan, they stay together.
+    # All components of an aligned source are kept, so that scans can be compared.
     together = {name for name, own in zip(names, counts, strict=True) if own and name in aligned}
     kept = np.flatnonzero(counts | np.isin(names, list(together)))
     left = tuple(names[k] for k in kept)
@@ -244,8 +239,7 @@ def scan_fields(
 
 
 def resolves_per_turn_waves(points: ScanPoints) -> bool:
-    """Return whether ``points`` are close enough for what repeats with the spindle's turns."""
-    # An angle that is wrapped jumps by a turn once a turn.
+    """Return whether ``points`` are dense enough for errors that repeat with the turns."""
     steps = np.abs(np.diff(np.unwrap(points.c)))
     return not len(steps) or float(np.median(steps)) <= 2 * np.pi / _LEAST_POINTS_PER_TURN
 
@@ -267,22 +261,17 @@ def _count(rows: FloatArray, left_out: float) -> BoolArray:
     return counts
 
 
-# Which points stand for a whole scan where its systematic errors are judged?
-#
-# Sensitivity fields are smooth over a scan: a few thousand points, evenly chosen in time, show what
-# millions would, in memory that does not grow.
-
-# Sixteen points a turn of the paper's scan and more: enough for what repeats eight times a turn.
+# Number of points at which fields are computed, which bounds memory. Fields are smooth; 512 turns
+# have sixteen points each, enough for errors with eight waves a turn.
 MOST_TRACED = 8192
 
 _COLUMNS = ("time", "x", "y", "height", "z", "z_rate", "c", "distance")
 
 
 class ScanTrace:
-    """Points of a scan, evenly chosen while they pass; time and Z count from the first one.
+    """Selects evenly spaced points of a scan; time and Z are relative to the first point.
 
-    seen: points that passed
-    undetected: which changes by the covariance are of what the step test could not show, (r,)
+    seen: number of points of the scan;  undetected: see ``ScanPoints``
     """
 
     def __init__(self, most: int = MOST_TRACED) -> None:
@@ -302,10 +291,10 @@ class ScanTrace:
         motion: FloatArray,
         distance: FloatArray,
     ) -> ScanPoints:
-        """Take in the next points, each array (n,), and return them as fields look at them.
+        """Take the next points, each array (n,), and return them as ``ScanPoints``.
 
-        session, time: of the trigger's counter, by which the samples are counted [s]; what comes
-            after a restart of the counter is taken to follow at once
+        session, time: of the trigger counter [s]; after a restart of the counter the time
+            continues without a gap
         motion: H(z), its rate, and its change by each direction of the covariance, (2 + r, n)
         """
         if len(time):
@@ -331,7 +320,7 @@ class ScanTrace:
 
     @property
     def every(self) -> int:
-        """Of how many points one is kept."""
+        """Step from one kept point to the next."""
         return self._kept.every
 
     def _keep(self, points: ScanPoints) -> None:
@@ -341,7 +330,7 @@ class ScanTrace:
         self._kept.add_chosen(np.stack([*rows, *points.dynamics[:, chosen]]).T, len(points))
 
     def points(self) -> ScanPoints:
-        """Return those kept, in the order of time."""
+        """Return the kept points in the order of time."""
         rows = self._kept.rows() if self.seen else np.empty((0, len(_COLUMNS)))
         columns = dict(zip(_COLUMNS, rows.T, strict=False))
         return ScanPoints(**columns, dynamics=rows.T[len(_COLUMNS) :], undetected=self.undetected)

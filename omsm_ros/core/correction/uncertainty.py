@@ -1,9 +1,9 @@
-"""How well is each height known? (GUM, first order, k = 1)
+"""Standard uncertainty of each height (GUM, first order, k = 1).
 
-``height = H(z) + distance / g``. The parameters of G carry their covariance through the
-filter: with Σ = L Lᵀ the variance of H(z) is ``Σ_r |F_r z|²``, where ``F_r = Σ_j L_jr ∂G/∂θ_j``
-is again a transfer function. A lateral lag that is wrong by δ moves the point along the
-path; where Z follows the surface that costs ``δ dH(z)/dt`` of height.
+``height = H(z) + distance / g``. The covariance Σ = L Lᵀ of the parameters of G is propagated
+through the filter: the variance of H(z) is ``Σ_r |F_r z|²``, where ``F_r = Σ_j L_jr ∂G/∂θ_j`` is
+again a transfer function. A lateral lag that is wrong by δ moves the point along the path; where Z
+follows the surface this is a height error of ``δ dH(z)/dt``.
 """
 
 from __future__ import annotations
@@ -31,47 +31,43 @@ from omsm_ros.quantities import (
     Quantity,
 )
 
-# What single readings of a scan scatter by beyond what is stated of them.
+# Name of the scatter of a scan beyond the stated sources of single readings.
 SCAN_SCATTER = "scan_scatter"
-# A direction of the covariance that adds less than this share of the variance is left out.
+# Share of the variance below which a direction of the covariance is left out.
 _NEGLIGIBLE = 1e-6
-# Sensitivities are derivatives of the motion: each costs one order of the interpolation.
+# Order of interpolation; a sensitivity is a derivative of the motion, which loses one order.
 _ORDER = 5
 
 
-def _source(says: str = "", quantity: Quantity = UNCERTAINTY) -> Any:
-    """Return a field of :class:`ErrorSources`, zero by default.
-
-    says: what it is of, for the budget; empty for one that acts on the whole scan too, which
-        :mod:`source_kinds` describes;  quantity: its plausible range
-    """
-    return field(default=0.0, metadata={"says": says, "quantity": quantity})
+def _source(quantity: Quantity = UNCERTAINTY) -> Any:
+    """Return a field of :class:`ErrorSources` with the plausible range ``quantity``."""
+    return field(default=0.0, metadata={"quantity": quantity})
 
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorSources:
-    """Standard uncertainties besides that of the dynamics.
+    """Standard uncertainties of single points, except those of the dynamics.
 
     probe_noise: of a reading [m];  probe_resolution: step of a reading [m]
     encoder_noise: of z [m];  encoder_resolution: step of z [m]
     static_gain: of the calibration's static gain [1]
     lateral_lag: of the delay of X, Y, B and C [s]; it shifts the points along the path
-    motion_error: of what follows the motion but not linearly, backlash and the like [m]
+    motion_error: of non-linear parts of the motion, such as backlash [m]
     discretisation: of H against G on this motion [m]
     vibration: of the probe against the part while the spindle turns, rms [m]
-    pitch: of the Z slide's pitch [rad], which moves the beam by itself times the Abbe arm
+    pitch: of the Z slide's pitch [rad], which acts through the Abbe arm
     """
 
-    probe_noise: float = _source("noise of a reading")
-    probe_resolution: float = _source("step of a reading")
-    encoder_noise: float = _source("noise of the Z encoder")
-    encoder_resolution: float = _source("step of the Z encoder")
-    static_gain: float = _source(quantity=GAIN_UNCERTAINTY)
-    lateral_lag: float = _source(quantity=TIME_UNCERTAINTY)
+    probe_noise: float = _source()
+    probe_resolution: float = _source()
+    encoder_noise: float = _source()
+    encoder_resolution: float = _source()
+    static_gain: float = _source(GAIN_UNCERTAINTY)
+    lateral_lag: float = _source(TIME_UNCERTAINTY)
     motion_error: float = _source()
-    discretisation: float = _source("difference of the digital filter from G")
-    vibration: float = _source("of the probe against the turning part")
-    pitch: float = _source(quantity=ANGLE_UNCERTAINTY)
+    discretisation: float = _source()
+    vibration: float = _source()
+    pitch: float = _source(ANGLE_UNCERTAINTY)
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -80,10 +76,10 @@ class ErrorSources:
 
     @classmethod
     def of(cls, calibration: Calibration) -> ErrorSources:
-        """Return what the calibration's certificate states; what it does not state counts as zero.
+        """Return the sources that the calibration's certificate states, zero for the others.
 
-        But for the latency: where nothing divides the lag, any part of it may be latency.
-        Its noise is that of readings at rest, so it holds the probe's resolution already.
+        An unresolved latency may be any part of the lag. The noise is that of readings at
+        standstill, which includes the resolution of the probe.
         """
         return cls(
             probe_noise=_standard_uncertainty(calibration.certificate, "noise_m"),
@@ -107,11 +103,11 @@ def contributions(
     z_rate: FloatArray,
     abbe_arm: float = 0.0,
 ) -> dict[str, FloatArray | float]:
-    """Return variances of the heights [m²] by their source, each (n,) or the same for all points.
+    """Return variances of the heights [m²] by their source, each (n,) or one for all points.
 
     noise_gain: of H for white noise;  distance: readings [m], (n,)
-    dynamics, undetected: variance of H(z) [m²] from the noise of the step test, and from what the
-        test could not show, (n,);  z_rate: of H(z) [m/s], (n,)
+    dynamics, undetected: variance of H(z) [m²] from the noise of the step test and from undetected
+        model error, (n,);  z_rate: of H(z) [m/s], (n,)
     abbe_arm: from the Z encoder's line to the beam [m]
     """
     scale = sources.static_gain / static_gain**2
@@ -131,7 +127,7 @@ def contributions(
 def reading_variances(
     sources: ErrorSources, noise_gain: float, static_gain: float
 ) -> dict[str, float]:
-    """Return the variances of a height [m²] by what scatters from reading to reading.
+    """Return the variances of a height [m²] by the sources of single readings.
 
     noise_gain: of H for white noise
     """
@@ -147,9 +143,10 @@ def reading_variances(
 def with_lateral_uncertainty(
     points: SurfacePoints, surface: Surface, lateral: float
 ) -> SurfacePoints:
-    """Return the points with ``lateral`` [m], their lateral standard uncertainty, times the slope.
+    """Return the points with the height uncertainty from a lateral uncertainty added.
 
-    The slope is the nominal ``surface``'s; ``lateral`` is that of each of two directions.
+    lateral: standard uncertainty in each of two directions [m], multiplied by the slopes of
+        ``surface``
     """
     slope_x, slope_y = slopes_by_differences(surface, points.x, points.y)
     variance = points.uncertainty**2 + lateral**2 * (slope_x**2 + slope_y**2)
@@ -157,7 +154,7 @@ def with_lateral_uncertainty(
 
 
 def covariance_parts(calibration: Calibration) -> tuple[Calibration, Calibration]:
-    """Return the calibration with the covariance of noise alone, and with that of hidden terms."""
+    """Return the calibration with the covariance of noise, and of undetected model error."""
     undetected = calibration.undetected_error_covariance
     return (
         replace(calibration, covariance=calibration.covariance - undetected),
@@ -172,7 +169,7 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
     combined, poles = sensitivity_numerators(calibration), np.tile(g.poles(), 2)
     slow = static_until(calibration)
     if slow > 0:
-        # G(0) is one for certain: what is uncertain of the gain moves, see at_rest_until.
+        # G(0) = 1 exactly: an uncertain gain acts on motion only, see at_rest_until.
         combined = slow * np.column_stack([np.zeros(len(combined)), combined])
         square = np.asarray(polynomial.polymul(square, [1.0, slow]), np.float64)
         poles = np.append(poles, -1 / slow)
@@ -187,17 +184,17 @@ def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[
 
 
 def static_until(calibration: Calibration) -> float:
-    """Return the time [s] over which a motion counts as rest, whose gain is one; 0 without one.
+    """Return the time constant [s] below which an uncertain gain acts; 0 if there is none.
 
-    A calibration that leaves open how slow relaxations go carries a variance of the whole
-    gain, which holds above ``valid_from`` of its certificate.
+    The variance of the gain of a calibration, which stands for unknown slow relaxations, holds
+    above the frequency ``valid_from`` of its certificate.
     """
     lowest = _standard_uncertainty(calibration.certificate, "valid_from")
     return 1 / (2 * np.pi * lowest) if lowest > 0 and calibration.covariance[0, 0] > 0 else 0.0
 
 
 def filter_history(calibration: Calibration) -> Callable[[FloatArray], FloatArray]:
-    """Return what the sensitivity filters take for the past of their first samples (k,)."""
+    """Return the function that gives the motion before the first samples of sensitivity filters."""
     return past_stationary if static_until(calibration) > 0 else past_motion
 
 
@@ -210,9 +207,9 @@ def derivative_filter(
 ) -> DigitalFilter:
     """Return a filter for a ratio whose numerator may exceed the denominator by one degree.
 
-    Such a ratio, the derivative of a response that does not fall, gets a pole above the
-    Nyquist frequency: below a tenth of it that is 1 % of magnitude. Where a resonance folds
-    to slow motion the bilinear transform, which does not fold, serves better here.
+    Such a ratio, the derivative of a response that does not fall, gets a pole above the Nyquist
+    frequency, which changes its magnitude by 1 % at a tenth of that. Where a resonance would alias
+    to slow motion the bilinear transform is used, which does not alias.
     """
     used = np.trim_zeros(numerator, "b")
     if len(used) > len(denominator):
@@ -227,14 +224,14 @@ def derivative_filter(
 
 
 def sensitivity_numerators(calibration: Calibration) -> FloatArray:
-    """Return F_r times denominator², ascending powers of s, a row a direction of the covariance."""
+    """Return F_r times denominator², ascending powers of s, one row for each direction r."""
     g = calibration.dynamics
     per_parameter = _sensitivity_numerators(g.numerator, g.denominator)
     return np.asarray(_factor(calibration.covariance).T @ per_parameter, np.float64)
 
 
 def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Return ∂G/∂θ_j times denominator², ascending powers of s, one row a parameter."""
+    """Return ∂G/∂θ_j times denominator², ascending powers of s, one row for each parameter."""
     m, n = len(numerator) - 1, len(denominator) - 1
     rows = np.zeros((m + n + 2, max(2 * n, m + n + 1) + 1))
     for i in range(m + 1):
@@ -246,7 +243,7 @@ def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> F
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
-    """Return L with L Lᵀ = covariance, (p, rank); scaled first, as variances span many decades."""
+    """Return L with L Lᵀ = covariance, (p, rank); scaled, because variances span many decades."""
     deviations = np.sqrt(np.diag(covariance))
     free = np.flatnonzero(deviations)
     correlation = covariance[np.ix_(free, free)] / np.outer(deviations[free], deviations[free])

@@ -1,7 +1,7 @@
-"""Where on the workpiece is the probe looking?
+"""Kinematics of the machine: positions of the axes and distance to points of the workpiece.
 
-Chain: workpiece → C → Y → X → base → Z → B → probe. The frame of the chuck has its third axis
-along the spindle, which is parallel to Z; x and y are slide positions from the spindle axis.
+Chain: workpiece → C → Y → X → base → Z → B → probe. The workpiece frame has its third axis along
+the spindle, which is parallel to Z; x and y are slide positions relative to the spindle axis.
 """
 
 from __future__ import annotations
@@ -19,13 +19,12 @@ from omsm_ros.units import MICROMETRE_M
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
-    """Where the probe sits and looks; all zero for a probe on the spindle axis, along Z.
+    """Position and direction of the probe; all zero for a probe on the spindle axis, along Z.
 
-    centre_x, centre_y: slide positions at which the probe looks at the spindle axis [m]
+    centre_x, centre_y: slide positions at which the beam meets the spindle axis [m]
     probe_x, probe_z: from the pivot of B to the point of zero distance, at b = 0 [m]
     beam_x, beam_y: slope of the beam against Z at b = 0 [1]
-    abbe_arm: from the Z encoder's line to the beam [m]; what an unknown pitch of the slide
-        costs over it is a term of the uncertainty
+    abbe_arm: from the Z encoder's line to the beam [m], through which a pitch of the slide acts
     """
 
     centre_x: float = 0.0
@@ -51,7 +50,7 @@ class WorkpiecePoints(NamedTuple):
 
 
 def workpiece_xy(x: FloatArray, y: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Turn positions x, y [m] from the spindle axis back by the spindle angle c [rad], each (n,).
+    """Return positions x, y [m] rotated back by the spindle angle c [rad], each (n,).
 
     ``X = x cos c + y sin c``, ``Y = -x sin c + y cos c``.
     """
@@ -66,7 +65,7 @@ def workpiece_points(
     c: FloatArray,
     distance: FloatArray,
 ) -> WorkpiecePoints:
-    """Return the surface points at which the probe looked.
+    """Return the surface points that the probe measured.
 
     slides: x, y and the probe's own z (H(z)) [m], each (n,);  b, c: [rad], (n,)
     distance: true distance along the beam, growing with the height of the surface [m], (n,)
@@ -101,7 +100,7 @@ def _reach(
     if not b.any():
         return x, y, z
     cosine, sine = np.cos(b), np.sin(b)
-    # 1 - cos b as 2 sin²(b/2): the pivot's arm may be long and b small.
+    # 1 - cos b as 2 sin²(b/2), which is exact for small b and a long arm.
     versine = 2 * np.sin(b / 2) ** 2
     return (
         x * cosine + z * sine + geometry.probe_z * sine - geometry.probe_x * versine,
@@ -110,16 +109,12 @@ def _reach(
     )
 
 
-# How does the Z slide pitch along its way? A measured curve, and what it does over an arm.
-#
-# An encoder that sits ``arm`` beside the beam sees the slide's motion and ``arm · α`` more (Abbe).
-
-
 @dataclass(frozen=True, eq=False)
 class PitchCurve:
-    """Pitch ``angle`` (k,) [rad] at ``position`` (k,) of Z [m]; straight between, level beyond.
+    """Measured pitch ``angle`` (k,) [rad] of the Z slide over ``position`` (k,) [m].
 
-    Raises ConfigurationError unless the positions increase.
+    It is interpolated linearly and constant beyond the ends. Raises ConfigurationError unless the
+    positions increase.
     """
 
     position: FloatArray
@@ -127,23 +122,20 @@ class PitchCurve:
 
     def __post_init__(self) -> None:
         if len(self.position) < 2 or np.any(np.diff(self.position) <= 0):
-            raise ConfigurationError(
-                "positions of the pitch do not increase; sort them, each once, two or more"
-            )
+            raise ConfigurationError("kinematics.pitch")
 
     def over(self, arm: float, z: FloatArray) -> FloatArray:
-        """Return what an encoder ``arm`` [m] beside the beam reads too much at ``z`` (n,) [m]."""
+        """Return the Abbe error ``arm · α`` [m] of an encoder ``arm`` [m] beside the beam, (n,)."""
         return np.asarray(arm * np.interp(z, self.position, self.angle), np.float64)
 
 
-# What a motion follows and a probe looks at: a height over the plane, and its slopes.
-
-# The slope of a wave of a millimetre is short by 0.07 %, and rounding far below a microradian.
+# Step of central differences: the slope of a wave of 1 mm is 0.07 % too small, and rounding is far
+# below a microradian.
 _STEP_M = 10 * MICROMETRE_M
 
 
 class Surface(Protocol):
-    """Anything with a height over the plane."""
+    """A surface with a height over the plane."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m], of their broadcast shape."""

@@ -1,8 +1,8 @@
-"""How fast can the machine and the probe run a path, apart from its dynamic error?
+"""Limits of machine and probe on the speed of a path, apart from its dynamic error.
 
-Each limit compares one quantity of the path with what is allowed, and says how many times
-as fast the same path may be run until the two are equal. Run k times as fast, velocities grow
-by k, accelerations by k² and jerks by k³. What is not declared is named, not assumed harmless.
+Each limit compares one quantity of the path with its allowed value. The speed factor k is that at
+which both are equal; velocities grow with k, accelerations with k² and jerks with k³. Limits that
+are not declared are reported as not evaluated.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from omsm_ros.quantities import Quantity
 from omsm_ros.units import MICROMETRE_M, RPM_RAD_S
 
 FASTEST = 100.0
-"""No path is said to run more than so many times as fast; nor less than the inverse."""
+"""Largest speed factor that is searched; the least one is its inverse."""
 
-# A hundredth of a per cent, of the speed or of what it is allowed.
+# Relative precision of the speed factor.
 _PRECISION = 1e-4
-# Of what is allowed: a path that does not move has no logarithm.
+# Least ratio of a value to its limit, because zero has no logarithm.
 _TINY = 1e-12
 
-# One written in another unit, such as a range of 100 for micrometres, shall not bind nowhere.
+# Plausible ranges, so that a value in another unit, such as 100 for micrometres, is refused.
 _DECLARED = {
     "servo_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
     "probe_range": Quantity("limit", "m", 1e-9, 1.0, "give it in metres"),
@@ -45,7 +45,7 @@ _DECLARED = {
 
 @dataclass(frozen=True, kw_only=True)
 class MachineLimits:
-    """What machine and probe can do; None where nobody has declared it.
+    """Limits of machine and probe; None if not declared.
 
     servo_frequency: natural frequency of the Z servo, taken as critically damped [Hz]; typical
         of a slow tool servo, and that of the paper, are 50 Hz
@@ -75,8 +75,8 @@ class MachineLimits:
 class SpeedLimit:
     """One limit of a path.
 
-    value: as the path is;  allowed: at most, in the same ``unit``
-    speed_factor: how many times as fast the path may be run, 0 if at no speed
+    value: of the path;  allowed: largest value, in the same ``unit``
+    speed_factor: at which the limit is reached, 0 if it is exceeded at any speed
     """
 
     name: str
@@ -89,13 +89,13 @@ class SpeedLimit:
 def highest_factor(
     value_at: Callable[[float], float], allowed: float, now: float | None = None
 ) -> float:
-    """Return the largest speed factor at which ``value_at(factor)``, which rises, is allowed.
+    """Return the largest factor at which the increasing ``value_at(factor)`` is ``allowed``.
 
-    now: ``value_at(1)``, where it is known already
+    now: ``value_at(1)``, if known already
 
-    Between 1 / FASTEST and FASTEST, and never too large; 0 if it is not allowed at any. What
-    grows with a power of the speed is a straight line over logarithms, so that false position
-    (Illinois: an end that stays counts half) needs few of the values, which cost time.
+    The factor lies between 1 / FASTEST and FASTEST and is never too large; 0 if none is allowed.
+    The method is false position with the Illinois modification, on logarithms, where a power of
+    the factor is a straight line, because each value takes time.
     """
 
     def over(value: float) -> float:
@@ -140,9 +140,9 @@ def speed_limits(
 ) -> tuple[list[SpeedLimit], list[str]]:
     """Return the limits that can be evaluated, and the names of those that cannot.
 
-    valid_up_to: frequency to which the calibration is trusted [Hz]
-    dynamics: from encoder to probe, by which the probe leaves the path beyond the servo
-    budget: allowed error of a height, k = 2 [m], for what exposure and timing cost
+    valid_up_to: frequency to which the calibration is valid [Hz]
+    dynamics: from encoder to probe, which adds to the following error of the servo
+    budget: allowed error of a height, k = 2 [m], for exposure and timing
     """
     evaluated, missing = [], []
     for limit in _all_limits(path, limits, valid_up_to, budget, dynamics):
@@ -192,10 +192,9 @@ def following_error(
     factor: float = 1.0,
     dynamics: TransferFunction | None = None,
 ) -> float:
-    """Return the largest distance [m] by which the probe leaves the path run at ``factor``.
+    """Return the largest deviation [m] of the probe from the path at a speed ``factor``.
 
-    The servo is 1 / (1 + s/ω)², and ``dynamics`` what the probe's motion is of the encoder's; run
-    faster, the path is the same over less time.
+    The servo is 1 / (1 + s/ω)²; ``dynamics`` is from encoder to probe.
     """
     omega = 2 * np.pi * servo_frequency
     motion = TransferFunction(np.ones(1), np.array([1.0, 2 / omega, 1 / omega**2]))
@@ -203,7 +202,7 @@ def following_error(
         both = np.asarray(np.convolve(motion.denominator, dynamics.denominator), np.float64)
         motion = TransferFunction(dynamics.numerator, both, dynamics.delay)
     moved = through(discretise(motion, sample_period / factor), z)
-    # The past before the first sample is guessed; its response is over after ten time constants.
+    # The motion before the first sample is unknown; its response ends after ten time constants.
     settling = min(int(10 / omega / (sample_period / factor)), len(z) // 2)
     return float(np.max(np.abs(z - moved)[settling:]))
 
@@ -222,8 +221,8 @@ def _following(
     now, taken, share = excursion(1.0), 0.0, 1.0
     if path.distance is not None and np.any(np.isfinite(path.distance)):
         span = float(np.nanmax(path.distance) - np.nanmin(path.distance)) / 2
-        # More than the servo's own error is shape, tilt and set-up, whatever the speed; less
-        # shows a servo that is better than declared.
+        # An excess over the servo's error is shape, tilt and set-up, independent of the speed; a
+        # smaller excursion shows a servo that is better than declared.
         taken, share = max(span - now, 0.0), min(span / now, 1.0) if now else 1.0
     value, allowed = share * now + taken, limits.probe_range / 2
     factor = highest_factor(lambda k: share * excursion(k) + taken, allowed, value)
@@ -237,7 +236,7 @@ def _spindle_rpm(path: ScanPath) -> float | None:
 
 
 def _spacing(path: ScanPath) -> float | None:
-    """Return the largest distance between neighbouring points [m], over the chuck's plane."""
+    """Return the largest distance between neighbouring points in the plane of the chuck [m]."""
     if path.x is None or path.c is None:
         return None
     radius = 0.5 * np.abs(path.x[1:] + path.x[:-1])

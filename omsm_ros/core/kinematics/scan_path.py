@@ -1,34 +1,35 @@
-"""Which path does a scan take, what is the highest content of its motion, how steep is it?"""
+"""Path of a scan, with the bandwidth and the derivatives of its Z motion."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
-from omsm_ros.readable import count
+from omsm_ros.errors import Notice
 
+# Number of gaps that a message names.
 _MOST_NAMED = 3
-# What the samples hold above it is the encoder's noise rather than the path.
+# Share of the mean square velocity that defines the bandwidth; the rest may be encoder noise.
 _CONTENT_SHARE = 0.999
-# The Fourier transform of a length with a large prime factor takes ten times as long. Of so many
-# samples, the few at the end that make up such a factor are less than half a per cent.
+# Length from which the end of a record is cut to a length with small prime factors, whose Fourier
+# transform is ten times as fast; less than 0.5 % is cut.
 _LONG = 65_536
 _SMALL_FACTORS = (2, 3, 5, 7, 11, 13)
-# Derivatives are those of quintics over a quarter period of the fastest content, but of at least
-# so many samples, so that the encoder's noise stays below the path.
+# Half width of the quintics that give derivatives: a quarter period of the bandwidth, within these
+# limits [samples]. The lower one keeps the encoder's noise below the path.
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 250
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanPath:
-    """A path over time: z [m] (n,), and what else is known of it, each (n,) or None.
+    """A path over time: z [m] (n,), and other channels (n,) or None.
 
     x: [m];  c: [rad];  distance: of a recorded scan [m], NaN where the probe lost the surface
-    left_out: which samples of the recording are none of the path, and why; empty if all are
+    left_out: samples of the recording that are not part of the path; None if all are
     """
 
     z: FloatArray
@@ -36,25 +37,24 @@ class ScanPath:
     x: FloatArray | None = None
     c: FloatArray | None = None
     distance: FloatArray | None = None
-    left_out: str = ""
+    left_out: Notice | None = None
 
 
 class ScanPathReader:
-    """The first samples of a path, gathered from the blocks of a stream while they pass.
+    """Collects the first ``most`` samples of a path from the blocks of both streams.
 
-    Across a gap in the counter, or where Z was lost, or to another sample period, no motion is
-    known: the path is the longest run without any of them.
+    The path is the longest run without a gap in the counter, a lost Z or a change of the sample
+    period.
     """
 
     def __init__(self, most: int) -> None:
-        """``most`` samples of either stream are kept."""
         self._most = most
         self._runs: list[list[AxisBlock]] = []
         self._kept = self._passed = self._readings_kept = 0
         self._readings: list[tuple[int, FloatArray]] = []
 
     def add(self, block: Block) -> None:
-        """Take what is still wanted of ``block``."""
+        """Take the samples of ``block`` that are still needed."""
         if isinstance(block, AxisBlock):
             self._passed += len(block)
             if self._kept < self._most:
@@ -72,7 +72,7 @@ class ScanPathReader:
         self._kept += len(block)
 
     def path(self) -> ScanPath | None:
-        """Return the path gathered so far; None if Z was never known."""
+        """Return the path collected so far; None without any Z."""
         if not self._runs:
             return None
         run = max(self._runs, key=lambda run: sum(map(len, run)))
@@ -91,24 +91,22 @@ class ScanPathReader:
             left_out=self._left_out(first, len(z)),
         )
 
-    def _left_out(self, first: int, judged: int) -> str:
+    def _left_out(self, first: int, judged: int) -> Notice | None:
         breaks = [_break(before[-1], after[0]) for before, after in pairwise(self._runs)]
+        named = [gap for gap in breaks[:_MOST_NAMED] if gap is not None]
         if judged == self._passed and not breaks:
-            return ""
-        text = (
-            f"judged are only {count(judged)} of {count(self._passed)} samples, triggers {first} "
-            f"to {first + judged - 1}"
+            return None
+        if len(breaks) > _MOST_NAMED:
+            named.append(Notice("kinematics.more_gaps", gaps=len(breaks) - _MOST_NAMED))
+        return Notice(
+            "kinematics.left_out",
+            judged=judged,
+            samples=self._passed,
+            first=first,
+            last=first + judged - 1,
+            gaps=Notice("kinematics.longest_run", gaps=named) if named else "",
+            most=Notice("kinematics.most", most=self._most) if self._passed > self._most else "",
         )
-        if breaks:
-            text += f", the longest run without a gap: {_named(breaks)}"
-        if self._passed > self._most:
-            text += f"; no more than the first {count(self._most)} are looked at"
-        return text
-
-
-def _named(breaks: Sequence[str]) -> str:
-    rest = len(breaks) - _MOST_NAMED
-    return ", ".join(breaks[:_MOST_NAMED]) + (f" and {rest} more gaps" if rest > 0 else "")
 
 
 def _known(block: AxisBlock) -> Iterator[AxisBlock]:
@@ -123,51 +121,47 @@ def _known(block: AxisBlock) -> Iterator[AxisBlock]:
         yield replace(block, first_sample=block.first_sample + begin, **channels)
 
 
-def _break(last: AxisBlock, block: AxisBlock) -> str:
-    """Return in words what parts two blocks; empty if one continues the other."""
-    end = last.first_sample + len(last)
-    missing = block.first_sample - end
-    if missing > 0:
-        return f"{count(missing)} are missing ({end} to {block.first_sample - 1})"
-    if missing < 0:
-        return f"after {end - 1} the counter goes on from {block.first_sample}"
+def _break(last: AxisBlock, block: AxisBlock) -> Notice | None:
+    """Return what separates two blocks; None if one continues the other."""
+    end, first = last.end, block.first_sample
+    if first > end:
+        return Notice("kinematics.gap", samples=first - end, first=end, last=first - 1)
+    if first < end:
+        return Notice("kinematics.reset", last=end - 1, first=first)
     if abs(block.sample_period / last.sample_period - 1) >= SAME_PERIOD:
-        return f"from {end} on the sample period is {block.sample_period:.6g} s"
-    return ""
+        return Notice("kinematics.period", first=end, period=block.sample_period)
+    return None
 
 
 def content_frequency(z: FloatArray, sample_period: float) -> float:
-    """Return the frequency [Hz] below which 99.9 % of the mean square velocity lies; 0 at rest.
+    """Return the frequency [Hz] below which 99.9 % of the mean square velocity lies.
 
-    The encoder's white noise, as large as it is in the upper half of the band, is taken off. What
-    changes the velocity slowly from end to end, as the feed over a round part does, is no more
-    than that: a Fourier series would see a jump where the ends meet, and all frequencies in it. A
-    few whole turns have no such jump, but get one where a cubic is taken off; so the lower counts.
+    It is 0 at standstill. The white noise of the encoder is estimated in the upper half of the
+    band and subtracted. A slow change of the velocity from end to end would be a jump of the
+    periodic continuation with all frequencies in it, so a cubic is subtracted. Whole turns have no
+    such jump, but a cubic would make one; therefore the lower frequency of both ways is returned.
     """
     velocity = np.diff(z)
     if len(velocity) > _LONG:
         velocity = velocity[: _with_small_factors(len(velocity))]
     steady = np.full(len(velocity), np.mean(velocity))
     return min(
-        _content_frequency_around(slow, velocity, sample_period)
-        for slow in (steady, _slow_part(velocity))
+        _content_without(slow, velocity, sample_period) for slow in (steady, _slow_part(velocity))
     )
 
 
-def _content_frequency_around(
-    slow: FloatArray, velocity: FloatArray, sample_period: float
-) -> float:
+def _content_without(slow: FloatArray, velocity: FloatArray, sample_period: float) -> float:
     power = np.abs(np.fft.rfft(velocity - slow)) ** 2
-    # White noise of z, differenced.
+    # Spectrum of differenced white noise.
     shape = 4 * np.sin(0.5 * np.pi * np.arange(len(power)) / (len(power) - 1)) ** 2
     upper = slice(len(power) // 2, None)
-    # The power of a line of noise is exponentially distributed: its median is ln 2 of its mean.
+    # The power of a noise line is exponentially distributed, with a median of ln 2 of the mean.
     noise = float(np.median(power[upper] / shape[upper])) / np.log(2) * shape
     moved = power - noise
-    # Beyond five standard deviations of the noise's sum, something moves.
+    # A motion exceeds five standard deviations of the sum of the noise.
     if np.sum(moved) <= 5 * float(np.linalg.norm(noise)):
         return 0.0
-    # Of Parseval's sum, `moved` holds the half of positive frequencies.
+    # `moved` has the positive frequencies only, half of Parseval's sum.
     slowly = float(np.sum((slow - np.mean(slow)) ** 2)) * len(velocity) / 2
     gathered = slowly + np.cumsum(moved)
     place = int(np.argmax(gathered >= _CONTENT_SHARE * gathered[-1]))
@@ -175,7 +169,7 @@ def _content_frequency_around(
 
 
 def _with_small_factors(number: int) -> int:
-    """Return the largest number up to ``number`` with ``_SMALL_FACTORS`` alone."""
+    """Return the largest number up to ``number`` that has only ``_SMALL_FACTORS``."""
     for found in range(number, 1, -1):
         rest = found
         for factor in _SMALL_FACTORS:
@@ -187,12 +181,12 @@ def _with_small_factors(number: int) -> int:
 
 
 def _slow_part(velocity: FloatArray) -> FloatArray:
-    """Return the cubic that is nearest to ``velocity`` (n,), of any unit."""
+    """Return the least-squares cubic of ``velocity`` (n,)."""
     along = np.linspace(-1.0, 1.0, len(velocity))
     part = np.zeros(len(velocity))
     for degree in range(min(4, len(velocity))):
         basis = np.asarray(np.polynomial.legendre.Legendre.basis(degree)(along), np.float64)
-        # Nearly orthogonal already; from what is left each time, so that it is so to the last bit.
+        # Fitted to the remainder each time, because the basis is only nearly orthogonal.
         part += basis * (basis @ (velocity - part) / (basis @ basis))
     return part
 
@@ -200,7 +194,7 @@ def _slow_part(velocity: FloatArray) -> FloatArray:
 def steepest(z: FloatArray, sample_period: float, content: float) -> tuple[float, float, float]:
     """Return the largest |velocity| [m/s], |acceleration| [m/s²] and |jerk| [m/s³] of ``z`` (n,).
 
-    By local quintics (Savitzky and Golay) as wide as ``content`` [Hz] allows.
+    From local quintics (Savitzky-Golay) as wide as the bandwidth ``content`` [Hz] allows.
     """
     width = 1 / (8 * content * sample_period) if content else _MOST_HALF_WIDTH
     half = int(np.clip(width, _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH))

@@ -1,7 +1,6 @@
-"""Motions of the cell as functions of time, such as a machine can run.
+"""Motions as functions of time: step tests, scans, chirps and planned step tests.
 
-Each motion gives the commanded axes at any time, also before its start: a machine is
-already moving when the first trigger comes.
+Each motion gives the commanded axes at any time, also before its start.
 """
 
 from __future__ import annotations
@@ -14,12 +13,11 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.readable import count, quantity
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, RPM_HZ, RPM_RAD_S
 
 
 class AxisPositions(NamedTuple):
-    """Commanded positions, each of the shape of the time they were asked for: m, m, m, rad, rad."""
+    """Commanded positions x, y, z [m], b, c [rad], each of the shape of the time."""
 
     x: FloatArray
     y: FloatArray
@@ -42,14 +40,14 @@ class Motion(Protocol):
 
 
 def s_curve(phase: FloatArray) -> FloatArray:
-    """Return rest-to-rest move from 0 to 1 over ``phase`` 0…1 with a jerk of constant magnitude.
+    """Return the move from 0 to 1 over ``phase`` 0…1 with a jerk of constant magnitude.
 
     The jerk is ±32 (per unit of phase cubed) with signs + - - + over the four quarters.
     """
     p = np.clip(phase, 0.0, 1.0)
     mirrored = np.where(p > 0.5, 1.0 - p, p)
     late = mirrored - 0.25
-    # Products, for a power of three takes ten times as long.
+    # Products, because a power of three takes ten times as long.
     first = 16 / 3 * (mirrored * mirrored * mirrored)
     second = 1 / 12 + late * (1 + late * (4 - 16 / 3 * late))
     half = np.where(mirrored < 0.25, first, second)
@@ -63,7 +61,7 @@ def _z_only(z: FloatArray) -> AxisPositions:
 
 @dataclass(frozen=True, slots=True)
 class StepTest:
-    """Z climbs ``count`` steps and comes down again, resting ``dwell`` after each edge.
+    """Z climbs ``count`` steps and descends them again, with a rest after each edge.
 
     step: height of a step [m]
     count: steps up; as many follow down
@@ -79,18 +77,17 @@ class StepTest:
     def __post_init__(self) -> None:
         if self.count < 1 or not self.dwell > self.rise >= 0:
             raise ConfigurationError(
-                f"step test: count {self.count!r} must be 1 or more and dwell {self.dwell!r} s "
-                f"longer than rise {self.rise!r} s, which is not negative"
+                "kinematics.step_test", count=self.count, dwell=self.dwell, rise=self.rise
             )
 
     @property
     def duration(self) -> float:
-        """[s], with one dwell of rest before the first edge."""
+        """Duration [s], with one dwell before the first edge."""
         return self.dwell * (2 * self.count + 1)
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]."""
-        # Rest before the first edge and after the last one are edges of no height.
+        # The rests before the first and after the last edge are edges of zero height.
         levels = np.r_[np.zeros(1), np.arange(self.count + 1), np.arange(self.count)[::-1]]
         edge = np.floor(time / self.dwell)
         index = np.clip(edge, 0, 2 * self.count).astype(np.int64)
@@ -119,15 +116,14 @@ class Spiral:
     def __post_init__(self) -> None:
         if self.start_radius <= 0 or self.feed_per_turn <= 0 or self.spindle_speed == 0:
             raise ConfigurationError(
-                f"spiral: start_radius {self.start_radius!r} m and feed_per_turn "
-                f"{self.feed_per_turn!r} m must be positive, spindle_speed "
-                f"{self.spindle_speed!r} rpm not zero"
+                "kinematics.spiral",
+                radius=self.start_radius,
+                feed=self.feed_per_turn,
+                speed=self.spindle_speed,
             )
         if self.feed_per_turn > self.start_radius:
             raise ConfigurationError(
-                f"spiral: a feed of {self.feed_per_turn!r} m a turn from a radius of "
-                f"{self.start_radius!r} m makes not one turn; give a smaller feed, or a larger "
-                "radius"
+                "kinematics.feed", feed=self.feed_per_turn, radius=self.start_radius
             )
 
     @property
@@ -153,7 +149,7 @@ class Circle:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return self.turns / (abs(self.spindle_speed) * RPM_HZ)
 
     def positions(self, time: FloatArray) -> AxisPositions:
@@ -182,7 +178,7 @@ class Chirp:
     duration: float = 25.0
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Return the commanded axes at ``time`` [s]; at rest before the start."""
+        """Return the commanded axes at ``time`` [s], at standstill before the start."""
         running = np.maximum(time, 0.0)
         sweep = (self.end_frequency - self.start_frequency) / self.duration
         turns = self.start_frequency * running + 0.5 * sweep * running**2
@@ -193,7 +189,7 @@ class Chirp:
 class Multisine:
     """Z swings at several ``frequencies`` [Hz] at once, each with ``amplitude`` [m].
 
-    Their phases keep the peak low (Schroeder 1970). Before its start it swings already.
+    Their phases keep the peak low (Schroeder 1970). It oscillates also before its start.
     """
 
     frequencies: tuple[float, ...] = (0.7, 1.3, 2.9, 5.1, 7.7, 11.3, 14.9)
@@ -208,31 +204,26 @@ class Multisine:
         return _z_only(self.amplitude * z)
 
 
-# A step test that a machine can run and that hides nothing between samples.
-#
-# Edges are jerk-limited S-curves, and each starts at another fraction of the sample period,
-# so that what still folds does not fold alike every time.
-
-# The golden ratio's fraction spreads any number of edges evenly over the sample period.
+# The golden ratio distributes any number of edges evenly over the sample period.
 _GOLDEN = 0.6180339887498949
-# An S-curve of this many samples has nothing worth naming beyond half the rate.
+# Samples in an S-curve from which its content above the Nyquist frequency is negligible.
 _LEAST_RISE_SAMPLES = 10
-# What `omsm plan steps` makes: 90 µm of travel with steps of two heights, and a minute, after
-# which a relaxation as slow as the test itself is open by 12 ppm (10 nm of noise at 1 kHz).
+# Defaults of a planned step test: 90 µm of travel with steps of two heights in one minute, which
+# determines a relaxation as slow as the test to 12 ppm (10 nm of noise at 1 kHz).
 PLANNED_COUNT = 14
 PLANNED_DWELL_S = 2.0
-# A second height that is no simple part of the first: 3 µm beside 9.8 µm.
+# Ratio of the second height to the first, 3 µm to 9.8 µm, no simple fraction.
 SECOND_SHARE = 3 / 9.8
-# A quarter of an hour at 1 kHz, thirty megabytes.
+# Lines of a table that a controller reads: a quarter of an hour at 1 kHz, 30 MB.
 _MOST_LINES = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
-    """Start of each edge [s], height of each [m], its rise [s], and the whole duration [s].
+    """A step test: start [s] and height [m] of each edge, their rise [s], and the duration [s].
 
-    It is a motion of the cell like any in :mod:`omsm_ros.core.kinematics.trajectories`.
-    Raises ConfigurationError where an edge starts before the one before it has ended.
+    Edges are jerk-limited S-curves that start at different fractions of the sample period, so that
+    aliased content differs from edge to edge. Raises ConfigurationError if edges overlap.
     """
 
     starts: tuple[float, ...]
@@ -242,14 +233,11 @@ class StepPlan:
 
     def __post_init__(self) -> None:
         if np.any(np.diff(self.starts) < self.rise):
-            raise ConfigurationError(
-                f"step plan: an edge starts within the rise of {self.rise!r} s of the one before "
-                "it; leave a rest between edges"
-            )
+            raise ConfigurationError("kinematics.edges_overlap", rise=self.rise)
 
     @property
     def travel(self) -> float:
-        """From the lowest plateau to the topmost [m]."""
+        """Distance from the lowest to the highest plateau [m]."""
         return float(np.ptp(np.cumsum([0.0, *self.heights])))
 
     def z(self, time: FloatArray) -> FloatArray:
@@ -259,7 +247,7 @@ class StepPlan:
         edge = np.maximum(np.searchsorted(starts, time, side="right") - 1, 0)
         phase = (time - starts[edge]) / self.rise
         progress = np.ones_like(phase)
-        # An edge takes a hundredth of its rest: there is next to nothing to evaluate.
+        # Evaluated only within the edges, a hundredth of the time.
         moving = phase < 1
         progress[moving] = s_curve(phase[moving])
         return np.asarray(levels[edge] + heights[edge] * progress)
@@ -282,34 +270,31 @@ def plan_steps(
 ) -> StepPlan:
     """Return ``count`` steps up and as many down, dithered within ``sample_period`` [s].
 
-    Half of the way up, all of it down, half of it up again: a motion about the middle of its
-    travel separates a slow relaxation from a drift twice as well as one to its end and back.
+    The motion goes half of the travel up, all of it down and half of it up again. It separates a
+    slow relaxation from a drift twice as well as a motion from one end to the other and back.
 
-    step: [m];  second_step: of every other one [m], None for equal steps: two heights
-        separate what is not linear (backlash, friction, stiffening) from what only lags
+    step: [m];  second_step: height of every other step [m], None for equal steps; two heights
+        separate non-linearity (backlash, friction, stiffening) from linear dynamics
     dwell: from edge to edge [s], as long as the slowest relaxation to be separated from gain
-    rise: of an edge [s]
-    half_range: of the probe [m], which must hold the whole travel
+    rise: of an edge [s];  half_range: of the probe [m], which must include the whole travel
 
     Raises ConfigurationError for a plan that the probe or the sampling cannot follow.
     """
     if rise < _LEAST_RISE_SAMPLES * sample_period:
         raise ConfigurationError(
-            f"step plan: rise {rise!r} s is too sharp for samples every {sample_period!r} s; "
-            f"use at least {_LEAST_RISE_SAMPLES * sample_period!r} s"
+            "kinematics.rise",
+            rise=rise,
+            period=sample_period,
+            least=_LEAST_RISE_SAMPLES * sample_period,
         )
     upward = np.where(np.arange(count) % 2, step if second_step is None else second_step, step)
     travel = float(np.sum(upward))
     if travel > 2 * half_range:
         raise ConfigurationError(
-            f"step plan: {count!r} steps travel {quantity(travel, 'm')}, which leaves the probe's "
-            f"range of ±{quantity(half_range, 'm')}; use fewer or smaller steps"
+            "kinematics.travel", count=count, travel=travel, half_range=half_range
         )
     if dwell < 3 * rise:
-        raise ConfigurationError(
-            f"step plan: dwell {dwell!r} s leaves no rest after a rise of {rise!r} s; "
-            f"dwell {3 * rise!r} s or longer"
-        )
+        raise ConfigurationError("kinematics.dwell", dwell=dwell, rise=rise, least=3 * rise)
     edges = np.arange(1, 2 * count + 1)
     dither = (edges * _GOLDEN) % 1.0 * sample_period
     middle = count // 2
@@ -325,13 +310,15 @@ def plan_steps(
 def plan_csv(plan: StepPlan, period: float) -> str:
     """Return ``time_s,z_m`` lines every ``period`` [s], a header first.
 
-    Raises ConfigurationError for more lines than a controller takes.
+    Raises ConfigurationError for more than a million lines.
     """
     if plan.duration > _MOST_LINES * period:
         raise ConfigurationError(
-            f"step plan: {quantity(plan.duration, 's')} every {quantity(period, 's')} are "
-            f"{count(round(plan.duration / period))} lines, at most {count(_MOST_LINES)}; "
-            "plan fewer steps or shorter rests"
+            "kinematics.lines",
+            duration=plan.duration,
+            period=period,
+            lines=round(plan.duration / period),
+            most=_MOST_LINES,
         )
     time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
     rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]

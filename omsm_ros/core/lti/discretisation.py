@@ -1,10 +1,16 @@
-"""How does a continuous G(s) act on samples?
+"""Discretisation of a continuous G(s) for smooth motions.
 
-Between samples the encoder's motion is smooth, so it is taken as the polynomial through
-the newest ``order + 1`` samples, and the differential equation of G is integrated exactly
-over it. Poles are mapped by exp(pT): one far above the Nyquist frequency becomes a
-response within the sample, where the bilinear transform would make it ring at Nyquist.
-The pure delay is a Lagrange interpolator of the same order. At 0 Hz the gain is G(0).
+Between samples the motion is taken as the polynomial of ``order`` m through the newest m + 1
+samples, over which the differential equation of G is integrated exactly:
+
+``x[k] = exp(a) x[k-1] + Σ_j w_j u[k-j]``, ``y[k] = c x[k] + d u[k]``, j = 0 … m.
+
+Poles are mapped by exp(pT): one far above the Nyquist frequency becomes a response within the
+sample, while the bilinear transform would make it oscillate at Nyquist. The zeros are those of the
+Rosenbrock pencil of this system. The state space is a series of sections of first and second
+order, each scaled by its own frequency, because in companion form poles that lie decades apart
+lose the digits of the slow ones. The delay is a Lagrange interpolator of the same order. At 0 Hz
+the gain is G(0).
 """
 
 from __future__ import annotations
@@ -23,21 +29,27 @@ from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.linear_algebra import generalised_eigenvalues, sosfilt
 from omsm_ros.quantities import SAMPLE_PERIOD
 
-# Where are the zeros of a continuous system whose input is a polynomial between samples?
-#
-# The input in the step from sample k-1 to k is the polynomial of ``order`` m through the samples
-# k-m … k. The step is then integrated exactly:
-#
-# ``x[k] = exp(a) x[k-1] + Σ_j w_j u[k-j]``, ``y[k] = c x[k] + d u[k]``, j = 0 … m.
-#
-# The zeros are those of the Rosenbrock pencil of this system. The state space is a series of
-# sections of first and second order, each scaled by its own frequency: in companion form the
-# products of poles that lie decades apart would drown the digits of the slow ones.
-
-# With a norm below one half the next term of the series is less than the rounding of 1.
+# Terms of the exponential series: for a norm below one half the next term is less than rounding.
 _SERIES_TERMS = 16
-# A zero this far out is a constant factor to 1e-9 of the gain, or infinity after rounding.
+# A zero beyond this is a constant factor to 1e-9 of the gain, or infinite but for rounding.
 _FAR_ZERO = 1e9
+# Default order: the error is below 1 pm on the motion in test_discretisation.py, with a noise gain
+# of 1.03.
+DEFAULT_ORDER = 3
+# Radians a sample at which the gain is matched if G(0) = 0: slow, but not zero.
+_MATCHED_RAD = 0.02
+# Relative tolerance for slow motion. A first-order hold of typical dynamics is off by 4e-5, order 3
+# by 1e-8; an aliased resonance or a lost root by much more.
+_TOLERANCE = 1e-2
+# Fewest samples of a motion: a window of ten per cent then fades six samples at each end.
+MIN_SAMPLES = 64
+# Share of the record over which the window fades at each end.
+_FADE = 0.1
+BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
+"""Terms of a window with side lobes below -92 dB (Harris, Proc. IEEE 66, 1978)."""
+
+# Share of the Nyquist band above which a motion is not resolved by its samples.
+_RESOLVED_SHARE = 0.2
 
 
 class _StateSpace(NamedTuple):
@@ -52,10 +64,10 @@ class _StateSpace(NamedTuple):
 def polynomial_hold_zeros(
     zeros: ComplexArray, poles: ComplexArray, order: int, dc_zeros: int = 0
 ) -> ComplexArray:
-    """Return the zeros in the z plane of the system with these roots, in radians a sample.
+    """Return the zeros in the z plane of the system with these roots [rad/sample].
 
-    dc_zeros: zeros at s = 0, which the interpolation maps to z = 1 exactly if it reproduces
-        polynomials of that degree; among eigenvalues that coincide they would be blurred
+    dc_zeros: number of zeros at s = 0, which are set to z = 1 exactly, because coinciding
+        eigenvalues are inaccurate
     """
     if not len(poles):
         return np.empty(0, np.complex128)
@@ -77,10 +89,10 @@ def polynomial_hold_zeros(
 
 
 def _with_exact_ones(found: ComplexArray, count: int) -> ComplexArray:
-    """Put 1 in the place of the ``count`` zeros nearest to it.
+    """Return the zeros with the ``count`` ones nearest to 1 set to 1.
 
-    Rounding may make a conjugate pair of one of them and a slow zero beside it: that one then
-    gets what 1 leaves of the sum of the pair, which rounding does not move.
+    Rounding may turn one of them and a slow zero into a conjugate pair. The slow zero then follows
+    from the sum of the pair, which is accurate.
     """
     nearest = found[np.argsort(abs(found - 1))]
     taken, others = nearest[:count], nearest[count:]
@@ -91,9 +103,9 @@ def _with_exact_ones(found: ComplexArray, count: int) -> ComplexArray:
 
 
 def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
-    """Return the sections in series; the gain is arbitrary."""
+    """Return the series of sections as a state space with arbitrary gain."""
     whole = _StateSpace(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
-    for numerator, denominator in _sections_of_polynomial_hold(zeros, poles):
+    for numerator, denominator in _ratios(zeros, poles):
         part = _section(numerator, denominator)
         corner = np.zeros((len(whole.a), len(part.a)))
         whole = _StateSpace(
@@ -105,10 +117,8 @@ def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
     return whole
 
 
-def _sections_of_polynomial_hold(
-    zeros: ComplexArray, poles: ComplexArray
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Return proper ratios of real, monic, ascending polynomials, of second order but for one."""
+def _ratios(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Return proper ratios of real, monic, ascending polynomials of second or first order."""
     denominators = [*_quadratics(_pairs(poles)), *_by_two(_reals(poles))]
     pairs, reals = _quadratics(_pairs(zeros)), _reals(zeros)
     numerators = []
@@ -145,7 +155,7 @@ def _expanded(roots: FloatArray) -> FloatArray:
 
 
 def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
-    """Return a ratio of first or second order with states y and y'/ω and an output near 1."""
+    """Return the state space of a ratio of first or second order with states y and y'/ω."""
     n = len(denominator) - 1
     omega = abs(denominator[0]) ** (1 / n)
     powers = omega ** np.arange(n + 1)
@@ -163,7 +173,7 @@ def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
 def _hold_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Return exp(a) and the weights w_j (n, order + 1) of u[k], u[k-1], … from k-1 to k."""
     n = len(a)
-    # Driving states by a chain of integrators makes one exponential hold ∫ e^{a(1-v)} b v^j/j! dv.
+    # With a chain of integrators as input, one exponential contains ∫ e^{a(1-v)} b v^j/j! dv.
     chain = np.zeros((n + order + 1, n + order + 1))
     chain[:n, :n] = a
     chain[:n, n] = b
@@ -176,9 +186,9 @@ def _hold_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArra
 
 
 def matrix_exponential(matrix: FloatArray) -> FloatArray:
-    """Return exp(``matrix``) (n, n): its Taylor series at a 2^k-th part of it, squared k times.
+    """Return exp(``matrix``) (n, n) by scaling, Taylor series and squaring.
 
-    For the few states here; scipy's takes a tenth of a second to load.
+    It replaces scipy.linalg.expm, which takes 0.1 s to load.
     """
     norm = float(np.linalg.norm(matrix, 1))
     squarings = max(int(np.ceil(np.log2(norm))) + 1, 0) if norm > 0 else 0
@@ -191,26 +201,21 @@ def matrix_exponential(matrix: FloatArray) -> FloatArray:
     return result
 
 
-# In which order are the roots of a digital filter multiplied, so that few digits are lost?
-#
-# As :func:`scipy.signal.zpk2sos` does, without loading ``scipy.signal``: the poles nearest to the
-# unit circle, which amplify most, get the zeros nearest to them and come last.
-
-
 def second_order_sections(zeros: ComplexArray, poles: ComplexArray, gain: float) -> FloatArray:
     """Return sections (k, 6) as in scipy of ``gain · Π(1 - z_i/z) / Π(1 - p_i/z)``.
 
     zeros, poles: in the z plane, complex ones with their conjugates
+
+    Like :func:`scipy.signal.zpk2sos`, without loading ``scipy.signal``: the poles nearest to the
+    unit circle are combined with the zeros nearest to them and come last.
     """
-    # A root at the origin is a factor of 1.
+    # Padded with roots at the origin, which are factors of 1.
     longest = max(len(zeros), len(poles), 1)
     count = longest + longest % 2
     padded = [np.append(r, np.zeros(count - len(r))) for r in (zeros, poles)]
     remaining = list(padded[0])
     sections = []
-    for pair in sorted(
-        _pairs_of_second_order_sections(padded[1]), key=_amplification, reverse=True
-    ):
+    for pair in sorted(_root_pairs(padded[1]), key=_amplification, reverse=True):
         sections.append([*_monic(_nearest(pair[0], remaining)), *_monic(pair)])
     ordered = np.array(sections[::-1], np.float64)
     ordered[0, :3] *= gain
@@ -220,7 +225,7 @@ def second_order_sections(zeros: ComplexArray, poles: ComplexArray, gain: float)
 def bilinear_roots(
     zeros: ComplexArray, poles: ComplexArray, gain: float, sample_period: float
 ) -> tuple[ComplexArray, ComplexArray, float]:
-    """Map roots [rad/s] and gain of a proper ratio by ``s = 2 (z - 1) / (T (z + 1))``."""
+    """Return zeros, poles and gain of a proper ratio mapped by ``s = 2 (z - 1) / (T (z + 1))``."""
     rate = 2 / sample_period
     mapped = gain * np.prod(rate - zeros) / np.prod(rate - poles)
     at_nyquist = -np.ones(len(poles) - len(zeros))
@@ -228,7 +233,7 @@ def bilinear_roots(
     return digital_zeros, (rate + poles) / (rate - poles), float(np.real(mapped))
 
 
-def _pairs_of_second_order_sections(roots: ComplexArray) -> list[tuple[complex, complex]]:
+def _root_pairs(roots: ComplexArray) -> list[tuple[complex, complex]]:
     real = sorted((r for r in roots if r.imag == 0), key=abs, reverse=True)
     conjugate = [(r, np.conj(r)) for r in roots if r.imag > 0]
     return conjugate + list(zip(real[::2], real[1::2], strict=True))
@@ -239,7 +244,7 @@ def _amplification(pair: tuple[complex, complex]) -> float:
 
 
 def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
-    """Take out of ``zeros`` the pair nearest to ``pole``: conjugate, or two real ones."""
+    """Remove from ``zeros`` and return the pair nearest to ``pole``, conjugate or both real."""
     first = min(zeros, key=lambda zero: abs(zero - pole))
     zeros.remove(first)
     if first.imag:
@@ -253,15 +258,6 @@ def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
 def _monic(pair: tuple[complex, complex]) -> list[float]:
     """Return the coefficients of (1 - r/z)(1 - s/z), ascending in 1/z."""
     return [1.0, float(np.real(-pair[0] - pair[1])), float(np.real(pair[0] * pair[1]))]
-
-
-# Below 1 pm on the paper's motion (test_discretisation.py), with a noise gain of 1.03.
-DEFAULT_ORDER = 3
-# Radians a sample at which the gain of a response without DC is matched: slow, yet not nothing.
-_MATCHED_RAD = 0.02
-# Of the slow response. A first-order hold of the paper's dynamics is off by 4e-5, a third-order one
-# by 1e-8; a resonance that folds here, or a lost root, by much more.
-_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,14 +282,14 @@ class DigitalFilter:
         return np.concatenate([np.roots(section[3:]) for section in self.sections])
 
     def settling_samples(self, tolerance: float) -> int:
-        """Return the samples until a wrong start is forgotten to ``tolerance`` of itself."""
+        """Return the samples after which a wrong initial state has decayed to ``tolerance``."""
         slowest = float(max(abs(self.poles)))
         recursive = np.log(tolerance) / np.log(slowest) if slowest > 0 else 0.0
         return int(np.ceil(recursive)) + 2 * len(self.sections)
 
     @cached_property
     def noise_gain(self) -> float:
-        """Standard deviation out per standard deviation in, for white noise."""
+        """Ratio of the standard deviations of output and input for white noise."""
         pulse = np.zeros(self.settling_samples(1e-9) + 1)
         pulse[0] = 1.0
         dc_zeros = np.zeros((len(self.sections), 2))
@@ -306,15 +302,15 @@ def discretise(
     order: int = DEFAULT_ORDER,
     poles: ComplexArray | None = None,
 ) -> DigitalFilter:
-    """Integrate ``dynamics`` over the polynomial of ``order`` through the newest samples.
+    """Return the digital filter of ``dynamics`` for motions that are smooth to ``order``.
 
-    poles: of ``dynamics`` [rad/s], where they are known better than from its coefficients
+    poles: of ``dynamics`` [rad/s], if known better than from its coefficients
 
-    Raises ConfigurationError for an order outside 1 to 7 or a sample_period that is not
-    positive, DataError for dynamics that samples this far apart cannot represent.
+    Raises ConfigurationError for an order outside 1 to 7 or an implausible sample period. Raises
+    DataError for dynamics that cannot be represented at this sample period.
     """
     if not 1 <= order <= 7:
-        raise ConfigurationError(f"interpolation order {order!r}, expected 1 to 7")
+        raise ConfigurationError("lti.order", order=order)
     SAMPLE_PERIOD.checked(sample_period, ConfigurationError, "sample_period")
     continuous = (dynamics.poles() if poles is None else poles) * sample_period
     dc_zeros = min(int(np.flatnonzero(dynamics.numerator)[0]), order + 1)
@@ -330,13 +326,14 @@ def discretise(
 
 
 def _checked(digital: DigitalFilter, dynamics: TransferFunction) -> DigitalFilter:
-    """Raise DataError where H misses G at slow motion: folded resonances, or roots ill rounded."""
+    """Return H; raise DataError if it differs from G at slow motion, by aliasing or rounding."""
     slow = np.array([0.5, 1.0]) * _MATCHED_RAD / (2 * np.pi * digital.sample_period)
     if not np.allclose(digital.response(slow), dynamics.response(slow), rtol=_TOLERANCE, atol=0.0):
         raise DataError(
-            f"sampled every {digital.sample_period!r} s, a transfer function with poles "
-            f"{dynamics.poles()!r} rad/s would be off by more than {_TOLERANCE:.0%} even for slow "
-            "motion; sample faster or identify a lower order"
+            "lti.not_sampled",
+            period=digital.sample_period,
+            poles=dynamics.poles(),
+            tolerance=_TOLERANCE,
         )
     return digital
 
@@ -348,7 +345,7 @@ def _gain(
     poles: ComplexArray,
     late: int,
 ) -> float:
-    """Return the factor that makes H equal to G at 0 Hz, or close to 0 where G(0) = 0."""
+    """Return the gain that makes H equal to G at 0 Hz, or near it if G(0) = 0."""
     angle = 0.0 if dynamics.dc_gain != 0 else _MATCHED_RAD
     z = np.exp(1j * angle)
     monic = np.prod(1 - zeros / z) / np.prod(1 - poles / z) * z**-late
@@ -375,7 +372,7 @@ def bilinear(
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:
-    """Return a delay of ``delay`` samples: leading whole samples, and zeros of the interpolator."""
+    """Return whole samples and zeros of the interpolator for a delay of ``delay`` samples."""
     if delay == 0:
         return 0, np.empty(0, np.complex128)
     whole = max(int(np.floor(delay)) - (order - 1) // 2, 0)
@@ -388,50 +385,30 @@ def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:
     return whole + first, np.asarray(np.roots(np.trim_zeros(taps)), np.complex128)
 
 
-# How many nanometres does the discretisation cost on this very motion?
-#
-# The error of H against G is weighed with the spectrum of the motion's velocity, whose window
-# leaks far less than that of millimetres of travel. Above the band nothing is claimed: there
-# the samples hold the encoder's noise rather than the motion.
-
-# A window of ten per cent fades six samples at either end.
-MIN_SAMPLES = 64
-# Share of the record that the window fades at either end.
-_FADE = 0.1
-BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
-"""Terms of a window whose side lobes are below -92 dB (Harris, Proc. IEEE 66, 1978)."""
-
-# A motion that fills more of the Nyquist band is not resolved by its samples.
-_RESOLVED_SHARE = 0.2
-
-
 def checked_motion(z: FloatArray) -> FloatArray:
-    """Return ``z`` (n,) as float64; raises DataError if it is too short or not finite."""
+    """Return ``z`` (n,) as float64; raise DataError if it is too short or not finite."""
     motion = np.asarray(z, np.float64)
     if motion.ndim != 1 or len(motion) < MIN_SAMPLES:
-        raise DataError(
-            f"motion of shape {motion.shape!r}, expected {MIN_SAMPLES} samples or more; "
-            "give a longer one"
-        )
+        raise DataError("lti.short_motion", shape=motion.shape, least=MIN_SAMPLES)
     if not np.all(np.isfinite(motion)):
         lost = int(np.count_nonzero(~np.isfinite(motion)))
-        raise DataError(f"motion holds {lost!r} values that are not finite; leave them out")
+        raise DataError("lti.lost_motion", values=lost)
     return motion
 
 
 def velocity_spectrum(
     z: FloatArray, sample_period: float, faded: bool = False
 ) -> tuple[FloatArray, ComplexArray]:
-    """Return the frequencies [Hz] (k,) and the windowed velocity's spectrum [m/s] (k,).
+    """Return frequencies [Hz] (k,) and the spectrum of the windowed velocity [m/s] (k,).
 
-    faded: a window that fades only the ends, instead of one that leaks least
+    faded: use a Tukey window instead of a Blackman-Harris window
 
     Half the sum of |V|² is the mean square velocity. The velocity is a difference quotient,
-    restored to a derivative; its mean, a drift, is left in. Zeros are appended up to a length
-    that transforms fast.
+    corrected to a derivative, and includes its mean. The record is zero-padded to a length with a
+    fast transform. Velocity is used because it leaks less than millimetres of travel.
     """
     velocity = np.diff(checked_motion(z)) / sample_period
-    weights = _fading(len(velocity)) if faded else _low_leakage(len(velocity))
+    weights = _tukey(len(velocity)) if faded else _blackman_harris(len(velocity))
     samples = fast_length(len(velocity))
     frequency = np.fft.rfftfreq(samples, sample_period)
     spectrum = np.fft.rfft(velocity * weights, samples) / np.sinc(frequency * sample_period)
@@ -451,14 +428,14 @@ def fast_length(samples: int) -> int:
     )
 
 
-def _low_leakage(samples: int) -> FloatArray:
-    # cos kx as polynomials of cos x: one cosine instead of three.
+def _blackman_harris(samples: int) -> FloatArray:
+    # cos kx as polynomials of cos x, which needs one cosine instead of three.
     a0, a1, a2, a3 = BLACKMAN_HARRIS
     cosine = np.cos(2 * np.pi / samples * np.arange(samples))
     return np.asarray(a0 - a2 + cosine * (a1 - 3 * a3 + cosine * (2 * a2 + cosine * 4 * a3)))
 
 
-def _fading(samples: int) -> FloatArray:
+def _tukey(samples: int) -> FloatArray:
     """Return a Tukey window that rises and falls over ``_FADE`` of the samples each."""
     weights = np.ones(samples)
     length = _FADE * samples
@@ -471,7 +448,7 @@ def _fading(samples: int) -> FloatArray:
 def discretisation_error(
     dynamics: TransferFunction, digital: DigitalFilter, z: FloatArray, up_to: float
 ) -> tuple[float, float]:
-    """Return the root mean square and peak to valley of (H - G) z [m] within 0 … ``up_to`` [Hz]."""
+    """Return rms and peak to valley of (H - G) z [m] for the motion within 0 … ``up_to`` [Hz]."""
     period = digital.sample_period
     frequency, velocity = velocity_spectrum(z, period, faded=True)
     band = (frequency > 0) & (frequency <= min(up_to, _RESOLVED_SHARE * 0.5 / period))
@@ -484,7 +461,7 @@ def discretisation_error(
     rms = float(np.sqrt(np.sum(abs(error) ** 2) / 2))
     samples = len(z) - 1
     padded = fast_length(samples)
-    amplitude = np.sqrt(padded * np.sum(_fading(samples) ** 2)) / 2
+    amplitude = np.sqrt(padded * np.sum(_tukey(samples) ** 2)) / 2
     over_time = np.fft.irfft(error * amplitude, padded)[:samples]
     fade = int(_FADE * samples) + 1
     return rms, float(np.ptp(over_time[fade:-fade]))

@@ -1,4 +1,4 @@
-"""How does one signal answer another? Estimated without a model."""
+"""Frequency responses: estimates without a model, uncertainty of a model, and valid band."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omsm_ros.units import DEGREE_RAD
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
-    """A response estimated without a model, arrays (k,).
+    """A frequency response estimated without a model, arrays (k,).
 
     frequency: [Hz];  coherence: 0-1;  uncertainty: standard, relative
     """
@@ -33,7 +33,7 @@ def frequency_response(
     Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
     that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.
     """
-    from scipy import signal  # loaded when it is needed: it takes half a second
+    from scipy import signal  # imported here, because it takes half a second to load
 
     du, dy = np.diff(motion), np.diff(output)
     rate = 1 / sample_period
@@ -50,17 +50,15 @@ def frequency_response(
     )
 
 
-# How well is a response known, and up to which frequency is it trusted?
-
-# 95 % of a normal distribution.
+# Coverage factor for 95 % of a normal distribution.
 COVERAGE_FACTOR = 1.959964
-# Octaves from one trial frequency to the next.
+# Step of the trial frequencies [octaves].
 _SHOWN_STEP = 1 / 24
 
 
 @dataclass(frozen=True, slots=True)
 class ResponseLimits:
-    """Half-widths of the 95 % band within which a response is trusted: gain [1], phase [rad]."""
+    """Largest half-widths of the 95 % band of a valid response: gain [1], phase [rad]."""
 
     gain: float = 0.005
     phase: float = 0.5 * DEGREE_RAD
@@ -68,7 +66,7 @@ class ResponseLimits:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """Standard uncertainty over ``frequency`` [Hz]: relative gain [1] and phase [rad], all (k,)."""
+    """Standard uncertainty of relative gain [1] and phase [rad] at ``frequency`` [Hz], all (k,)."""
 
     frequency: FloatArray
     gain: FloatArray
@@ -89,11 +87,10 @@ def relative_response_jacobian(dynamics: TransferFunction, frequency: FloatArray
 
 
 def spread_along(directions: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the standard deviation along ``directions`` (…, p) of what has ``covariance`` (p, p).
+    """Return the standard deviation (…,) along ``directions`` (…, p) for ``covariance`` (p, p).
 
-    Shape (…,). What two parameters do alike, such as a delay and a pole far above the band, no data
-    tell apart: they are known to seconds each, and together to microseconds. Where such terms
-    cancel to less than their own rounding, that is what is returned, and not zero.
+    Parameters with the same effect, such as a delay and a pole far above the band, have large
+    variances that cancel. Where they cancel to less than rounding, the rounding is returned.
     """
     variance = np.einsum("...p,pq,...q->...", directions, covariance, directions)
     size = np.abs(directions)
@@ -110,7 +107,7 @@ def response_band(
 
 
 def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: FloatArray) -> float:
-    """Return the standard uncertainty of the delay τ + d1 - n1/n0 of slow motion [s].
+    """Return the standard uncertainty of the low-frequency delay τ + d1 - n1/n0 [s].
 
     covariance: (p, p), order numerator, denominator[1:], delay
     """
@@ -126,7 +123,7 @@ def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: Floa
 
 
 def widening(band: Band, other: Band, apart: ComplexArray) -> float:
-    """Return the least factor, at least 1, by which ``band`` must grow to hold all of ``other``.
+    """Return the least factor, at least 1, by which ``band`` must grow to include ``other``.
 
     apart: ln of the other's response over that of ``band``, at the same frequencies (k,)
     """
@@ -159,18 +156,19 @@ def is_detectable(
     noise: FloatArray,
     limits: ResponseLimits,
 ) -> BoolArray:
-    """Return whether the data would show a response off by ``limits`` at ``centres`` (c,) [Hz].
+    """Return True where the data show a response error of ``limits`` at ``centres`` (c,) [Hz].
 
-    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of what the motion gave, (k,)
+    frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of the output of the motion, (k,)
     noise: mean square of the transform of the probe's noise, (k,)
-    Where they would not, a model interpolates or extrapolates, and what it misses there shows in
-    no residual. Taken over a third of an octave: a deviation δ of G adds δ · answer, so its best
-    estimate has the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+
+    Elsewhere the model interpolates or extrapolates, and residuals do not show its errors. Within
+    a third of an octave a deviation δ of G adds δ · answer, so that its best estimate has the
+    variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
     """
     power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
     edges = np.outer([2 ** (-1 / 6), 2 ** (1 / 6)], centres)
     first = np.searchsorted(frequency, edges[0])
-    # At low frequency no line may lie within a third of an octave: then the next one.
+    # At low frequency there may be no line within a third of an octave; the next one is taken.
     last = np.maximum(np.searchsorted(frequency, edges[1], side="right"), first + 1)
     near = [slice(*ends) for ends in zip(first, last, strict=True)]
     energy = np.array([np.sum(power[part]) for part in near])
@@ -181,9 +179,9 @@ def is_detectable(
 def excited_up_to(
     frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
 ) -> float:
-    """Return the highest frequency [Hz] at which the data would show a response off by ``limits``.
+    """Return the highest frequency [Hz] at which the data show a response error of ``limits``.
 
-    Arguments as of :func:`is_detectable`; 0 where they show it nowhere.
+    Arguments as for :func:`is_detectable`; 0 if they do not show it at any frequency.
     """
     centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
     found = np.flatnonzero(is_detectable(centres, frequency, answer, noise, limits))

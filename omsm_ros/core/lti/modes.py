@@ -1,7 +1,13 @@
-"""The modes of a response, Eq. 8, and how well they are known of an identified one.
+"""Modes of a response with their uncertainties (Eq. 8), and the two-mass model (Eq. 6, 7).
 
-G without its delay is a sum over its poles. A conjugate pair adds, up to a part in s,
-``residue / (s² + 2 ζ ω s + ω²)``; the print lacks the s behind 2 ζ ω.
+G without its delay is a sum over its poles. A conjugate pair adds, except for a part in s,
+``residue / (s² + 2 ζ ω s + ω²)``; the printed Eq. 8 lacks the s after 2 ζ ω.
+
+The two-mass model is a chain from the ground: ``m1`` on ``k1, c1``, and ``m2`` on ``m1`` through
+``k2, c2``, driven by a force on ``m1``. Eq. 7 is the motion of ``m2`` (non-collocated); that of
+``m1`` is the collocated one. The printed ``a1 = (k1 + k2) c1`` does not follow from the equations
+of motion and is unstable for ordinary machines; correct is ``a1 = k1 c2 + k2 c1``. A response does
+not determine the common scale of masses and stiffnesses, so ``m1`` must be known, or is the unit.
 """
 
 from __future__ import annotations
@@ -19,8 +25,24 @@ from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import DataError, IdentificationError
 
-# Evenly up to the highest frequency: the terms are compared with the response at each.
+# Number of frequencies at which the modal terms are compared with the response.
 _LINES = 400
+# Order of the uncertainties of a fitted two-mass model; m1 is given.
+FITTED = ("m2", "k1", "k2", "c1", "c2")
+# Frequencies at which the shape of a response is read over three decades, 0.2 % apart: closer than
+# the width of any mode of a metal structure.
+_SHAPE_LINES = 4000
+# Search range of a mass or a spring about its start value, as natural logarithm.
+_SEARCHED = 8.0
+# Least prominence of a peak in ln of the gain; less is rounding.
+_LEAST_PROMINENCE = 1e-6
+# Model error that is allowed besides the stated uncertainty, relative to it.
+_MODEL_ERROR = 0.1
+# Least eigenvalue of a correlation relative to the greatest; less is rounding.
+_INDEFINITE = 1e-9
+# Evaluations for each of six start values, of which the best is continued. With eight evaluations
+# one record in eight led into a valley that the search did not leave in 500.
+_RACE_EVALUATIONS = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,9 +68,9 @@ def modal_sum(terms: Sequence[ModalTerm], frequency: ArrayLike) -> ComplexArray:
 class KnownMode:
     """A pole or a conjugate pair, with standard uncertainties.
 
-    frequency: undamped [Hz];  damping: ratio [1];  residue: of Eq. 8 where G(0) = 1 [1/s²]
-    The damping of a real pole is 1 by definition, its uncertainty 0; it has no residue.
-    Of poles that coincide the uncertainties are infinite.
+    frequency: undamped [Hz];  damping: ratio [1];  residue: of Eq. 8 with G(0) = 1 [1/s²]
+    The damping of a real pole is 1 by definition, its uncertainty 0, and its residue None. The
+    uncertainties of coinciding poles are infinite.
     """
 
     frequency: float
@@ -66,12 +88,11 @@ class KnownMode:
 
 
 def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[KnownMode, ...]:
-    """Return the modes of G, slowest first, with uncertainties linear in those of the coefficients.
+    """Return the modes of G, slowest first, with first-order uncertainties.
 
     covariance: (p, p), order numerator, denominator[1:], delay
 
-    Of poles that nearly coincide the linear uncertainty is large without bound, and says
-    no more than that.
+    The first-order uncertainty of nearly coinciding poles grows without bound.
     """
     upper = sorted((pole for pole in dynamics.poles() if pole.imag >= 0), key=abs)
     # Where poles coincide, D'(p) = 0.
@@ -80,7 +101,7 @@ def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[Kno
 
 
 def mode_entries(dynamics: TransferFunction, covariance: FloatArray) -> list[dict[str, object]]:
-    """Return the modes as JSON values with units, for a certificate; what is not finite as None."""
+    """Return the modes as JSON values for a certificate, with None for infinite values."""
     return [
         {
             "frequency_hz": mode.frequency,
@@ -99,9 +120,9 @@ def _finite(value: float | None) -> float | None:
 
 
 def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
-    """Return max ``|G - Eq. 8|`` over max ``|G|`` below ``up_to`` [Hz], without the delay.
+    """Return max ``|G - Eq. 8|`` / max ``|G|`` below ``up_to`` [Hz], without the delay.
 
-    What the terms do not say: real poles and the parts in s. None where nothing oscillates.
+    The terms of Eq. 8 lack real poles and the parts in s. None without an oscillating mode.
     """
     size = len(dynamics.numerator) + len(dynamics.denominator)
     modes = known_modes(dynamics, np.zeros((size, size)))
@@ -168,32 +189,6 @@ def _spread(direction: FloatArray, covariance: FloatArray) -> float:
     return spread if np.isfinite(spread) else np.inf
 
 
-# The machine as masses, springs and dampers: the paper's Eq. 6 and 7, and their fit to a G(s).
-#
-# Two masses in a chain from the ground: ``m1`` on ``k1, c1``, and ``m2`` on ``m1`` through
-# ``k2, c2``, driven by a force on ``m1``. Eq. 7 is the motion of ``m2`` (non-collocated); of
-# ``m1`` itself it is the collocated one. Its printed ``a1 = (k1 + k2) c1`` does not follow
-# from the equations of motion, and is unstable for ordinary machines; it is
-# ``a1 = k1 c2 + k2 c1``. A response says nothing of the scale of masses and stiffnesses
-# together, so one of them has to be known, ``m1``, or taken as the unit of the others.
-
-# What a fit finds, in the order of its uncertainties; m1 is given.
-FITTED = ("m2", "k1", "k2", "c1", "c2")
-# Times twenty over three decades: 0.2 % apart, closer than the width of any mode of metal.
-_LINES_MASSES_AND_SPRINGS = 200
-# Natural logarithm of how far from its guess a mass or a spring may come out.
-_SEARCHED = 8.0
-# In ln of the gain: less is rounding.
-_LEAST_PROMINENCE = 1e-6
-# Of the stated uncertainty, where no coefficient could follow the model.
-_UNSTATED = 0.1
-# Of the greatest eigenvalue of a correlation; rounding leaves less.
-_INDEFINITE = 1e-9
-# The six guesses race for this many steps; the best of them is followed to its end. After eight
-# steps the leader of one record in eight led into a valley that it left in no 500 steps.
-_RACE_EVALUATIONS = 30
-
-
 @dataclass(frozen=True)
 class TwoMass:
     """m1, m2 [kg];  k1, k2 [N/m];  c1, c2 [N·s/m]; all positive."""
@@ -208,7 +203,7 @@ class TwoMass:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value > 0):
-                raise DataError(f"two-mass model: {name} is {value!r}, expected a positive number")
+                raise DataError("lti.two_mass", name=name, value=value)
 
     def _denominator(self) -> list[float]:
         m1, m2, k1, k2, c1, c2 = self.m1, self.m2, self.k1, self.k2, self.c1, self.c2
@@ -221,20 +216,22 @@ class TwoMass:
         ]
 
     def non_collocated(self) -> TransferFunction:
-        """Return Eq. 7 scaled to G(0) = 1: the probe's mass, m2."""
+        """Return the motion of m2 (Eq. 7), scaled to G(0) = 1."""
         return TransferFunction.from_ascending([self.k2, self.c2], self._denominator()).normalised()
 
     def collocated(self) -> TransferFunction:
-        """Return the driven mass, m1, scaled to G(0) = 1."""
+        """Return the motion of the driven mass m1, scaled to G(0) = 1."""
         numerator = [self.k2, self.c2, self.m2]
         return TransferFunction.from_ascending(numerator, self._denominator()).normalised()
 
 
 @dataclass(frozen=True, eq=False)
 class TwoMassFit:
-    """model: fitted;  uncertainty: standard, relative, of m2, k1, k2, c1, c2, shape (5,)
-    misfit: root of χ² per degree of freedom, of the response's difference over what is
-        stated of it; about 1 where the model is right, infinite where the search did not end
+    """A fitted two-mass model.
+
+    uncertainty: standard, relative, of m2, k1, k2, c1, c2, shape (5,)
+    misfit: root of the reduced χ² of the difference of the responses; about 1 if the model is
+        right, infinite if the search did not converge
     """
 
     model: TwoMass
@@ -250,21 +247,18 @@ def fit_two_mass(
     collocated: bool,
     frequencies: ArrayLike,
 ) -> TwoMassFit:
-    """Return masses, springs and dampers whose Eq. 7 comes closest to an identified ``dynamics``.
+    """Return the masses, springs and dampers whose Eq. 7 fits an identified ``dynamics`` best.
 
-    covariance: of its coefficients (p, p), weighs the fit and gives the uncertainty; a delay
-        among them is one more thing that the model has to explain
-    table_mass: m1 [kg], which no response determines; 1 for all others relative to it
-    frequencies: lines to compare at [Hz]
+    covariance: of its coefficients (p, p), for the weights and the uncertainty
+    table_mass: m1 [kg], which a response does not determine; 1 for values relative to it
+    frequencies: at which the responses are compared [Hz]
 
-    Raises IdentificationError when G has fewer than two modes to explain.
+    Raises IdentificationError if G has fewer than two oscillating modes.
     """
     lines = np.asarray(frequencies, np.float64)
     oscillating = oscillations(dynamics)
     if len(oscillating) < 2:
-        raise IdentificationError(
-            f"the two-mass model needs two oscillating modes, the response has {len(oscillating)!r}"
-        )
+        raise IdentificationError("lti.few_modes", modes=len(oscillating))
     target = np.log(dynamics.response(lines))
     jacobian = _stacked_jacobian(dynamics, lines)
     whiten = _whitener(jacobian, covariance)
@@ -289,11 +283,11 @@ def fit_two_mass(
 def _least(
     residual: Callable[[FloatArray], FloatArray], starts: Sequence[FloatArray]
 ) -> optimize.OptimizeResult:
-    """Return the least sum of squares; all ``starts`` race, and the best of them is followed."""
+    """Minimise the sum of squares from all ``starts`` briefly, then from the best to the end."""
 
     def descend(start: FloatArray, evaluations: int | None) -> optimize.OptimizeResult:
         box = (start - _SEARCHED, start + _SEARCHED)
-        # What is well stated weighs 10⁴ times what is not: one-sided differences are too coarse.
+        # Central differences, because the weights span a factor of 10⁴.
         return optimize.least_squares(
             residual, start, jac="3-point", x_scale="jac", bounds=box, max_nfev=evaluations
         )
@@ -307,19 +301,19 @@ def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArr
 
 
 def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return W with Wᵀ W the inverse covariance of the response at all lines together, (k, k).
+    """Return W (k, k) with Wᵀ W the inverse covariance of the response at all lines.
 
-    The response of a few coefficients is the same statement many times over. What it cannot
-    state at all, for it has no coefficient for it, counts ten times as much as its variance.
+    The covariance of the response of a few coefficients is singular, so a model error of a tenth
+    of the standard uncertainty is added, independent from line to line.
     """
     stated = jacobian @ covariance @ jacobian.T
     variance = np.maximum(np.diag(stated), 0.0)
     floor = 1e-6 * float(np.max(variance)) or 1.0
-    further = _UNSTATED**2 * np.diag(np.maximum(variance, floor))
+    further = _MODEL_ERROR**2 * np.diag(np.maximum(variance, floor))
     total = stated + further
     deviation = np.sqrt(np.maximum(np.diag(total), np.diag(further)))
     values, directions = np.linalg.eigh(total / np.outer(deviation, deviation))
-    # Coefficients far apart in size leave a covariance that rounding makes indefinite.
+    # Coefficients of very different size make the covariance indefinite by rounding.
     least = _INDEFINITE * float(values[-1])
     return np.asarray((directions / np.sqrt(np.maximum(values, least))).T / deviation)
 
@@ -330,7 +324,7 @@ def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:
 
 
 def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArray]:
-    """Return the uncoupled guesses with either mode belonging to the second mass."""
+    """Return start values of uncoupled oscillators with either mode at the second mass."""
     low, high = (2 * np.pi * frequency for frequency in oscillating[:2])
     starts = []
     for ratio in (0.05, 0.2, 0.8):
@@ -344,10 +338,10 @@ def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArra
 
 @dataclass(frozen=True)
 class ResponseFeatures:
-    """What a response looks like; Hz, NaN where it has no such point below ``up_to``.
+    """Salient points of a response [Hz], NaN if there is none below the highest frequency.
 
-    resonance: of the highest peak of the gain, and that gain;  minimum: of the lowest dip
-    bandwidth_3db: where the gain first leaves 1 by 3 dB;  bandwidth_1_percent: by 1 %
+    resonance, resonance_gain: highest peak of the gain;  minimum, minimum_gain: lowest dip
+    bandwidth_3db, bandwidth_1_percent: where the gain first differs from 1 by 3 dB and by 1 %
     """
 
     resonance: float
@@ -359,8 +353,8 @@ class ResponseFeatures:
 
 
 def response_features(dynamics: TransferFunction, up_to: float) -> ResponseFeatures:
-    """Read the salient points of |G| below ``up_to`` [Hz]."""
-    frequency = np.geomspace(1e-3 * up_to, up_to, 20 * _LINES_MASSES_AND_SPRINGS)
+    """Return the salient points of |G| below ``up_to`` [Hz]."""
+    frequency = np.geomspace(1e-3 * up_to, up_to, _SHAPE_LINES)
     gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
     highest, lowest = _highest_peak(np.log(gain)), _highest_peak(-np.log(gain))
 
@@ -384,6 +378,6 @@ def finite_values(read: ResponseFeatures) -> dict[str, float | None]:
 
 
 def _highest_peak(values: FloatArray) -> int | None:
-    """Return the index of the highest peak, None without one; an end is no peak."""
+    """Return the index of the highest peak, not at an end; None without one."""
     peaks, _ = signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
     return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None

@@ -1,8 +1,8 @@
-"""How does a digital filter run over a stream that is already moving when it begins?
+"""Digital filters over a stream that is already moving when it begins.
 
-The first samples are taken as the end of a motion of constant acceleration that has gone
-on for ever; the filter's state is the one such a motion leaves. What remains is the
-response to the difference between the true past and that polynomial.
+The initial state is that after an infinite motion of constant acceleration that ends in the first
+samples. The remaining error is the response to the difference between the true past and this
+polynomial.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from omsm_ros.linear_algebra import sosfilt
 # Position, velocity, acceleration.
 POLYNOMIAL_DEGREE = 2
 START_SAMPLES = 12
-"""Samples from which the past of a motion is taken: a parabola through twelve has 0.74 of one
-sample's noise at its end, through five 0.94, and a motion has hardly bent meanwhile."""
+"""Samples that give the past motion. The end of a parabola through twelve samples has 0.74 of the
+noise of one sample, through five 0.94, and a motion is still a parabola over twelve samples."""
 
 
 def past_motion(first: FloatArray) -> FloatArray:
-    """Fit a parabola to ``first`` (k,), k >= 3, over its index: ascending coefficients (3,).
+    """Return the ascending coefficients (3,) of the parabola through ``first`` (k,), k >= 3.
 
-    Least squares about the middle sample, where the fit is best conditioned, then shifted.
+    It is fitted over the index about the middle sample, where it is best conditioned, then shifted.
     """
     middle = (len(first) - 1) / 2
     index = np.arange(len(first)) - middle
     weights = np.linalg.pinv(np.vander(index, POLYNOMIAL_DEGREE + 1, increasing=True))
     start = first[0]
-    # A sum of products with a fixed length, unlike a BLAS call, has one order of additions.
+    # A sum of products instead of a BLAS call, because its order of additions is fixed.
     centred = (weights * (first - start)).sum(axis=1)
     shifted = np.array(
         [
@@ -45,25 +45,25 @@ def past_motion(first: FloatArray) -> FloatArray:
 
 
 def past_stationary(first: FloatArray) -> FloatArray:
-    """Return the coefficient (1,) of a rest where :func:`past_motion` has its first sample.
+    """Return the coefficient (1,) of a standstill at the first sample of :func:`past_motion`.
 
-    For a filter that remembers a minute: a parabola through some samples is, so far back,
-    metres of travel.
+    A filter with a time constant of a minute needs it: a parabola through some samples would be
+    metres of travel so long before.
     """
     return past_motion(first)[:1]
 
 
 class Recursion:
-    """A digital filter with its state; ``run`` may cut the stream anywhere."""
+    """A digital filter with its state, run over a stream block by block."""
 
     def __init__(self, digital: DigitalFilter) -> None:
         self._sections = digital.sections
         self._state = np.zeros((len(digital.sections), 2))
 
     def start(self, motion: FloatArray) -> None:
-        """Take the state that the polynomial ``motion`` (ascending, of the index) has left.
+        """Set the state after the polynomial ``motion`` (ascending, of the index).
 
-        The next sample to run is that of index 0.
+        The next sample has index 0.
         """
         for state, section in zip(self._state, self._sections, strict=True):
             out = _polynomial_response(section, motion)
@@ -74,25 +74,25 @@ class Recursion:
             motion = out
 
     def run(self, samples: FloatArray, out: FloatArray | None = None) -> FloatArray:
-        """Return the response (n,) to ``samples`` (n,), bit-identical however the stream is cut.
+        """Return the response (n,) to ``samples`` (n,), bit-identical for any division into blocks.
 
-        out: where it is written, see :func:`omsm_ros.linear_algebra.sosfilt`
+        out: array for the result, see :func:`omsm_ros.linear_algebra.sosfilt`
         """
         return sosfilt(self._sections, samples, self._state, out)
 
 
 def through(digital: DigitalFilter, z: FloatArray) -> FloatArray:
-    """Return the response (n,) of ``digital`` to ``z`` (n,), which comes out of a steady motion."""
+    """Return the response (n,) of ``digital`` to ``z`` (n,), started by its first samples."""
     recursion = Recursion(digital)
     recursion.start(past_motion(z[:START_SAMPLES]))
     return recursion.run(z)
 
 
 def _polynomial_response(section: FloatArray, motion: FloatArray) -> FloatArray:
-    """Return the polynomial with which a section (6,) answers an everlasting one, ``motion``."""
+    """Return the stationary response of a section (6,) to the polynomial ``motion``."""
     powers = _shifts(len(motion))
     forward = sum(b * power for b, power in zip(section[:3], powers, strict=True))
-    if not section[4:].any():  # a delay, of which a long one has hundreds
+    if not section[4:].any():  # a pure delay; long ones have hundreds of sections
         return np.asarray(forward @ motion, np.float64)
     backward = sum(a * power for a, power in zip(section[3:], powers, strict=True))
     return np.asarray(np.linalg.solve(backward, forward @ motion), np.float64)

@@ -1,4 +1,4 @@
-"""A continuous transfer function G(s) and what can be read off it.
+"""A continuous transfer function G(s), its roots and low-frequency behaviour.
 
 ``G(s) = (n_0 + n_1 s + … ) / (1 + d_1 s + …) · exp(-s·delay)``, the paper's Eq. 11
 with a pure delay; coefficients in ascending powers of s, SI units.
@@ -39,8 +39,8 @@ class TransferFunction:
     """G(s) with ascending ``numerator`` (m+1,), ``denominator`` (n+1,), m ≤ n, and ``delay`` [s].
 
     ``denominator[0]`` is 1 exactly; use :meth:`from_ascending` to have it scaled.
-    Raises DataError for coefficients that are not finite, a denominator that is longer than its
-    degree, or an improper ratio.
+    Raises DataError for coefficients that are not finite, a denominator that ends in 0, or an
+    improper ratio.
     """
 
     numerator: FloatArray
@@ -51,28 +51,27 @@ class TransferFunction:
         for name in ("numerator", "denominator"):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.ndim != 1 or not len(values) or not np.all(np.isfinite(values)):
-                raise DataError(f"{name} {values!r} must be a row of finite numbers")
+                raise DataError("lti.coefficients", name=name, values=values)
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if self.denominator[0] != 1.0:
-            raise DataError(
-                f"denominator[0] is {float(self.denominator[0]):g}, expected 1; divide all by it"
-            )
+            raise DataError("lti.denominator", value=float(self.denominator[0]))
         if self.denominator[-1] == 0:
-            raise DataError("the last coefficient of the denominator is 0; leave it out")
+            raise DataError("lti.last_coefficient")
         if len(self.numerator) > len(self.denominator):
             raise DataError(
-                f"improper: numerator of degree {len(self.numerator) - 1}, "
-                f"denominator of degree {len(self.denominator) - 1}, expected at least as many"
+                "lti.improper",
+                numerator=len(self.numerator) - 1,
+                denominator=len(self.denominator) - 1,
             )
         if not (np.isfinite(self.delay) and self.delay >= 0):
-            raise DataError(f"delay {self.delay!r} s, expected zero or more")
+            raise DataError("lti.delay", delay=self.delay)
 
     @classmethod
     def from_ascending(
         cls, numerator: ArrayLike, denominator: ArrayLike, delay: float = 0.0
     ) -> TransferFunction:
-        """Scale both polynomials so that the denominator's constant term is 1."""
+        """Return the ratio scaled so that the constant term of the denominator is 1."""
         den = np.asarray(denominator, np.float64)
         return cls(np.asarray(numerator, np.float64) / den[0], den / den[0], delay)
 
@@ -83,7 +82,7 @@ class TransferFunction:
 
     @property
     def low_frequency_delay(self) -> float:
-        """-dφ/dω at ω = 0 [s]: how late a slow motion comes out."""
+        """Group delay -dφ/dω at ω = 0 [s]."""
         num = np.append(self.numerator, 0.0)
         den = np.append(self.denominator, 0.0)
         return float(self.delay + den[1] - num[1] / num[0])
@@ -91,7 +90,7 @@ class TransferFunction:
     def normalised(self) -> TransferFunction:
         """Return the same dynamics with G(0) = 1."""
         if self.dc_gain == 0:
-            raise DataError("a transfer function with G(0) = 0 cannot be normalised; give another")
+            raise DataError("lti.no_gain")
         return TransferFunction(self.numerator / self.dc_gain, self.denominator, self.delay)
 
     def response(self, frequency: ArrayLike) -> ComplexArray:
@@ -113,11 +112,11 @@ class TransferFunction:
 
     @property
     def is_stable(self) -> bool:
-        """True if every pole lies strictly in the left half plane."""
+        """True if all poles lie in the open left half plane."""
         return bool(np.all(self.poles().real < 0))
 
     def modes(self) -> tuple[Mode, ...]:
-        """Return poles as frequency and damping, slowest first; a conjugate pair counts once."""
+        """Return frequency and damping of the poles, slowest first, once for a conjugate pair."""
         upper = [p for p in self.poles() if p.imag >= 0]
         modes = [Mode(float(abs(p) / (2 * np.pi)), float(-p.real / abs(p))) for p in upper]
         return tuple(sorted(modes, key=lambda mode: mode.frequency))
@@ -126,8 +125,8 @@ class TransferFunction:
 def ascending_roots(coefficients: FloatArray) -> ComplexArray:
     """Return the roots of a polynomial in ascending powers, trailing zeros ignored.
 
-    The coefficients of a transfer function in s span ten or more decades, so the
-    variable is scaled to bring the roots near 1 before the companion matrix is solved.
+    The coefficients in s span ten decades or more, so the variable is scaled to bring the roots
+    near 1.
     """
     trimmed = np.trim_zeros(np.asarray(coefficients, np.float64), "b")
     degree = len(trimmed) - 1
@@ -140,13 +139,11 @@ def ascending_roots(coefficients: FloatArray) -> ComplexArray:
     return np.asarray(np.roots(scaled[::-1] / scaled[-1]) * scale, np.complex128)
 
 
-# What a response does to slow motion: ``ln G = -L s + k s² + …``, lag L and curvature k.
-
-
 def slow_motion_jacobian(dynamics: TransferFunction) -> FloatArray:
     """Return d(L, k)/d(numerator, denominator[1:], delay), shape (2, p) [s, s²].
 
-    With ``∂ln G/∂n_i = s^i/N`` and ``∂ln G/∂d_i = -s^i/D``, cut after s².
+    Lag L and curvature k describe slow motion: ``ln G = -L s + k s² + …``. The derivatives
+    ``∂ln G/∂n_i = s^i/N`` and ``∂ln G/∂d_i = -s^i/D`` are expanded to s².
     """
     up = _inverse_series(dynamics.numerator)
     down = _inverse_series(dynamics.denominator)
@@ -158,30 +155,27 @@ def slow_motion_jacobian(dynamics: TransferFunction) -> FloatArray:
 
 
 def _inverse_series(polynomial: FloatArray) -> FloatArray:
-    """Return 1/polynomial to s², (3,)."""
+    """Return the series of 1/polynomial to s², (3,)."""
     n0, n1, n2 = np.append(polynomial, np.zeros(2))[:3]
     return np.array([1.0 / n0, -n1 / n0**2, n1**2 / n0**3 - n2 / n0**2], np.float64)
 
 
 def _shifted(series: FloatArray, powers: int) -> FloatArray:
-    """Return the times s to the ``powers``, to s²."""
+    """Return the series times s to the ``powers``, to s²."""
     return np.asarray(np.append(np.zeros(powers), series)[:3], np.float64)
-
-
-# Hand-over of an identified G(s) to python-control, for its plots, margins and designs.
 
 
 def to_control(dynamics: TransferFunction, delay_order: int = 3) -> control.TransferFunction:
     """Return ``dynamics`` as a ``control.TransferFunction`` in rad/s.
 
-    A delay becomes a Padé approximant of ``delay_order``, good up to about
-    ``delay_order / delay`` rad/s: python-control has no delay of its own.
+    A delay becomes a Padé approximant of ``delay_order``, accurate up to about
+    ``delay_order / delay`` rad/s, because python-control has no delays.
     Raises ConfigurationError for a delay_order that is not positive.
     """
-    import control  # loaded when it is needed: it takes a second
+    import control  # imported here, because it takes a second to load
 
     if delay_order < 1:
-        raise ConfigurationError(f"delay_order {delay_order!r}, expected 1 or more")
+        raise ConfigurationError("lti.delay_order", order=delay_order)
     rational = control.TransferFunction(dynamics.numerator[::-1], dynamics.denominator[::-1])
     if dynamics.delay == 0:
         return rational

@@ -1,7 +1,10 @@
-"""Frozen records that modules hand to each other; they mirror the wire contract.
+"""Blocks of samples, which mirror the messages, and the account of every sample.
 
-A *block* is a run of consecutive samples of one trigger counter. All quantities
-are SI; arrays are float64 of shape (n,) unless said otherwise.
+A *block* is a run of consecutive samples of one trigger counter. All quantities are SI; arrays
+are float64 of shape (n,) unless stated otherwise.
+
+For each stream ``received == corrected + pending + sum(counted.values())`` at any time. Samples
+that never came are ``missing`` and not part of this sum.
 """
 
 from __future__ import annotations
@@ -33,17 +36,16 @@ FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 
-# No device here delivers more in one message; a longer block is a forgery or a wrong unit.
+# No device delivers more samples in one message; a longer block is damaged or forged.
 MAX_BLOCK_SAMPLES = 4_000_000
 
-# Of fewer steps the median may be the jump itself.
-_STEPS_REPORTED = 5
+# The median of fewer steps may be the jump of a wrapped angle.
+_LEAST_STEPS = 5
 
 SAME_PERIOD = 1e-6
-"""Sample periods are written, not measured: alike to this part, six digits, they are one."""
+"""Relative difference of two stated sample periods that are equal, from six written digits."""
 
-
-# What is not plausible was not measured: it counts as lost.
+# Channels with their plausible ranges; a value outside counts as lost.
 _AXES = {"x": POSITION, "y": POSITION, "z": POSITION, "b": ANGLE, "c": ANGLE}
 _DISTANCE = {"distance": DISTANCE}
 _ACCELERATION = dict.fromkeys("xyz", ACCELERATION)
@@ -59,51 +61,38 @@ class Status(IntEnum):
     LOST = 4
 
 
-def empty_parts() -> IntArray:
-    """Return the parts of a block of one message, (0, 2)."""
-    return np.empty((0, 2), np.int64)
-
-
-def _empty_f32() -> NDArray[np.float32]:
-    return np.empty(0, np.float32)
-
-
-def _empty_u8() -> NDArray[np.uint8]:
-    return np.empty(0, np.uint8)
-
-
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Block:
-    """What every block has: when and where in the trigger count it lies.
+    """Base of all blocks: time and trigger counts of its samples.
 
     stamp_ns: time of the first sample [ns, ROS time]
-    first_sample: trigger counter of the first sample
+    first_sample: trigger count of the first sample
     sample_period: [s]
-    parts: first sample and stamp [ns] of each message it was joined of, (k, 2); empty if of one
+    parts: first sample and stamp [ns] of each joined message, (k, 2); (0, 2) for one message
     """
 
     stamp_ns: int
     first_sample: int
     sample_period: float
-    parts: IntArray = field(default_factory=empty_parts)
+    parts: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     def __len__(self) -> int:
-        """Samples in the block."""
+        """Return the number of samples."""
         raise NotImplementedError
 
     @property
     def end(self) -> int:
-        """Trigger counter after the last sample."""
+        """Trigger count after the last sample."""
         return self.first_sample + len(self)
 
     @property
     def stamps(self) -> IntArray:
-        """First sample and stamp [ns] of each message that it is of, (k, 2)."""
+        """First sample and stamp [ns] of each message, (k, 2)."""
         return self.parts if len(self.parts) else np.array([(self.first_sample, self.stamp_ns)])
 
     @property
     def newest(self) -> tuple[int, int]:
-        """First sample and stamp [ns] of the last message that it is of."""
+        """First sample and stamp [ns] of the last message."""
         if not len(self.parts):
             return self.first_sample, self.stamp_ns
         return int(self.parts[-1, 0]), int(self.parts[-1, 1])
@@ -112,13 +101,12 @@ class Block:
         self, name: str, lengths: set[int], channels: Mapping[str, Quantity] = MappingProxyType({})
     ) -> None:
         if len(lengths) != 1:
-            raise DataError(
-                f"{name}: channels of different lengths {sorted(lengths)!r}, expected one; "
-                "check the driver that made it"
-            )
+            raise DataError("streams.block_lengths", block=name, lengths=sorted(lengths))
         (length,) = lengths
         if not 0 < length <= MAX_BLOCK_SAMPLES:
-            raise DataError(f"{name}: {length!r} samples, expected 1 to {MAX_BLOCK_SAMPLES}")
+            raise DataError(
+                "streams.block_samples", block=name, samples=length, most=MAX_BLOCK_SAMPLES
+            )
         SAMPLE_PERIOD.checked(self.sample_period, DataError, f"{name}: sample_period")
         COUNTER.checked(self.first_sample, DataError, f"{name}: first_sample")
         STAMP.checked(self.stamp_ns, DataError, f"{name}: stamp")
@@ -128,7 +116,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AxisBlock(Block):
-    """Axis encoders: x, y, z [m]; b, c [rad]; each of shape (n,), NaN where it was lost."""
+    """Axis positions x, y, z [m] and b, c [rad], each (n,), NaN where lost."""
 
     x: FloatArray
     y: FloatArray
@@ -148,20 +136,19 @@ class AxisBlock(Block):
 class DistanceBlock(Block):
     """Probe readings: distance [m] (n,), intensity 0-1 (n,) or (0,), status (n,) or (0,).
 
-    The distance is NaN where the status is not OK, whatever was given.
-    An empty status means that every sample is OK, an empty intensity that the
-    device does not report it.
+    The distance is NaN where the status is not OK. An empty status means that every sample is OK,
+    an empty intensity that the device does not report it.
     """
 
     distance: FloatArray
-    intensity: NDArray[np.float32] = field(default_factory=_empty_f32)
-    status: NDArray[np.uint8] = field(default_factory=_empty_u8)
+    intensity: NDArray[np.float32] = field(default_factory=lambda: np.empty(0, np.float32))
+    status: NDArray[np.uint8] = field(default_factory=lambda: np.empty(0, np.uint8))
 
     def __post_init__(self) -> None:
         optional = {len(a) for a in (self.intensity, self.status) if len(a)}
         self._check("DistanceBlock", {len(self.distance)} | optional, _DISTANCE)
         if len(self.status) and np.any(self.status != Status.OK):
-            # As the message promises, whoever sent it: a reading that is not OK is none.
+            # The sender may have left a number in a reading that is not OK.
             readings = np.where(self.status == Status.OK, self.distance, np.nan)
             object.__setattr__(self, "distance", readings)
 
@@ -170,14 +157,14 @@ class DistanceBlock(Block):
 
     @property
     def ok(self) -> BoolArray:
-        """True where the probe gave a usable, finite reading, shape (n,)."""
+        """True where the probe gave a valid, finite reading, shape (n,)."""
         finite = np.isfinite(self.distance)
         return finite & (self.status == Status.OK) if len(self.status) else finite
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class AccelerationBlock(Block):
-    """Acceleration x, y, z [m/s²], each of shape (n,), NaN where it was lost."""
+    """Acceleration x, y, z [m/s²], each (n,), NaN where lost."""
 
     x: FloatArray
     y: FloatArray
@@ -191,10 +178,10 @@ class AccelerationBlock(Block):
 
 
 class AngleUnwrapper:
-    """An angle that counts on, of one that may begin anew on every turn [rad].
+    """Unwraps an angle [rad] block by block, so that it can be delayed and interpolated.
 
-    Whatever delays or interpolates C would take such a jump for a turn back. A jump is told from a
-    spindle that makes a turn from sample to sample by the steps around it.
+    A jump is a step that differs by a whole turn from the median of the steps around it, so that
+    a spindle may turn by more than half a turn from sample to sample.
     """
 
     def __init__(self) -> None:
@@ -202,38 +189,32 @@ class AngleUnwrapper:
         self._steps = np.empty(0)
 
     def of(self, angle: FloatArray) -> FloatArray:
-        """Return the next angles (n,), finite; the same array where there is nothing to count."""
+        """Return the next angles (n,), finite, unwrapped; the same array if none jumps."""
         before = np.concatenate([self._last, angle])
         steps = np.diff(before)
         known = np.concatenate([self._steps, steps])
-        if len(known) >= _STEPS_REPORTED:
+        if len(known) >= _LEAST_STEPS:
             turns = np.round((steps - np.median(known)) / (2 * np.pi))
             if np.any(turns):
                 steps = steps - 2 * np.pi * turns
                 before[1:] -= 2 * np.pi * np.cumsum(turns)
                 angle = before[len(self._last) :]
         self._last = before[-1:]
-        self._steps = np.concatenate([self._steps, steps])[-_STEPS_REPORTED:]
+        self._steps = np.concatenate([self._steps, steps])[-_LEAST_STEPS:]
         return angle
 
 
-# Where did every sample go?
-#
-# For each stream ``received == corrected + pending + sum(counted.values())`` at any time. What
-# never came is none of these: trigger counts that a session left out are ``missing``.
-
-
 class RejectionReason(IntEnum):
-    """Why a sample gave no surface point; 0 means that it did.
+    """Reason why a sample gave no surface point; 0 means that it did.
 
-    INVALID: not finite, or the probe gave no usable reading, on either side of a pair
+    INVALID: either sample of the pair is not finite or not a valid reading
     UNMATCHED: the other stream has no sample of this trigger count
-    DUPLICATE: the trigger count was seen before
-    LATE: came after later samples, into a gap that had been passed
-    SETTLING: the filter had just started
-    OVERDUE: waited for its partner, or for whom its partner waited, longer than is allowed
-    BEYOND: taken where no member of the calibration set knows the dynamics
-    SLIPPED: the counters of the two streams no longer count the same triggers
+    DUPLICATE: a sample of this trigger count came before
+    LATE: came after later samples
+    SETTLING: within the settling time of the filter
+    OVERDUE: one sample of the pair waited for the other longer than allowed
+    BEYOND: outside the range of the calibration set
+    SLIPPED: the counters of the two streams count different triggers
     """
 
     NONE = 0
@@ -249,7 +230,7 @@ class RejectionReason(IntEnum):
 
 @dataclass(frozen=True)
 class StreamAccount:
-    """One stream: samples received, turned into points, still waiting, and counted by reason.
+    """Number of samples of one stream: received, corrected, waiting, and counted by reason.
 
     missing: trigger counts that never came, between the first and the last of each session
     """
@@ -263,7 +244,7 @@ class StreamAccount:
 
 @dataclass(frozen=True)
 class Account:
-    """Both streams of a corrector."""
+    """Accounts of both streams of a corrector."""
 
     axes: StreamAccount = StreamAccount()
     distance: StreamAccount = StreamAccount()
@@ -274,7 +255,7 @@ class Account:
 
 
 class Tally:
-    """The running account of one stream."""
+    """Running account of one stream."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -283,40 +264,36 @@ class Tally:
         self._counted: Counter[RejectionReason] = Counter()
 
     def count(self, reason: RejectionReason, samples: int) -> None:
-        """Enter ``samples`` under ``reason``; NONE means corrected."""
+        """Count ``samples`` under ``reason``; NONE means corrected."""
         if reason is RejectionReason.NONE:
             self.corrected += samples
         else:
             self._counted[reason] += samples
 
     def count_each(self, reasons: NDArray[np.uint8]) -> None:
-        """Enter one sample under each of ``reasons`` (n,)."""
+        """Count one sample under each of ``reasons`` (n,)."""
         for value, samples in enumerate(np.bincount(reasons)):
             self.count(RejectionReason(value), int(samples))
 
     def snapshot(self, pending: int) -> StreamAccount:
-        """Return the account as it stands with ``pending`` samples waiting."""
+        """Return the present account, with ``pending`` samples waiting."""
         counted = {reason.name.lower(): n for reason, n in sorted(self._counted.items()) if n}
         return StreamAccount(self.received, self.corrected, pending, counted, self.missing)
 
-
-# Many small blocks as few large ones: a filter's call costs more than a sample.
-#
-# Whoever falls behind finds more blocks waiting, and catches up by dealing with them at once.
 
 B = TypeVar("B", AxisBlock, DistanceBlock)
 AnyBlock = TypeVar("AnyBlock", bound=Block)
 
 MOST_TOGETHER = 100
-"""Samples, as a driver's block has: each place in a queue keeps room for its longest message."""
+"""Most samples of a joined block; DDS keeps room for the longest message in each queue."""
 
-# Stamps within one block are those of its first sample and the period; they are moved no further.
+# Joining moves the stamps of a block onto the line from the first one; this is the most [s].
 _STAMP_TOLERANCE_S = 1e-3
 _NOT_CHANNELS = ("stamp_ns", "first_sample", "sample_period", "parts")
 
 
 def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:
-    """Return the blocks in runs, the count of each block following on that of the one before."""
+    """Return the blocks in runs without a gap in the count."""
     runs: list[list[AnyBlock]] = []
     for block in blocks:
         if runs and block.first_sample == runs[-1][-1].end:
@@ -327,10 +304,10 @@ def uninterrupted(blocks: Sequence[AnyBlock]) -> list[list[AnyBlock]]:
 
 
 def consecutive(blocks: Sequence[B]) -> list[list[B]]:
-    """Return the blocks in their order, those in one list that :func:`joined` can make one.
+    """Return the blocks in their order, grouped so that :func:`joined` can join each group.
 
-    They have consecutive counts, one period, the same channels, and stamps that continue the
-    first one's; beyond MOST_TOGETHER samples a list has one block.
+    Blocks of a group have consecutive counts, one period, the same channels, and stamps that
+    follow from the first one, and at most MOST_TOGETHER samples if they are several.
     """
     runs: list[list[B]] = []
     length = 0
@@ -356,7 +333,7 @@ def _continues(first: B, length: int, block: B) -> bool:
 
 
 def _nonempty_channels(block: B) -> tuple[str, ...]:
-    """Return names of the channels that have samples: an empty one means something of its own."""
+    """Return the names of the channels that are not empty."""
     return tuple(name for name in _channels(block) if len(getattr(block, name)))
 
 
@@ -365,7 +342,7 @@ def _channels(block: B) -> tuple[str, ...]:
 
 
 def joined(run: Sequence[B]) -> B:
-    """Return one block of the samples of several that follow on, with the first one's stamp."""
+    """Return one block of the samples of consecutive blocks, with the stamp of the first."""
     if len(run) == 1:
         return run[0]
     return replace(
@@ -378,7 +355,7 @@ def joined(run: Sequence[B]) -> B:
 
 
 def without_first_message(block: B, messages: int) -> B:
-    """Return a block that was joined of several messages without the first of them."""
+    """Return a joined block without its first ``messages`` messages."""
     if not messages:
         return block
     first, stamp_ns = block.parts[messages].tolist()

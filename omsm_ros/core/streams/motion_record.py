@@ -1,8 +1,8 @@
-"""One recording of an axis and of what the probe saw, on one regular grid.
+"""Recordings of Z and the probe on one regular grid, and the buffer of the newest motion.
 
-Blocks of one trigger are paired by its counter. Where the rates differ there is no common
-trigger: then the axis is interpolated by the stamps, on a grid that has every sample of the
-probe on it and is at least as fine as the axis's own sampling.
+Blocks of one trigger are paired by its counter. If the rates differ there is no common trigger:
+then the axis is interpolated by the stamps, on a grid that contains every sample of the probe and
+is at least as fine as the sampling of the axis.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 import numpy as np
 
+from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import (
     SAME_PERIOD,
     AxisBlock,
@@ -29,7 +30,6 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.continuity import TIME_JUMP_S
 from omsm_ros.core.streams.pairing import STAMP_TOLERANCE_S, Pairing, SampleRun, StreamInput
-from omsm_ros.core.streams.stamps import axes_at_probe
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import SAMPLE_PERIOD
@@ -37,9 +37,9 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # Five hours at 1 kHz; a larger span of the counter is two recordings or a forged block.
 MAX_RECORD_SAMPLES = 20_000_000
-_LONG = f"more than {MAX_RECORD_SAMPLES} on one grid; check both sample periods"
 
 B = TypeVar("B", bound=Block)
+Probed = TypeVar("Probed", AxisBlock, DistanceBlock)
 Values: TypeAlias = Callable[[Any], "tuple[FloatArray, BoolArray]"]
 
 
@@ -50,13 +50,13 @@ class MotionRecord:
     sample_period: of the grid [s]
     z: encoder [m], finite everywhere; interpolated where it was lost, and not ``ok`` there
     distance: probe [m], NaN where it has no reading
-    ok: True where both are measured and to be trusted
+    ok: True where both are measured and valid
     reference: second sensor along the same motion [m], NaN where it has no reading, or None
-    z_lost: True where z is interpolated, or None where it never is
-    by_stamps: whether two clocks, not one trigger, say which samples belong together
-    counts: what became of every sample received
+    z_lost: True where z is interpolated, None if it never is
+    by_stamps: True if the samples were paired by stamps instead of a common trigger
+    counts: number of samples by what became of them
 
-    Raises DataError when the arrays do not fit each other.
+    Raises DataError for arrays of different lengths.
     """
 
     sample_period: float
@@ -74,7 +74,7 @@ class MotionRecord:
             arrays.append(self.reference)
         lengths = sorted({len(a) for a in arrays})
         if len(lengths) != 1:
-            raise DataError(f"record: channels of different lengths {lengths!r}")
+            raise DataError("streams.record_lengths", lengths=lengths)
         SAMPLE_PERIOD.checked(self.sample_period, DataError, "record: sample_period")
 
     def __len__(self) -> int:
@@ -89,7 +89,7 @@ class MotionRecord:
         ok: BoolArray | None = None,
         reference: FloatArray | None = None,
     ) -> MotionRecord:
-        """Return a record of plain arrays (n,); NaN in any channel marks a lost sample."""
+        """Return a record of arrays (n,); NaN in any channel marks a lost sample."""
         z = np.asarray(z, np.float64)
         distance = np.asarray(distance, np.float64)
         known = np.isfinite(z)
@@ -121,14 +121,13 @@ def assemble(
 ) -> MotionRecord:
     """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
 
-    by_stamps: join them by their stamps, as those of different rates are, whatever they count
+    by_stamps: pair them by their stamps also at equal rates
 
-    Raises DataError when nothing can be paired, when it is more than one recording, or when the
-    counters of axes and distance slipped against each other.
+    Raises DataError if nothing can be paired, for more than one recording, or if the counters of
+    axes and distance slipped against each other.
     """
     if not axes or not distance:
-        counts = f"{len(axes)} axis blocks and {len(distance)} distance blocks"
-        raise DataError(f"{counts}: both are needed; check that both topics were recorded")
+        raise DataError("streams.no_blocks", axes=len(axes), distance=len(distance))
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
     if abs(probe_period / period - 1) < SAME_PERIOD and not by_stamps:
@@ -139,19 +138,17 @@ def assemble(
 def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]) -> float:
     periods = sorted({float(block.sample_period) for block in blocks})
     if periods[-1] > periods[0] * (1 + SAME_PERIOD):
-        raise DataError(
-            f"{name} blocks of different sample periods {periods!r} s; identify each by itself"
-        )
+        raise DataError("streams.different_periods", stream=name, periods=periods)
     return periods[0]
 
 
 def _ordered(blocks: Iterable[B]) -> list[B]:
-    """Return blocks in the order in which they were taken, not in which they came."""
+    """Return the blocks in the order of their stamps."""
     return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
 
 
 def _runs(blocks: Iterable[Block], values: Values, intake: StreamInput) -> Iterator[SampleRun]:
-    """Yield what is new of each block; ``values`` gives its channel (n,) and where it is usable."""
+    """Yield the new samples of each block; ``values`` gives its channel and validity, each (n,)."""
     for block in _ordered(blocks):
         if (arrival := intake.new(block)) is not None:
             value, ok = values(block)
@@ -169,7 +166,7 @@ def _reading(block: Any) -> tuple[FloatArray, BoolArray]:
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The axis on the counts ``first`` … of one session, (n,), NaN and not ``known`` in gaps."""
+    """The axis on the counts of one session from ``first`` on, (n,); NaN where not ``known``."""
 
     runs: list[SampleRun]
     first: int
@@ -185,9 +182,7 @@ class _Grid:
         first, samples = runs[0].first, runs[-1].end - runs[0].first
         if sessions > 1 or samples > MAX_RECORD_SAMPLES:
             raise DataError(
-                f"the recording spans {samples!r} samples in {sessions!r} runs of the trigger "
-                f"counter, expected one of at most {MAX_RECORD_SAMPLES}: two recordings in one, "
-                "a counter that was reset, or a clock set back; identify from one of them"
+                "streams.record_span", samples=samples, sessions=sessions, most=MAX_RECORD_SAMPLES
             )
         z, known = np.full(samples, np.nan), np.zeros(samples, np.bool_)
         for run in runs:
@@ -198,9 +193,9 @@ class _Grid:
     def matched(
         self, name: str, blocks: Sequence[DistanceBlock], trigger: CommonTrigger
     ) -> tuple[FloatArray, BoolArray, StreamAccount]:
-        """Return readings on the grid (n,), True where usable (n,), and the account of all of them.
+        """Return readings on the grid (n,), their validity (n,), and the account of the stream.
 
-        Raises DataError where their counter slipped against that of the axes.
+        Raises DataError if its counter slipped against that of the axes.
         """
         axes, intake = StreamInput(), StreamInput(trigger.counter_offset)
         pairing = Pairing(axes, intake, trigger)
@@ -216,7 +211,8 @@ class _Grid:
             seen[place], ok[place] = np.where(usable, reading.values[0], np.nan), usable
         pairing.distance.clear()
         if pairing.watch.found is not None:
-            raise DataError(f"{name}: {pairing.watch.found}")
+            slip = pairing.watch.found.notice()
+            raise DataError("streams.slip_of", stream=name, **slip.values)
         return seen, ok, intake.tally.snapshot(0)
 
 
@@ -232,10 +228,11 @@ def _by_counter(
     lost = account.counted.get("unmatched", 0) + account.counted.get("duplicate", 0)
     if lost + account.counted.get("late", 0) == account.received:
         raise DataError(
-            f"axis samples {grid.first}…{grid.first + len(grid.z) - 1} and distance samples from "
-            f"{distance[0].first_sample} share no trigger count at the same time: record both "
-            f"at once, with stamps that differ by less than {STAMP_TOLERANCE_S} s, or, where each "
-            "counts for itself, join them by their stamps (--by-stamps)"
+            "streams.nothing_in_common",
+            first=grid.first,
+            last=grid.first + len(grid.z) - 1,
+            distance=distance[0].first_sample,
+            tolerance=STAMP_TOLERANCE_S,
         )
     own = replace(trigger, counter_offset=0)
     return MotionRecord(
@@ -275,11 +272,13 @@ def _by_stamp(
     distance: Sequence[DistanceBlock],
     reference: Sequence[DistanceBlock],
 ) -> MotionRecord:
-    """Join by counter, once the axis is where a trigger of the grid would have latched it."""
+    """Interpolate the axis at the samples of the grid, and pair both by counter."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
     finer = max(int(np.ceil(probe_period / axis_period - SAME_PERIOD)), 1)
     if finer * sum(map(len, distance)) > MAX_RECORD_SAMPLES:
-        raise DataError(f"readings every {probe_period:g} s, axes every {axis_period:g} s: {_LONG}")
+        raise DataError(
+            "streams.grid", probe=probe_period, axes=axis_period, most=MAX_RECORD_SAMPLES
+        )
     grid = [_refined(block, finer) for block in _ordered(distance)]
     moved = list(axes_at_probe(_ordered(axes), grid))
     second = []
@@ -292,7 +291,7 @@ def _by_stamp(
 
 
 def _refined(block: DistanceBlock, finer: int) -> DistanceBlock:
-    """Return the block on a grid ``finer`` times as fine, its readings ``finer`` counts apart."""
+    """Return the block on a grid that is ``finer`` times as fine, NaN between its readings."""
     values = np.full(len(block) * finer, np.nan)
     values[::finer] = np.where(block.ok, block.distance, np.nan)
     return DistanceBlock(
@@ -325,10 +324,7 @@ def _covered(record: MotionRecord) -> MotionRecord:
     known = np.ones(len(record), np.bool_) if record.z_lost is None else ~record.z_lost
     places = np.flatnonzero(known)
     if not len(places):
-        raise DataError(
-            "the axis samples share no time with the distance stamps: they are not of one "
-            "recording, or the clocks of their senders differ; set them"
-        )
+        raise DataError("streams.no_common_time")
     part = slice(int(places[0]), int(places[-1]) + 1)
     return replace(
         record,
@@ -343,7 +339,7 @@ def _covered(record: MotionRecord) -> MotionRecord:
 def _unfilled(
     counts: Mapping[str, int], distance: Sequence[DistanceBlock], finer: int
 ) -> dict[str, int]:
-    """Return the account of the readings themselves, without what lies between them on the grid."""
+    """Return the counts of the readings, without the grid samples between them."""
     received = sum(map(len, distance))
     duplicates, unmatched = (counts[name] // finer for name in ("duplicates", "unmatched"))
     paired = counts["paired"]
@@ -355,33 +351,29 @@ def _unfilled(
     }
 
 
-# The last motion of the cell, kept while it happens, for an identification on request.
-
-B_MOTION_BUFFER = TypeVar("B", AxisBlock, DistanceBlock)
-
-# A block takes some 2 kB beside its samples, which is much for a block of one and little for one
-# of a hundred: that many blocks are joined as long as they hold fewer samples than that each.
+# A block needs 2 kB besides its samples, which is much for a short block: that many blocks are
+# joined if they have fewer samples than that on average.
 _MANY = 100
 
 
-class BlockBuffer(Generic[B_MOTION_BUFFER]):
-    """Blocks of one topic since its trigger counter last started anew, bounded in samples.
+class BlockBuffer(Generic[Probed]):
+    """Blocks of one topic since its trigger counter was last reset, bounded in samples.
 
-    The oldest blocks go when ``capacity`` samples are exceeded; ``forgotten`` counts theirs.
-    Short blocks that follow on are joined, so that memory is that of their samples.
+    The oldest blocks are dropped when ``capacity`` samples are exceeded; ``forgotten`` counts
+    their samples. Short consecutive blocks are joined to save memory.
     """
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
-        self._blocks: deque[B_MOTION_BUFFER] = deque()
+        self._blocks: deque[Probed] = deque()
         self._samples = 0
-        self._apart = 0  # of the newest blocks, those not joined yet
+        self._apart = 0  # number of the newest blocks that are not joined yet
         self.forgotten = 0
 
-    def add(self, block: B_MOTION_BUFFER) -> None:
-        """Append a block; a counter that falls back behind the last block begins a new motion.
+    def add(self, block: Probed) -> None:
+        """Append a block; a counter that falls begins a new motion.
 
-        Unless its stamp is a little older too: then the block came late, or once more.
+        If its stamp is a little older too, the block is a late or repeated one.
         """
         if not self._blocks or block.first_sample >= self._blocks[-1].first_sample:
             self._blocks.append(block)
@@ -398,9 +390,9 @@ class BlockBuffer(Generic[B_MOTION_BUFFER]):
             self._forget(1)
 
     def _join(self) -> None:
-        """Join short blocks but the newest, which a late one may still have to stand before."""
+        """Join short blocks except the newest one, before which a late block may be inserted."""
         newest = self._blocks.pop()
-        blocks: list[B_MOTION_BUFFER] = [self._blocks.pop() for _ in range(self._apart - 1)][::-1]
+        blocks: list[Probed] = [self._blocks.pop() for _ in range(self._apart - 1)][::-1]
         if sum(map(len, blocks)) < _MANY * len(blocks):
             blocks = [joined(run) for run in consecutive(blocks)]
         self._blocks.extend(blocks)
@@ -408,7 +400,7 @@ class BlockBuffer(Generic[B_MOTION_BUFFER]):
         self._apart = 1
 
     def forget(self) -> None:
-        """Forget all blocks: what comes does not belong to them."""
+        """Drop all blocks, because a new motion begins."""
         self._forget(len(self._blocks))
 
     def _forget(self, blocks: int) -> None:
@@ -419,11 +411,11 @@ class BlockBuffer(Generic[B_MOTION_BUFFER]):
         self._apart = min(self._apart, len(self._blocks))
 
     def __len__(self) -> int:
-        """Samples held."""
+        """Return the number of samples held."""
         return self._samples
 
-    def recent(self, duration: float = 0.0) -> list[B_MOTION_BUFFER]:
-        """Return blocks that reach into the last ``duration`` seconds of the motion; 0 = all."""
+    def recent(self, duration: float = 0.0) -> list[Probed]:
+        """Return the blocks of the last ``duration`` seconds of the motion; 0 = all."""
         if not self._blocks or duration == 0:
             return list(self._blocks)
         last = self._blocks[-1]

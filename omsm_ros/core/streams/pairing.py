@@ -1,13 +1,13 @@
-"""Which samples of two streams belong to one trigger?
+"""Pairing of the samples of two streams by their trigger counts.
 
-Both streams are queues in the order of their sessions and trigger counts. Their heads are
-compared: equal counts of the same session make pairs, and a head that the other stream has
-already passed will never find its partner. Every decision rests on the two heads alone,
-so the outcome does not depend on how the streams were interleaved or cut.
+Both streams are queues in the order of sessions and trigger counts. Their heads are compared:
+equal counts of linked sessions make pairs, and a head that the other stream has passed has no
+partner. A decision depends on the two heads only, so that it does not matter how the streams were
+interleaved or cut.
 
-Sessions are counted by each stream for itself. The first pair with the same count *and* the
-same time links a session of one stream to a session of the other. From then on their stamps
-are watched: pairs whose counts slipped against each other are none.
+Each stream numbers its own sessions. The first pair of equal count *and* equal time links a
+session of one stream to a session of the other. Pairs whose counters have slipped against each
+other by their stamps are refused.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import Block, FloatArray, RejectionReason, Tally
-from omsm_ros.core.streams.continuity import Arrival, StampLine, TriggerCount
+from omsm_ros.core.streams.continuity import Arrival, TriggerCount
+from omsm_ros.core.streams.stamps import StampLine
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, TriggerSlipDetector
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# Two drivers stamp the same trigger with a common clock; scheduling may part them by this much.
+# Two drivers stamp the same trigger with a common clock; scheduling delays them by less.
 STAMP_TOLERANCE_S = 0.5
-# So many runs in a row that do not fit end the look for those that do.
+# The search for runs of the other stream's time ends after this number of misses in a row.
 _MISSES = 8
 
 
@@ -36,9 +37,9 @@ _MISSES = 8
 class SampleRun:
     """Consecutive samples of one stream.
 
-    session, first: of the first sample;  stamp_ns, period_ns: its time and the step [ns]
-    reasons: why a sample cannot become a point, Reason, (n,)
-    values: the stream's channels, (channels, n)
+    session, first: session and count of the first sample
+    stamp_ns, period_ns: its time, and the time between samples [ns]
+    reasons: Reason why a sample gives no point, (n,);  values: channels, (channels, n)
     """
 
     session: int
@@ -52,7 +53,7 @@ class SampleRun:
     def of(
         cls, block: Block, arrival: Arrival, reasons: NDArray[np.uint8], values: FloatArray
     ) -> SampleRun:
-        """Return what is new of ``block``, all of whose samples have ``reasons`` and ``values``."""
+        """Return the new samples of ``block``, all of which have ``reasons`` and ``values``."""
         period_ns = _period_ns(block)
         whole = cls(arrival.session, arrival.first, block.stamp_ns, period_ns, reasons, values)
         return whole.part(arrival.skip, len(whole)) if arrival.skip else whole
@@ -82,9 +83,9 @@ class SampleRun:
 
 
 class StreamInput:
-    """One stream's blocks on their way to a partner: what is new of each, what is counted.
+    """Input of one stream: places its blocks, counts their samples and keeps their stamps.
 
-    offset: added to the stream's trigger counts;  stamps: of its blocks
+    offset: added to the trigger counts
     """
 
     def __init__(self, offset: int = 0) -> None:
@@ -94,9 +95,9 @@ class StreamInput:
         self._count = TriggerCount()
 
     def new(self, block: Block, parts: Sequence[Block] = ()) -> Arrival | None:
-        """Count the samples of ``block``; None if all were there before, or came too late.
+        """Return the place of ``block``, counting its samples; None if none of them is new.
 
-        parts: the blocks it was joined of, each with a stamp of its own
+        parts: the blocks it was joined from, each with its stamp
         """
         arrival = self._count.place(block, len(block))
         self.tally.received += len(block)
@@ -111,7 +112,7 @@ class StreamInput:
         return arrival
 
     def _note(self, block: Block, arrival: Arrival) -> None:
-        """Keep the stamps of what is new of ``block``."""
+        """Keep the stamps of the new samples of ``block``."""
         begins, period_ns = arrival.first + arrival.skip, _period_ns(block)
         if not len(block.parts):
             first = block.first_sample + self._offset
@@ -128,16 +129,16 @@ class StreamInput:
         self.stamps.extend(arrival.session, firsts[new] + skipped, stamps)
 
     def end(self) -> None:
-        """Begin a session with whatever comes next."""
+        """Begin a new session with the next block."""
         self._count.end()
 
 
 class RunQueue:
     """Runs of one stream that wait for a partner.
 
-    pending: samples without one;  held: in pairs that are not settled yet
+    pending: samples without a partner;  held: samples in pairs that are not settled yet
     given_up: the newest samples that waited too long
-    stamps: of the blocks they came in
+    stamps: of the blocks in which they came
     """
 
     def __init__(self, tally: Tally, stamps: StampLine) -> None:
@@ -158,19 +159,19 @@ class RunQueue:
         self.pending += len(run)
 
     def drop(self, samples: int, reason: RejectionReason = RejectionReason.UNMATCHED) -> SampleRun:
-        """Take the oldest ``samples`` of the head, which have no partner for ``reason``."""
+        """Remove the oldest ``samples`` of the head, counting them under ``reason``."""
         run = self._cut(samples)
         self.stamps.advance(run.session, run.end - 1)
         self._tally.count_each(np.where(run.reasons, run.reasons, np.uint8(reason)))
         return run
 
     def hold(self, samples: int) -> SampleRun:
-        """Take the oldest ``samples`` of the head, which have partners; settle or refuse them."""
+        """Remove the oldest ``samples`` of the head, which have partners; settle or refuse them."""
         self.held += samples
         return self._cut(samples)
 
     def settle(self, run: SampleRun, partner_reasons: NDArray[np.uint8]) -> None:
-        """Enter a run that was held, whose partners have these reasons."""
+        """Count a run that was held; its partners have the reasons ``partner_reasons`` (n,)."""
         self.held -= len(run)
         if run.reasons.any() or partner_reasons.any():
             self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
@@ -178,25 +179,25 @@ class RunQueue:
             self._tally.count(RejectionReason.NONE, len(run))
 
     def refuse(self, run: SampleRun) -> None:
-        """Enter a run that was held, and whose partners are of other triggers."""
+        """Count a run that was held as slipped."""
         self.held -= len(run)
         self._tally.count_each(
             np.where(run.reasons, run.reasons, np.uint8(RejectionReason.SLIPPED))
         )
 
     def limit(self, samples: int) -> None:
-        """Give the oldest up until no more than ``samples`` wait."""
+        """Drop the oldest as overdue until no more than ``samples`` wait."""
         while self.pending > samples:
             excess = min(self.pending - samples, len(self._runs[0]))
             self.given_up = self.drop(excess, RejectionReason.OVERDUE)
 
     def clear(self) -> None:
-        """Drop all that waits, which will find no partner."""
+        """Drop all waiting samples as unmatched."""
         while self._runs:
             self.drop(len(self._runs[0]))
 
     def misplaced_runs(self, other: SampleRun) -> int:
-        """Return how many runs come before the newest ones of ``other``'s time; 0 without such."""
+        """Return the number of runs before those of the time of ``other``; 0 if there are none."""
         first = misses = 0
         for place in range(len(self._runs) - 1, 0, -1):
             misses = misses + 1 if _apart(self._runs[place], other) else 0
@@ -214,18 +215,10 @@ class RunQueue:
         return run.part(0, samples)
 
 
-@dataclass(frozen=True, slots=True)
-class _Link:
-    """A session of the axes, and the session of the distance that counts the same triggers."""
-
-    axes: int
-    distance: int
-
-
 class Pairing:
-    """Joins the two queues.
+    """Pairs the samples of two queues.
 
-    stamp_skew: time of the axes less time of the distance at the newest common count [s]
+    stamp_skew: time of the axes minus time of the distance at the newest common count [s]
     """
 
     def __init__(
@@ -235,11 +228,12 @@ class Pairing:
         self.distance = RunQueue(distance.tally, distance.stamps)
         self.stamp_skew: float | None = None
         self.watch = TriggerSlipDetector(axes.stamps, distance.stamps, trigger)
-        self._link = _Link(-1, -1)
+        # Sessions of axes and distance that count the same triggers.
+        self._link = (-1, -1)
         self._held: deque[tuple[SampleRun, SampleRun]] = deque()
 
     def pairs(self) -> Iterator[tuple[SampleRun, SampleRun]]:
-        """Yield complete runs of axes and distance, of equal count and length."""
+        """Yield settled runs of axes and distance, of equal counts and length."""
         while (a := self.axes.head) is not None and (d := self.distance.head) is not None:
             order = self._order(a, d)
             if order == 0:
@@ -254,24 +248,24 @@ class Pairing:
                 self.distance.drop(samples, _missing(d, self.axes))
 
     def end(self) -> Iterator[tuple[SampleRun, SampleRun]]:
-        """Yield the pairs that still wait to be settled, as far as stamps can tell; none follow."""
+        """Settle the pairs that still wait by the stamps there are, and yield them."""
         if self._held:
             yield from self._settle(self._held[-1][0].end, self.watch.end())
 
     def _joined(self, a: SampleRun, d: SampleRun) -> Iterator[tuple[SampleRun, SampleRun]]:
-        """Yield the pairs that two heads of equal count settle; theirs may have to wait."""
+        """Pair two heads of equal count, and yield the pairs that are settled by their stamps."""
         self.stamp_skew = (a.stamp_ns - d.stamp_ns) / NANOSECONDS_PER_S
         sessions, first, samples = (a.session, d.session), a.first, min(len(a), len(d))
         if sessions != self.watch.sessions:
             yield from self.end()
         self._held.append((self.axes.hold(samples), self.distance.hold(samples)))
         verdicts = self.watch.settled(sessions, first, first + samples, a.period_ns)
-        # Pairs with one verdict are one run, however many stamps it rests on.
+        # Successive pairs with the same verdict are yielded as one run.
         for slipped, alike in groupby(verdicts, key=itemgetter(1)):
             yield from self._settle(max(until for until, _ in alike), slipped)
 
     def _settle(self, until: int, slipped: bool) -> Iterator[tuple[SampleRun, SampleRun]]:
-        """Yield the pairs that waited before the count ``until``, but for those that slipped."""
+        """Settle the pairs before the count ``until``; yield them unless they slipped."""
         while self._held and (first := self._held[0][0].first) < until:
             a, d = self._held.popleft()
             if until < a.end:
@@ -287,10 +281,10 @@ class Pairing:
                 yield a, d
 
     def _drop_misplaced(self, a: SampleRun, d: SampleRun) -> bool:
-        """Drop heads of a wrong time, where the other stream's goes with what comes after them.
+        """Drop heads of a wrong time if later runs of that stream fit the other; return if so.
 
-        Of a block whose stamp was wrong alone, nothing says so but the blocks that follow it: one
-        head would be taken for older, and the other stream dropped from then on.
+        A single wrong stamp shows only by the blocks that follow. Without this its head would be
+        taken for an older session, and the other stream would be dropped from then on.
         """
         axes, distance = self.axes.misplaced_runs(d), self.distance.misplaced_runs(a)
         if bool(axes) == bool(distance):
@@ -302,40 +296,40 @@ class Pairing:
         return True
 
     def _samples_before(self, run: SampleRun, other_first: int, a: SampleRun, d: SampleRun) -> int:
-        """Return samples of ``run`` before the other head, all of them if the sessions differ."""
+        """Return the number of samples before the other head, all if sessions are not linked."""
         if not self._linked(a, d):
             return len(run)
         return min(other_first - run.first, len(run))
 
     def _linked(self, a: SampleRun, d: SampleRun) -> bool:
-        return (a.session, d.session) == (self._link.axes, self._link.distance)
+        return (a.session, d.session) == self._link
 
     def _order(self, a: SampleRun, d: SampleRun) -> int:
-        """Return -1 if the axes' head has no partner, 1 if the distance's, 0 for a pair."""
+        """Return -1 if the head of the axes has no partner, 1 for the distance, 0 for a pair."""
         if not self._linked(a, d):
             if _apart(a, d):
                 return self._earlier_session(a, d)
             if max(a.first, d.first) < min(a.end, d.end):
-                self._link = _Link(a.session, d.session)
+                self._link = (a.session, d.session)
         return _sign(a.first - d.first)
 
     def _earlier_session(self, a: SampleRun, d: SampleRun) -> int:
-        """Return which of two heads that cannot be of one session is left over from before."""
-        if a.session == self._link.axes:
+        """Return -1 or 1 if the head of the axes or of the distance is of an older session."""
+        if a.session == self._link[0]:
             return -1
-        if d.session == self._link.distance:
+        if d.session == self._link[1]:
             return 1
         return _sign(a.stamp_ns - d.stamp_ns) or -1
 
 
 def _apart(a: SampleRun, d: SampleRun) -> bool:
-    """Return True if one trigger count would have had two different times."""
+    """Return True if the same trigger count has two different times."""
     count = max(a.first, d.first)
     return abs(a.stamp_of(count) - d.stamp_of(count)) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
 
 
 def _missing(run: SampleRun, other: RunQueue) -> RejectionReason:
-    """Return why the other stream has no partner for the first sample of ``run``."""
+    """Return the reason why the first sample of ``run`` has no partner."""
     lost = other.given_up
     overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
     return RejectionReason.OVERDUE if overdue else RejectionReason.UNMATCHED

@@ -1,57 +1,38 @@
-"""Where were the axes when the probe looked, if no trigger joins them?
+"""Stamps over the trigger count: the line through them, and the stamps of blocks to come.
 
-Two devices with rates and clocks of their own are joined by their time stamps. The stamps
-of a device's blocks jitter, its sample clock does not: a line through the stamps of a
-session gives the time of every sample. Between its samples an axis is a quintic spline,
-which follows a motion below a tenth of the sample rate to parts in a million. The result
-are axis blocks as the probe's own trigger would have latched them.
+The stamps of a device's blocks jitter, its sample clock does not: a line through the stamps of a
+session gives the time of every sample. Its slope shows a stated sample period that is wrong.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import (
-    AngleUnwrapper,
-    AxisBlock,
-    Block,
-    DistanceBlock,
-    FloatArray,
-    uninterrupted,
-    without_first_message,
-)
-from omsm_ros.core.streams.continuity import TriggerCount
-from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.readable import quantity
+from omsm_ros.core.streams.blocks import Block, BoolArray, FloatArray, IntArray
+from omsm_ros.errors import DataError, Notice
 from omsm_ros.units import NANOSECONDS_PER_S
 
-if TYPE_CHECKING:
-    from scipy.interpolate import BSpline
-
-# A cubic would be off by 2.6 nm on the paper's motion, a quintic is not (test_motion_record.py).
-_SPLINE_DEGREE = 5
-# Gauss and Legendre: nodes in half exposures, and their weights.
-_EXPOSURE_NODES = np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
-_EXPOSURE_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
-# Sample clocks are quartz; stamps that disagree more with the stated period are wrong.
+# Sample clocks are quartz oscillators; a stated period that is off by more is wrong.
 _MAX_RATE_ERROR = 1e-3
-_AXES = ("x", "y", "z", "b", "c")
-_C = _AXES.index("c")
-
-B = TypeVar("B", AxisBlock, DistanceBlock)
+# Clocks of two computers differ by a tenth of this; the lag of a motion changes by less than 1 %.
+_GREATEST_DIFFERENCE = 5e-3
+# Number of standard uncertainties by which the stamps must contradict a stated period.
+_COVERAGE = 5.0
+# The uncertainty of a line through fewer blocks is not known well enough to contradict a period.
+_LEAST_BLOCKS = 5
 
 
 @dataclass(frozen=True, slots=True)
 class StampClock:
-    """Time of the sample ``count``: ``start + (count - first) · period``.
+    """Time of the sample ``count``: ``start + offset + (count - first) · period``.
 
-    first, start_ns: a sample and its time, whole and below [ns];  period_ns: [ns]
+    first, start_ns: a sample and its stamp [ns];  offset_ns: from its stamp to the line [ns]
+    period_ns: [ns];  period_uncertainty_ns: standard uncertainty of it [ns]
     jitter: standard deviation of the stamps about the line [s]
     """
 
@@ -59,7 +40,34 @@ class StampClock:
     start_ns: int
     offset_ns: float
     period_ns: float
-    jitter: float
+    period_uncertainty_ns: float = 0.0
+    jitter: float = 0.0
+
+    @classmethod
+    def through(cls, stamps: IntArray, nominal_ns: float) -> StampClock:
+        """Return the regression line through ``stamps`` (k, 2), counts and times [ns].
+
+        nominal_ns: period [ns], which is taken where all stamps are of one count
+        """
+        first, start = stamps[0].tolist()
+        count, since = (stamps - stamps[0]).T.astype(np.float64)
+        late = since - count * nominal_ns
+        if np.ptp(count) == 0:
+            return cls(first, start, float(late.mean()), nominal_ns)
+        centred = count - count.mean()
+        square = float(centred @ centred)
+        drift = float(centred @ late / square)
+        offset = float(late.mean() - drift * count.mean())
+        residual = late - offset - drift * count
+        variance = float(residual @ residual) / max(len(count) - 2, 1)
+        return cls(
+            first,
+            start,
+            offset,
+            nominal_ns + drift,
+            float(np.sqrt(variance / square)),
+            float(np.std(residual)) / NANOSECONDS_PER_S,
+        )
 
     def since(self, count: FloatArray, origin_ns: int) -> FloatArray:
         """Return the times of samples ``count`` (n,) after ``origin_ns`` [s]."""
@@ -68,339 +76,271 @@ class StampClock:
         return np.asarray((whole + fine) / NANOSECONDS_PER_S, np.float64)
 
 
+def stamps_of(blocks: Sequence[Block]) -> IntArray:
+    """Return the first counts and stamps [ns] of all messages in ``blocks``, (k, 2)."""
+    return np.concatenate([block.stamps for block in blocks])
+
+
 def fit_clock(blocks: Sequence[Block]) -> StampClock:
-    """Return the line through the stamps of one session's blocks, its first sample the reference.
+    """Return the line through the stamps of the blocks of one session.
 
     Raises DataError if the stamps contradict the blocks' sample period.
     """
     nominal = blocks[0].sample_period * NANOSECONDS_PER_S
-    stamps = np.concatenate([block.stamps for block in blocks])
-    first, start = stamps[0].tolist()
+    stamps = stamps_of(blocks)
+    clock = StampClock.through(stamps, nominal)
+    drift, limit = abs(clock.period_ns - nominal), _MAX_RATE_ERROR * nominal
+    if drift > limit + _COVERAGE * clock.period_uncertainty_ns:
+        raise DataError(
+            "streams.rate",
+            stamped=clock.period_ns / NANOSECONDS_PER_S,
+            stated=blocks[0].sample_period,
+        )
+    if drift <= limit:
+        return clock
+    # The jitter of few blocks hides the rate: the stated period stands.
     count, since = (stamps - stamps[0]).T.astype(np.float64)
-    late = since - count * nominal
-    if np.ptp(count) == 0:
-        return StampClock(first, start, float(late.mean()), nominal, 0.0)
-    centred = count - count.mean()
-    drift = float(centred @ late / (centred @ centred))
-    offset = float(late.mean() - drift * count.mean())
-    jitter = float(np.std(late - offset - drift * count)) / NANOSECONDS_PER_S
-    uncertain = jitter * NANOSECONDS_PER_S / np.sqrt(float(centred @ centred))
-    if abs(drift) > _MAX_RATE_ERROR * nominal + 5 * uncertain:
-        raise DataError(
-            f"stamps advance by {nominal + drift!r} ns a sample, the blocks state {nominal!r} ns; "
-            "stamps of a recording in time lapse cannot join two clocks"
-        )
-    if abs(drift) > _MAX_RATE_ERROR * nominal:
-        # Few blocks with jitter say little about the rate: the stated one stands.
-        offset, drift = float(late.mean()), 0.0
-    return StampClock(first, start, offset, nominal + drift, jitter)
-
-
-def axes_at_probe(
-    axes: Iterable[AxisBlock],
-    distance: Iterable[DistanceBlock],
-    *,
-    delay: float = 0.0,
-    exposure: float = 0.0,
-) -> Iterator[AxisBlock]:
-    """Return an axis block for every distance block, of the same counts, stamps and period.
-
-    delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
-    exposure: over which the probe averages, and so is the motion [s]
-
-    A message of the probe of which samples were there before has none. Samples that no run of axis
-    samples covers are NaN. Raises DataError if there is nothing
-    to interpolate, ConfigurationError for an exposure that is negative or not finite.
-    """
-    if not (np.isfinite(delay) and 0 <= exposure < np.inf):
-        raise ConfigurationError(
-            f"delay {delay!r} s and exposure {exposure!r} s, expected a number and zero or more"
-        )
-    tracks = [_Track.of(run, clock) for run, clock in _runs(axes)]
-    if not any(track.spline for track in tracks):
-        raise DataError(
-            f"no {_SPLINE_DEGREE + 1} axis samples on end are finite, so none can be interpolated; "
-            "check that the axes were recorded without gaps"
-        )
-    nodes = delay + (0.5 * exposure * _EXPOSURE_NODES if exposure else np.zeros(1))
-    weights = _EXPOSURE_WEIGHTS if exposure else np.ones(1)
-    clocks = [(fit_clock(session), session) for session in _sessions(distance)]
-    return (
-        _at(block, clock, tracks, nodes, weights) for clock, session in clocks for block in session
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _Track:
-    """Consecutive axis samples: a spline over seconds after ``origin_ns``, ``begin`` to ``end``."""
-
-    origin_ns: int
-    begin: float
-    end: float
-    spline: BSpline | None
-
-    @classmethod
-    def of(cls, run: Sequence[AxisBlock], clock: StampClock) -> _Track:
-        values = np.stack([np.concatenate([getattr(b, name) for b in run]) for name in _AXES], 1)
-        count = run[0].first_sample + np.arange(len(values), dtype=np.float64)
-        time = clock.since(count, run[0].stamp_ns)
-        # Here, because it takes longer to load than a scan to correct, and few need it.
-        from scipy.interpolate import make_interp_spline
-
-        usable = len(values) > _SPLINE_DEGREE and bool(np.all(np.isfinite(values)))
-        if usable:
-            values[:, _C] = AngleUnwrapper().of(values[:, _C])
-        spline = make_interp_spline(time, values, _SPLINE_DEGREE) if usable else None
-        return cls(run[0].stamp_ns, float(time[0]), float(time[-1]), spline)
-
-
-def _at(
-    block: DistanceBlock,
-    clock: StampClock,
-    tracks: Sequence[_Track],
-    nodes: FloatArray,
-    weights: FloatArray,
-) -> AxisBlock:
-    count = block.first_sample + np.arange(len(block), dtype=np.float64)
-    values = np.full((len(block), len(_AXES)), np.nan)
-    for track in tracks:
-        begin, end = clock.since(count[[0, -1]], track.origin_ns) + nodes[[0, -1]]
-        if track.spline is None or end < track.begin or begin > track.end:
-            continue
-        time = clock.since(count, track.origin_ns)
-        inside = (time + nodes.min() >= track.begin) & (time + nodes.max() <= track.end)
-        if inside.any():
-            seen = [track.spline(time[inside] + node) for node in nodes]
-            values[inside] = np.average(seen, axis=0, weights=weights)
-    channels = {name: values[:, i].copy() for i, name in enumerate(_AXES)}
-    return AxisBlock(
-        stamp_ns=block.stamp_ns,
-        first_sample=block.first_sample,
-        sample_period=block.sample_period,
-        parts=block.parts,
-        **channels,
-    )
-
-
-def _sessions(blocks: Iterable[B]) -> list[list[B]]:
-    """Return the blocks by session, without messages that overlap or come late."""
-    count, placed = TriggerCount(), []
-    for block in blocks:
-        arrival = count.place(block, len(block))
-        again = int(np.searchsorted(block.stamps[:, 0], arrival.first + arrival.skip))
-        if again < len(block.stamps):
-            placed.append((arrival.session, without_first_message(block, again)))
-    return [[b for _, b in group] for _, group in groupby(placed, key=lambda item: item[0])]
-
-
-def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], StampClock]]:
-    """Return uninterrupted runs of blocks, each with the clock of its session."""
-    runs: list[tuple[list[AxisBlock], StampClock]] = []
-    for session in _sessions(blocks):
-        clock = fit_clock(session)
-        runs += [(run, clock) for run in uninterrupted(session)]
-    return runs
-
-
-# Does the sample period that a device writes agree with the time that its samples took?
-
-# Clocks of two computers differ by a tenth of this; a motion's lag by less than 1 %.
-_GREATEST_DIFFERENCE = 5e-3
-# Standard uncertainties of the stamped period that must lie between it and the written one.
-_CLEARLY = 5.0
-# A line through fewer does not know how uncertain it is.
-_LEAST_BLOCKS = 5
-
-
-def stamped_period(blocks: Sequence[Block]) -> tuple[float, float] | None:
-    """Return the sample period by the stamps and its standard uncertainty [s], relative to none.
-
-    A line through the stamps over the trigger count; None with too few blocks for one.
-    """
-    return _line(*_marks(blocks))
-
-
-def _marks(blocks: Sequence[Block]) -> tuple[FloatArray, FloatArray]:
-    """Return the counts and stamps [s] of first samples, each (n,), from those of the first."""
-    count = np.array([block.first_sample - blocks[0].first_sample for block in blocks], np.float64)
-    stamp = np.array([block.stamp_ns - blocks[0].stamp_ns for block in blocks]) / NANOSECONDS_PER_S
-    return count, stamp
-
-
-def _line(count: FloatArray, stamp: FloatArray) -> tuple[float, float] | None:
-    if len(count) < _LEAST_BLOCKS:
-        return None
-    spread = float(np.sum((count - count.mean()) ** 2))
-    if spread == 0:
-        return None
-    slope = float((count - count.mean()) @ stamp) / spread
-    residual = stamp - stamp.mean() - slope * (count - count.mean())
-    return slope, float(np.sqrt(residual @ residual / (len(count) - 2) / spread))
+    offset = float((since - count * nominal).mean())
+    return StampClock(clock.first, clock.start_ns, offset, nominal, jitter=clock.jitter)
 
 
 def check_period(name: str, blocks: Sequence[Block], time_lapse: float = 1.0) -> None:
     """Raise DataError where the stamps of ``blocks`` clearly contradict their sample period.
 
-    time_lapse: how much faster than real time the recording was played [1]
-    Frequencies and lags would all be wrong by the same factor, and no residual would show it.
+    time_lapse: factor by which the recording was played faster than real time [1]
+    A wrong period scales all frequencies and lags, and no residual shows it.
     """
     if not blocks:
         return
-    said = contradiction(name, *_marks(blocks), blocks[0].sample_period, time_lapse)
-    if said is not None:
-        raise DataError(said)
+    stamps = np.array([(block.first_sample, block.stamp_ns) for block in blocks])
+    fault = period_fault(name, stamps, blocks[0].sample_period, time_lapse)
+    if fault is not None:
+        raise DataError(fault.code, **fault.values)
 
 
-def contradiction(
-    name: str, count: FloatArray, stamp: FloatArray, written: float, time_lapse: float = 1.0
-) -> str | None:
-    """Return what the stamps say against the ``written`` sample period [s], None if nothing.
+def period_fault(
+    name: str, stamps: IntArray, stated: float, time_lapse: float = 1.0
+) -> Notice | None:
+    """Return how ``stamps`` (k, 2) contradict the ``stated`` sample period [s], None if not.
 
-    count, stamp: of first samples of blocks, (n,) and (n,) [s];  time_lapse: see `check_period`
+    stamps: counts and times [ns] of one session;  time_lapse: see :func:`check_period`
     """
-    stamped = _line(count, stamp)
-    if stamped is None:
+    if len(stamps) < _LEAST_BLOCKS or np.ptp(stamps[:, 0]) == 0:
         return None
-    period, uncertainty = stamped[0] * time_lapse, stamped[1] * time_lapse
-    off = abs(period - written)
-    if period <= 0 or off <= max(_GREATEST_DIFFERENCE * written, _CLEARLY * uncertainty):
+    line = StampClock.through(stamps, stated * NANOSECONDS_PER_S)
+    scale = time_lapse / NANOSECONDS_PER_S
+    period, uncertainty = line.period_ns * scale, line.period_uncertainty_ns * scale
+    allowed = max(_GREATEST_DIFFERENCE * stated, _COVERAGE * uncertainty)
+    if period <= 0 or abs(period - stated) <= allowed:
         return None
-    if (jumped := _jump(count, stamp, written / time_lapse)) is not None:
-        place, size = jumped
-        return (
-            f"{name} blocks: the stamps jump by {quantity(size, 's')} at sample {place:.0f} of the "
-            f"recording, and agree with a sample period of {written:.6g} s elsewhere: the clock "
-            "was set meanwhile; record again, once it is set"
-        )
-    return (
-        f"{name} blocks state a sample period of {written:.6g} s, but by their stamps it is "
-        f"{period:.6g} s: correct sample_period of the driver and record again (or declare "
-        'settings {"time_lapse": …} for a recording that was not made in real time)'
-    )
+    if (jump := _jump(stamps, stated / time_lapse)) is not None:
+        count, size = jump
+        return Notice("streams.clock_set", stream=name, jump=size, sample=count, stated=stated)
+    return Notice("streams.period", stream=name, stated=stated, stamped=period)
 
 
-def _jump(count: FloatArray, stamp: FloatArray, period: float) -> tuple[float, float] | None:
-    """Return where and by how much [s] the stamps jump, None unless one jump explains them."""
-    samples, passed = np.diff(count), np.diff(stamp)
+def _jump(stamps: IntArray, period: float) -> tuple[int, float] | None:
+    """Return the sample and size [s] of a jump of the stamps, None unless one jump explains them.
+
+    The sample counts from the first one.
+    """
+    samples, passed = np.diff(stamps, axis=0).T
+    passed = passed / NANOSECONDS_PER_S
     ahead = passed - samples * period
     place = int(np.argmax(np.abs(ahead)))
-    others = np.delete(np.arange(len(ahead)), place)
-    rest = float(np.sum(ahead[others])), float(np.sum(samples[others])) * period
-    if abs(rest[0]) > _GREATEST_DIFFERENCE * abs(rest[1]):
+    others = np.arange(len(ahead)) != place
+    if abs(np.sum(ahead[others])) > _GREATEST_DIFFERENCE * abs(np.sum(samples[others])) * period:
         return None
-    return float(count[place + 1]), float(ahead[place])
+    return int(stamps[place + 1, 0] - stamps[0, 0]), float(ahead[place])
 
 
-# What has happened lately, as against ever? A fault of this morning is history, not a state.
-#
-# All times come from the caller [s], from a clock that only goes forward.
-
-# As long as somebody who looks up at an alarm needs to find its cause still named.
-WINDOW_S = 10.0
+# A stamp that is this far ahead begins a motion after a pause. It is half of the time after which
+# a live node settles the pairs that wait [ns].
+_PAUSE_NS = 0.5e9
 
 
-class RecentIncrease:
-    """By how much counts rose within the last ``window`` [s].
+class StampLine:
+    """Stamps of the blocks of one stream, in the order of sessions and counts, as a queue."""
 
-    What was counted before the first look counts as new then.
-    """
+    def __init__(self) -> None:
+        # Rows before ``_head`` are done. Arrays, because a bag brings thousands at once.
+        self._sessions, self._counts, self._stamps = array("q"), array("q"), array("q")
+        self._head = 0
+        self._current: tuple[int, int, int] | None = None
 
-    def __init__(self, window: float = WINDOW_S) -> None:
-        self._window = window
-        self._looks: deque[tuple[float, dict[str, float]]] = deque()
+    def add(self, session: int, count: int, stamp_ns: int) -> None:
+        """Append the newest block's session, first count and stamp."""
+        self._clear()
+        self._sessions.append(session)
+        self._counts.append(count)
+        self._stamps.append(stamp_ns)
 
-    def update(self, counts: Mapping[str, float], now: float) -> dict[str, float]:
-        """Return name → increase, of those that rose; a count that fell began anew at zero."""
-        self._looks.append((now, dict(counts)))
-        while len(self._looks) > 1 and self._looks[1][0] <= now - self._window:
-            self._looks.popleft()
-        since, before = self._looks[0]
-        base = before if since <= now - self._window else {}
-        rises = {
-            name: value - earlier if value >= (earlier := base.get(name, 0)) else value
-            for name, value in counts.items()
-        }
-        return {name: rise for name, rise in rises.items() if rise > 0}
+    def extend(self, session: int, counts: IntArray, stamps: IntArray) -> None:
+        """Append first counts and stamps of the newest blocks of a session, each (n,)."""
+        self._clear()
+        self._sessions.extend(array("q", [session]) * len(counts))
+        self._counts.frombytes(np.ascontiguousarray(counts, np.int64).tobytes())
+        self._stamps.frombytes(np.ascontiguousarray(stamps, np.int64).tobytes())
 
+    def _clear(self) -> None:
+        for column in (self._sessions, self._counts, self._stamps):
+            del column[: self._head]
+        self._head = 0
 
-class SampleFlow:
-    """Samples that come: how many a second, and since when none."""
+    def __len__(self) -> int:
+        """Return the number of blocks to come."""
+        return len(self._counts) - self._head
 
-    def __init__(self, window: float = WINDOW_S) -> None:
-        self._window = window
-        self._looks: deque[tuple[float, int]] = deque()
-        self._last: float | None = None
+    def advance(self, session: int, count: int) -> bool:
+        """Move to the block that holds ``count``; return whether it begins there."""
+        before = self._head
+        while self._head < len(self._counts) and self._next() <= (session, count):
+            self._head += 1
+        if self._head == before:
+            return False
+        self._current = self._row(self._head - 1)
+        return self._current[:2] == (session, count)
 
-    def update(self, samples: int, now: float) -> None:
-        """Note the number of ``samples`` that came in all."""
-        if samples > (self._looks[-1][1] if self._looks else 0):
-            self._last = now
-        self._looks.append((now, samples))
-        while len(self._looks) > 2 and self._looks[1][0] <= now - self._window:
-            self._looks.popleft()
+    def skip(self, blocks: int) -> None:
+        """Move on by ``blocks`` blocks."""
+        if blocks:
+            self._head += blocks
+            self._current = self._row(self._head - 1)
 
-    def silent(self, now: float) -> float | None:
-        """Return the time since a sample was last seen to have come; None if none ever did."""
-        return None if self._last is None else now - self._last
+    def coming(self, session: int, end: int) -> tuple[IntArray, IntArray] | None:
+        """Return first counts below ``end`` and stamps of a session's next blocks, each (1 + n,).
 
-    @property
-    def rate(self) -> float:
-        """Samples a second over the window [1/s]."""
-        if len(self._looks) < 2:
-            return 0.0
-        (start, before), (end, after) = self._looks[0], self._looks[-1]
-        return (after - before) / (end - start) if end > start else 0.0
-
-
-# When is a recorded message due, played at another rate, paused, and begun later?
-
-
-class Playback:
-    """Time of a recording against a clock that only goes forward, whose readings are given [s].
-
-    begin_ns: time of the recording with which it begins [ns]
-    rate: seconds of the recording a second; 0 for all at once
-    """
-
-    def __init__(self, begin_ns: int, rate: float) -> None:
-        self._begin_ns, self._rate = begin_ns, rate
-        self._played = 0.0  # seconds of the recording, up to the last resumption
-        self._since: float | None = None
-
-    @property
-    def paused(self) -> bool:
-        """Whether time stands still."""
-        return self._since is None
-
-    def resume(self, now: float) -> None:
-        """Let time go on, if it stands."""
-        if self._since is None:
-            self._since = now
-
-    def pause(self, now: float) -> None:
-        """Stop time, if it goes on."""
-        self._played, self._since = self._seconds(now), None
-
-    def go_to(self, stamp_ns: int, now: float) -> None:
-        """Continue from another time of the recording."""
-        self._played = (stamp_ns - self._begin_ns) / NANOSECONDS_PER_S
-        self._since = None if self._since is None else now
-
-    def time_ns(self, now: float) -> int:
-        """Return the time of the recording [ns]."""
-        return self._begin_ns + round(self._seconds(now) * NANOSECONDS_PER_S)
-
-    def late(self, stamp_ns: int, now: float) -> float | None:
-        """Return for how long a message of ``stamp_ns`` has been due [s]; None if it is not yet.
-
-        At rate 0 nothing is ever late.
+        The first row is the current block; None where the session has none.
         """
-        if self.paused:
+        if self._current is None or self._current[0] != session:
             return None
-        if not self._rate:
-            return 0.0
-        overdue = (self.time_ns(now) - stamp_ns) / (NANOSECONDS_PER_S * self._rate)
-        return overdue if overdue >= 0 else None
+        until = bisect_right(self._sessions, session, self._head)
+        place = slice(self._head, bisect_left(self._counts, end, self._head, until))
+        _, count, stamp = self._current
+        counts, stamps = self._counts[place], self._stamps[place]
+        return np.concatenate([[count], counts]), np.concatenate([[stamp], stamps])
 
-    def _seconds(self, now: float) -> float:
-        return self._played + (0.0 if self._since is None else (now - self._since) * self._rate)
+    def leaps(self, session: int, count: int, period_ns: float) -> bool:
+        """Return whether a block begins at ``count`` after a pause."""
+        if self._current is None or not len(self) or self._next() != (session, count):
+            return False
+        begun, before, stamp = self._current
+        ahead = self._stamps[self._head] - stamp - (count - before) * period_ns
+        return begun == session and ahead >= _PAUSE_NS
+
+    def next_in(self, session: int, end: int) -> int:
+        """Return the count at which the next block begins, at most ``end``."""
+        if len(self) and self._sessions[self._head] == session:
+            return min(self._counts[self._head], end)
+        return end
+
+    def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
+        """Return the time of the sample ``count`` [ns], None where no stamp is known."""
+        if self._current is None or self._current[0] != session:
+            return None
+        return self._current[2] + (count - self._current[1]) * period_ns
+
+    def stamp_difference(
+        self, other: StampLine, sessions: tuple[int, int], period_ns: float
+    ) -> float | None:
+        """Return how much later a count is stamped here than in ``other`` [ns], None if unknown.
+
+        It compares the current blocks. Stamps are subtracted as integers: a float cannot hold
+        nanoseconds since 1970.
+        """
+        here, there = self._current, other._current
+        if here is None or there is None or (here[0], there[0]) != sessions:
+            return None
+        return here[2] - there[2] + (there[1] - here[1]) * period_ns
+
+    def _next(self) -> tuple[int, int]:
+        return self._sessions[self._head], self._counts[self._head]
+
+    def _row(self, at: int) -> tuple[int, int, int]:
+        return self._sessions[at], self._counts[at], self._stamps[at]
+
+
+def upcoming_stamps(
+    lines: Sequence[StampLine], sessions: tuple[int, int], end: int, period_ns: float
+) -> tuple[FloatArray, BoolArray] | None:
+    """Return the rows of :class:`StampHistory` (n, 5) for the next blocks of two streams.
+
+    There is a row for each count below ``end`` at which a block begins. The second array (n,) is
+    True where a block begins after a pause. None where a stream has no stamp yet. The values are
+    those of :class:`StampLine` to the last bit.
+    """
+    one, other = (line.coming(s, end) for line, s in zip(lines, sessions, strict=True))
+    if one is None or other is None:
+        return None
+    counts = np.union1d(one[0][1:], other[0][1:])
+    (first, stamp, leap), (other_first, other_stamp, other_leap) = (
+        _at(counts, *blocks, period_ns) for blocks in (one, other)
+    )
+    skew = stamp - other_stamp + (other_first - first) * period_ns
+    time = stamp + (counts - first) * period_ns
+    columns = [counts, skew, first == counts, other_first == counts, time]
+    return np.stack(columns, axis=1, dtype=np.float64), leap | other_leap
+
+
+def _at(
+    counts: IntArray, firsts: IntArray, stamps: IntArray, period_ns: float
+) -> tuple[IntArray, IntArray, BoolArray]:
+    """Return count and stamp of the blocks that hold ``counts`` (n,), and which begin a motion."""
+    ahead = np.diff(stamps) - np.diff(firsts) * period_ns
+    leap = np.concatenate([[False], ahead >= _PAUSE_NS])
+    block = np.searchsorted(firsts, counts, "right") - 1
+    return firsts[block], stamps[block], (firsts[block] == counts) & leap[block]
+
+
+# Stamps that advance faster or slower than the counts by more than this factor were made in time
+# lapse, or hold no times. A slip of a third of the judged span is still within it.
+_TIME_LAPSE = 1.5
+
+
+class StampHistory:
+    """The newest comparisons of the stamps of two streams, ``most`` of them.
+
+    Each row holds: count, stamp of the first stream minus stamp of the second [ns], whether a
+    block of the first and of the second stream begins there, time of the first stream [ns].
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._room, self._held = np.empty((2 * most, 5)), 0
+
+    @property
+    def rows(self) -> FloatArray:
+        """The rows held (n, 5), in their order."""
+        return self._room[max(self._held - self._most, 0) : self._held]
+
+    def add(self, rows: FloatArray) -> None:
+        """Append rows, (n, 5)."""
+        rows = rows[-self._most :]
+        if self._held + len(rows) > len(self._room):
+            kept = self.rows.copy()
+            self._held = len(kept)
+            self._room[: self._held] = kept
+        self._room[self._held : self._held + len(rows)] = rows
+        self._held += len(rows)
+
+    def after(self, count: float) -> FloatArray:
+        """Return the rows beyond a count."""
+        return self.rows[np.searchsorted(self.rows[:, 0], count, "right") :]
+
+    def recent(self, first: float, since: float, least: int) -> FloatArray | None:
+        """Return the rows from the count ``since`` on, with at least ``least`` blocks a stream.
+
+        first: rows before this count are left out;  None if too few remain
+        """
+        rows = self.rows[np.searchsorted(self.rows[:, 0], first) :]
+        starts = [np.flatnonzero(rows[:, column]) for column in (2, 3)]
+        if min(map(len, starts)) < least:
+            return None
+        begin = int(np.searchsorted(rows[:, 0], since))
+        return rows[min(begin, *(int(s[-least]) for s in starts)) :]
+
+    def stamps_follow_counts(self, period_ns: float) -> bool:
+        """Return whether stamps advance about as fast as the counts."""
+        (first, *_, began), (last, *_, ended) = self.rows[0], self.rows[-1]
+        elapsed, passed = (last - first) * period_ns, ended - began
+        return bool(elapsed < _TIME_LAPSE * passed and passed < _TIME_LAPSE * elapsed)

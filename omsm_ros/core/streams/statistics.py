@@ -1,4 +1,4 @@
-"""How much do points scatter? Robustly, so that dust and edges do not count."""
+"""Robust scatter of readings, and an even selection from a stream of unknown length."""
 
 from __future__ import annotations
 
@@ -10,42 +10,43 @@ from numpy.typing import NDArray
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.linear_algebra import sosfilt
 
-# Of the normal distribution, whose median absolute value is 0.6745 σ.
+# The median absolute value of a normal distribution is 0.6745 σ.
 SIGMA_OF_MAD = 1.4826
+# Order of the differences that remove the shape of the surface.
 _ORDER = 6
-# Of white noise of unit size: Σ binomial(6, k)².
+# Standard deviation of sixth differences of white noise of σ = 1: √Σ binomial(6, k)².
 _GAIN = np.sqrt(924.0)
-# Of normal values, whose mean size is √(2/π) σ; one speck of dust counts less than in a square.
+# The mean absolute value of a normal distribution is √(2/π) σ; outliers count less than in squares.
 _SIGMA_OF_MEAN_SIZE = np.sqrt(np.pi / 2)
-# Differences over which it is averaged, exponentially: known to 2 % then.
+# Number of differences in the exponential average, which is then known to 2 %.
 _MEMORY = 2048
-# Five standard deviations of that: what exceeds less is chance.
+# An excess of five standard deviations of the average; less is random.
 _EXCEEDS = 1.1
-# No reading scatters by less; heights of metres are rounded to it.
+# Rounding of heights of a metre.
 _ROUNDING_M = 1e-12
 
 
 def spread(values: FloatArray) -> float:
-    """Return the standard deviation of Gaussian values (n,) about zero, whatever a few do."""
+    """Return the standard deviation of normal values (n,) about zero, robust against outliers."""
     return SIGMA_OF_MAD * float(np.median(np.abs(values)))
 
 
 def median(values: FloatArray) -> float:
-    """Return the median; of some hundred values numpy's own takes ten times as long."""
+    """Return the median of ``values`` (n,); numpy takes ten times as long for a few hundred."""
     ordered, half = np.sort(values), len(values) // 2
     return float(ordered[half] + ordered[-1 - half]) / 2
 
 
 def spread_about_median(values: FloatArray) -> float:
-    """Return the standard deviation of normal values, little moved by others among them."""
+    """Return the standard deviation of normal values (n,), robust against outliers."""
     return SIGMA_OF_MAD * median(abs(values - median(values)))
 
 
 def noise_of(deviation: FloatArray) -> float:
-    """Return the standard deviation of what changes from point to point [m], robustly.
+    """Return the standard deviation of the noise from point to point [m], robustly.
 
-    From second differences of points in the order in which they were measured, for which form and
-    slow drift are straight lines: ``median |d_(i−1) − 2 d_i + d_(i+1)| = 0.6745 √6 σ``.
+    Second differences of points in the order of measurement remove form and slow drift:
+    ``median |d_(i−1) − 2 d_i + d_(i+1)| = 0.6745 √6 σ``.
     """
     if len(deviation) < 3:
         return 0.0
@@ -53,15 +54,14 @@ def noise_of(deviation: FloatArray) -> float:
 
 
 class RunningScatter:
-    """Follows the scatter of a scan's heights, sample by sample, however they are cut into blocks.
+    """Running scatter of the heights of a scan, independent of their division into blocks.
 
-    A probe that looks at a turning part may be noisier than at rest before a flat: it sees less
-    light, something vibrates, or readings step where noise at rest did not carry them over the
-    step. That shows in the heights themselves, whatever the surface is: sixth differences of 0.3 mm
-    at 40 Hz, sampled at 1 kHz, are 37 nm, those of white noise are √924 of it.
+    A probe over a turning part may be noisier than in the step test, because of less light,
+    vibration or the resolution of its readings. Sixth differences of the heights show it for any
+    surface: those of 0.3 mm at 40 Hz, sampled at 1 kHz, are 37 nm; those of white noise √924 σ.
 
-    expected: standard deviation of one height by what is stated of single readings [m]; zero where
-        nothing is stated, and then every scatter exceeds it
+    expected: standard deviation of one height by the stated sources of single readings [m]; any
+        scatter exceeds zero
     """
 
     def __init__(self, expected: float) -> None:
@@ -77,9 +77,9 @@ class RunningScatter:
         self._heights = np.empty(0)
 
     def excess(self, session: int, sample: IntArray, height: FloatArray) -> FloatArray:
-        """Return the variance of each next height beyond what was expected [m²], (n,).
+        """Return the variance of each next height beyond the expected one [m²], (n,).
 
-        session, sample: counts of its trigger, by which neighbours are known
+        session, sample: of its trigger, to find neighbours
         """
         if session != self._session:
             self._session = session
@@ -91,7 +91,7 @@ class RunningScatter:
         neighbours = samples[_ORDER:] - samples[:-_ORDER] == _ORDER
         sizes = np.abs(np.diff(heights, _ORDER))[neighbours] * (_SIGMA_OF_MEAN_SIZE / _GAIN)
         running = self._running(sizes)
-        # Of each height, by the differences up to it: those of earlier blocks stand in front.
+        # The scatter at a height comes from the differences up to it, also of earlier blocks.
         seen = np.zeros(len(samples), np.int64)
         seen[_ORDER:] = np.cumsum(neighbours)
         scatter = running[seen[before:]]
@@ -99,16 +99,16 @@ class RunningScatter:
         return np.where(exceeds, scatter**2 - self._expected**2, 0.0)
 
     def _running(self, sizes: FloatArray) -> FloatArray:
-        """Return the mean before any of ``sizes`` (n,) and after each of them, (n + 1,)."""
+        """Return the running mean before ``sizes`` (n,) and after each of them, (n + 1,)."""
         sums = [self._faded(sizes, 0)]
         if 1.0 + self._decay * self._sums[1] == self._sums[1]:
-            # As of some 50 000 samples one more does not change what all weigh together.
+            # After 50 000 samples the sum of weights no longer changes in floating point.
             return np.asarray(sums[0] / self._sums[1], np.float64)
         sums.append(self._faded(np.ones(len(sizes)), 1))
         return np.asarray(sums[0] / np.maximum(sums[1], np.finfo(np.float64).tiny), np.float64)
 
     def _faded(self, values: FloatArray, k: int) -> FloatArray:
-        """Return the k-th fading sum before any of ``values`` (n,) and after each, (n + 1,)."""
+        """Return the k-th decaying sum before ``values`` (n,) and after each of them, (n + 1,)."""
         state = np.array([[self._decay * self._sums[k], 0.0]])
         sums = np.empty(len(values) + 1)
         sums[0] = self._sums[k]
@@ -117,14 +117,10 @@ class RunningScatter:
         return sums
 
 
-# Which samples of a stream of unknown length stand for all of it, in bounded memory?
-
-
 class EvenSelection:
-    """Keeps every k-th row, k the least power of two with which no more than ``most`` are kept.
+    """Keeps every k-th row of a stream, with the least power of two k that keeps ``most`` or fewer.
 
-    What is kept does not depend on how the stream was cut. It lies in one piece: of small parts
-    each would cost more than its rows, for as long as the stream lasts.
+    The selection does not depend on the division into blocks.
     """
 
     def __init__(self, most: int) -> None:
@@ -134,26 +130,26 @@ class EvenSelection:
         self._room: NDArray[Any] = np.empty(0)
 
     def __len__(self) -> int:
-        """Rows kept."""
+        """Return the number of rows kept."""
         return -(-self._seen // self._every)
 
     @property
     def every(self) -> int:
-        """Of how many rows one is kept."""
+        """The step k from one kept row to the next."""
         return self._every
 
     def add(self, rows: NDArray[Any]) -> None:
-        """Take in the next ``rows`` (n, …)."""
+        """Take the next ``rows`` (n, …)."""
         self.add_chosen(rows[self.chosen(len(rows))], len(rows))
 
     def chosen(self, rows: int) -> slice:
-        """Return which of the next ``rows`` are wanted, for whoever makes only those."""
+        """Return which of the next ``rows`` will be kept, so that only those need be computed."""
         while -(-(self._seen + rows) // self._every) > self._most:
             self._halve()
         return slice(-self._seen % self._every, rows, self._every)
 
     def add_chosen(self, part: NDArray[Any], rows: int) -> None:
-        """Take in what :meth:`chosen` asked for, (k, …), of the next ``rows``."""
+        """Take the ``part`` (k, …) of the next ``rows`` that :meth:`chosen` returned."""
         held = len(self)
         self._seen += rows
         if len(part):
@@ -169,11 +165,11 @@ class EvenSelection:
             self._room = room
 
     def _halve(self) -> None:
-        """Leave out every other row."""
+        """Drop every other row."""
         held = len(self)
         self._room[: -(-held // 2)] = self._room[:held:2].copy()
         self._every *= 2
 
     def rows(self) -> NDArray[Any]:
-        """Return all rows kept so far, in order, until the next are added; empty before any."""
+        """Return the rows kept so far, in order; a view that is valid until the next are added."""
         return self._room[: len(self)]

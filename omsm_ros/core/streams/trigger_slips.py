@@ -1,20 +1,22 @@
-"""Do equal trigger counts of two streams still mean the same trigger?
+"""Detection of slips between the trigger counters of two streams.
 
 A trigger that one device missed, or a counter that was started later, shifts one count against
-the other, and nothing but the stamps shows it. For equal counts the *skew* is the time of the
-axes less the time of the distance, a whole number of sample periods where the counts slipped.
-Its median over about a second is judged every fifth of one, against what the stamps allow:
-``|median| >= period / 2 + tolerance + 3 scatter`` is a slip, ``|median| < period / 2 + tolerance``
-ends it, and between the two the last verdict holds. The scatter is that within the second or that
-over the last half minute, whichever is larger: a driver's clock wanders while it learns. What it
-has still to learn is larger than that, and taken from how it moves: the mean of n arrivals moves by
-1/n of their scatter with the next, and is wrong by 1/√n of it, so by √n times what it moves.
+the other, and only the stamps show it. The *skew* is the time of the axes minus the time of the
+distance at equal counts; after a slip it is a whole number of sample periods.
 
-Until then nothing is shown: a pair waits until stamps that agree have come after it, from both
-streams, at the start until the first verdict, and where a stamp is off until a verdict on what
-came after it. Blocks of one driver carry the same stamps to the nanosecond, and wait for nothing.
+The median skew of about a second is judged every 0.2 s. A slip begins at
+``|median| >= period / 2 + tolerance + 3 scatter``. It ends at
+``|median| < period / 2 + tolerance``. Between the two the last verdict holds. The scatter is that
+within the second, or that over the last half minute if it is larger, because a driver's clock
+wanders while it is estimated from arrivals. The error of that estimate is bounded by its movement:
+a mean of n arrivals moves by 1/n of their scatter with the next one and is wrong by 1/√n of it,
+which is √n times the movement.
 
-Every decision rests on the stamps of blocks up to that count alone, so live and offline agree.
+A pair waits for a verdict: until stamps of both streams that agree have come after it, at the start
+until the first verdict, and after a stamp that is off until the stamps that follow it are judged.
+Blocks of one driver carry the same stamps to the nanosecond and never wait.
+
+A decision uses only the stamps of blocks up to its count, so that live and offline agree.
 """
 
 from __future__ import annotations
@@ -22,45 +24,48 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.streams.continuity import StampHistory, StampLine, upcoming_stamps
+from omsm_ros.core.streams.stamps import StampHistory, StampLine, upcoming_stamps
 from omsm_ros.core.streams.statistics import median, spread_about_median
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
-from omsm_ros.units import MILLISECOND_S, NANOSECONDS_PER_S
+from omsm_ros.units import NANOSECONDS_PER_S
 
 # Stamps of a driver are within 0.1 ms of the truth after 10 s (devices/clock.py); two drivers.
 TWO_DRIVERS_S = 0.2e-3
-# A driver's first stamps are as uneven as its first arrivals: of this time nothing is judged [s].
+# The first stamps of a driver are as uneven as its first arrivals: they are not judged [s].
 _FIRST_S = 1.0
-# More than half of the span must have slipped: found 0.4 s to 0.8 s after it happened [s].
+# Length of the judged median, and time between verdicts. A slip is found after half to all of
+# the span [s].
 _SPAN_S, _STRIDE_S = 0.8, 0.2
-# Stamps of either stream that a verdict needs; of long blocks they span more than a second.
+# Stamps of each stream that a verdict needs; those of long blocks span more than a second.
 _LEAST_STAMPS = 8
-_SURE_STAMPS = 3  # one or two at the end cost the pairs that they are of, but show no slip
-# Over which the scatter is also taken: the window of a driver's clock [s].
+# Stamps at the end of a stream that show a slip; fewer refuse their own pairs only.
+_SURE_STAMPS = 3
+# Time over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
-# Blocks of one sample at 1 kHz make 800 in a span; more are not needed for a median.
+# Stamps kept for a median; single-sample blocks at 1 kHz make 800 in a span.
 _MOST_STAMPS = 1024
-# Scatter (standard deviation) of single stamps that the median of several never reaches.
+# Standard deviations of single stamps that the median of several does not reach.
 _SEVERAL_TIMES = 3.0
-# A driver's clock is the end of a line, which moves more than a mean does. In 20 to 30 starts with
-# arrivals uneven by ±20 ms: 0.5 gives 2 false alarms, 0.7 none; 1.0 finds small slips late.
+# A driver's clock is the end of a regression line, which moves more than a mean does. In 20 to 30
+# starts with arrivals uneven by ±20 ms, 0.5 gives 2 false alarms, 0.7 none; 1.0 finds small slips
+# late.
 _END_OF_LINE = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonTrigger:
-    """What is stated of the trigger that two devices count.
+    """Statement about the trigger that two devices count.
 
     counter_offset: added to the distance's count, it gives the axes' count [samples]
-    stamp_tolerance: by how much their stamps of one trigger may differ, all the time [s]
+    stamp_tolerance: constant difference of their stamps of one trigger that is allowed [s]
 
-    Raises ConfigurationError for numbers that are neither.
+    Raises ConfigurationError for implausible numbers.
     """
 
     counter_offset: int = 0
@@ -71,41 +76,71 @@ class CommonTrigger:
         STAMP_TOLERANCE.checked(self.stamp_tolerance, ConfigurationError, "stamp_tolerance")
 
 
-# One driver's stamps of one trigger, rounded twice, differ by no more than this [ns].
-_SAME_NS = 2.0
-# Stamps that are worth taking together.
-_MANY = 16
-# Pairs wait no longer than this for the first verdict: blocks are too long for one [s].
-_MOST_WAIT_S = 10.0
-
 EQUAL_COUNTS = CommonTrigger()
+
+# Two stamps of one trigger by one driver differ by rounding only [ns].
+_SAME_NS = 2.0
+# Number of stamps from which vectorised processing is faster.
+_MANY = 16
+# Time after which pairs are released without a first verdict, where blocks are too long [s].
+_MOST_WAIT_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class TriggerSlip:
-    """What the stamps say of two counters.
+    """Verdict on two trigger counters.
 
-    samples: periods by which axes are stamped later at equal counts, 0 as long as they agree
-    seen_from: a slip of fewer samples does not stand out of the stamps' scatter; None = not judged
-    remedy: in words for people
+    samples: periods by which axes are stamped later at equal counts; 0 while they agree
+    seen_from: least slip that exceeds the scatter of the stamps [samples]; None if not judged
+    skew: time of the axes minus time of the distance at equal counts [s]
+    trigger: the statement it was judged by
+
+    ``str(slip)`` is the sentence for the user.
     """
 
     samples: int = 0
     seen_from: int | None = None
-    remedy: str = ""
+    skew: float = 0.0
+    trigger: CommonTrigger = EQUAL_COUNTS
+
+    @classmethod
+    def judged(
+        cls, skew: float, period: float, trigger: CommonTrigger, limit: float | None = None
+    ) -> TriggerSlip:
+        """Return the verdict on a ``skew`` [samples] of counters with a ``period`` [s].
+
+        limit: skew that is a slip [samples]; None takes that of stamps without scatter
+        """
+        limit = _steady(trigger, period) if limit is None else limit
+        if abs(skew) < limit:
+            return cls()
+        samples = round(skew) or int(math.copysign(1, skew))
+        return cls(samples, math.ceil(limit), skew * period, trigger)
+
+    def notice(self) -> Notice:
+        """Return the slip as code and values."""
+        return Notice(
+            "streams.slip",
+            samples=self.samples,
+            skew=self.skew,
+            tolerance=self.trigger.stamp_tolerance,
+            offset=self.trigger.counter_offset - self.samples,
+        )
 
     def __str__(self) -> str:
-        return (
-            f"the trigger counter slipped by {self.samples} samples against that of the axes: "
-            f"{self.remedy}"
-        )
+        return str(self.notice())
+
+
+def _steady(trigger: CommonTrigger, period: float) -> float:
+    """Return the skew of stamps without scatter that is a slip [samples]."""
+    return 0.5 + trigger.stamp_tolerance / period
 
 
 class TriggerSlipDetector:
     """Judges pairs of two streams by the stamps of their blocks.
 
-    sessions: of axes and distance, whose pairs are watched
-    found: the last slip there was, healed or not; None if there was none
+    sessions: of axes and distance, whose pairs are judged
+    found: the last slip, also if it has ended; None if there was none
     """
 
     def __init__(self, axes: StampLine, distance: StampLine, trigger: CommonTrigger) -> None:
@@ -118,26 +153,26 @@ class TriggerSlipDetector:
         self.sessions, self._start = sessions, first
         self._state = TriggerSlip()
         self._judged, self._since, self._period_ns = -1, 0.0, 1.0
-        # Nothing was judged yet; whether one driver stamps both, once any stamp was seen.
+        # True until the first verdict; True while both streams carry the stamps of one driver.
         self._starting, self._common = True, False
-        # Of each stream: stamps seen, and the last block that began where stamps agree.
+        # Per stream: number of stamps, and the last block that began where stamps agree.
         self._stamps, self._shown = [0, 0], [first, first]
-        # Up to where a verdict found none, in spite of stamps that are off; the last of those.
+        # Count up to which a verdict found no slip; last count with a stamp that is off.
         self._judged_to, self._odd_at = first, -math.inf
-        # Whether any stamp since the last verdict is off enough: without one no median is.
+        # True if any stamp since the last verdict is off; otherwise the median is not.
         self._odd = False
         self._seen = StampHistory(_MOST_STAMPS)
-        # Skew at each stride of the last half minute without a slip [ns].
+        # Skew at each verdict of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
 
     @property
     def same_stamps(self) -> bool:
-        """Whether both streams carry the same stamps: then one device latches both."""
+        """True if both streams carry the same stamps, because one device latches both."""
         return self._common
 
     @property
     def state(self) -> TriggerSlip:
-        """What the stamps said last."""
+        """The last verdict."""
         if self._state.samples:
             return self._state
         window = self._window()
@@ -150,9 +185,9 @@ class TriggerSlipDetector:
     def settled(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
     ) -> Iterator[tuple[int, bool]]:
-        """Watch the pairs from ``first`` to ``end``, which go on with those before.
+        """Judge the pairs from ``first`` to ``end``, which follow on those before.
 
-        Yield up to which count all those that still wait are settled, and whether they slipped.
+        Yield counts up to which waiting pairs are settled, with True where they slipped.
         """
         if sessions != self.sessions:
             self._restart(sessions, first)
@@ -178,10 +213,10 @@ class TriggerSlipDetector:
             yield end, bool(self._state.samples)
 
     def _skip_unremarkable(self, end: int, period_ns: float) -> int | None:
-        """Take the next stamps up to the first that stands out, as :meth:`_observe` takes each.
+        """Take the next stamps up to the first that is off, as :meth:`_observe` takes each.
 
-        Return the last one's count; None if that one has to be looked at by itself. Of a bag
-        thousands are there at once, and of one driver or two nearly none stands out.
+        Return the count of the last one; None if the next has to be observed alone. A bag brings
+        thousands at once, nearly all of which agree.
         """
         if self._starting or self._odd or self._state.samples or sum(map(len, self._lines)) < _MANY:
             return None
@@ -211,7 +246,7 @@ class TriggerSlipDetector:
         return int(rows[-1, 0])
 
     def end(self) -> bool:
-        """Return whether the pairs that still wait slipped, as far as it can be told."""
+        """Return whether the pairs that still wait slipped, as far as their stamps show."""
         since = self._start - 1 if self._starting else min(self._shown)
         few = self._starting and min(self._stamps) < _LEAST_STAMPS
         if (
@@ -228,7 +263,7 @@ class TriggerSlipDetector:
         return bool(found.samples)
 
     def _agreed_until(self, count: int, period_ns: float) -> int:
-        """Return up to where stamps have shown that there is no slip."""
+        """Return the count up to which stamps have shown that there is no slip."""
         per_s = NANOSECONDS_PER_S / period_ns
         if self._starting and count - self._start <= _MOST_WAIT_S * per_s:
             return self._start
@@ -241,7 +276,7 @@ class TriggerSlipDetector:
         return min(line.next_in(session, end) for line, session in pairs)
 
     def _observe(self, count: int, period_ns: float) -> None:
-        """Take the skew where a block of either stream begins."""
+        """Take the skew at ``count``, where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self.sessions
         begun = axes.advance(a, count), distance.advance(d, count)
         skew = axes.stamp_difference(distance, self.sessions, period_ns)
@@ -264,7 +299,7 @@ class TriggerSlipDetector:
         self._odd |= self._is_off(skew) and not early_days
 
     def _note(self, count: int, skew: float, begun: tuple[bool, bool]) -> None:
-        """Keep what one stamp shows, of the streams whose blocks have ``begun`` there."""
+        """Keep the skew of one stamp for the streams whose blocks have ``begun`` there."""
         first = not any(self._stamps)
         self._common = abs(skew) <= _SAME_NS and (first or self._common)
         for stream in np.flatnonzero(begun):
@@ -276,7 +311,7 @@ class TriggerSlipDetector:
 
     def _off_ns(self) -> float:
         """Return the skew that is off [ns]."""
-        return self._steady(self._period_ns) * self._period_ns
+        return self._steady() * self._period_ns
 
     def _is_off(self, skew: float) -> bool:
         return abs(skew) >= self._off_ns()
@@ -293,21 +328,21 @@ class TriggerSlipDetector:
         if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
             self._state, self._odd = TriggerSlip(), True
             if rows is not None:
-                self._starting, self._judged_to = False, count  # stamps tell nothing
+                self._starting, self._judged_to = False, count  # stamps show nothing
         else:
             window = rows[:, 1] / self._period_ns
             self._state = self._verdict(window)
             self._starting, self._judged_to = False, int(rows[0, 0])
-            self._odd = bool(np.any(abs(window) >= self._steady(self._period_ns)))
+            self._odd = bool(np.any(abs(window) >= self._steady()))
             self.found = self._state if self._state.samples else self.found
 
     def _recent(self) -> FloatArray | None:
-        """Return the stamps to be judged, as :class:`StampHistory` has them; None if too few."""
+        """Return the rows of :class:`StampHistory` to be judged; None if too few."""
         first = self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
         return self._seen.recent(first, self._since, _LEAST_STAMPS)
 
     def _window(self) -> FloatArray | None:
-        """Return the skews to be judged [samples], None if they say nothing."""
+        """Return the skews to be judged [samples]; None if too few or in time lapse."""
         rows = self._recent()
         return (
             None
@@ -315,9 +350,8 @@ class TriggerSlipDetector:
             else rows[:, 1] / self._period_ns
         )
 
-    def _steady(self, period_ns: float) -> float:
-        """Return the skew of stamps without scatter that is a slip [samples]."""
-        return 0.5 + self._trigger.stamp_tolerance * NANOSECONDS_PER_S / period_ns
+    def _steady(self) -> float:
+        return _steady(self._trigger, self._period_ns / NANOSECONDS_PER_S)
 
     def _limit(self, window: FloatArray) -> float:
         """Return the skew that is a slip [samples]."""
@@ -325,29 +359,17 @@ class TriggerSlipDetector:
         scatter = max(
             spread_about_median(window), spread_about_median(wander), _clock_uncertainty(wander)
         )
-        return self._steady(self._period_ns) + _SEVERAL_TIMES * scatter
+        return self._steady() + _SEVERAL_TIMES * scatter
 
     def _verdict(self, window: FloatArray) -> TriggerSlip:
-        skew, limit = median(window), self._limit(window)
-        slipped = abs(skew) >= (self._steady(self._period_ns) if self._state.samples else limit)
-        if not slipped:
-            return TriggerSlip()
-        samples = round(skew) or int(math.copysign(1, skew))
-        return TriggerSlip(samples, math.ceil(limit), self._remedy(skew, self._period_ns))
-
-    def _remedy(self, skew: float, period_ns: float) -> str:
-        later = skew * period_ns / NANOSECONDS_PER_S / MILLISECOND_S
-        return (
-            f"at equal counts axes are stamped {later:.4g} ms later, beyond what stamp_tolerance "
-            f"{self._trigger.stamp_tolerance / MILLISECOND_S:.4g} ms and the scatter allow; check "
-            "that both count the same trigger line and restart both drivers, or state "
-            f"counter_offset {self._trigger.counter_offset - round(skew)} if they are known to be "
-            "so far apart, or a stamp_tolerance that covers how late a link delivers"
-        )
+        limit, period = self._limit(window), self._period_ns / NANOSECONDS_PER_S
+        begun = self._steady() if self._state.samples else limit
+        found = TriggerSlip.judged(median(window), period, self._trigger, begun)
+        return replace(found, seen_from=math.ceil(limit)) if found.samples else found
 
 
 def _clock_uncertainty(wander: FloatArray) -> float:
-    """Return by how much clocks that moved as in ``wander`` (n,) may still be wrong."""
+    """Return the error that clocks with the skews ``wander`` (n,) may still have."""
     if len(wander) <= 2:
         return 0.0
     return _END_OF_LINE * spread_about_median(np.diff(wander)) * math.sqrt(len(wander))

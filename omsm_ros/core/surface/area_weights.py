@@ -1,12 +1,13 @@
-"""For how much of the surface does each point of a scan stand?
+"""Area of the surface that each point of a scan represents.
 
-Read off the scan as it ran. Where the path turns about the spindle, a point stands for the arc that
-it covers, ``r |Δθ|``, whatever the speed was and however many points beside it were lost; each ring
-of equal area and a few turns counts alike, whatever the feed was while it was crossed, and one that
-was seen in part, as at the rim of a part beside the spindle's axis, by that part. On a single line
-a point stands for the way from half-way to the one before to half-way to the one after. Elsewhere,
-as on a raster or where points come in no order, a point stands for what lies nearer to it than to
-any other.
+It depends on the path of the scan.
+
+- A path about the spindle: a point represents the arc that it covers, ``r |Δθ|``, independent of
+  speed and lost points. Rings of equal area and a few turns each have equal weights, independent
+  of the feed; a ring that was measured in part has the weight of that part.
+- A single line: a point represents the way between the midpoints to both neighbours.
+- A raster, or points in no order: a point represents the area that is nearer to it than to any
+  other point.
 """
 
 from __future__ import annotations
@@ -16,33 +17,30 @@ import numpy as np
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.quantities import MAP_SPACING
 
-# A raster passes the axis now on this side, now on that, and never gets around it twice.
+# Turns about the spindle from which a path is a spiral; a raster does not make two.
 _LEAST_TURNS = 2.0
-# Points in no order may, by chance: as many of their steps go back as go on. Of a path whose steps
-# are as wide as gaps, so many go on.
+# Share of steps in one direction from which wide steps are a path; it is half for random points.
 _LEAST_ONWARD = 2 / 3
-# Rings so fine that the rim is a thousandth of the area, of whole turns and points enough for a
-# mean.
+# Rings: most of them, and turns and points that each has at least, for a mean.
 _MOST_RINGS, _TURNS_PER_RING, _POINTS_PER_RING = 2048, 2.0, 20
-# Across a gap larger than this nobody has looked, and no point stands for it: as an angle [rad],
-# and in steps of the path. A single point that stood for 30° of a turn of 2000 points would bring
-# its noise into every figure.
+# Largest gap that its neighbours represent, as an angle [rad] and in usual steps of the path. A
+# larger weight would bring the noise of a single point into every figure.
 _LARGEST_ARC, _MOST_STEPS = np.pi / 6, 10.0
-# Of a turn: as wide as the widest arc that may be missing.
+# Sectors of a turn, as wide as the largest gap.
 _SECTORS = round(2 * np.pi / _LARGEST_ARC)
-# The side of a grid; the number of its cells falls to a quarter as their size doubles where they
-# fill the surface, and to a half where they lie along single tracks.
+# Most cells along the side of a grid. When their size doubles, the number of occupied cells falls
+# to a quarter if they fill the surface, and to a half along single tracks; the limit between both.
 _MOST_CELLS, _FILLED = 512, 3.5
-# Half a cell is what a point is displaced by at most: an eighth of the way between even points.
+# Cells along the distance of two evenly spaced points, so that points move by an eighth of it.
 _FINER = 4
-# Of its length: as wide as a single line may be.
+# Largest width of a single line relative to its length.
 _LINE_WIDTH = 1e-6
 
 
 def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatArray:
-    """Return the area that each point of a scan, in its order, stands for (n,), of mean 1.
+    """Return the area that each point represents (n,), with a mean of 1; points in scan order.
 
-    even: the points are of an evenly spaced grid, whole or every k-th; then all stand for one area
+    even: the points are an evenly spaced grid, or every k-th of one, and have equal weights
     """
     if even:
         return np.ones(len(x))
@@ -65,12 +63,12 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
 
 
 def turns(x: FloatArray, y: FloatArray) -> float:
-    """Return how many times the path gets around the origin."""
+    """Return the number of turns of the path about the origin."""
     return _turns(np.unwrap(np.arctan2(y, x)))
 
 
 def _along_line(x: FloatArray, y: FloatArray) -> FloatArray | None:
-    """Return the place of each point (n,) along the line that all lie on [m]; None if on none."""
+    """Return the position of each point (n,) along a common line [m]; None if there is none."""
     across = np.stack([x - np.mean(x), y - np.mean(y)])
     direction = np.linalg.eigh(across @ across.T)[1]
     width, length = (float(np.ptp(way @ across)) for way in direction.T)
@@ -80,7 +78,7 @@ def _along_line(x: FloatArray, y: FloatArray) -> FloatArray | None:
 
 
 def _ways(along: FloatArray) -> FloatArray:
-    """Return the way (n,) that each point stands for [m]; across a gap nobody has looked."""
+    """Return the way (n,) that each point represents [m], without gaps."""
     order = np.argsort(along, kind="stable")
     steps = np.diff(along[order])
     steps = np.minimum(steps, _MOST_STEPS * _usual(steps))
@@ -94,7 +92,7 @@ def _turns(angle: FloatArray) -> float:
 
 
 def _is_path(angle: FloatArray) -> bool:
-    """Return whether the points follow each other about the origin, or come in no order."""
+    """Return True if the points follow a path about the origin, False if they are in no order."""
     steps = np.diff(angle)
     moved = steps[steps != 0]
     if not len(moved) or _usual(np.abs(moved)) <= _LARGEST_ARC:
@@ -104,7 +102,7 @@ def _is_path(angle: FloatArray) -> bool:
 
 
 def _usual(steps: FloatArray) -> float:
-    """Return the median of the steps; where the path rests, or a point is told again, is none."""
+    """Return the median of the steps that are not zero."""
     return float(np.median(steps[steps > 0]))
 
 
@@ -119,7 +117,7 @@ def _rings(x: FloatArray, y: FloatArray, turned: float) -> tuple[IntArray, Float
 
 
 def _arcs(radius: FloatArray, angle: FloatArray) -> FloatArray:
-    """Return the arc from half-way to the point before to half-way to the one after (n,) [m]."""
+    """Return the arc between the midpoints to both neighbours (n,) [m]."""
     steps = np.abs(np.diff(angle))
     steps = np.minimum(steps, min(_MOST_STEPS * _usual(steps), _LARGEST_ARC))
     covered = np.empty(len(angle))
@@ -129,9 +127,9 @@ def _arcs(radius: FloatArray, angle: FloatArray) -> FloatArray:
 
 
 def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
-    """Return the share of each of ``count`` rings that the path has seen (count,), by sectors.
+    """Return the share of each of ``count`` rings that was measured (count,), by sectors.
 
-    Where the feed is fast a ring is crossed within half a turn; then those beside it see the rest.
+    Points of the neighbouring rings count too, because a fast feed crosses a ring in half a turn.
     """
     sector = np.floor(angle * (_SECTORS / (2 * np.pi))).astype(np.int64) % _SECTORS
     points = np.bincount(group * _SECTORS + sector, minlength=count * _SECTORS)
@@ -143,12 +141,12 @@ def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
 
 
 def _nearest(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the cell of each point (n,), and of each cell the area that lies nearest to it (k,).
+    """Return the cell of each point (n,), and the area that is nearest to each cell (k,).
 
-    Cells with points share the scanned area as Voronoi's polygons do. The scanned area is that of
-    these cells, and of the gaps into which no disc fits whose radius is the distance of tracks.
+    The areas are the Voronoi polygons of the occupied cells within the scanned area. The scanned
+    area includes gaps that are narrower than the distance of two tracks.
     """
-    # Loading it takes as long as weighing; a scan that turns needs none of it.
+    # Imported here: it takes as long to load as to weigh a scan, and spirals do not need it.
     from scipy import ndimage
 
     even = int(np.clip(np.sqrt(len(x)), 1, _MOST_CELLS))
@@ -156,7 +154,7 @@ def _nearest(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
     cell, shape = _tiles(x, y, side)
     filled = (np.bincount(cell, minlength=shape[0] * shape[1]) > 0).reshape(shape)
     reach = side / _filled_side(x, y, even)
-    # Closing (Serra 1982): what a disc of that radius grows by, less what it would take back.
+    # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
     margin = int(np.ceil(reach)) + 1
     own = np.s_[margin:-margin, margin:-margin]
     far, nearest = ndimage.distance_transform_edt(~np.pad(filled, margin), return_indices=True)
@@ -167,19 +165,19 @@ def _nearest(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
 
 
 def _filled_side(x: FloatArray, y: FloatArray, side: int) -> int:
-    """Return how many cells, ``side`` at most, the longer side has where tracks fill them all."""
+    """Return the number of cells, ``side`` at most, along the longer side that tracks fill."""
     while side > 2 and _occupied(x, y, side) < _FILLED * _occupied(x, y, side // 2):
         side //= 2
     return side
 
 
 def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int, int]]:
-    """Return the cell of each point (n,), and how many there are in x and y; ``side`` at most."""
+    """Return the cell of each point (n,), and the number of cells in x and y, at most ``side``."""
     spans = np.array([np.ptp(x), np.ptp(y)])
-    spans[spans < MAP_SPACING.low] = 0.0  # one place, but for the last bits
+    spans[spans < MAP_SPACING.low] = 0.0  # one place, up to rounding
     counts = np.maximum(np.round(side * spans / (spans.max() or 1.0)), 1.0).astype(np.int64)
     places = [
-        # What lies on the far edge lies in the last cell.
+        # Points on the far edge belong to the last cell.
         np.minimum(((values - values.min()) * (count / (span or 1.0))).astype(np.int64), count - 1)
         for values, span, count in zip((x, y), spans, counts, strict=True)
     ]

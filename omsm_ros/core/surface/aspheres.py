@@ -1,8 +1,13 @@
-"""Shapes of revolution and their relatives: conic with aspheric terms, toroid, biconic.
+"""Conics with aspheric terms, toroids, biconics and Forbes' polynomials.
 
-Radii are positive for a concave surface, whose edge is higher than its vertex. A surface has no
-height, NaN, beyond where its conic ends. Sags are written without the difference of nearly equal
-numbers: ``C s / (1 + √(1 − (1 + k) C² s))`` is exact to rounding for any radius.
+Radii are positive for a concave surface, whose edge is higher than its vertex. The height is NaN
+beyond the end of a conic. Sags are written without differences of nearly equal numbers:
+``C s / (1 + √(1 − (1 + k) C² s))`` is exact to rounding for any radius.
+
+Forbes' polynomials are functions of ``x = (r/radius)²``: G. W. Forbes, "Shape specification for
+axially symmetric optical surfaces", Opt. Express 15, 5218 (2007), "Robust, efficient computational
+methods for axially symmetric optical aspheres", Opt. Express 18, 19700 (2010), and "Characterizing
+the shape of freeform optics", Opt. Express 20, 2483 (2012).
 """
 
 from __future__ import annotations
@@ -18,17 +23,14 @@ from omsm_ros.core.surface.height_grid import Gradient
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, Quantity
 
-# Twelve even powers differ by no more than rounding (their products have a condition of 3e16).
+# Most coefficients: twelve even powers are already nearly linearly dependent (condition 3e16).
 MOST_TERMS = 20
 
 
 def checked_terms(values: tuple[float, ...], name: str, quantity: Quantity = COEFFICIENT) -> None:
-    """Raise SurfaceError unless these are plausible coefficients, and not too many."""
+    """Raise SurfaceError for more than MOST_TERMS coefficients or implausible ones."""
     if len(values) > MOST_TERMS:
-        raise SurfaceError(
-            f"{name} has {len(values)} coefficients, expected {MOST_TERMS} at most; leave out the "
-            "others, or describe the surface by a grid"
-        )
+        raise SurfaceError("surface.terms", name=name, terms=len(values), most=MOST_TERMS)
     for place, value in enumerate(values):
         quantity.checked(value, SurfaceError, f"{name}[{place}]")
 
@@ -39,7 +41,7 @@ def curvature_of(radius: float | None) -> float:
 
 
 def root_of(argument: FloatArray) -> FloatArray:
-    """Return the square root, NaN where there is none."""
+    """Return the square root, NaN unless the argument is positive."""
     return np.where(argument > 0, np.sqrt(np.maximum(argument, 0.0)), np.nan)
 
 
@@ -76,9 +78,9 @@ class Asphere:
         return np.asarray(height, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Return the slopes ∂z/∂x, ∂z/∂y [1]; zero at the tip of a cone, which has none."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]; zero at the tip of a cone."""
         s, c = np.square(x) + np.square(y), curvature_of(self.radius)
-        # Of dz/dr over r, so that nothing is divided at the centre.
+        # (dz/dr)/r, which is finite at the centre.
         each = c / root_of(1 - (1 + self.conic_constant) * c**2 * s)
         if self.even_terms:
             powers = [2 * (i + 1) * a for i, a in enumerate(self.even_terms)]
@@ -93,7 +95,7 @@ class Asphere:
 
 @dataclass(frozen=True, slots=True)
 class Toroid:
-    """A conic in the plane of y and z, turned about a line parallel to y above its vertex.
+    """A conic in the plane of y and z, rotated about a line parallel to y above its vertex.
 
     ``z = R_x − √((R_x − g(y))² − x²)``, g the conic of ``radius_y`` and ``conic_constant``
 
@@ -135,7 +137,7 @@ class Toroid:
 
 @dataclass(frozen=True, slots=True)
 class Biconic:
-    """A conic of its own along x and along y.
+    """A surface with one conic along x and another along y.
 
     ``z = (C_x x² + C_y y²) / (1 + √(1 − (1 + k_x) C_x² x² − (1 + k_y) C_y² y²))``
 
@@ -156,13 +158,13 @@ class Biconic:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the conics have ended."""
-        curvature_term, root, _, _ = self._parts(x, y)
-        return np.asarray(curvature_term / (1 + root), np.float64)
+        sag, root, _, _ = self._parts(x, y)
+        return np.asarray(sag / (1 + root), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
-        curvature_term, root, p, q = self._parts(x, y)
-        share = curvature_term / ((1 + root) ** 2 * root)
+        sag, root, p, q = self._parts(x, y)
+        share = sag / ((1 + root) ** 2 * root)
         cx, cy = curvature_of(self.radius_x), curvature_of(self.radius_y)
         return (
             np.asarray(2 * cx * x / (1 + root) + share * p * x),
@@ -184,21 +186,14 @@ def _polynomial(coefficients: tuple[float, ...] | list[float], s: FloatArray) ->
     return value
 
 
-# Forbes' polynomials, for aspheres of revolution and for freeforms.
-#
-# G. W. Forbes, "Shape specification for axially symmetric optical surfaces", Opt. Express 15, 5218
-# (2007), "Robust, efficient computational methods for axially symmetric optical aspheres", Opt.
-# Express 18, 19700 (2010), and "Characterizing the shape of freeform optics", Opt. Express 20, 2483
-# (2012). All are functions of ``x = (r/radius)²``.
-
 Series = tuple[FloatArray, FloatArray]
 
 
 def bfs_series(coefficients: Sequence[float], x: FloatArray) -> Series:
-    """Return Σ a_m Q_m^bfs(x) and its derivative, the polynomials of mild aspheres.
+    """Return Σ a_m Q_m^bfs(x) of mild aspheres, and its derivative.
 
     ``P_(m+1) = (2 − 4x) P_m − P_(m−1)`` and ``f_m Q_m = P_m − g_(m−1) Q_(m−1) − h_(m−2) Q_(m−2)``
-    (2010, eq. 2.9 and appendix): orthonormal in the slope of the departure along the normal.
+    (2010, eq. 2.9 and appendix): orthonormal in the slope of the deviation along the normal.
     """
     zero = np.zeros_like(x)
     plain = [(2 + zero, zero), (6 - 8 * x, zero - 8)]
@@ -224,7 +219,7 @@ def bfs_series(coefficients: Sequence[float], x: FloatArray) -> Series:
 
 
 def _recurrence(count: int) -> list[tuple[float, float, float]]:
-    """Return f_m, g_(m−1), h_(m−2) for m = 0 to ``count − 1``; zero where there is none."""
+    """Return f_m, g_(m−1), h_(m−2) for m = 0 to ``count − 1``, with zeros for negative indices."""
     found: list[tuple[float, float, float]] = []
     f: list[float] = []
     g: list[float] = []
@@ -240,7 +235,7 @@ def _recurrence(count: int) -> list[tuple[float, float, float]]:
 
 
 def con_series(coefficients: Sequence[float], x: FloatArray) -> Series:
-    """Return Σ a_m Q_m^con(x) and its derivative, the polynomials of strong aspheres.
+    """Return Σ a_m Q_m^con(x) of strong aspheres, and its derivative.
 
     ``Q_m^con(x) = P_m^(0,4)(2x − 1)``, Jacobi polynomials (2007, eq. 2.4).
     """
@@ -248,13 +243,13 @@ def con_series(coefficients: Sequence[float], x: FloatArray) -> Series:
 
 
 def freeform_series(coefficients: Sequence[float], m: int, x: FloatArray) -> Series:
-    """Return Σ a_n Q_n^m(x) and its derivative by x, the polynomials of freeforms, m ≥ 1.
+    """Return Σ a_n Q_n^m(x) of freeforms, m ≥ 1, and its derivative by x.
 
-    They are what their definition says (2012, sec. 3): of degree n, the sign of its power (−1)ⁿ,
-    and ``u^m cos mθ Q_n^m(u²)`` orthonormal in the gradient, whose products are averaged over θ
-    and, with weight 1/√(1 − u²), over u.
+    By definition (2012, sec. 3) Q_n^m has degree n, a leading coefficient of sign (−1)ⁿ, and
+    ``u^m cos mθ Q_n^m(u²)`` is orthonormal in the gradient, averaged over θ and, with the weight
+    1/√(1 − u²), over u.
     """
-    # Well conditioned for that weight, so that no digit is lost on the way to high degrees.
+    # Jacobi polynomials of this weight are well conditioned up to high degrees.
     orders = -0.5, m - 1.5
     changed = _orthonormal(len(coefficients), m, orders) @ np.asarray(coefficients, np.float64)
     return _jacobi_series([float(a) for a in changed], *orders, x)
@@ -264,7 +259,7 @@ def freeform_series(coefficients: Sequence[float], m: int, x: FloatArray) -> Ser
 def _orthonormal(count: int, m: int, orders: tuple[float, float]) -> FloatArray:
     """Return the upper triangle (count, count) whose columns are Q_n^m in Jacobi polynomials.
 
-    ``|∇(u^m Q cos mθ)|²`` has the mean ``(A² + m² B²)/2`` over θ, with A = ∂/∂u (u^m Q) and
+    The mean of ``|∇(u^m Q cos mθ)|²`` over θ is ``(A² + m² B²)/2``, with A = ∂/∂u (u^m Q) and
     B = u^(m−1) Q. The mean over u = sin φ is a sum over even steps of φ, exact for polynomials.
     """
     steps = m + 2 * count + 2
@@ -282,7 +277,7 @@ def _orthonormal(count: int, m: int, orders: tuple[float, float]) -> FloatArray:
 def _jacobi_series(
     coefficients: Sequence[float], alpha: float, beta: float, x: FloatArray
 ) -> Series:
-    """Return Σ a_k P_k^(α,β)(2x − 1) and its derivative by x, by their recurrence of three."""
+    """Return Σ a_k P_k^(α,β)(2x − 1) and its derivative by x, by the three-term recurrence."""
     t, zero, both = 2 * x - 1, np.zeros_like(x), alpha + beta
     before: Series = (zero, zero)
     now: Series = (zero + 1, zero)

@@ -1,7 +1,6 @@
-"""How far is a measured surface from the nominal one?
+"""Deviation of measured points from a nominal surface, its statistics and profiles.
 
-All functions take a cloud in any order; none needs a grid. Nothing is filtered or
-thinned: every point that is passed in counts in the statistics.
+Points may come in any order and need no grid. They are not filtered or thinned.
 """
 
 from __future__ import annotations
@@ -14,32 +13,30 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.surface.area_weights import area_weights
-from omsm_ros.errors import DataError
+from omsm_ros.errors import DataError, Notice
 from omsm_ros.linear_algebra import least_squares
-from omsm_ros.readable import plain, quantity
 
-# Of a ring of a profile, each seen once at least: form of up to five waves around averages out.
+# Sectors of a ring that must all have points: a form with up to five waves a turn averages out.
 _SECTORS = 12
-# A radius off by a third, a sign, a unit or a place; form errors are a hundredth of a shape.
+# Deviation relative to the shape that shows a wrong radius, sign, unit or position; form errors are
+# a hundredth of the shape.
 _UNLIKE = 0.3
-# Of a nearly flat part the form itself may be more than its shape.
-_PLAINLY_M, _ROUNDING_M = 0.2e-6, 1e-12
-# So many points tell what a shape is.
+# Deviation of a nearly flat part that may be form error, and shape that is rounding only [m].
+_FORM_M, _ROUNDING_M = 0.2e-6, 1e-12
+# Number of points that determines a shape.
 _ENOUGH_POINTS = 20_000
-# Three numbers each: 12 MB.
+# Points kept for area weights, 12 MB.
 _MOST_WEIGHED = 2**19
-# Beyond this a spacing is a mistaken unit, and its rings would not fit into memory.
-_MOST_STRETCHES = 1_000_000
+# Most intervals of a profile; more are a wrong unit of the spacing, and would not fit into memory.
+_MOST_INTERVALS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class FormStatistics:
-    """Figures of a deviation.
+    """Statistics of a deviation.
 
-    peak_to_valley: largest minus smallest [m]
-    rms: root mean square about zero, every point alike [m]
-    rms_area_weighted: the same, every piece of area alike [m]
-    points: number of points these stand on
+    peak_to_valley: largest minus smallest [m];  points: number of points
+    rms, rms_area_weighted: root mean square about zero, with equal weights of points or areas [m]
     """
 
     peak_to_valley: float
@@ -50,13 +47,10 @@ class FormStatistics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Profile:
-    """Mean deviation over successive stretches; stretches without points are left out.
+    """Mean deviation in successive intervals, without empty ones; k = 0 if all are empty.
 
-    It is empty, k = 0, where the cloud does not touch the line.
-
-    position: mean position of the points of a stretch [m], increasing, (k,)
-    value: their mean [m], (k,)
-    points: how many they are, (k,)
+    position: mean position of the points of an interval [m], increasing, (k,)
+    value: their mean [m], (k,);  points: their number, (k,)
     """
 
     position: FloatArray
@@ -73,10 +67,7 @@ def deviation(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface
     expected = nominal.height(x, y)
     outside = int(np.sum(~np.isfinite(expected)))
     if outside:
-        raise DataError(
-            f"{outside} of {len(x)} points lie where the nominal surface {nominal!r} has no "
-            "height; check its parameters and the units of the cloud"
-        )
+        raise DataError("surface.outside", outside=outside, points=len(x), nominal=repr(nominal))
     return np.asarray(height - expected, np.float64)
 
 
@@ -88,10 +79,10 @@ def level(
     tilt: bool = False,
     weights: FloatArray | None = None,
 ) -> FloatArray:
-    """Return deviation (n,) [m] without its least-squares piston, and without tilt if asked for.
+    """Return the deviation (n,) [m] minus its least-squares piston and, with ``tilt``, its tilt.
 
-    A piston is the unknown stand-off of the probe; remove a tilt only where the part's
-    seat on the spindle is not of interest. ``weights`` (n,) as for :func:`statistics`.
+    The piston is the unknown stand-off of the probe; the tilt is the seat of the part on the
+    spindle. ``weights`` (n,) as for :func:`statistics`.
     """
     weight = np.ones_like(deviation) if weights is None else weights
     _check(x=x, y=y, deviation=deviation, weights=weight)
@@ -101,12 +92,14 @@ def level(
     return np.asarray(deviation - design @ fitted, np.float64)
 
 
-def mismatch_text(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> list[str]:
-    """Return what says that points are not of ``nominal``, in words for people, or nothing.
+def mismatch_text(
+    x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface
+) -> list[Notice]:
+    """Return a notice if the points deviate from ``nominal`` by about its own shape, or nothing.
 
     x, y, height: [m], each (n,), in the frame of the surface
-    A measurement with a wrong sign, unit or place deviates by as much as the shape itself. What
-    has no shape, a plane, cannot be told so.
+
+    A wrong sign, unit or position makes such a deviation. It cannot be found for a plane.
     """
     every = max(-(-len(x) // _ENOUGH_POINTS), 1)
     x, y, height = x[::every], y[::every], height[::every]
@@ -118,26 +111,20 @@ def mismatch_text(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Sur
         float(np.sqrt(np.mean(level(x[here], y[here], values[here], tilt=True) ** 2)))
         for values in (height - expected, expected)
     )
-    if shape < _ROUNDING_M or left < max(_UNLIKE * shape, _PLAINLY_M):
+    if shape < _ROUNDING_M or left < max(_UNLIKE * shape, _FORM_M):
         return []
-    return [
-        f"the points depart from the nominal surface by {quantity(left, 'm')} rms beside a tilt, "
-        f"and that from a plane by {quantity(shape, 'm')}: they are not of this surface, or lie "
-        "elsewhere on it; check its parameters, and sign, unit and zero of each axis"
-    ]
+    return [Notice("surface.unlike", deviation=left, shape=shape)]
 
 
 def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
-    """Return the figures of a deviation (n,) [m] whose points stand for areas ∝ ``weights`` (n,).
+    """Return the statistics of a deviation (n,) [m] of points with areas ∝ ``weights`` (n,).
 
     Raises DataError for values that are not finite or weights that are not areas.
     """
     _check(deviation=deviation, weights=weights)
     total = float(np.sum(weights))
     if np.any(weights < 0) or total <= 0:
-        raise DataError(
-            f"weights from {float(weights.min())!r} to {float(weights.max())!r}, expected areas"
-        )
+        raise DataError("surface.weights", least=float(weights.min()), most=float(weights.max()))
     square = np.square(deviation)
     return FormStatistics(
         peak_to_valley=float(np.ptp(deviation)),
@@ -148,11 +135,10 @@ def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
 
 
 class RunningStatistics:
-    """Statistics of a cloud that comes in portions, its piston removed as by :func:`level`.
+    """Statistics of points that come in portions, with the piston removed as by :func:`level`.
 
-    Peak to valley and rms are of all points, exact up to rounding: sums are taken about the first
-    value, for a deviation is small against its stand-off. What is weighted by area is of all, or
-    of a quarter of a million and more, evenly chosen.
+    Peak to valley and rms are exact up to rounding, because sums are taken about the first value.
+    Area weights use all points, or an even selection of a quarter of a million and more.
     """
 
     def __init__(self) -> None:
@@ -163,7 +149,7 @@ class RunningStatistics:
         self._weighed = EvenSelection(_MOST_WEIGHED)
 
     def add(self, x: FloatArray, y: FloatArray, deviation: FloatArray) -> None:
-        """Take in the next portion of the scan, each array (n,) [m]."""
+        """Take the next portion of the scan, each array (n,) [m]."""
         _check(x=x, y=y, deviation=deviation)
         if not self._points:
             self._start = float(deviation[0])
@@ -176,9 +162,9 @@ class RunningStatistics:
         self._weighed.add(np.stack([x, y, shifted], axis=1))
 
     def statistics(self) -> FormStatistics:
-        """Return the statistics of all portions so far. Raises DataError if there was none."""
+        """Return the statistics of all portions so far; raise DataError if there are none."""
         if not self._points:
-            raise DataError("0 points: there is nothing to take statistics of; give one or more")
+            raise DataError("surface.no_points")
         x, y, shifted = self._weighed.rows().T
         weights = area_weights(x, y)
         piston = float(np.average(shifted, weights=weights))
@@ -214,15 +200,14 @@ def line_profile(
 def radial_profile(
     x: FloatArray, y: FloatArray, deviation: FloatArray, *, spacing: float
 ) -> Profile:
-    """Return mean over rings of width ``spacing`` [m] about the origin: what a turned part repeats.
+    """Return the mean over rings of width ``spacing`` [m] about the origin, the form of revolution.
 
-    Each of 12 directions counts alike, and a ring that was not seen in all of them is left
-    out: over a part of a turn the errors of the other orders would not average to zero.
-    Choose ``spacing`` wider than the feed per turn.
+    Each of 12 sectors has equal weight, and a ring without points in all of them is left out, so
+    that other orders average to zero. ``spacing`` should exceed the feed per turn.
     """
     _check(x=x, y=y, deviation=deviation)
     radius = np.hypot(x, y)
-    ring = _stretches(radius, spacing)
+    ring = _intervals(radius, spacing)
     sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
     cell = ring * _SECTORS + sector
     shape = (int(ring.max()) + 1, _SECTORS)
@@ -239,8 +224,8 @@ def radial_profile(
 
 
 def _averaged(position: FloatArray, value: FloatArray, spacing: float) -> Profile:
-    stretch = _stretches(position, spacing)
-    filled, index, points = np.unique(stretch, return_inverse=True, return_counts=True)
+    interval = _intervals(position, spacing)
+    filled, index, points = np.unique(interval, return_inverse=True, return_counts=True)
     return Profile(
         position=np.bincount(index, position, len(filled)) / points,
         value=np.bincount(index, value, len(filled)) / points,
@@ -248,26 +233,22 @@ def _averaged(position: FloatArray, value: FloatArray, spacing: float) -> Profil
     )
 
 
-def _stretches(position: FloatArray, spacing: float) -> IntArray:
+def _intervals(position: FloatArray, spacing: float) -> IntArray:
     if not (np.isfinite(spacing) and spacing > 0):
-        raise DataError(f"spacing of a profile is {spacing!r} m, expected a positive number")
+        raise DataError("surface.spacing", spacing=spacing)
     extent = float(np.max(np.abs(position), initial=0.0)) / spacing
-    if extent > _MOST_STRETCHES:
-        raise DataError(
-            f"spacing {spacing!r} m cuts the profile into {plain(extent)} stretches; widen it"
-        )
+    if extent > _MOST_INTERVALS:
+        raise DataError("surface.intervals", spacing=spacing, intervals=extent)
     return np.asarray(np.floor(position / spacing), np.int64)
 
 
 def _check(**arrays: FloatArray) -> None:
     lengths = {name: np.shape(array) for name, array in arrays.items()}
     if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
-        raise DataError(f"form: arrays of shapes {lengths!r}, expected one row of one length each")
+        raise DataError("surface.shapes", shapes=lengths)
     for name, array in arrays.items():
         if not len(array):
-            raise DataError(f"form: {name} is empty; give one point or more")
+            raise DataError("surface.empty", name=name)
         bad = int(np.sum(~np.isfinite(array)))
         if bad:
-            raise DataError(
-                f"form: {bad} of {len(array)} values of {name} are not finite; drop and count them"
-            )
+            raise DataError("surface.not_finite", bad=bad, values=len(array), name=name)

@@ -1,4 +1,4 @@
-"""Heights at the crossings of evenly spaced rows and columns."""
+"""Height maps on an even grid, as points and as nominal surfaces; slopes of surfaces."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from omsm_ros.errors import DataError
 from omsm_ros.quantities import MAP_SPACING, POSITION
 from omsm_ros.units import MICROMETRE_M
 
-# Coordinates written with five digits lie this much of a spacing beside their place.
-_LARGEST_STRAY = 0.02
-# Levels of a coordinate, as shares of its extent: finer than any map of 100 000 columns.
+# Largest deviation of a coordinate from the grid, in spacings, from rounding to five digits.
+_LARGEST_DEVIATION = 0.02
+# Resolution of a coordinate relative to its extent, finer than a map of 100 000 columns.
 _LEVEL = 1e-7
-# A map of which less than this is measured is a list of places.
+# Least share of measured places of a map; fewer points are a list.
 _LEAST_FILLED = 0.2
 
 
@@ -26,7 +26,7 @@ _LEAST_FILLED = 0.2
 class HeightGrid:
     """A map: ``height[row, column]`` [m] at ``x0 + column·dx``, ``y0 + row·dy``; NaN = missing.
 
-    Raises DataError for implausible spacings or places, or a map that is none.
+    Raises DataError for implausible spacings or positions, or an array that is no map.
     """
 
     height: FloatArray
@@ -37,7 +37,7 @@ class HeightGrid:
 
     def __post_init__(self) -> None:
         if self.height.ndim != 2 or not self.height.size:
-            raise DataError(f"map of shape {self.height.shape!r}, expected rows and columns")
+            raise DataError("surface.map", shape=self.height.shape)
         for name in ("dx", "dy"):
             MAP_SPACING.checked(getattr(self, name), DataError, f"spacing {name} of the map")
         for name in ("x0", "y0"):
@@ -54,13 +54,13 @@ class HeightGrid:
         return np.asarray(self.y0 + self.dy * np.arange(self.height.shape[0]), np.float64)
 
     def points(self, notes: tuple[str, ...] = ()) -> MeasuredPoints:
-        """Return the places that have a height, row by row."""
+        """Return the points with a height, row by row."""
         x, y = np.meshgrid(self.x, self.y)
         return measured(x.ravel(), y.ravel(), self.height.ravel(), notes=notes)
 
 
 def as_grid(points: MeasuredPoints) -> HeightGrid | None:
-    """Return the map that the points are, without any interpolation; None if they are none."""
+    """Return the map with the points as its places, not interpolated; None if not on a grid."""
     columns, rows = _levels(points.x), _levels(points.y)
     if columns is None or rows is None:
         return None
@@ -83,32 +83,32 @@ def _levels(values: FloatArray) -> tuple[IntArray, float, float] | None:
         return None
     found = np.unique(np.round((values - least) / (span * _LEVEL)))
     steps = np.diff(found)
-    steps = steps[steps > 3]  # rounding of one and the same level
+    steps = steps[steps > 3]  # rounding of equal coordinates
     if not len(steps) or len(steps) > len(values) // 2:
         return None
     step = span / max(round(1 / (float(np.median(steps)) * _LEVEL)), 1)
     level = (values - least) / step
     number = np.round(level)
-    if float(np.max(np.abs(level - number))) > _LARGEST_STRAY:
+    if float(np.max(np.abs(level - number))) > _LARGEST_DEVIATION:
         return None
     return number.astype(np.int64), least, step
 
 
 class GridSurface:
-    """A map as a nominal surface, between its places by cubic splines.
+    """A map as a nominal surface, interpolated by cubic splines.
 
-    It has no height beyond its edges, nor where one of the four places around is missing. Raises
+    The height is NaN beyond its edges and where one of the four places around is missing. Raises
     DataError for a map of fewer than four rows or columns.
     """
 
     def __init__(self, grid: HeightGrid) -> None:
-        from scipy.interpolate import RectBivariateSpline  # takes a third of a second to load
+        from scipy.interpolate import RectBivariateSpline  # takes 0.3 s to load
 
         if min(grid.height.shape) < 4:
-            raise DataError(f"map of shape {grid.height.shape!r}, expected 4 rows and columns")
+            raise DataError("surface.small_map", shape=grid.height.shape)
         self._grid, self._known = grid, np.isfinite(grid.height)
-        # Only cells whose places are all known are used; the others must not bend these.
-        filled = np.where(self._known, grid.height, _filled_from_neighbours(grid.height))
+        # Missing places are filled, so that the spline in the complete cells is smooth.
+        filled = np.where(self._known, grid.height, _filled(grid.height))
         self._spline = RectBivariateSpline(grid.y, grid.x, filled)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -127,7 +127,7 @@ class GridSurface:
         return np.where(known, self._spline.ev(*places, dx=dy, dy=dx), np.nan)
 
     def _measured(self, x: FloatArray, y: FloatArray) -> BoolArray:
-        """Return where the four places around are all known."""
+        """Return True where the four places around are all known."""
         grid, slack = self._grid, 1e-9
         column, row = (x - grid.x0) / grid.dx, (y - grid.y0) / grid.dy
         rows, columns = grid.height.shape
@@ -143,8 +143,8 @@ class GridSurface:
         return np.asarray(inside & whole[low, left])
 
 
-def _filled_from_neighbours(height: FloatArray) -> FloatArray:
-    """Return the map with each missing place as the nearest known one of its row, else the mean."""
+def _filled(height: FloatArray) -> FloatArray:
+    """Return the map with missing places interpolated along the row, or the mean of the map."""
     made = np.full_like(height, np.nanmean(height))
     index = np.arange(height.shape[1])
     for row, values in enumerate(height):
@@ -154,19 +154,17 @@ def _filled_from_neighbours(height: FloatArray) -> FloatArray:
     return made
 
 
-# How steep is a surface, and where is its normal?
-
 Gradient: TypeAlias = tuple[FloatArray, FloatArray]
 """Slopes ∂z/∂x and ∂z/∂y [1], each of the shape of x and y."""
 
-# Of a shape that tells its height alone: central differences are off by step²/6 times the third
-# derivative, 1e-9 on an optic of 50 mm radius, and its height is known to 1e-17 m.
+# Step of central differences for a shape without slopes. Their error is step²/6 times the third
+# derivative, 1e-9 on an optic with a radius of 50 mm; rounding of the height is 1e-17 m.
 _STEP_M = 2 * MICROMETRE_M
 
 
 @runtime_checkable
 class SlopedSurface(Protocol):
-    """A surface that knows its slopes in closed form."""
+    """A surface with slopes in closed form."""
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m], of their broadcast shape."""
@@ -178,7 +176,7 @@ class SlopedSurface(Protocol):
 
 
 def gradient_of(surface: Surface, x: FloatArray, y: FloatArray) -> Gradient:
-    """Return the slopes of ``surface`` at x, y [m]; by differences if it knows its height alone."""
+    """Return the slopes of ``surface`` at x, y [m], by differences if it has no gradient."""
     if isinstance(surface, SlopedSurface):
         return surface.gradient(x, y)
     return slopes_by_differences(surface, x, y, _STEP_M)

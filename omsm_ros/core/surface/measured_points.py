@@ -1,4 +1,4 @@
-"""What any instrument delivers of a surface: heights at places, in metres."""
+"""Measured points of a surface from any instrument, in metres."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.errors import DataError
+from omsm_ros.errors import DataError, Notice
 from omsm_ros.quantities import COUNTER, POSITION, UNCERTAINTY
 
-# Odd, of bits without a pattern: 2⁶⁴ over the golden ratio.
+# Odd multiplier of the hash, 2⁶⁴ divided by the golden ratio (Knuth).
 _MIXED = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -21,10 +21,10 @@ class MeasuredPoints:
     """Heights over a plane, scattered or on a grid, in the frame of the instrument.
 
     x, y, height: [m], each (n,)
-    uncertainty: standard uncertainty of each height [m], k = 1, (n,); None where nobody states it
-    sample: place of each point in the order of the scan, (n,); None where nobody states it
-    missing: how many places of a map have no height; they are left out
-    notes: what a reader of the results should know about how the file was understood
+    uncertainty: standard uncertainty of each height [m], k = 1, (n,); None if not stated
+    sample: position of each point in the order of the scan, (n,); None if not stated
+    missing: number of places of a map without a height, which are left out
+    notes: for the user, about the interpretation of the file
 
     Raises DataError for lengths that differ, no points at all, or implausible coordinates.
     """
@@ -43,9 +43,9 @@ class MeasuredPoints:
         shapes = {name: np.shape(column) for name, column in columns.items()}
         shapes |= {name: np.shape(column) for name, column in optional if column is not None}
         if len(set(shapes.values())) != 1 or self.x.ndim != 1:
-            raise DataError(f"points of {shapes!r} values, expected one row of one length each")
+            raise DataError("surface.columns", shapes=shapes)
         if not len(self.x):
-            raise DataError("a surface of no points; give one that has heights")
+            raise DataError("surface.empty_surface")
         for name, column in columns.items():
             POSITION.checked_all(column, DataError, name)
         if self.uncertainty is not None:
@@ -57,7 +57,7 @@ class MeasuredPoints:
         return len(self.x)
 
     def part(self, place: BoolArray | IntArray) -> MeasuredPoints:
-        """Return the points at ``place``: which of them (n,), or their numbers."""
+        """Return the points at ``place``, a mask (n,) or indices."""
         return MeasuredPoints(
             x=self.x[place],
             y=self.y[place],
@@ -78,7 +78,7 @@ def measured(
     *,
     sample: NDArray[Any] | None = None,
 ) -> MeasuredPoints:
-    """Return the points (n,) [m] with a place and a height; those that have none are counted."""
+    """Return the points (n,) [m] that have a position and a height; others count as missing."""
     with np.errstate(invalid="ignore"):  # a signalling NaN of single precision is a NaN too
         x, y, height = (np.ascontiguousarray(v, np.float64) for v in (x, y, height))
     known = np.isfinite(height) & ~np.isnan(x) & ~np.isnan(y)
@@ -95,12 +95,11 @@ def measured(
 
 
 def without_duplicates(points: MeasuredPoints) -> MeasuredPoints:
-    """Return the points without those that stand there again in every digit; a note tells them.
+    """Return the points without exact duplicates, whose number is added as a note.
 
-    What a program has written twice is no second measurement.
+    A point that a program has written twice is no second measurement.
     """
-    # A product of all bits of a point in 64: of 20 million points two are taken for one by chance
-    # in one file of 100 000.
+    # A 64-bit hash of each point: of 20 million points two collide in one file of 100 000.
     number = np.zeros(len(points), np.uint64)
     for values in (points.x, points.y, points.height):
         number = (number ^ values.view(np.uint64)) * _MIXED
@@ -108,5 +107,5 @@ def without_duplicates(points: MeasuredPoints) -> MeasuredPoints:
     _, first = np.unique(number, return_index=True)
     if len(first) == len(points):
         return points
-    note = f"{len(points) - len(first)} points stand there again in every digit: left out"
+    note = str(Notice("surface.duplicates", points=len(points) - len(first)))
     return replace(points.part(np.sort(first)), notes=(*points.notes, note))

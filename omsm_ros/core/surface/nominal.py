@@ -1,7 +1,7 @@
 """Nominal surfaces: height and slope over the workpiece plane.
 
-A surface is described in the workpiece frame of the scan: x, y in the plane of the
-chuck, height along the spindle axis, all in metres.
+A surface is described in the workpiece frame of the scan: x, y in the plane of the chuck, height
+along the spindle axis, all in metres.
 """
 
 from __future__ import annotations
@@ -51,9 +51,7 @@ from omsm_ros.quantities import (
     TERM_SIZE,
 )
 
-# Shapes by a series of terms: XY polynomial, Zernike, and Forbes' Q polynomials.
-
-# Up to order 27; a picture of them takes two seconds and 400 MB.
+# Most Zernike terms, up to order 27; a picture of them takes 2 s and 400 MB.
 MOST_ZERNIKES = 400
 
 
@@ -94,7 +92,7 @@ class XYPolynomial:
         return self._at(x, y, along_x), self._at(x, y, along_y)
 
     def _coefficients(self) -> FloatArray:
-        """Return the value [m] of each pair of powers (i, j); terms of equal powers add up."""
+        """Return the value [m] of each pair of powers (i, j), the sum of its terms."""
         table = np.zeros([max((getattr(t, n) for t in self.terms), default=0) + 1 for n in "xy"])
         for term in self.terms:
             table[term.x, term.y] += term.value
@@ -109,7 +107,7 @@ class XYPolynomial:
 class ZernikeSurface:
     """A sum of Zernike polynomials over a disc about the origin.
 
-    radius: of the disc [m], beyond which the polynomials go on
+    radius: of the disc [m], beyond which the polynomials are extrapolated
     coefficients: [m], from the first number of the ``indexing`` on: 1 for Noll and Fringe, 0 for
         ANSI;  norm: "peak": each term is one at the rim, "rms": of root mean square one
 
@@ -124,14 +122,16 @@ class ZernikeSurface:
     def __post_init__(self) -> None:
         DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
         if self.indexing not in NUMBERING:
-            raise SurfaceError(f"indexing is {self.indexing!r}, expected one of {list(NUMBERING)}")
+            raise SurfaceError("surface.indexing", indexing=self.indexing, known=NUMBERING)
         if self.norm not in ("peak", "rms"):
-            raise SurfaceError(f"norm is {self.norm!r}, expected 'peak' or 'rms'")
+            raise SurfaceError("surface.norm", norm=self.norm)
         most = MOST_FRINGE if self.indexing == "fringe" else MOST_ZERNIKES
         if len(self.coefficients) > most:
             raise SurfaceError(
-                f"coefficients are {len(self.coefficients)}, expected {most} at most in the "
-                f"numbering {self.indexing!r}"
+                "surface.zernikes",
+                terms=len(self.coefficients),
+                most=most,
+                indexing=self.indexing,
             )
         for place, value in enumerate(self.coefficients):
             TERM_SIZE.checked(value, SurfaceError, f"coefficients[{place}]")
@@ -160,7 +160,7 @@ class ZernikeSurface:
         return u / self.radius, v / self.radius
 
     def _terms(self) -> tuple[list[ZernikeIndex], FloatArray]:
-        """Return the terms that are there, and their sizes at the rim [m]."""
+        """Return the terms that are not zero, and their sizes at the rim [m]."""
         numbered = first_terms(len(self.coefficients), self.indexing)
         used = [(t, c) for t, c in zip(numbered, self.coefficients, strict=True) if c]
         scale = [1 / rms_of(t) if self.norm == "rms" else 1.0 for t, _ in used]
@@ -169,7 +169,7 @@ class ZernikeSurface:
 
 @dataclass(frozen=True, slots=True)
 class QBfs:
-    """Forbes' mild asphere: a best-fit sphere and a departure along its normal.
+    """Forbes' mild asphere: a best-fit sphere and a deviation along its normal.
 
     ``z = sphere + u²(1 − u²) Σ a_m Q_m^bfs(u²) / √(1 − r²/R²)``, ``u = r/aperture_radius``
 
@@ -207,7 +207,7 @@ class QBfs:
 
 @dataclass(frozen=True, slots=True)
 class QCon:
-    """Forbes' strong asphere: a conic and a departure along the axis.
+    """Forbes' strong asphere: a conic and a deviation along the axis.
 
     ``z = conic + u⁴ Σ a_m Q_m^con(u²)``, ``u = r/aperture_radius``
 
@@ -252,9 +252,6 @@ def _check_series(
     checked_terms(coefficients, "coefficients", TERM_SIZE)
 
 
-# Forbes' freeform: a best-fit sphere and gradient-orthogonal terms with and without an angle.
-
-
 @dataclass(frozen=True, slots=True)
 class QTerm:
     """``value`` [m] of the term of degree ``n`` in u² and angular order ``m``.
@@ -274,13 +271,13 @@ class QTerm:
 
 @dataclass(frozen=True, slots=True)
 class QFreeform:
-    """A sphere and a departure along its normal (Opt. Express 20, 2483, eq. 2.2).
+    """Forbes' freeform: a sphere and a deviation along its normal (2012, eq. 2.2).
 
     ``z = sphere + δ / √(1 − r²/R²)``, ``u = r/aperture_radius``, ``δ = u²(1 − u²) Σ a_n Q_n^bfs(u²)
     + Σ u^m [a_nm cos mθ + b_nm sin mθ] Q_n^m(u²)``
 
     radius: R of the sphere [m], None for flat;  aperture_radius: where u is one [m]
-    terms: those of m = 0 are the ones of Q bfs; terms of equal n and m add up
+    terms: those with m = 0 are those of QBfs; terms of equal n and m add up
     """
 
     aperture_radius: float
@@ -296,22 +293,20 @@ class QFreeform:
         """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
         square, c = np.square(x) + np.square(y), curvature_of(self.radius)
         root = root_of(1 - c**2 * square)
-        departure, _, _ = self._departure_from_sphere(x, y)
-        return np.asarray(c * square / (1 + root) + departure / root, np.float64)
+        deviation, _, _ = self._bump(x, y)
+        return np.asarray(c * square / (1 + root) + deviation / root, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         c = curvature_of(self.radius)
         root = root_of(1 - c**2 * (np.square(x) + np.square(y)))
-        departure, along_x, along_y = self._departure_from_sphere(x, y)
-        # Of the sphere, and of 1/root, divided by x or y.
-        rate = c / root + departure * c**2 / root**3
+        deviation, along_x, along_y = self._bump(x, y)
+        # Slopes of the sphere and of 1/root, divided by x or y.
+        rate = c / root + deviation * c**2 / root**3
         return np.asarray(along_x / root + rate * x), np.asarray(along_y / root + rate * y)
 
-    def _departure_from_sphere(
-        self, x: FloatArray, y: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return δ [m] and its slopes [1]; u^m exp(imθ) is a power of (x + iy)/aperture_radius."""
+    def _bump(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return δ [m] and its slopes [1], with u^m exp(imθ) = ((x + iy)/aperture_radius)^m."""
         w: ComplexArray = np.asarray(np.add(x, np.multiply(1j, y)) / self.aperture_radius)
         s = np.square(w.real) + np.square(w.imag)
         total = np.zeros((3, *w.shape))
@@ -348,7 +343,7 @@ def _angular(
     """Return Re(e wᵐ) q(|w|²) and its derivatives by the parts of w; ``lower`` is e w^(m−1)."""
     q, rate = series
     power = (lower * w).real
-    # An analytic function changes along y by i times what it does along x.
+    # The derivative of an analytic function along y is i times that along x.
     along_x = m * lower.real * q + 2 * w.real * power * rate
     along_y = -m * lower.imag * q + 2 * w.imag * power * rate
     return power * q, along_x, along_y
@@ -396,14 +391,14 @@ class Sphere:
 
 @dataclass(frozen=True, slots=True)
 class OffAxisParaboloid:
-    """A piece of a paraboloid, its height taken along the normal at its centre.
+    """A section of a paraboloid, with the height along the normal at its centre.
 
     parent_focal_length: f of the parent ``Z = R²/4f`` [m]
-    off_axis_distance: from the parent's axis to the centre of the piece [m]
+    off_axis_distance: from the parent's axis to the centre of the section [m]
 
-    x points away from the parent's axis. With slope ``m = d/2f`` at the centre and
-    ``q² = 1 + m²``, a point (u, v, w) of the tangent frame lies on the parent where
-    ``4 f q w = ((u - m w)/q)² + v²``; the smaller root of this quadratic is the height.
+    x points away from the parent's axis. Let ``m = d/2f`` be the slope at the centre and
+    ``q² = 1 + m²``. A point (u, v, w) of the tangent frame lies on the parent if
+    ``4 f q w = ((u - m w)/q)² + v²``. The smaller root of this quadratic is the height.
     """
 
     parent_focal_length: float
@@ -416,11 +411,11 @@ class OffAxisParaboloid:
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""
         b, c, root, _ = self._quadratic(x, y)
-        # 2c / (b + √…) is the small root without the cancellation of (b - √…) / 2a.
+        # 2c / (b + √…) is the small root without the cancellation in (b - √…) / 2a.
         return np.asarray(2 * c / (b + root), np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Return the slopes ∂z/∂x, ∂z/∂y [1]: of ``a w² − b w + c = 0``, differentiated."""
+        """Return the slopes ∂z/∂x, ∂z/∂y [1], from the derivative of ``a w² − b w + c = 0``."""
         b, c, root, slope = self._quadratic(x, y)
         q2 = 1 + slope**2
         w = 2 * c / (b + root)
@@ -435,7 +430,7 @@ class OffAxisParaboloid:
         q2 = 1 + slope**2
         b = 2 * slope / q2 * np.asarray(x) + 4 * self.parent_focal_length * np.sqrt(q2)
         c = np.square(x) / q2 + np.square(y)
-        with np.errstate(invalid="ignore"):  # beyond the rim there is no surface
+        with np.errstate(invalid="ignore"):  # NaN beyond the rim
             root = np.sqrt(b**2 - 4 * slope**2 / q2 * c)
         return b, c, root, slope
 

@@ -1,7 +1,7 @@
-"""A surface elsewhere: moved and turned on the machine, or cut out beside its axis.
+"""Surfaces in another pose: moved and rotated on the machine, or an off-axis section.
 
-Heights stay along the machine's z. A point q of the machine is ``p = Rᵀ (q − t)`` in the part's own
-frame; the height over x, y is where ``p_z = h(p_x, p_y)``, found by Newton's method.
+Heights stay along the machine's z. A point q of the machine is ``p = Rᵀ (q − t)`` in the frame of
+the part; the height over x, y solves ``p_z = h(p_x, p_y)`` by Newton's method.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from omsm_ros.core.surface.height_grid import Gradient, gradient_of
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import LENGTH, TURN
 
-# Newton's method doubles the digits each time; a surface too steep for it gets no height.
+# Iterations of Newton's method, which doubles the digits each time; NaN if it does not converge.
 _MOST_STEPS = 25
 _SETTLED = 4 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pose:
-    """Where a part sits, from where its frame and the machine's agree.
+    """Pose of a part relative to the frame of the machine.
 
     x, y, piston: position of its origin along x, y, z [m]
     tip, tilt, clocking: rotation about x, then about y, then about z [rad]
@@ -43,19 +43,19 @@ class Pose:
 
     @property
     def origin(self) -> FloatArray:
-        """Of the part in the machine's frame (3,) [m]."""
+        """Origin of the part in the machine's frame (3,) [m]."""
         return np.array([self.x, self.y, self.piston])
 
     @property
     def rotation(self) -> FloatArray:
-        """R (3, 3): from the part's frame to the machine's."""
+        """Rotation R (3, 3) from the part's frame to the machine's."""
         about_x, about_y, about_z = self._turns()
         return np.asarray(about_z @ about_y @ about_x, np.float64)
 
     def rotation_rates(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the derivatives (3, 3) of R by tip, tilt and clocking."""
         about_x, about_y, about_z = self._turns()
-        # d/dα of a turn is the turn times its axis' cross product, which commutes with it.
+        # The derivative of a rotation is the rotation times the cross product with its axis.
         return (
             np.asarray(about_z @ about_y @ about_x @ _CROSS[0]),
             np.asarray(about_z @ about_y @ _CROSS[1] @ about_x),
@@ -81,7 +81,7 @@ _CROSS = (
 
 @dataclass(frozen=True, slots=True)
 class PosedSurface:
-    """``surface`` in its ``pose`` on the machine."""
+    """A ``surface`` in a ``pose`` on the machine."""
 
     surface: Surface
     pose: Pose
@@ -103,9 +103,9 @@ class PosedSurface:
 
 @dataclass(frozen=True, slots=True)
 class OffAxisSection:
-    """A piece of a ``parent``, its height taken along the parent's normal at the piece's centre.
+    """A section of a ``parent``, with the height along the parent's normal at its centre.
 
-    distance: from the parent's axis to the centre of the piece [m]
+    distance: from the parent's axis to the centre of the section [m]
     azimuth: of the centre about the parent's axis, from the parent's x [rad]
 
     x points away from the parent's axis.
@@ -125,10 +125,7 @@ class OffAxisSection:
         height = float(self.parent.height(x, y)[0])
         slopes = np.array([float(part[0]) for part in gradient_of(self.parent, x, y)])
         if not np.all(np.isfinite([height, *slopes])):
-            raise SurfaceError(
-                f"distance is {self.distance!r} m, where the parent {self.parent!r} has no height; "
-                "check both"
-            )
+            raise SurfaceError("surface.off_axis", distance=self.distance, parent=repr(self.parent))
         normal = np.array([-slopes[0], -slopes[1], 1.0]) / np.sqrt(1 + slopes @ slopes)
         along = np.array([away[0], away[1], slopes @ away])
         along /= np.linalg.norm(along)
@@ -153,9 +150,9 @@ def _intersected(
     y: FloatArray,
     centre: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return, over x, y [m], the surface's own x and y and the height z in the turned frame.
+    """Return x and y in the frame of the surface, and the height z in the rotated frame, over x, y.
 
-    rotation: R;  centre: of the turned frame on the surface (3,) [m], at its origin if None
+    rotation: R;  centre: of the rotated frame on the surface (3,) [m], its origin if None
     """
     across, along = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y))
     z = np.zeros(across.shape)
@@ -180,7 +177,7 @@ def _intersected(
 def _turned_slopes(
     surface: Surface, rotation: FloatArray, found: tuple[FloatArray, FloatArray, FloatArray]
 ) -> Gradient:
-    """Return the slopes in the turned frame: those of the normal R (−∂x, −∂y, 1)."""
+    """Return the slopes in the rotated frame, from the normal R (−∂x, −∂y, 1)."""
     slope_x, slope_y = gradient_of(surface, found[0], found[1])
     nx, ny, nz = (
         rotation[i, 2] - rotation[i, 0] * slope_x - rotation[i, 1] * slope_y for i in range(3)
@@ -190,13 +187,13 @@ def _turned_slopes(
 
 @dataclass(frozen=True, slots=True)
 class Sum:
-    """Several surfaces, one on top of the other, in one frame."""
+    """The sum of the heights of several surfaces in one frame."""
 
     parts: tuple[Surface, ...]
 
     def __post_init__(self) -> None:
         if not self.parts:
-            raise SurfaceError("a sum of no parts is no surface; name at least one")
+            raise SurfaceError("surface.empty_sum")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""

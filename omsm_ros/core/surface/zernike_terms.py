@@ -4,9 +4,9 @@
 towards y, and ``R(1) = 1`` (ISO 14999-2; "peak"). Noll's and ANSI Z80.28's are these times
 ``sqrt((2 − δ_m0)(n + 1))``, of root mean square one over the disc ("rms").
 
-``R_n^m(ρ) = ρ^m P_k^(0,m)(2ρ² − 1)``, ``k = (n − m)/2``: the angular part with its ρ^m is a power
-of x + i y, and the Jacobi polynomials P come by their recurrence of three terms, so that no angle
-and no factorial is ever computed.
+``R_n^m(ρ) = ρ^m P_k^(0,m)(2ρ² − 1)``, ``k = (n − m)/2``. The angular part with its ρ^m is a power
+of x + i y. The Jacobi polynomials P follow from their three-term recurrence. No angle and no
+factorial is computed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 Norm: TypeAlias = Literal["peak", "rms"]
 Indexing: TypeAlias = Literal["noll", "fringe", "ansi"]
 
-
-# The set ends there by its definition.
+# The Fringe set ends here by definition.
 MOST_FRINGE = 37
 
 
@@ -45,7 +44,7 @@ def noll(j: int) -> ZernikeIndex:
 def fringe(j: int) -> ZernikeIndex:
     """Return the term of the Fringe number j = 1 to 37 (University of Arizona; ISO 14999-2).
 
-    Its last is the symmetric one of order twelve, out of turn, and there are no others.
+    The last one, 37, is the rotationally symmetric term of order twelve, out of sequence.
     """
     if j == MOST_FRINGE:
         return ZernikeIndex(12, 0)
@@ -66,7 +65,7 @@ NUMBERING: dict[str, tuple[Callable[[int], ZernikeIndex], int]] = {
     "fringe": (fringe, 1),
     "ansi": (ansi, 0),
 }
-"""Each numbering with the number that it begins with."""
+"""Each numbering with its first number."""
 
 
 def first_terms(count: int, indexing: Indexing = "fringe") -> tuple[ZernikeIndex, ...]:
@@ -81,14 +80,14 @@ def terms_up_to(order: int, least: int = 0) -> tuple[ZernikeIndex, ...]:
 
 
 def rms_of(term: ZernikeIndex) -> float:
-    """Return the root mean square over the disc of a term that is one at the rim."""
+    """Return the root mean square over the disc of a term that is 1 at the rim."""
     return float(1 / np.sqrt((1 if term.m == 0 else 2) * (term.n + 1)))
 
 
 def _jacobi(
     t: FloatArray, m: int, highest: int, slopes: bool
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield P_k^(0,m)(t) and its derivative, 0 if not asked for, for k = 0 to ``highest``."""
+    """Yield P_k^(0,m)(t) and its derivative, 0 unless ``slopes``, for k = 0 to ``highest``."""
     before, value = np.zeros_like(t), np.ones_like(t)
     before_slope, slope = (np.zeros_like(t) if slopes else np.zeros(()) for _ in range(2))
     yield value, slope
@@ -108,7 +107,7 @@ def _jacobi(
 
 
 def _by_angle(terms: Sequence[ZernikeIndex]) -> dict[int, list[tuple[int, int, bool]]]:
-    """Return, by |m|, the place of each term, its k, and whether it is a sine."""
+    """Return for each |m| the position of each term, its k, and True for a sine."""
     found: dict[int, list[tuple[int, int, bool]]] = {}
     for place, (n, m) in enumerate(terms):
         found.setdefault(abs(m), []).append((place, (n - abs(m)) // 2, m < 0))
@@ -116,10 +115,10 @@ def _by_angle(terms: Sequence[ZernikeIndex]) -> dict[int, list[tuple[int, int, b
 
 
 def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[ZernikeIndex]) -> FloatArray:
-    """Return the terms (k, n), one at the rim, at x, y (n,) of the unit disc."""
+    """Return the terms (k, n), 1 at the rim, at x, y (n,) of the unit disc."""
     made = np.empty((len(terms), *np.shape(x)))
     t = 2 * (x**2 + y**2) - 1
-    # (x + iy)^m, each part by itself: numbers of one part lie side by side.
+    # Real and imaginary part of (x + iy)^m separately, for contiguous memory.
     real, imaginary = np.ones_like(t), np.zeros_like(t)
     groups = _by_angle(terms)
     for m in range(max(groups, default=0) + 1):
@@ -140,7 +139,7 @@ def zernike_slopes(
     t, base = 2 * (x**2 + y**2) - 1, x + 1j * y
     for m, wanted in _by_angle(terms).items():
         power = base**m
-        # d(x + iy)^m: along x it is m (x + iy)^(m-1), along y i times that.
+        # Derivative of (x + iy)^m: m (x + iy)^(m-1) along x, i times that along y.
         turned = m * base ** max(m - 1, 0)
         radial = list(_jacobi(t, m, max(k for _, k, _ in wanted), True))
         for place, k, sine in wanted:

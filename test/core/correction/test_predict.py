@@ -133,8 +133,8 @@ def test_a_hopeless_calibration_has_no_safe_speed() -> None:
 def test_message_tells_error_residual_and_advice() -> None:
     message = predicted(late_probe(2e-6), sine(1.0)).message
     assert "1.88 µm peak to valley" in message
-    assert "within 12.6 nm (k = 2, largest on the path)" in message
-    assert "up to 3.98 times as fast; then dynamics binds" in message
+    assert "after correction 12.6 nm (k = 2, largest on the path), within the budget" in message
+    assert "maximum speed: 3.98 × this motion, limited by dynamics" in message
 
 
 @pytest.mark.parametrize("budget", [0.0, -1e-9, np.nan, np.inf])
@@ -212,7 +212,7 @@ def test_the_limit_that_binds_is_the_headline() -> None:
     z = spiral()
     found = predict_error(late_probe(1e-9), ScanPath(z=z, sample_period=PERIOD), limits=slow_servo)
     assert found.binding == "probe range against following error"
-    assert f"then {found.binding} binds" in found.message
+    assert f"limited by {found.binding}" in found.message
     assert found.speed_factor == min(limit.speed_factor for limit in found.limits)
     assert "spindle speed" in found.not_evaluated
     assert "Z jerk" in found.not_evaluated

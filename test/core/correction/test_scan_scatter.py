@@ -96,7 +96,7 @@ def test_the_points_of_a_noisier_scan_state_what_they_scatter_by(
     found = float(np.std(points.height[settled]))
     assert np.median(points.uncertainty[settled]) == pytest.approx(found, rel=0.05)
     (reason,) = excess_noise_reasons(corrector.budget)
-    assert "probe_noise" in reason.remedy
+    assert "probe_noise" in str(reason.remedy)
 
 
 def test_of_a_scan_as_stated_there_is_nothing_to_say(true_calibration: Calibration) -> None:

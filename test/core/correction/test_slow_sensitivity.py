@@ -84,7 +84,7 @@ def test_the_prediction_states_the_undetected_error_and_the_dwell_that_would_rev
     found = predict_error(with_noise(), path, 50e-9, unlimited)
     assert found.residual_hidden == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
     assert found.residual == pytest.approx(found.residual_hidden, rel=0.01)
-    assert "could not have shown, mostly creep of 10.5 s" in found.message
+    assert "cannot detect, mostly creep of 10.5 s" in found.message
     # 100 nm against 50 nm: four times as long.
     assert "rests of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message
 

@@ -223,8 +223,8 @@ def test_plans_at_their_limits_are_made():
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"sample_period": 2.01e-3}, r"rise 0.02 s is too sharp for samples every 0.00201 s"),
-        ({"dwell": 0.0599}, "dwell 0.06 s or longer"),
+        ({"sample_period": 2.01e-3}, r"rise 0.02 s is too short for samples every 0.00201 s"),
+        ({"dwell": 0.0599}, "'dwell' 0.06 s or longer"),
         ({"step": 10.1e-6}, r"10 steps travel 101 µm.*range of ±50.0 µm; use fewer or smaller"),
     ],
 )

@@ -36,7 +36,7 @@ def test_blocks_that_continue_each_other_are_one_path() -> None:
     found = path_of(axes(0, 100), distance(0, 100), axes(100, 250), distance(100, 250))
     np.testing.assert_array_equal(found.z, Z[:250])
     np.testing.assert_array_equal(found.distance, -Z[:250])
-    assert found.left_out == ""
+    assert found.left_out is None
 
 
 def test_the_longest_run_is_taken_where_there_is_a_gap() -> None:
@@ -44,8 +44,8 @@ def test_the_longest_run_is_taken_where_there_is_a_gap() -> None:
     found = path_of(axes(0, 100), distance(0, 100), axes(220, 900), distance(220, 900))
     np.testing.assert_array_equal(found.z, Z[220:900])
     np.testing.assert_array_equal(found.distance, -Z[220:900])
-    assert found.left_out == (
-        "judged are only 680 of 780 samples, triggers 220 to 899, the longest run without a gap: "
+    assert str(found.left_out) == (
+        "only 680 of 780 samples are judged, triggers 220 to 899, the longest run without a gap: "
         "120 are missing (100 to 219)"
     )
 
@@ -59,8 +59,8 @@ def test_the_longest_run_is_taken_where_z_was_lost() -> None:
     )
     np.testing.assert_array_equal(found.z, Z[301:900])
     np.testing.assert_array_equal(found.distance, -Z[301:900])
-    assert found.left_out == (
-        "judged are only 599 of 900 samples, triggers 301 to 899, the longest run without a gap: "
+    assert str(found.left_out) == (
+        "only 599 of 900 samples are judged, triggers 301 to 899, the longest run without a gap: "
         "2 are missing (100 to 101), 1 are missing (300 to 300)"
     )
     assert path_of(replace(axes(0, 100), z=np.full(100, np.nan))) is None
@@ -68,11 +68,12 @@ def test_the_longest_run_is_taken_where_z_was_lost() -> None:
 
 def test_each_kind_of_break_is_named_and_of_many_three() -> None:
     found = path_of(axes(0, 300), replace(axes(300, 350), sample_period=2e-3), axes(0, 100))
-    assert "from 300 on the sample period is 0.002 s, after 349 the counter goes on from 0" in (
-        found.left_out
+    assert (
+        "from 300 on the sample period is 0.002 s, after 349 the counter continues from 0"
+        in str(found.left_out)
     )
     found = path_of(*(axes(k, k + 50) for k in range(0, 600, 100)))
-    assert found.left_out.endswith("50 are missing (250 to 299) and 2 more gaps")
+    assert str(found.left_out).endswith("50 are missing (250 to 299), 2 more gaps")
 
 
 def test_another_period_is_another_path() -> None:
@@ -85,8 +86,7 @@ def test_another_period_is_another_path() -> None:
 def test_no_more_is_kept_than_asked_for() -> None:
     found = path_of(axes(0, 100), axes(100, 200), axes(200, 900), most=150)
     np.testing.assert_array_equal(found.z, Z[:150])
-    assert found.left_out == (
-        "judged are only 150 of 900 samples, triggers 0 to 149; no more than the first 150 are "
-        "looked at"
+    assert str(found.left_out) == (
+        "only 150 of 900 samples are judged, triggers 0 to 149; at most the first 150 are used"
     )
     assert path_of(distance(0, 10)) is None

@@ -234,7 +234,7 @@ def test_a_path_does_not_know_how_it_was_cut_into_blocks(lengths, most):
     np.testing.assert_array_equal(found.z, SWING[:kept] + 2)
     np.testing.assert_array_equal(found.c, SWING[:kept] + 4)
     np.testing.assert_array_equal(found.distance, SWING[:kept] * 0.1)
-    assert (found.left_out == "") == (kept == total)
+    assert (found.left_out is None) == (kept == total)
 
 
 def test_without_readings_a_path_has_no_distance():

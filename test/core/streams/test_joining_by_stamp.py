@@ -13,8 +13,9 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.streams import blocks as merging
+from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import AxisBlock, Block, DistanceBlock
-from omsm_ros.core.streams.stamps import axes_at_probe, fit_clock
+from omsm_ros.core.streams.stamps import fit_clock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.quantities import COUNTER
@@ -165,7 +166,7 @@ def test_repeated_blocks_bring_nothing_new() -> None:
 
 
 def test_too_few_axis_samples_are_refused() -> None:
-    with pytest.raises(DataError, match="6 axis samples on end"):
+    with pytest.raises(DataError, match="run of 6 finite axis samples"):
         axes_at_probe([], probe_blocks())
 
 

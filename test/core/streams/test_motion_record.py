@@ -134,7 +134,7 @@ def test_streams_that_count_for_themselves_meet_in_time_where_that_is_asked_for(
     axes = [axis_block(moved)]
     probe = [distance_block(-moved[100:900], first=5000)]
     probe = [replace(block, stamp_ns=axes[0].stamp_ns + 100_000_000) for block in probe]
-    with pytest.raises(DataError, match="--by-stamps"):
+    with pytest.raises(DataError, match="by_stamps"):
         assemble(axes, probe)
     record = assemble(axes, probe, by_stamps=True)
     assert record.by_stamps

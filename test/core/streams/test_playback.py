@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from omsm_ros.core.streams.stamps import Playback
+from omsm_ros.core.streams.monitoring import Playback
 
 S = 1_000_000_000
 BEGIN = 1_700_000_000 * S

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from omsm_ros.core.streams.stamps import RecentIncrease, SampleFlow
+from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 
 
 def test_a_fault_is_recent_for_the_window_and_history_after() -> None:

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, Status
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
-from omsm_ros.core.streams.stamps import axes_at_probe
 from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.errors import DataError
 

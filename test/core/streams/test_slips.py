@@ -180,7 +180,7 @@ def test_an_offset_that_is_stated_is_none(late: int) -> None:
 def test_the_remedy_names_the_offset_that_would_do() -> None:
     done = join(Device(ALL).blocks(), Device(ALL[7:]).blocks())
     assert done.watch is not None
-    assert "counter_offset 7 " in str(done.watch.state)
+    assert "'counter_offset' 7 " in str(done.watch.state)
 
 
 @pytest.mark.parametrize("who", [0, 1])

@@ -21,16 +21,10 @@ from omsm_ros.core.streams.blocks import (
     joined,
     uninterrupted,
 )
-from omsm_ros.core.streams.continuity import LoadMeter, TriggerCount
+from omsm_ros.core.streams.continuity import TriggerCount
+from omsm_ros.core.streams.monitoring import LoadMeter, Playback, RecentIncrease, SampleFlow
 from omsm_ros.core.streams.motion_record import BlockBuffer
-from omsm_ros.core.streams.stamps import (
-    Playback,
-    RecentIncrease,
-    SampleFlow,
-    StampClock,
-    fit_clock,
-    stamped_period,
-)
+from omsm_ros.core.streams.stamps import StampClock, fit_clock, period_fault, stamps_of
 from omsm_ros.core.streams.statistics import (
     EvenSelection,
     RunningScatter,
@@ -93,14 +87,14 @@ class TestCounts:
         assert watch.missing == spanned - len(held)
         assert watch.repeated == sum(length for _, length in placed) - len(held)
         assert watch.samples == sum(length for _, length in placed)
-        assert watch.begin_ns == placed[0][0] * 1_000_000
+        assert next(watch.marks())[0, 1] == placed[0][0] * 1_000_000
 
     def test_a_late_block_that_comes_twice_fills_its_gap_once(self):
         watch = StreamWatch()
         for first in (0, 20, 40, 10, 10):
             watch.add(distance(first))
         assert (watch.missing, watch.repeated) == (10, 10)
-        said = list(watch.faults("probe"))
+        said = list(map(str, watch.faults("probe")))
         assert "10 trigger numbers are missing" in said[0]
         assert "10 samples repeat" in said[1]
 
@@ -216,12 +210,14 @@ class TestClocks:
         count = np.array([b.first_sample for b in blocks]) - 1_000_000
         stamps = np.array([b.stamp_ns - 5_000_000_000 for b in blocks]) / 1e9
         (slope, _), covariance = np.polyfit(count, stamps, 1, cov=True)
-        found, uncertainty = stamped_period(blocks)
-        assert found == pytest.approx(slope, rel=1e-9)
-        assert uncertainty == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-6)
+        found = StampClock.through(stamps_of(blocks), PERIOD * 1e9)
+        assert found.period_ns == pytest.approx(1e9 * slope, rel=1e-9)
+        assert found.period_uncertainty_ns == pytest.approx(
+            1e9 * np.sqrt(covariance[0, 0]), rel=1e-6
+        )
 
     def test_blocks_of_one_count_have_no_period(self):
-        assert stamped_period([distance(5)] * 6) is None
+        assert period_fault("probe", stamps_of([distance(5)] * 6), PERIOD) is None
 
     def test_stamps_that_a_stated_offset_or_tolerance_explains_are_no_fault(self):
         axes, probe = StreamWatch(), StreamWatch()
@@ -231,7 +227,7 @@ class TestClocks:
             probe.add(block)
         skew = counter_skew(axes, probe)
         assert skew == pytest.approx(3e-3, rel=0.01)
-        (said,) = skew_fault(skew, PERIOD)
+        (said,) = map(str, skew_fault(skew, PERIOD))
         assert "axes are stamped 3.001 ms later" in said
         assert not list(skew_fault(skew, PERIOD, CommonTrigger(counter_offset=-3)))
         assert not list(skew_fault(skew, PERIOD, CommonTrigger(stamp_tolerance=2.6e-3)))

@@ -10,7 +10,7 @@ import pytest
 
 from omsm_ros.core.streams import trigger_slips
 from omsm_ros.core.streams.blocks import AxisBlock, joined, uninterrupted
-from omsm_ros.core.streams.continuity import StampHistory, StampLine, upcoming_stamps
+from omsm_ros.core.streams.stamps import StampHistory, StampLine, upcoming_stamps
 from omsm_ros.core.streams.trigger_slips import CommonTrigger
 
 from .test_slips import Device, join, without

@@ -1,6 +1,6 @@
 import pytest
 
-from omsm_ros.core.streams.continuity import LoadMeter
+from omsm_ros.core.streams.monitoring import LoadMeter
 
 
 def test_latency_and_share():

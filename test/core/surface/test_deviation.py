@@ -265,7 +265,7 @@ def test_a_wrong_radius_sign_or_unit_is_reported_with_both_sizes(spiral, radius)
     x, y = spiral
     (said,) = form.unlike(x, y, Sphere(radius=0.2).height(x, y), Sphere(radius=radius))
     left = form.level(x, y, x**2 + y**2, tilt=True) * (1 / 0.4 - 0.5 / radius)
-    number, unit = said.split(" by ")[1].split()[:2]
+    number, unit = str(said).split(" by ")[1].split()[:2]
     assert unit == "µm"
     assert float(number) == pytest.approx(1e6 * np.sqrt(np.mean(left**2)), rel=0.01)
 

@@ -239,5 +239,5 @@ def test_a_line_of_a_spacing_that_is_none_is_refused(spacing):
 
 
 def test_too_many_stretches_are_refused_by_their_number():
-    with pytest.raises(DataError, match=r"1e-15 m cuts the profile into .* stretches; widen it"):
+    with pytest.raises(DataError, match=r"1e-15 m divides the profile into .* intervals; widen it"):
         form.line_profile(X, Y, ERROR, half_width=1e-3, spacing=1e-15)

@@ -76,7 +76,7 @@ def test_points_that_are_none_are_refused(change, reported):
 
 
 def test_no_points_are_refused():
-    with pytest.raises(DataError, match="no points"):
+    with pytest.raises(DataError, match="without points"):
         MeasuredPoints(x=np.empty(0), y=np.empty(0), height=np.empty(0))
 
 

@@ -1,4 +1,4 @@
-"""Points that have no place, and points that stand there again."""
+"""Points without a position, and exact duplicates."""
 
 from itertools import permutations
 
@@ -34,7 +34,7 @@ def test_points_that_stand_there_again_count_once_and_a_note_says_so():
     found = without_duplicates(measured(*twice))
     np.testing.assert_array_equal(found.x, x)
     np.testing.assert_array_equal(found.height, height)
-    assert found.notes == ("507 points stand there again in every digit: left out",)
+    assert found.notes == ("507 points are exact duplicates of others: left out",)
     # One place that was measured twice is two measurements.
     assert len(measured(x, y, height).notes) == 0
     assert (
@@ -99,7 +99,7 @@ def test_what_no_instrument_delivers_is_refused_by_name_and_place(columns, repor
 
 def test_a_place_where_all_is_missing_is_no_surface():
     nothing = np.full(4, np.nan)
-    with pytest.raises(DataError, match="no points"):
+    with pytest.raises(DataError, match="without points"):
         measured(np.zeros(4), np.zeros(4), nothing)
 
 

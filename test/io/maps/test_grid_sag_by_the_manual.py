@@ -179,7 +179,7 @@ def test_an_impossible_first_line_is_reported(tmp_path, first, reported):
 def test_the_unit_that_is_given_must_be_the_one_of_the_file(tmp_path):
     path = sag(tmp_path / "a.dat", (1, 1, 2))
     assert read_points(path, units_of("in")).height.max() == pytest.approx(29 * 0.0254)
-    with pytest.raises(FileError, match="x and y are in in, and --unit says mm"):
+    with pytest.raises(FileError, match="x and y are in inch, and --unit says mm"):
         read_points(path, units_of("mm"))
     with pytest.raises(FileError, match="its heights are in in, and --unit says um"):
         read_points(path, units_of("in,um"))

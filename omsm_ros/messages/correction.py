@@ -1,0 +1,204 @@
+"""Sentences about the correction: uncertainty budget, traffic light, prediction, counter offset."""
+
+from __future__ import annotations
+
+# What the standard uncertainty of each source is of.
+_SOURCES = {
+    "probe_noise": "noise of a reading",
+    "probe_resolution": "step of a reading",
+    "encoder_noise": "noise of the Z encoder",
+    "encoder_resolution": "step of the Z encoder",
+    "discretisation": "difference of the digital filter from G",
+    "vibration": "vibration of the probe against the turning part",
+    "scan_scatter": "scatter of this scan beyond the stated sources",
+    "dynamics": "noise of the step test",
+    "could_hide": "model error that the step test cannot detect",
+    "static_gain": "static gain of the probe",
+    "lateral_lag": "latency that X and C do not share",
+    "lag_change": "lag of Z since the step test",
+    "motion_error": "half the backlash of Z",
+    "tilt": "tilt of the part, each way",
+    "decentre": "shift of the part, each way",
+    "clocking": "turn of the part",
+    "expansion": "thermal strain of the part",
+    "centre_x": "zero of X at the spindle",
+    "centre_y": "zero of Y at the spindle",
+    "beam": "tilt of the beam, each way",
+    "squareness": "angle of X to the spindle's plane",
+    "parallelism": "angle of Z to the spindle, each way",
+    "straightness_x": "straightness of X towards the probe",
+    "straightness_z": "straightness of Z, lateral",
+    "pitch": "pitch of Z, over the Abbe arm",
+    "spindle_axial": "axial motion in step with the spindle",
+    "spindle_radial": "radial motion in step with the spindle",
+    "spindle_tilt": "tilt in step with the spindle",
+    "encoder_scale": "scale of the Z encoder",
+    "encoder_interpolation": "interpolation of the Z encoder",
+    "probe_linearity": "cubic error of the probe at the end of its range",
+    "probe_periodic": "periodic error of the probe",
+    "probe_slope": "error of the probe by the slope, each way",
+    "probe_slope_square": "error of the probe by the square of the slope",
+    "drift_rate": "steady drift",
+    "drift_walk": "drift as a random walk",
+    "drift": "drift with a correlation time",
+}
+# Groups of sources of which one has to be stated, with the way to find it.
+_GROUPS = {
+    "drift": (
+        "drift",
+        "hold the probe on one place of the part for the duration of the scan, or scan twice, and "
+        "state drift, drift_rate or drift_walk",
+    ),
+    "centre": (
+        "centre of the spindle",
+        "scan a reference sphere, run 'omsm align', and state centre_x with its uncertainty",
+    ),
+    "spindle": (
+        "spindle",
+        "measure its error motion with a ball and a capacitive sensor, and state spindle_axial",
+    ),
+    "straightness": (
+        "straightness of X",
+        "scan an optical flat along X, and state straightness_x",
+    ),
+    "linearity": (
+        "linearity of the probe",
+        "step Z through the range of the probe on a flat, and state probe_linearity",
+    ),
+    "slope_error": (
+        "slope error of the probe",
+        "scan a reference sphere, and state probe_slope",
+    ),
+    "z_scale": (
+        "scale of Z",
+        "compare Z with a laser interferometer, or take it from the scale's certificate, and "
+        "state encoder_scale",
+    ),
+    "vibration": (
+        "vibration",
+        "hold the probe on the axis of the turning part for some turns, and state vibration, the "
+        "rms of the part that does not repeat with the turn",
+    ),
+    "lag_change": (
+        "change since the step test",
+        "repeat the step test after the scan, run 'omsm compare' on both, and state lag_change, "
+        "the difference of their lags",
+    ),
+    "z_pitch": (
+        "pitch of Z",
+        "measure it with an autocollimator along Z, give the arm in the geometry, and state pitch",
+    ),
+}
+
+TEMPLATES: dict[str, str] = {
+    **{f"correction.source_{name}": text for name, text in _SOURCES.items()},
+    **{f"correction.{name}": f"{what} not evaluated" for name, (what, _) in _GROUPS.items()},
+    **{f"correction.{name}_remedy": remedy for name, (_, remedy) in _GROUPS.items()},
+    # Traffic light
+    "correction.green": (
+        "calibration valid up to {valid_up_to:Hz}, uncertainty below {accuracy:m} (k = 2)"
+    ),
+    "correction.amber": "calibration valid up to {valid_up_to:Hz}, uncertainty budget incomplete",
+    "correction.red": "accuracy not supported by data",
+    "correction.rejected": "the calibration was rejected",
+    "correction.no_certificate": "the calibration has no certificate",
+    "correction.identify_remedy": "identify again",
+    "correction.too_large": (
+        "uncertainty {uncertainty:m} (k = 2) exceeds the accuracy of {accuracy:m} asked for"
+    ),
+    "correction.too_large_remedy": ("begin with {largest:words}, which alone contributes {part:m}"),
+    "correction.latency": (
+        "latency of the probe not separated from the lag, which contributes {uncertainty:m} (k = 2)"
+    ),
+    "correction.latency_remedy": (
+        "scan the part at two spindle speeds and run 'omsm selfcal', or in both directions and run "
+        "'omsm reversal', or declare it with 'omsm latency'"
+    ),
+    "correction.pose": "pose of the part not evaluated ({missing:list})",
+    "correction.pose_remedy": (
+        "register the part to its nominal surface (--fit auto, or 'omsm form'), or state them"
+    ),
+    "correction.pose_fitted_remedy": "these are fixed; state them, or fit them too (--fit auto)",
+    "correction.noisier": (
+        "heights of this scan scatter by {scatter:m}, the stated sources of single readings by "
+        "{stated:m}"
+    ),
+    "correction.noisier_remedy": (
+        "compare exposure, intensity and vibration with those of the step test; if the scan is as "
+        "it should be, state probe_noise"
+    ),
+    # Where the figure of a source comes from
+    "correction.from_samples": "from sample to sample of this scan",
+    "correction.in_probe_noise": "included in probe_noise, the scatter of heights at standstill",
+    "correction.from_path": "on the path of this scan",
+    "correction.from_covariance": "covariance of the calibration",
+    "correction.from_certificate": "certificate of the calibration",
+    # Statements about sources
+    "correction.source": "uncertainty {source} is unknown, expected one of {known:list}",
+    "correction.choice": "{source}: {name} is {value}, expected one of {known:list}",
+    "correction.no_reason": "{source} needs a reason: state where the figure comes from",
+    "correction.no_parameter": "{source} has no parameter {parameters:list}",
+    "correction.stated_twice": "{source} is stated {times} times; state it once",
+    "correction.parameter": "{source} has no parameter {parameter!r}, expected one of {known:list}",
+    "correction.needs_parameter": "{source} needs {parameter} [{unit}]; state it beside value",
+    "correction.no_slope": "the slope of the surface is not known; give a nominal surface",
+    "correction.negative_uncertainty": (
+        "{source}: standard uncertainty {value!r} {unit}, expected zero or more"
+    ),
+    # Correction
+    "correction.polarity": "polarity {polarity!r}, expected 1 or -1",
+    "correction.period_changed": (
+        "sample period {period!r} s after blocks of {before!r} s; both streams must keep one "
+        "sample period"
+    ),
+    "correction.other_rate": (
+        "sample period {period!r} s, but the calibration was identified at {calibrated!r} s; "
+        "identify at this rate or accept another rate explicitly"
+    ),
+    # Counter offset
+    "correction.few_samples": (
+        "{samples} samples with a distance do not determine an offset of up to {most} samples; "
+        "record {least} or more before a fixed target"
+    ),
+    "correction.several_offsets": (
+        "the motion fits at several offsets (least residual elsewhere {ratio:.3g} times that at "
+        "{samples} samples, {least} required); move Z unevenly by many times the noise before a "
+        "fixed target, or state {opt.counter_offset}"
+    ),
+    "correction.gain": (
+        "the distance answers to Z with {gain:.3g}, before a fixed target it is 1 ({least} to "
+        "{most}); record a motion of Z before a fixed target, or state {opt.counter_offset}"
+    ),
+    "correction.no_whole_offset": (
+        "the counters differ by {samples:.2f} ± {uncertainty:.2f} samples, which is no whole "
+        "number; move Z faster before a fixed target, state the lag, or state {opt.counter_offset}"
+    ),
+    # Prediction
+    "correction.budget": "budget {budget!r} m, expected a positive length",
+    "correction.short_motion": (
+        "motion of {samples} samples, expected more than {least}: the filter needs {settling} to "
+        "settle; give a longer motion"
+    ),
+    "correction.fastest": "maximum speed: more than {factor:g} × this motion",
+    "correction.faster": "maximum speed: {factor:plain} × this motion, limited by {limit}",
+    "correction.slower": "run it at {factor:plain} × this speed or slower, limited by {limit}",
+    "correction.slower_dynamics": "{better}, or run it at {factor:plain} × this speed",
+    "correction.no_speed": "no speed of this path is within the limit of {limit}",
+    "correction.no_speed_dynamics": (
+        "{better}: no speed of this path is within the limit of {limit}"
+    ),
+    "correction.better": "calibrate better (longer plateaus and more steps, omsm plan steps)",
+    "correction.dwell": (
+        "calibrate with rests of {dwell:.2g} s or more (omsm plan steps --dwell {dwell:.2g})"
+    ),
+    "correction.undetected_part": (
+        "; {part:m} of it are model errors that the step test cannot detect, mostly {mostly}"
+    ),
+}
+_PREDICTION = (
+    "dynamic error {error:m} peak to valley; after correction {residual:m} (k = 2, largest on the "
+    "path{undetected}), %s the budget of {budget:m}; {advice} (calibration valid up to "
+    "{valid_up_to:Hz})"
+)
+TEMPLATES["correction.within"] = _PREDICTION % "within"
+TEMPLATES["correction.exceeded"] = _PREDICTION % "beyond"
