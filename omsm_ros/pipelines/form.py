@@ -25,7 +25,7 @@ from omsm_ros.core.registration.placement import (
 )
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.core.surface.deviation import mismatch_text
+from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, without_duplicates
 from omsm_ros.errors import FileError
@@ -223,7 +223,7 @@ def form_facts(
 
 def _mismatch_text(form: FormResult, nominal: Surface) -> list[str]:
     x, y = form.map.x, form.map.y
-    return [*map(str, mismatch_text(x, y, nominal.height(x, y) + form.map.deviation, nominal))]
+    return [*map(str, mismatch(x, y, nominal.height(x, y) + form.map.deviation, nominal))]
 
 
 def _counts(form: FormResult, missing: int) -> dict[str, int]:

@@ -36,7 +36,7 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.deviation import mismatch_text
+from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.errors import DataError
 from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.results import save_fields
@@ -256,7 +256,7 @@ def _mismatch_text(done: Correction, nominal: Surface | None) -> list[str]:
     if nominal is None:
         return []
     x, y = (done.points[name].astype(np.float64) for name in "xy")
-    return [*map(str, mismatch_text(x, y, done.points["height"], nominal))]
+    return [*map(str, mismatch(x, y, done.points["height"], nominal))]
 
 
 def _publish(

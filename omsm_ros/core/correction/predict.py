@@ -324,14 +324,14 @@ def _message(
         better = Notice("correction.better" if dwell is None else "correction.dwell", dwell=dwell)
         advice = Notice(f"correction.{code}_dynamics", better=better, **values)
     mostly = calibration.certificate.get("hidden_mostly")
-    undetected: Notice | str = ""
+    part: Notice | str = ""
     if undetected and isinstance(mostly, str):
-        undetected = Notice("correction.undetected_part", part=2 * undetected, mostly=mostly)
+        part = Notice("correction.undetected_part", part=2 * undetected, mostly=mostly)
     return Notice(
         "correction.within" if 2 * residual <= budget else "correction.exceeded",
         error=peak_to_valley,
         residual=2 * residual,
-        undetected=undetected,
+        undetected=part,
         budget=budget,
         advice=advice,
         valid_up_to=calibration.valid_up_to,

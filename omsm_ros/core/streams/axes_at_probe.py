@@ -24,7 +24,7 @@ from omsm_ros.core.streams.blocks import (
     without_first_message,
 )
 from omsm_ros.core.streams.continuity import TriggerCount
-from omsm_ros.core.streams.stamps import Clock, fit_clock
+from omsm_ros.core.streams.stamps import StampClock, fit_clock
 from omsm_ros.errors import ConfigurationError, DataError
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class _Track:
     spline: BSpline | None
 
     @classmethod
-    def of(cls, run: Sequence[AxisBlock], clock: Clock) -> _Track:
+    def of(cls, run: Sequence[AxisBlock], clock: StampClock) -> _Track:
         values = np.stack([np.concatenate([getattr(b, name) for b in run]) for name in _AXES], 1)
         count = run[0].first_sample + np.arange(len(values), dtype=np.float64)
         time = clock.since(count, run[0].stamp_ns)
@@ -96,7 +96,7 @@ class _Track:
 
 def _at(
     block: DistanceBlock,
-    clock: Clock,
+    clock: StampClock,
     tracks: Sequence[_Track],
     nodes: FloatArray,
     weights: FloatArray,
@@ -133,9 +133,9 @@ def _sessions(blocks: Iterable[B]) -> list[list[B]]:
     return [[b for _, b in group] for _, group in groupby(placed, key=lambda item: item[0])]
 
 
-def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], Clock]]:
+def _runs(blocks: Iterable[AxisBlock]) -> list[tuple[list[AxisBlock], StampClock]]:
     """Return uninterrupted runs of blocks, each with the clock of its session."""
-    runs: list[tuple[list[AxisBlock], Clock]] = []
+    runs: list[tuple[list[AxisBlock], StampClock]] = []
     for session in _sessions(blocks):
         clock = fit_clock(session)
         runs += [(run, clock) for run in uninterrupted(session)]

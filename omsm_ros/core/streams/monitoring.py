@@ -40,7 +40,7 @@ class RecentIncrease:
         return {name: rise for name, rise in rises.items() if rise > 0}
 
 
-class Flow:
+class SampleFlow:
     """Sample rate of a stream over ``window`` [s], and the time since its last sample."""
 
     def __init__(self, window: float = WINDOW_S) -> None:

@@ -220,7 +220,7 @@ class StampLine:
         counts, stamps = self._counts[place], self._stamps[place]
         return np.concatenate([[count], counts]), np.concatenate([[stamp], stamps])
 
-    def leaps(self, session: int, count: int, period_ns: float) -> bool:
+    def follows_gap(self, session: int, count: int, period_ns: float) -> bool:
         """Return whether a block begins at ``count`` after a pause."""
         if self._current is None or not len(self) or self._next() != (session, count):
             return False

@@ -22,7 +22,7 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.continuity import TriggerCount
 from omsm_ros.core.streams.stamps import period_fault
-from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, Slip
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, TriggerSlip
 from omsm_ros.errors import Notice
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -282,7 +282,7 @@ def skew_fault(
     """Yield the slip that a ``skew`` of the counters [s] means, if it is one."""
     if skew is None:
         return
-    slip = Slip.judged(skew / period + trigger.counter_offset, period, trigger)
+    slip = TriggerSlip.judged(skew / period + trigger.counter_offset, period, trigger)
     if slip.samples:
         yield slip.notice()
 

@@ -92,9 +92,7 @@ def level(
     return np.asarray(deviation - design @ fitted, np.float64)
 
 
-def mismatch_text(
-    x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface
-) -> list[Notice]:
+def mismatch(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface) -> list[Notice]:
     """Return a notice if the points deviate from ``nominal`` by about its own shape, or nothing.
 
     x, y, height: [m], each (n,), in the frame of the surface

@@ -257,13 +257,13 @@ def seated(x, y):
 def test_points_of_the_surface_with_errors_of_form_are_not_called_others(spiral, shape):
     x, y = spiral
     height = shape.height(x, y) + seated(x, y) + zernike(x, y, 2, 1e-6)
-    assert form.unlike(x, y, height, shape) == []
+    assert form.mismatch(x, y, height, shape) == []
 
 
 @pytest.mark.parametrize("radius", [-0.2, 0.13, 0.4, 200.0])
 def test_a_wrong_radius_sign_or_unit_is_reported_with_both_sizes(spiral, radius):
     x, y = spiral
-    (said,) = form.unlike(x, y, Sphere(radius=0.2).height(x, y), Sphere(radius=radius))
+    (said,) = form.mismatch(x, y, Sphere(radius=0.2).height(x, y), Sphere(radius=radius))
     left = form.level(x, y, x**2 + y**2, tilt=True) * (1 / 0.4 - 0.5 / radius)
     number, unit = str(said).split(" by ")[1].split()[:2]
     assert unit == "µm"
@@ -272,4 +272,4 @@ def test_a_wrong_radius_sign_or_unit_is_reported_with_both_sizes(spiral, radius)
 
 def test_a_handful_of_points_says_nothing():
     nothing = np.zeros(2)
-    assert form.unlike(nothing, nothing, nothing + 1.0, PAPER_MIRROR) == []
+    assert form.mismatch(nothing, nothing, nothing + 1.0, PAPER_MIRROR) == []

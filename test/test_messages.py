@@ -1,0 +1,72 @@
+"""Sentences exist for every code that the core states, and use the values that come with it."""
+
+from __future__ import annotations
+
+import ast
+import string
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import omsm_ros
+from omsm_ros.errors import DataError, Notice
+from omsm_ros.messages import COMMAND, NODE, PYTHON, templates, written_for
+
+CORE = Path(omsm_ros.__file__).parent / "core"
+ROOMS = {path.name for path in CORE.iterdir() if path.is_dir()}
+
+
+def stated() -> Iterator[tuple[str, set[str] | None]]:
+    """Yield each code in the core with the names of its values; None if they are not literal."""
+    for path in sorted(CORE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or not node.args:
+                continue
+            code = node.args[0]
+            if isinstance(code, ast.Constant) and isinstance(code.value, str):
+                room, _, subject = code.value.partition(".")
+                if room in ROOMS and subject.isidentifier() and _states(node.func):
+                    names = {each.arg for each in node.keywords}
+                    values = None if None in names else {str(name) for name in names}
+                    yield code.value, values
+
+
+def _states(function: ast.expr) -> bool:
+    name = getattr(function, "id", getattr(function, "attr", ""))
+    return name.endswith("Error") or name in ("Notice", "Finding")
+
+
+def fields(template: str) -> set[str]:
+    """Return the names of the values that a template needs."""
+    found = {name for _, name, _, _ in string.Formatter().parse(template) if name}
+    return {name.partition(".")[0].partition("[")[0] for name in found} - {"opt"}
+
+
+STATED = list(stated())
+
+
+def test_every_code_has_a_sentence() -> None:
+    codes = {code for code, _ in STATED}
+    assert len(codes) > 80
+    assert codes <= set(templates())
+
+
+@pytest.mark.parametrize(("code", "values"), [(c, v) for c, v in STATED if v is not None])
+def test_a_sentence_uses_values_that_are_given(code: str, values: set[str]) -> None:
+    # A finding has further keywords of its own, such as its severity and values.
+    if not values & {"values", "limits", "severity"}:
+        assert fields(templates()[code]) <= values
+
+
+def test_an_option_is_named_for_its_audience() -> None:
+    error = DataError("streams.no_axis_run", least=6)
+    assert "6 finite axis samples" in str(error)
+    offset = Notice("correction.no_whole_offset", samples=1.5, uncertainty=0.1)
+    for audience, name in (
+        (COMMAND, "--counter-offset"),
+        (NODE, "parameter 'counter_offset'"),
+        (PYTHON, "'counter_offset'"),
+    ):
+        with written_for(audience):
+            assert str(offset).endswith(f"or state {name}")
