@@ -15,8 +15,8 @@ from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.ripple.ripple_guard import NamedLine, analyse_scans, name_lines
 from omsm_ros.core.ripple.scan_signal import scan_signal
 from omsm_ros.core.ripple.source_hypotheses import (
+    ALIASED,
     ARTEFACT,
-    FOLDED,
     PART,
     SYNCHRONOUS,
     UNDECIDED,
@@ -50,7 +50,7 @@ def _mixtures(runs: int) -> Iterator[Row]:
         "lines above 3 σ named rightly", 100 * counted["right"] / peaks, "%", 95, runs=runs
     )
     yield at_most(
-        "folded vibrations called on the part", counted["folded on the part"], "", 0, runs=runs
+        "aliased vibrations called on the part", counted["folded on the part"], "", 0, runs=runs
     )
     yield shown("lines above 3 σ", peaks, "", runs=runs)
     yield shown("of them undecided", 100 * counted["undecided"] / peaks, "%", runs=runs)
@@ -74,7 +74,7 @@ def judged(made: Mixture) -> Counter[str]:
             right = row.kind in expected
             counted["right" if right else "undecided" if row.kind == UNDECIDED else "wrong"] += 1
             counted["none"] += true is None
-            counted["folded on the part"] += row.kind == PART and FOLDED in expected
+            counted["folded on the part"] += row.kind == PART and ALIASED in expected
         for line in made.lines:
             if (
                 _expected(line, scan)
@@ -111,7 +111,7 @@ def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
         image = float(aliased_frequency(in_time, scan.rate))
         if image * len(place) / scan.rate < 6:
             return set()
-        return {FOLDED} if in_time > scan.rate / 2 else {VIBRATION}
+        return {ALIASED} if in_time > scan.rate / 2 else {VIBRATION}
     if in_time > scan.rate / 2:
         # Uneven steps along the path have no image; the wave is seen at its own length.
         steady = np.ptp(np.diff(place)) < 1e-9 * np.ptp(place)

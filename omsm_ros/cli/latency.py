@@ -92,7 +92,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         "residual": found.residual,
         "left_on_this_surface": found.followed,
         "disagreement": found.agreement.disagreement,
-        "not_told": undetermined(found),
+        "not_told": [*map(str, undetermined(found))],
         "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
         "samples": [account.as_dict() for account in accounts],
         "calibration": str(path),

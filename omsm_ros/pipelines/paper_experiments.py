@@ -12,7 +12,7 @@ import numpy as np
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Chirp, Circle
-from omsm_ros.core.ripple.source_hypotheses import FOLDED, PART
+from omsm_ros.core.ripple.source_hypotheses import ALIASED, PART
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.io.files import CLOUD, EXPERIMENT, REPORT, save_json, save_text
 from omsm_ros.io.folders import EXPERIMENT_FILES, result_folder
@@ -161,12 +161,12 @@ def _circles(out: Path, seed: int) -> _Done:
 def _vibration(out: Path, seed: int) -> _Done:
     scans = _scanned(out, ("F2", "F3"), seed)
     quiet, shaken = scans
-    aliased = [row for row in shaken.named if row.kind == FOLDED]
+    aliased = [row for row in shaken.named if row.kind == ALIASED]
     seen = aliased[0].line.possible["time"] if aliased else float("nan")
     true = aliased[0].frequency if aliased else float("nan")
     still = sum(row.kind != PART for row in quiet.named)
     rows = [
-        Compared("vibration that F3 feels", "680 Hz", quantity(true, "Hz", 5)),
+        Compared("vibration measured by F3", "680 Hz", quantity(true, "Hz", 5)),
         Compared("where the probe shows it", "about 350 Hz", quantity(seen, "Hz", 5),
                  "the paper's own formula gives 320 Hz"),
         Compared("lines of F2 that are not on the part", "minimal vibration", str(still)),
@@ -174,8 +174,8 @@ def _vibration(out: Path, seed: int) -> _Done:
                  quantity(1 / aliased[0].line.possible["path"] if aliased else None, "m"),
                  "33.93 µm a sample at 320 Hz; 20 µm would take a radius of 4.1 mm"),
     ]  # fmt: skip
-    return _spectrum_page(scans, rows, "A vibration that folds (Fig. 11)",
-                          "680 Hz, felt by the accelerometer, is seen at 320 Hz")  # fmt: skip
+    return _spectrum_page(scans, rows, "An aliased vibration (Fig. 11)",
+                          "680 Hz, measured by the accelerometer, has its alias at 320 Hz")  # fmt: skip
 
 
 def _named(scan: SpectrumOfScan) -> str:
@@ -195,7 +195,7 @@ def _spectrum_page(
             quantity(row.line.amplitude, "m"),
             plain(row.line.significance),
             row.kind,
-            "; ".join(row.evidence),
+            "; ".join(map(str, row.evidence)),
         )
         for scan in scans
         for row in scan.named

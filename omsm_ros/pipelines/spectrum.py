@@ -273,8 +273,8 @@ def _peak_facts(studied: StudiedScan, row: NamedLine) -> dict[str, Any]:
         "true_frequency": row.frequency,
         "true_wavelength": row.wavelength,
         "order": row.order,
-        "evidence": list(row.evidence),
-        "needs": row.needs or None,
+        "evidence": [*map(str, row.evidence)],
+        "needs": None if row.needs is None else str(row.needs),
     }
 
 

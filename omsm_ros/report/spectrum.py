@@ -14,8 +14,8 @@ from omsm_ros.core.ripple.density import Density, density, evenly, smoothed
 from omsm_ros.core.ripple.ripple_guard import NamedLine
 from omsm_ros.core.ripple.scan_signal import PATH, TIME
 from omsm_ros.core.ripple.source_hypotheses import (
+    ALIASED,
     ARTEFACT,
-    FOLDED,
     KINDS,
     PART,
     SYNCHRONOUS,
@@ -36,7 +36,7 @@ from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 COLOURS = {
     PART: "#009E73",
     VIBRATION: "#D55E00",
-    FOLDED: "#CC79A7",
+    ALIASED: "#CC79A7",
     SYNCHRONOUS: "#0072B2",
     ARTEFACT: "#E69F00",
     UNDECIDED: "#1F2933",
@@ -259,7 +259,7 @@ def _acceleration_table(scans: Sequence[Mapping[str, Any]]) -> Table:
         if scan["accelerometer"]
         for line in scan["accelerometer"]["lines"]
     ]
-    return Table("Felt by the accelerometer", ("frequency", "acceleration", "motion", "σ"), rows)
+    return Table("Accelerometer lines", ("frequency", "acceleration", "motion", "σ"), rows)
 
 
 def _scan_table(scans: Sequence[Mapping[str, Any]]) -> Table:

@@ -1,1 +1,1 @@
-"""The digital twin of the cell: samples as the devices give them, and the truth behind them."""
+"""Digital twin of the cell: samples as the devices report them, and the true values."""

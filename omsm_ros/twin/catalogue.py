@@ -1,6 +1,6 @@
-"""Disturbances by name, each in three plausible sizes: what a bench switches on.
+"""Disturbances by name, each in three plausible sizes, for benchmarks and tests.
 
-Small is a good machine on a good day, large one that its owner still thinks is sound.
+Small is typical of a good machine, large of a machine that may still be in use.
 """
 
 from __future__ import annotations
@@ -24,13 +24,12 @@ Sizes = tuple[Disturbances, Disturbances, Disturbances]
 Record = TypeVar("Record")
 
 SIZES = ("small", "medium", "large")
-
-
+# Amplitudes of periodic disturbances in the three sizes [m].
 _THREE_WAVES = (5e-9, 10e-9, 20e-9)
 
 
 def _each(family: str, record: Callable[..., Any], name: str, *sizes: Any, **fixed: Any) -> Sizes:
-    """Return one ``name`` of the ``family``'s record in three sizes."""
+    """Return the field ``name`` of a ``family`` of disturbances in three sizes."""
     small, medium, large = (
         Disturbances(**{family: record(**{name: size}, **fixed)}) for size in sizes
     )
@@ -159,13 +158,13 @@ CATALOGUE: dict[str, Sizes] = {
     "C latched late": _clocks("c_latch_late_s", 10e-6, 30e-6, 100e-6),
     "reference late": _each("reference", ReferenceSensor, "latency_s", 0.02e-3, 0.06e-3, 0.2e-3),
 }
-"""Small, medium and large of each disturbance by its name."""
+"""Small, medium and large size of each disturbance by name."""
 
 
 def together(first: Record, second: Record) -> Record:
-    """Return both disturbances at once, record by record; rows of creep, modes or lines are joined.
+    """Return both disturbances combined; tuples of creep, modes or lines are concatenated.
 
-    Raises ConfigurationError where both set the same number, each to something else.
+    Raises ConfigurationError where both set one number to different values.
     """
     if first == second:
         return first

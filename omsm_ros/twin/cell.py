@@ -1,7 +1,7 @@
-"""The whole cell: a motion over a surface, as the devices report it and as it truly was.
+"""Simulate the cell: a motion over a surface, as reported by the devices, and the true values.
 
-What is imitated, beside the probe's dynamics, scale, noise, resolution and range, the servo's lag
-and the encoder's noise, is what ``Disturbances`` lists; what is not stands in each family's file.
+The twin imitates dynamics, scale, noise, resolution and range of the probe, the lag of the servo,
+the noise of the encoder, and all ``Disturbances``. The file of each family states what it omits.
 """
 
 from __future__ import annotations
@@ -30,22 +30,30 @@ from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.twin.vibration import Vibration
 from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
 
-# The cell as it truly is at any instant, before any device looks at it.
+__all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]
 
 Random = Mapping[str, np.random.Generator]
 
-# Sample periods simulated beyond those asked for, so that a cubic has its four points.
+# Sample periods simulated in addition, for the four points of a cubic.
 _SPARE_SAMPLES = 3
-# Each turn of the search for a slanting beam's end leaves slope times slant of the error before;
-# it ends when the last one changed no more than this [m].
+# The search for the end of an inclined beam converges by slope times inclination; it ends at a
+# change of this size [m].
 _MOST_BEAM_ITERATIONS = 12
 _BEAM_SETTLED_M = 1e-12
+_LEAST_SUBSTEPS = 16
+# Half of this step changes a step test with 20 ms edges by 0.02 nm; the error is quadratic in it.
+_LONGEST_STEP_S = 1e-3 / _LEAST_SUBSTEPS
+# Uses of random numbers. New ones are appended, so that the others keep their numbers.
+_STREAMS = (
+    *("encoder", "probe", "drift", "vibration"),
+    *("spindle", "clocks", "dropout", "reference", "accelerometer"),
+)
 
 
 class ProbeTarget(NamedTuple):
-    """What the probe looks at, each (n,) [m].
+    """Situation at the probe, each (n,) [m].
 
-    probe: its own true Z;  surface: height of the part under it;  x, y: where, on the chuck
+    probe: its true Z;  surface: height of the part under it;  x, y: place on the chuck
     distance: true, along the beam
     """
 
@@ -69,18 +77,18 @@ class Timing:
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Duration [s]."""
         return self.samples * self.period
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything as signals in time.
+    """True state of the cell as signals in time.
 
-    slide, probe: true Z [m];  surface: as it sits on the chuck
-    stand_off: height of the probe's zero above the axis zero [m]
-    shifting: what moves the workpiece against the probe, at a time and a position of the slides
-    vibration: lines between workpiece and probe, which an accelerometer feels too
+    slide, probe: true Z [m];  surface: in its pose on the chuck
+    stand_off: height of the zero of the probe above the axis zero [m]
+    shifting: shifts of the workpiece relative to the probe, by time and position of the slides
+    vibration: lines between workpiece and probe, which an accelerometer measures too
     """
 
     disturbances: Disturbances
@@ -93,14 +101,14 @@ class Scene:
     vibration: Vibration
 
     def positions(self, time: FloatArray) -> AxisPositions:
-        """Return True positions of the axes, as commanded but for the wobble of B."""
+        """Return the true positions of the axes: the command, and the wobble of B."""
         slides = self.motion.positions(time)
         if not self.disturbances.machine.b_wobble_rad:
             return slides
         return slides._replace(b=slides.b + self.disturbances.machine.b_wobble(time))
 
     def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> ProbeTarget:
-        """Return what is before the probe at ``time`` (n,) [s], ``about`` so far away [m]."""
+        """Return the situation at ``time`` (n,) [s]; ``about``: start for the distance [m]."""
         slides = self.positions(time)
         x, y, raised = self._shift(time, slides)
         shifted = slides._replace(x=slides.x - x, y=slides.y - y)
@@ -113,7 +121,7 @@ class Scene:
         return self._along_the_beam(mount, shifted, probe, raised, about)
 
     def _shift(self, time: FloatArray, slides: AxisPositions) -> Shift:
-        """Return the whole shift of the workpiece against the probe."""
+        """Return the total shift of the workpiece relative to the probe."""
         total = Shift(np.zeros(1), np.zeros(1), np.zeros(1))
         for shifting in self.shifting:
             part = shifting(time, slides)
@@ -128,7 +136,7 @@ class Scene:
         raised: FloatArray,
         about: FloatArray | float,
     ) -> ProbeTarget:
-        """Return what ``look`` does, for a beam that slants or a probe that B carries about."""
+        """Return the same as ``look`` for an inclined beam, or a probe that is moved by B."""
         zero = probe + self.stand_off - raised
         distance = np.zeros_like(probe) + about
         for _ in range(_MOST_BEAM_ITERATIONS):
@@ -141,7 +149,7 @@ class Scene:
         return ProbeTarget(probe, height, at.x, at.y, distance)
 
     def over_an_exposure(self, time: FloatArray) -> ProbeTarget:
-        """Return the mean of what is before the probe during the exposures at ``time``."""
+        """Return the mean situation during the exposures at ``time``."""
         probe = self.disturbances.probe
         before, weights = probe.exposure_instants()
         look = self.look(time - before[0])
@@ -150,7 +158,7 @@ class Scene:
             look = ProbeTarget(*(weights @ np.array(parts) for parts in zip(*looks, strict=True)))
         if not self.vibration.lines:
             return look
-        # Lines may be faster than the looks: their mean is known in closed form.
+        # Lines may be faster than the nodes of the exposure, so their mean is in closed form.
         middle, half = time - probe.lag_s, probe.window_s / 2
         begin, c, end = (self.motion.positions(middle + d).c for d in (-half, 0.0, half))
         shaken = self.vibration.height(middle, c, probe.window_s, end - begin)
@@ -161,7 +169,7 @@ class Scene:
         c = self.motion.positions(time).c
         speed = np.asarray(np.gradient(c, period))
         shaken = self.vibration.acceleration(time, c, speed)
-        # What brings the part nearer moves the probe down.
+        # A motion of the part towards the probe counts as a motion of the probe downwards.
         return np.asarray(acceleration_of(self.probe).at(time) - shaken)
 
 
@@ -174,7 +182,7 @@ def scene_of(
     timing: Timing,
     random: Random,
 ) -> Scene:
-    """Simulate ``motion`` and gather what happens beside it; ``random`` by the name of the use."""
+    """Simulate ``motion`` and return the scene; ``random``: generators by the name of their use."""
     if disturbances.servo_bandwidth_hz is not None:
         plant = replace(plant, servo_bandwidth=disturbances.servo_bandwidth_hz)
     grid = _grid(plant, disturbances, timing)
@@ -197,7 +205,7 @@ def scene_of(
 
 
 def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> list[ShiftFunction]:
-    """Return what is switched on of all that moves the workpiece; ``times`` span the simulation."""
+    """Return the active shifts of the workpiece; ``times`` span the simulation."""
     machine, zero = disturbances.machine, np.zeros(1)
     result: list[ShiftFunction] = []
     if not is_default(machine.drift):
@@ -231,20 +239,12 @@ def _grid(plant: Plant, disturbances: Disturbances, timing: Timing) -> TimeGrid:
     )
 
 
-__all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]
-
-_LEAST_SUBSTEPS = 16
-# Half of this step changes a step test of 20 ms edges by 0.02 nm; the error falls with its square.
-_LONGEST_STEP_S = 1e-3 / _LEAST_SUBSTEPS
-
-
 @dataclass(frozen=True)
 class Cell:
-    """Everything that decides what the devices report.
+    """Configuration of the twin.
 
     encoder_noise: standard deviation [m]
     sample_period: of the common trigger [s];  seed: of all noise
-    disturbances: what else is not as it should be
     """
 
     plant: Plant = field(default_factory=Plant)
@@ -261,13 +261,13 @@ class Cell:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Truth:
-    """What only the twin knows beside the motion of the probe; arrays of shape (n,).
+    """True values of a recording, arrays of shape (n,).
 
-    time: when the trigger came [s];  slide: true Z of the carriage then [m]
-    x, y: where on the chuck the probe looked [m]
-    distance: true distance along the beam, before the probe's own errors [m]
-    surface: the part as it sits on the chuck
-    response: the transfer function from encoder to probe, and the share of latency in it
+    time: of the trigger [s];  slide: true Z of the slide then [m]
+    x, y: place of the probe on the chuck [m]
+    distance: true distance along the beam, without errors of the probe [m]
+    surface: the part in its pose on the chuck
+    response: transfer function from encoder to probe, and the share of latency in it
     """
 
     time: FloatArray
@@ -281,12 +281,12 @@ class Truth:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recording:
-    """Samples as reported, one block each, and the truth behind them; arrays of shape (n,).
+    """Reported samples, one block each, and the true values; arrays of shape (n,).
 
-    axes, distance: what the devices say;  reference, acceleration: if there are such
-    probe_motion: true motion of the probe, G · X_d, when (on the mean) the reading was made [m]
-    surface_height: true height of the surface then under the probe [m]
-    truth: what else is true, None where nobody knows
+    axes, distance: as reported;  reference, acceleration: None without such a sensor
+    probe_motion: true motion of the probe, G · X_d, averaged over the exposure [m]
+    surface_height: true height of the surface under the probe then [m]
+    truth: further true values, None if unknown
 
     ``probe_motion - truth.slide`` is the true dynamic error.
     """
@@ -300,7 +300,7 @@ class Recording:
     truth: Truth | None = None
 
     def motion_record(self) -> MotionRecord:
-        """Return the samples on one grid, as an identification takes them."""
+        """Return the samples on one grid, as input of an identification."""
         reference = [self.reference] if self.reference else []
         return assemble([self.axes], [self.distance], reference)
 
@@ -313,10 +313,10 @@ def record(
     stand_off: float = 0.0,
     substeps: int | None = None,
 ) -> Recording:
-    """Run ``motion`` over ``surface`` and report every sample of the trigger.
+    """Run ``motion`` over ``surface`` and return a sample for each trigger.
 
-    stand_off: height of the probe's zero above the axis zero [m]; the reading is
-    ``scale · (surface - probe motion - stand_off)``, rounded, and a lost target beyond range.
+    stand_off: height of the zero of the probe above the axis zero [m]; the reading is
+        ``scale · (surface - probe motion - stand_off)``, rounded, with no target out of range
     substeps: simulated steps in a sample period; None takes enough for 0.1 nm
     """
     random = _random_streams(cell.seed)
@@ -349,15 +349,8 @@ def _enough_substeps(sample_period: float) -> int:
     return max(_LEAST_SUBSTEPS, int(np.ceil(sample_period / _LONGEST_STEP_S)))
 
 
-# A new stream goes to the end: those before it stay as they are.
-_STREAMS = (
-    *("encoder", "probe", "drift", "vibration"),
-    *("spindle", "clocks", "dropout", "reference", "accelerometer"),
-)
-
-
 def _random_streams(seed: int) -> dict[str, np.random.Generator]:
-    """Return independent random numbers for each use: switching one on leaves the others."""
+    """Return an independent generator for each use."""
     children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
 
@@ -396,7 +389,7 @@ def _distance(
 def _further_channels(
     scene: Scene, when: Instants, timing: Timing, random: Mapping[str, np.random.Generator]
 ) -> dict[str, Any]:
-    """Return the reference and acceleration, as far as there are such sensors."""
+    """Return the channels of reference sensor and accelerometer, if present."""
     channels: dict[str, Any] = {}
     if reference := scene.disturbances.reference:
         channels["reference"] = reference.read(
@@ -412,7 +405,7 @@ def _further_channels(
 
 
 def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, DistanceBlock]]:
-    """Return the recording cut into blocks of ``size`` samples, as a driver publishes them."""
+    """Return the recording in blocks of ``size`` samples, as a driver publishes them."""
     axes, distance = recording.axes, recording.distance
     pairs = []
     for start in range(0, len(axes), size):

@@ -1,4 +1,4 @@
-"""Everything that makes a machine worse than its model, each with its size; nothing by default."""
+"""Disturbances of the simulated machine; none by default."""
 
 from __future__ import annotations
 
@@ -14,14 +14,12 @@ from omsm_ros.twin.vibration import VibrationLine
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Disturbances:
-    """One record a family; every quantity has its unit in its name.
+    """Disturbances by family; the name of each quantity ends with its unit.
 
-    servo_bandwidth_hz: of Z, None for the plant's own
-    probe: when it looks and what it makes of a distance
-    structure: between carriage and probe
+    servo_bandwidth_hz: of Z, None for that of the plant
+    probe: timing, linearity and light of the probe;  structure: between slide and probe
     machine: spindle, slides, drift, pose of the part, mount of the probe
-    encoder: of Z
-    clocks: when each device takes its sample
+    encoder: of Z;  clocks: sampling instants of the devices
     vibration: lines between workpiece and probe
     reference, accelerometer: further channels, None for none
     """

@@ -1,7 +1,7 @@
-"""What the machine does that no encoder sees: spindle, slides, drift, pose, mount of the probe.
+"""Machine errors that no encoder measures: spindle, slides, drift, pose, mount of the probe.
 
-Each is a shift of the workpiece against the probe: positive z brings it nearer. Not imitated:
-errors of Y and of the angle of C, roll of the slides, thermal growth that bends the part.
+Each is a shift of the workpiece relative to the probe; positive z brings it nearer. Not imitated:
+errors of Y and of the angle of C, roll of the slides, thermal deformation of the part.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from omsm_ros.twin.trajectory import Trajectory
 
 
 class Shift(NamedTuple):
-    """Of the workpiece against the probe, in the machine frame [m]; arrays (n,) or (1,)."""
+    """Shift of the workpiece relative to the probe, in the machine frame [m]; (n,) or (1,)."""
 
     x: FloatArray
     y: FloatArray
@@ -29,9 +29,9 @@ class Shift(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drift:
-    """Height of the workpiece over time, thermal as a rule; zero at time 0.
+    """Drift of the height of the workpiece, zero at time 0.
 
-    ramp_m_per_s: steady
+    ramp_m_per_s: constant rate
     exponential_m, time_constant_s: ``exponential_m · (1 - exp(-t/τ))``
     sine_m, period_s: amplitude and period
     random_walk_m_per_root_s: standard deviation after one second
@@ -65,10 +65,10 @@ class Drift:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Harmonic:
-    """A turning vector ``amplitude · (cos φ, sin φ)`` with ``φ = per_turn · c + phase_rad``.
+    """Rotating vector ``amplitude · (cos φ, sin φ)`` with ``φ = per_turn · c + phase_rad``.
 
-    amplitude: in the unit of what it is a harmonic of;  along one direction only its cosine
-    per_turn: turns of the vector a turn of the spindle; negative turns against it
+    amplitude: in the unit of its quantity; for a single direction only the cosine counts
+    per_turn: turns of the vector per turn of the spindle; negative for the opposite direction
     """
 
     amplitude: float
@@ -89,11 +89,11 @@ class Harmonic:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpindleError:
-    """Error motion of the spindle, in step with it and at random (ISO 230-7).
+    """Synchronous and asynchronous error motion of the spindle (ISO 230-7).
 
-    axial_m, radial_m, tilt_rad: harmonics;  tilt turns about the origin of X and Y
+    axial_m, radial_m, tilt_rad: harmonics;  tilt rotates about the origin of X and Y
     axial_noise_m, radial_noise_m, tilt_noise_rad: rms of the asynchronous part, white up to
-        half the trigger's rate
+        half the rate of the trigger
     """
 
     axial_m: tuple[Harmonic, ...] = ()
@@ -109,11 +109,11 @@ class SpindleError:
 
     @property
     def is_noisy(self) -> bool:
-        """True if any part of it is at random."""
+        """True if it has an asynchronous part."""
         return bool(self.axial_noise_m or self.radial_noise_m or self.tilt_noise_rad)
 
     def shift(self, time: FloatArray, slides: AxisPositions, noise: list[Trajectory]) -> Shift:
-        """Return the workpiece's shift under the probe; ``noise``: five signals of variance one."""
+        """Return the shift of the workpiece; ``noise``: five signals of variance one."""
         c = slides.c
         axial, radial, tilt = self.axial_m, self.radial_m, self.tilt_rad
         z = sum((h.along(c) for h in axial), np.zeros(1))
@@ -130,7 +130,7 @@ class SpindleError:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Straightness:
-    """Deviation of a slide from a straight line, over its position p.
+    """Straightness deviation of a slide over its position p.
 
     ``bow_m · (p / half_travel_m)² + periodic_m · sin(2π p / period_m)``
     """
@@ -151,12 +151,11 @@ class Straightness:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineErrors:
-    """All that the machine does and no encoder sees; nothing by default.
+    """Errors of the machine; none by default.
 
-    pose: of the part on the chuck
-    mount: where the probe truly sits and looks; a correction that does not know it has it as error
-    x_slide_along_z: straightness of X towards the probe;  z_slide_along_x: of Z, sideways
-    b_wobble_rad, b_wobble_hz: B swings; its encoder sees it
+    pose: of the part on the chuck;  mount: true place and direction of the probe
+    x_slide_along_z: straightness of X towards the probe;  z_slide_along_x: lateral, of Z
+    b_wobble_rad, b_wobble_hz: oscillation of B, which its encoder measures
     """
 
     pose: PartPose = field(default_factory=PartPose)
@@ -172,14 +171,14 @@ class MachineErrors:
         check_numbers(self, positive=("b_wobble_hz",))
 
     def slides_shift(self, slides: AxisPositions) -> Shift:
-        """Return the workpiece's shift by straightness, at the slides' positions."""
+        """Return the shift of the workpiece by straightness errors of the slides."""
         zero = np.zeros(1)
         along = self.x_slide_along_z.deviation(slides.x)
-        # A probe that is carried sideways sees the workpiece go the other way.
+        # A lateral motion of the probe is an opposite shift of the workpiece.
         return Shift(-self.z_slide_along_x.deviation(slides.z), zero, along)
 
     def b_wobble(self, time: FloatArray) -> FloatArray:
-        """Return the swing of B [rad] at ``time`` [s], of its shape."""
+        """Return the oscillation of B [rad] at ``time`` [s], of its shape."""
         return np.asarray(self.b_wobble_rad * np.sin(2 * np.pi * self.b_wobble_hz * time))
 
 

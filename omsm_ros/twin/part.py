@@ -1,4 +1,4 @@
-"""How the part sits on the chuck: six degrees of freedom from where it should."""
+"""The part on the chuck: its pose, its figure error and azimuthal ripple."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
-# Each turn of the iteration leaves tilt times slope, at most a hundredth, of the error before;
-# it ends when what is left is beyond rounding of a millimetre [m].
+# Each iteration reduces the error by tilt times slope, at most 1/100; it ends at the rounding of a
+# millimetre [m].
 _MOST_ITERATIONS = 8
 _SETTLED_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PartPose:
-    """How the part sits on the chuck, from where it should.
+    """Deviation of the part from its nominal pose on the chuck.
 
     x_m, y_m, z_m: shift of its origin
     tilt_x_rad, tilt_y_rad: rotation about x and about y;  clocking_rad: about the spindle
@@ -38,7 +38,7 @@ class PartPose:
 
     @property
     def rotation(self) -> FloatArray:
-        """From the part's frame to the chuck's (3, 3): about x, then y, then z."""
+        """Rotation from the frame of the part to that of the chuck (3, 3): about x, y, then z."""
         (sx, sy, sz), (cx, cy, cz) = (
             f(np.array([self.tilt_x_rad, self.tilt_y_rad, self.clocking_rad]))
             for f in (np.sin, np.cos)
@@ -51,7 +51,7 @@ class PartPose:
 
 @dataclass(frozen=True, slots=True)
 class MountedSurface:
-    """``surface`` in the pose that it has on the chuck; heights are along the spindle."""
+    """``surface`` in its ``pose`` on the chuck; heights are along the spindle."""
 
     surface: Surface
     pose: PartPose
@@ -62,7 +62,7 @@ class MountedSurface:
         across, along = np.asarray(x) - pose.x_m, np.asarray(y) - pose.y_m
         z = np.zeros(np.broadcast(across, along).shape)
         for _ in range(_MOST_ITERATIONS):
-            # In the part's frame: p = Rᵀ (q - shift).
+            # In the frame of the part: p = Rᵀ (q - shift).
             px, py, pz = (
                 turn[0, i] * across + turn[1, i] * along + turn[2, i] * z for i in range(3)
             )
@@ -74,20 +74,13 @@ class MountedSurface:
 
 
 def mounted_surface(surface: Surface, pose: PartPose) -> Surface:
-    """Return ``surface`` on the chuck; itself where it sits as it should."""
+    """Return ``surface`` in its ``pose``, or itself in the nominal pose."""
     return surface if is_default(pose) else MountedSurface(surface, pose)
-
-
-# What a turned mirror really looks like: its nominal shape and a figure error on top.
-#
-# Closed-form and smooth: primary astigmatism (the grip of the chuck), trefoil (three-point
-# mounting) and concentric ripple (the slow-tool servo), each oriented by the seed. Tool marks, if
-# there are any, are the scallops that a round tool leaves turn by turn.
 
 
 @dataclass(frozen=True, slots=True)
 class FigureError:
-    """A surface: ``nominal`` plus a seeded figure error.
+    """Surface ``nominal`` with a figure error: astigmatism, trefoil, concentric ripple, tool marks.
 
     radius: of the aperture [m], where astigmatism and trefoil reach their full size
     seed: of the orientations of astigmatism and trefoil
@@ -136,9 +129,6 @@ class FigureError:
         """Return the height of tool marks [m] at ``radius`` [m]: a parabola from cusp to cusp."""
         turn = radius / self.tool_feed
         return np.asarray(self.tool_marks * 4 * (turn - np.rint(turn)) ** 2, np.float64)
-
-
-# Marks of a tool that moved outward: a circle crosses one every wavelength.
 
 
 @dataclass(frozen=True, slots=True)

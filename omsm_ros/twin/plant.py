@@ -1,4 +1,4 @@
-"""What moves: a servo axis that follows its command, and a probe that follows the axis.
+"""Simulate the motion: a servo axis that follows its command, and a probe that follows the axis.
 
 ``command → servo → X_d (encoder) → G(s) → true motion of the probe``
 """
@@ -17,7 +17,7 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.trajectory import Trajectory
 
 PAPER_EQ_12 = TransferFunction.from_ascending(
-    # The print lacks the s behind 1.22e8; without it the plant would be unstable.
+    # The printed equation lacks the s after 1.22e8; without it the plant would be unstable.
     [1.26e12, -3.07e8, 1.29e5],
     [1.27e12, 1.22e8, 5.17e4, 1.0],
 )
@@ -26,15 +26,15 @@ PAPER_EQ_12 = TransferFunction.from_ascending(
 PAPER_STATIC_GAIN = PAPER_EQ_12.dc_gain
 PAPER_DYNAMICS = PAPER_EQ_12.normalised()
 
-# Slower than this, the rest of the lead-in would still be seen in the first sample.
+# Duration of the lead-in over the slowest time constant: the transient decays below rounding.
 _LEAD_IN_TIME_CONSTANTS = 40
-# Bounds the memory of a long scan.
+# Samples at a time, to bound the memory of a long scan.
 _CHUNK_SAMPLES = 50_000
 
 
 @dataclass(frozen=True)
 class Plant:
-    """A critically damped servo of ``servo_bandwidth`` [Hz] and the probe's dynamics G(s)."""
+    """Critically damped servo of ``servo_bandwidth`` [Hz] and dynamics G(s) of the probe."""
 
     dynamics: TransferFunction = PAPER_DYNAMICS
     servo_bandwidth: float = 200.0
@@ -47,19 +47,19 @@ class Plant:
 
     @property
     def servo(self) -> TransferFunction:
-        """1 / (1 + s/ω)², ω = 2π · servo_bandwidth."""
+        """Transfer function 1 / (1 + s/ω)², ω = 2π · servo_bandwidth."""
         omega = 2 * np.pi * self.servo_bandwidth
         return TransferFunction.from_ascending([1.0], [1.0, 2 / omega, 1 / omega**2])
 
     def lead_in(self) -> float:
-        """Return how long the cell must have been moving before its start is forgotten [s]."""
+        """Return the time after which the start of the motion has decayed [s]."""
         slowest = min(-np.r_[self.servo.poles(), self.dynamics.poles()].real)
         return float(_LEAD_IN_TIME_CONSTANTS / slowest + self.dynamics.delay)
 
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """True motion at the sample instants [m], each (n,): of the carriage and of the probe."""
+    """True motion of slide and probe at the sampling instants [m], each (n,)."""
 
     slide: FloatArray
     probe: FloatArray
@@ -67,7 +67,7 @@ class Response:
 
 @dataclass(frozen=True, eq=False)
 class Movement:
-    """True motion as signals in time [m]: of the carriage and of the probe."""
+    """True motion of slide and probe as signals in time [m]."""
 
     slide: Trajectory
     probe: Trajectory
@@ -75,10 +75,10 @@ class Movement:
 
 @dataclass(frozen=True, slots=True)
 class TimeGrid:
-    """When the simulation steps, and which of its steps are kept.
+    """Time steps of the simulation.
 
     lead, samples: sample periods before and after time 0
-    sample_period: [s];  substeps: steps in a sample period;  every: steps from kept to kept
+    sample_period: [s];  substeps: steps in a sample period;  every: steps between kept values
     """
 
     lead: int
@@ -89,14 +89,14 @@ class TimeGrid:
 
     @property
     def step(self) -> float:
-        """[s]"""
+        """Step [s]."""
         return self.sample_period / self.substeps
 
 
 def respond(
     plant: Plant, motion: Motion, samples: int, sample_period: float, substeps: int = 16
 ) -> Response:
-    """Move the plant through ``motion`` and look at it every ``sample_period`` [s]."""
+    """Return the response of the plant to ``motion`` every ``sample_period`` [s]."""
     lead = int(np.ceil(plant.lead_in() / sample_period))
     moved = move(plant, motion, TimeGrid(lead, samples, sample_period, substeps, substeps))
     at_samples = slice(lead - 1, lead - 1 + samples)
@@ -104,12 +104,11 @@ def respond(
 
 
 def move(plant: Plant, motion: Motion, grid: TimeGrid) -> Movement:
-    """Move the plant through ``motion`` from ``grid.lead`` periods before time 0.
+    """Return the response of the plant to ``motion``, from ``grid.lead`` periods before time 0.
 
-    Each sample period is cut into ``substeps``; the command is held at its value in the
-    middle of each, which is exact for a sharp step on the grid and of second order for
-    a smooth motion. The delay is taken in the argument of the command, so it is exact too;
-    only a sharp step that it moves off the grid is off by up to half a substep.
+    In each substep the command is held at its value in the middle, which is exact for a step on the
+    grid and of second order for a smooth motion. The delay shifts the time of the command; a step
+    off the grid has an error of up to half a substep.
     """
     servo, both = plant.servo, _series(plant.servo, plant.dynamics)
     return Movement(
@@ -132,13 +131,13 @@ def _through_system(
         held = _command(motion, begin, count * substeps, step) - start
         moved, state = signal.sosfilt(sections, held, zi=state)
         seen.append(moved[every - 1 :: every])
-    # A value is what was reached at the end of its step.
+    # Each value is reached at the end of its step.
     values = np.concatenate(seen) + system.dc_gain * start
     return Trajectory(every * step - grid.lead * period, every * step, values)
 
 
 def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:
-    """Return Z commanded in the middle of each of ``count`` steps [s] after ``begin`` [s]."""
+    """Return the commanded Z in the middle of ``count`` steps of ``step`` [s] from ``begin`` [s]."""
     return motion.positions(begin + (np.arange(count, dtype=np.float64) + 0.5) * step).z
 
 
@@ -151,10 +150,10 @@ def _series(first: TransferFunction, second: TransferFunction) -> TransferFuncti
 
 
 def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArray:
-    """Return the second-order sections from the held input of a step to the output at its end.
+    """Return second-order sections from the input held over a step to the output at its end.
 
-    Poles are mapped exactly; zeros are those of the Rosenbrock pencil of the held system;
-    the gain follows from G(0). A single polynomial of all of them would lose digits.
+    Poles are mapped exactly; zeros are those of the Rosenbrock pencil of the discrete system; the
+    gain follows from G(0). A single polynomial would lose digits.
     """
     a, b, c, d = signal.cont2discrete(_state_space(system, 1 / step), 1.0, method="zoh")[:4]
     n = len(a)

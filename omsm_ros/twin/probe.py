@@ -1,4 +1,4 @@
-"""A chromatic confocal probe: when it looks, and what it makes of the distance."""
+"""Simulate a chromatic confocal probe: exposure, linearity, light and noise."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from omsm_ros.twin.plant import PAPER_STATIC_GAIN
 from omsm_ros.twin.record_checks import LONGEST_LAG_S, check_numbers
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
-# Gauss-Legendre on four points is exact to the seventh power of time within an exposure: within
-# 1e-4 for what rings at 1 kHz in one of a millisecond.
+# Gauss-Legendre nodes of an exposure: exact to the seventh power of time, within 1e-4 for an
+# oscillation of 1 kHz over a millisecond.
 _EXPOSURE_NODES = 4
-# Of the difference that takes the slope: small against any figure, large against rounding.
+# Step of the difference for the slope: small against any form, large against rounding.
 _SLOPE_STEP_M = 1e-6
 _FULL_INTENSITY = 0.5
+# Least intensity over that of a flat surface, to bound the noise.
 _LEAST_INTENSITY = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
 class Probe:
-    """A chromatic confocal probe of the paper's kind.
+    """Chromatic confocal probe as in the paper.
 
-    scale: reading per true distance [1]; the paper's static error is placed here
+    scale: reading over true distance [1], which holds the static error of the paper
     noise: standard deviation of the reading [m];  resolution: of the reading [m]
-    half_range: beyond it the probe sees no target [m]
+    half_range: largest distance from zero with a reading [m]
     """
 
     scale: float = PAPER_STATIC_GAIN
@@ -40,18 +41,18 @@ class Probe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeErrors:
-    """Of time, of distance and of light; nothing by default.
+    """Errors of timing, distance and light; none by default.
 
-    latency_s: from the end of the exposure to the trigger that the reading is given to
-    exposure_s, averages: the reading is the mean over ``averages`` exposures on end
-    noise_m: more noise, added in quadrature
-    cubic_m: error of linearity at the end of the range, ``cubic_m · (d / half range)³``
-    periodic_m, period_m: error of linearity ``periodic_m · sin(2π d / period_m)``
-    slope_error_m_per_rad: error by the slope of the surface along X, as a tilted beam has it
-    slope_error_m_per_rad2: error by the square of the slope, in any direction
-    intensity_slope_rad: slope at which 1/e of the light comes back; noise grows as 1/√intensity
-    dropout_slope_rad: steeper than this there is no reading
-    dropout_probability: that a reading fails at random [1]
+    latency_s: from the end of the exposure to the trigger of the reading
+    exposure_s, averages: the reading is the mean over ``averages`` successive exposures
+    noise_m: additional noise, added in quadrature
+    cubic_m: linearity error at the end of the range, ``cubic_m · (d / half range)³``
+    periodic_m, period_m: linearity error ``periodic_m · sin(2π d / period_m)``
+    slope_error_m_per_rad: error per slope of the surface along X, as of an inclined beam
+    slope_error_m_per_rad2: error per squared slope, in any direction
+    intensity_slope_rad: slope at which 1/e of the light returns; noise grows as 1/√intensity
+    dropout_slope_rad: largest slope with a reading
+    dropout_probability: probability of a random dropout [1]
     """
 
     latency_s: float = 0.0
@@ -86,23 +87,23 @@ class ProbeErrors:
 
     @property
     def window_s(self) -> float:
-        """How long a reading looks."""
+        """Duration of the exposures of a reading."""
         return self.exposure_s * self.averages
 
     @property
     def lag_s(self) -> float:
-        """How late a reading is: its latency and half its window."""
+        """Delay of a reading: its latency and half its window."""
         return self.latency_s + self.window_s / 2
 
     @property
     def is_slope_sensitive(self) -> bool:
-        """True if what it reports depends on the slope of the surface."""
+        """True if readings depend on the slope of the surface."""
         sizes = (self.slope_error_m_per_rad, self.slope_error_m_per_rad2)
         limits = (self.intensity_slope_rad, self.dropout_slope_rad)
         return any(sizes) or any(limit is not None for limit in limits)
 
     def exposure_instants(self) -> tuple[FloatArray, FloatArray]:
-        """Return instants before the trigger [s] and weights, (k,), that stand for the exposure."""
+        """Return times before the trigger [s] and weights (k,) of the nodes of the exposure."""
         if not self.window_s:
             return np.array([self.latency_s]), np.ones(1)
         node, weight = np.polynomial.legendre.leggauss(_EXPOSURE_NODES)
@@ -110,7 +111,7 @@ class ProbeErrors:
 
 
 class Slope(NamedTuple):
-    """Of the surface under the probe, along X and along Y of the machine [1], each (n,)."""
+    """Slope of the surface under the probe, along X and Y of the machine [1], each (n,)."""
 
     x: FloatArray
     y: FloatArray
@@ -122,7 +123,7 @@ class Slope(NamedTuple):
 
 
 def slope_of(surface: Surface, x: FloatArray, y: FloatArray, c: FloatArray) -> Slope:
-    """Return the slope of ``surface`` at x, y [m] of the chuck, turned by ``c`` [rad]."""
+    """Return the slope of ``surface`` at x, y [m] of the chuck, rotated by ``c`` [rad]."""
     h = _SLOPE_STEP_M
     cosine, sine = np.cos(c), np.sin(c)
     along_x = surface.height(x + h * cosine, y - h * sine)
@@ -151,7 +152,7 @@ def read(
     period: float,
     random: ProbeRandom,
 ) -> DistanceBlock:
-    """Return what the probe reports of ``true_distance`` (n,) [m] to a surface of ``slope``."""
+    """Return the readings for ``true_distance`` (n,) [m] to a surface of ``slope``."""
     samples = len(true_distance)
     light = _intensity(errors, slope)
     noise = probe.noise if not errors.noise_m else float(np.hypot(probe.noise, errors.noise_m))
@@ -177,7 +178,7 @@ def read(
 def _error(
     probe: Probe, errors: ProbeErrors, distance: FloatArray, slope: Slope
 ) -> FloatArray | float:
-    """Return what the optics add to ``distance`` (n,) [m]."""
+    """Return the error of the optics at ``distance`` (n,) [m]."""
     error: FloatArray | float = 0.0
     if errors.cubic_m:
         error = error + errors.cubic_m * (distance / probe.half_range) ** 3
@@ -191,9 +192,8 @@ def _error(
 
 
 def _intensity(errors: ProbeErrors, slope: Slope) -> FloatArray:
-    """Return the light that comes back, per that of a flat, (n,) or (1,)."""
+    """Return the returned light over that of a flat surface, (n,) or (1,)."""
     if errors.intensity_slope_rad is None:
         return np.ones(1)
-    # Never quite dark: a noise without bound would be no noise any more.
     steep = slope.steepness / errors.intensity_slope_rad
     return np.asarray(np.maximum(np.exp(-(steep**2)), _LEAST_INTENSITY), np.float64)

@@ -1,4 +1,4 @@
-"""What every record of a disturbance is checked for, and when it is switched on."""
+"""Check the numbers of disturbances, and whether a disturbance is switched on."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 
 from omsm_ros.errors import ConfigurationError
 
-# By the unit that ends a field's name: what no machine exceeds. Beyond it a unit is wrong, and the
-# simulation would take for ever or leave the range of its numbers.
+# Largest plausible value by the unit at the end of a field's name; a larger one has a wrong unit.
 _LIMITS: Mapping[str, float] = {
     "_m": 10.0,
     "_s": 1e6,
@@ -21,7 +20,7 @@ _LIMITS: Mapping[str, float] = {
     "_ratio": 100.0,
 }
 LONGEST_LAG_S = 1.0
-"""Nothing that delays a sample is longer: the simulation starts so much earlier."""
+"""Largest delay of a sample [s]; the simulation starts earlier by this time."""
 
 
 def check_numbers(
@@ -31,10 +30,10 @@ def check_numbers(
     not_negative: tuple[str, ...] = (),
     lags: tuple[str, ...] = (),
 ) -> None:
-    """Raise ConfigurationError for a number of a record that is not finite or out of its limits.
+    """Raise ConfigurationError for a number of a record that is not finite or beyond its limits.
 
-    positive, not_negative: names of fields that must be so
-    lags: names of times that are at most a second, of either sign
+    positive, not_negative: names of such fields
+    lags: names of times of at most a second, of either sign
     """
     for field in fields(record):
         value = getattr(record, field.name)
@@ -59,5 +58,5 @@ def _limit(name: str) -> float:
 
 
 def is_default(record: Any) -> bool:
-    """Return True if a record is as it is without arguments: nothing is switched on."""
+    """Return True if a record equals its default, so that nothing is switched on."""
     return bool(record == type(record)())

@@ -1,4 +1,4 @@
-"""The paper's measurement on the twin: its step test and its scan, seeded, with the truth."""
+"""Simulate the measurement of the paper: step test and scan, with the true values."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from omsm_ros.twin.part import FigureError, PartPose
 
 @dataclass(frozen=True)
 class Scenario:
-    """What the cell does, and on what.
+    """Motion and part of a simulation.
 
-    seed: of all that is random;  part_seed: of the part's figure, None takes ``seed``
+    seed: of all random numbers;  part_seed: of the figure error, None takes ``seed``
     spindle_speed: [rpm];  feed_per_turn, start_radius: [m];  step_rise, sample_period: [s]
-    tool_marks: peak to valley of what the turning tool has left on the part [m]
+    tool_marks: peak to valley of the marks of the turning tool [m]
     """
 
     seed: int = 1
@@ -41,7 +41,7 @@ class Scenario:
 
     @property
     def part(self) -> FigureError:
-        """The mirror as it really is; scans of one ``part_seed`` see the same."""
+        """Mirror with its figure error, which is the same for one ``part_seed``."""
         seed = self.seed if self.part_seed is None else self.part_seed
         return FigureError(
             PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, seed=seed, tool_marks=self.tool_marks
@@ -49,12 +49,12 @@ class Scenario:
 
 
 def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """Return the paper's step test on a fixed flat."""
+    """Return the step test of the paper on a fixed flat."""
     return on_a_flat(scenario, StepTest(rise=scenario.step_rise), disturbances)
 
 
 def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """Return the step test of `omsm plan steps`, with rests half as long, on a fixed flat."""
+    """Return the step test of ``omsm plan steps`` with half its dwell, on a fixed flat."""
     step = StepTest().step
     motion = plan_steps(
         sample_period=scenario.sample_period,
@@ -70,10 +70,7 @@ def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) ->
 def on_a_flat(
     scenario: Scenario, motion: Motion, disturbances: Disturbances = NOTHING
 ) -> Recording:
-    """Return a ``motion`` before a fixed flat, its middle in the middle of the probe's range.
-
-    The flat is no part: it has no pose.
-    """
+    """Return a ``motion`` over a fixed flat without pose, centred in the range of the probe."""
     z = motion.positions(
         np.arange(0.0, motion.duration, scenario.sample_period, dtype=np.float64)
     ).z
@@ -83,8 +80,8 @@ def on_a_flat(
 
 
 def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """Return the spiral over the paper's mirror, as it really is."""
-    # Another seed than the step test's: the same noise twice would be no independent check.
+    """Return the spiral scan of the mirror with its figure error."""
+    # The seed differs from that of the step test, so that their noise is independent.
     cell = Cell(
         seed=scenario.seed + 1, sample_period=scenario.sample_period, disturbances=disturbances
     )
@@ -92,7 +89,7 @@ def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recordi
 
 
 def spiral_of(scenario: Scenario) -> Spiral:
-    """Return the commanded motion of the scan, along the nominal mirror."""
+    """Return the commanded motion of the scan over the nominal mirror."""
     return Spiral(
         PAPER_MIRROR, scenario.start_radius, scenario.feed_per_turn, scenario.spindle_speed
     )

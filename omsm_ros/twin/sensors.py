@@ -1,6 +1,8 @@
-"""The channels beside encoder and probe: a reference sensor and an accelerometer.
+"""Simulate reference sensor, accelerometer, sampling instants, and the encoder of Z.
 
-Not imitated: their anti-alias filters, saturation of the accelerometer, ground loops.
+Not imitated: anti-alias filters, saturation of the accelerometer, ground loops, a counter that
+slips (see the faults of the emulators), stamps of the computer, errors of the encoders of X, Y, B
+and C, count loss, bending of a scale.
 """
 
 from __future__ import annotations
@@ -18,17 +20,19 @@ from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
 
-# No accelerometer has content beyond 100 kHz.
+# Accelerometers measure up to 100 kHz.
 _SHORTEST_PERIOD_S = 5e-6
+# One of 10⁹ draws of a normal distribution lies beyond 6.1 σ.
+_JITTER_LIMIT = 7.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferenceSensor:
-    """A capacitive sensor on the carriage's own motion, as a CPL190 has it (250 µm).
+    """Capacitive sensor on the motion of the slide, as a CPL190 (250 µm).
 
-    latency_s: how late it reads;  scale_ppm: it reads so much too long
-    noise_m: standard deviation;  half_range_m: beyond it there is no reading
-    cubic_m: error of linearity at the end of its range
+    latency_s: of the reading;  scale_ppm: relative error, positive for a long reading
+    noise_m: standard deviation;  half_range_m: largest distance from zero with a reading
+    cubic_m: linearity error at the end of its range
     """
 
     latency_s: float = 0.0
@@ -48,7 +52,7 @@ class ReferenceSensor:
     def read(
         self, slide: Trajectory, time: FloatArray, period: float, random: np.random.Generator
     ) -> DistanceBlock:
-        """Return what it reports of the carriage for the triggers at ``time`` (n,) [s]."""
+        """Return the readings of the motion of the slide for triggers at ``time`` (n,) [s]."""
         z = slide.at(time - self.latency_s)
         said = z * (1 + self.scale_ppm * PPM) + self.cubic_m * (z / self.half_range_m) ** 3
         in_range = abs(z) <= self.half_range_m
@@ -64,12 +68,12 @@ class ReferenceSensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accelerometer:
-    """A piezoelectric accelerometer on the probe, as a PCB 356A17.
+    """Piezoelectric accelerometer on the probe, as a PCB 356A17.
 
-    sample_period_s: its own, None for the trigger's
-    noise_m_per_s2: standard deviation of a sample, each axis
-    high_pass_hz: it sees nothing at rest;  scale_ppm: it reads so much too much
-    cross_talk: part of z that x and y show [1]
+    sample_period_s: of the sensor, None for that of the trigger
+    noise_m_per_s2: standard deviation of a sample on each axis
+    high_pass_hz: cutoff frequency;  scale_ppm: relative error, positive for a large reading
+    cross_talk: share of z in x and y [1]
     """
 
     sample_period_s: float | None = None
@@ -94,7 +98,7 @@ class Accelerometer:
         period: float,
         random: np.random.Generator,
     ) -> AccelerationBlock:
-        """Return what it reports of the probe's ``acceleration`` (n,), every ``period`` [s]."""
+        """Return the readings for an ``acceleration`` (n,) of the probe, every ``period`` [s]."""
         z = self._high_passed(acceleration, period) * (1 + self.scale_ppm * PPM)
         noise = random.normal(0.0, self.noise_m_per_s2, (3, len(z)))
         return AccelerationBlock(
@@ -113,21 +117,13 @@ class Accelerometer:
 
 
 def acceleration_of(motion: Trajectory) -> Trajectory:
-    """Return the second derivative of a motion [m/s²]; 0.1 % low at a fiftieth of its rate."""
+    """Return the second derivative of a motion [m/s²], 0.1 % low at 1/50 of its rate."""
     second = np.diff(motion.values, 2) / motion.step**2
     return Trajectory(motion.start + motion.step, motion.step, second)
 
 
-# When each device takes its sample, against the instant that the trigger count stands for.
-#
-# Not imitated: a counter that slips (see the emulators' faults), stamps of the computer.
-
-# No draw of a normal distribution lies beyond this many sigma in a billion.
-_JITTER_LIMIT = 7.0
-
-
 class Instants(NamedTuple):
-    """When the trigger, the encoders of Z and C, and the probe take their samples [s], (n,)."""
+    """Sampling instants of trigger, encoders of Z and C, and probe [s], (n,)."""
 
     trigger: FloatArray
     z: FloatArray
@@ -137,12 +133,12 @@ class Instants(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockErrors:
-    """Times that are not what the trigger count says; nothing by default.
+    """Deviations of the sampling instants from the trigger count; none by default.
 
-    trigger_jitter_s: rms, of all devices together;  probe_jitter_s: rms, of the probe alone
-    probe_offset_s: the probe takes each sample so much later than its count says
-    probe_drift_ppm: and its clock is so much slower, so that it falls behind
-    z_latch_late_s, c_latch_late_s: the encoder is latched so much after the trigger
+    trigger_jitter_s: rms of all devices in common;  probe_jitter_s: rms of the probe alone
+    probe_offset_s: delay of the samples of the probe
+    probe_drift_ppm: deviation of its clock, positive for a slow clock
+    z_latch_late_s, c_latch_late_s: delay of the latch of the encoder after the trigger
     """
 
     trigger_jitter_s: float = 0.0
@@ -159,11 +155,11 @@ class ClockErrors:
 
     @property
     def lag_s(self) -> float:
-        """How much later than the reading the encoder of Z was looked at, at the start."""
+        """Delay of the encoder of Z relative to the reading, at the start."""
         return self.z_latch_late_s - self.probe_offset_s
 
     def reach_s(self, duration: float) -> float:
-        """Return how far a sample is taken from its nominal instant at most [s]."""
+        """Return the largest deviation of a sample from its nominal instant [s]."""
         jitter = _JITTER_LIMIT * (self.trigger_jitter_s + self.probe_jitter_s)
         late = max(abs(self.z_latch_late_s), abs(self.c_latch_late_s), abs(self.probe_offset_s))
         return jitter + late + abs(self.probe_drift_ppm) * PPM * duration
@@ -183,16 +179,12 @@ class ClockErrors:
         )
 
 
-# What the encoder of Z makes of the carriage's motion.
-#
-# Not imitated: errors of the encoders of X, Y, B and C, count loss, a scale that bends.
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pitch:
-    """The carriage pitches, and the encoder, ``arm_m`` beside the probe's line, sees ``E = L α``.
+    """Pitch α of the slide, by which the encoder measures ``E = L α`` in addition (Abbe error).
 
-    rad_per_m: steady bend of the way;  periodic_rad, period_m: of its rollers or screw
+    arm_m: L, offset of the encoder from the line of the probe
+    rad_per_m: curvature of the way;  periodic_rad, period_m: of its rollers or screw
     rad_per_m_s2: pitch under acceleration, through a mode of frequency_hz and damping_ratio
     """
 
@@ -214,7 +206,7 @@ class Pitch:
         return [self.rad_per_m_s2 * omega**2, 0.0, 0.0], ratio
 
     def angle(self, slide: Trajectory) -> FloatArray:
-        """Return the pitch α [rad] along the carriage's motion, (n,)."""
+        """Return the pitch α [rad] along the motion of the slide, (n,)."""
         z = slide.values
         steady = self.rad_per_m * z + self.periodic_rad * np.sin(2 * np.pi * z / self.period_m)
         if not self.rad_per_m_s2:
@@ -231,12 +223,12 @@ class Pitch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderErrors:
-    """Of the encoder of Z; nothing by default.
+    """Errors of the encoder of Z; none by default.
 
-    scale_ppm: reads so much too long
+    scale_ppm: relative error, positive for a long reading
     interpolation_m, signal_period_m: ``interpolation_m · sin(2π z / signal_period_m)``
     resolution_m: of its counts, 0 for none
-    pitch: it sees another motion than the probe
+    pitch: of the slide, by which the encoder measures another motion than that of the probe
     """
 
     scale_ppm: float = 0.0
@@ -249,14 +241,14 @@ class EncoderErrors:
         check_numbers(self, positive=("signal_period_m",), not_negative=("resolution_m",))
 
     def seen(self, slide: Trajectory) -> Trajectory:
-        """Return the position under the encoder [m], before its own errors."""
+        """Return the position under the encoder [m], without errors of the encoder itself."""
         if self.pitch is None:
             return slide
         values = slide.values + self.pitch.arm_m * self.pitch.angle(slide)
         return Trajectory(slide.start, slide.step, values)
 
     def read(self, position: FloatArray, noise: FloatArray) -> FloatArray:
-        """Return what it says at ``position`` (n,) [m], with ``noise`` (n,) [m]."""
+        """Return the reading at ``position`` (n,) [m], with ``noise`` (n,) [m]."""
         if is_default(self):
             return position + noise
         wave = self.interpolation_m * np.sin(2 * np.pi * position / self.signal_period_m)
@@ -265,6 +257,6 @@ class EncoderErrors:
         return np.asarray(np.round(said / step) * step if step else said, np.float64)
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """Return reading over motion of the carriage at ``s`` [rad/s], its linear part."""
+        """Return the linear response from motion of the slide to reading at ``s`` [rad/s]."""
         pitch = self.pitch.response(s) if self.pitch else np.zeros_like(s)
         return np.asarray((1 + self.scale_ppm * PPM) * (1 + pitch), np.complex128)

@@ -1,10 +1,10 @@
-"""What a real structure does beside G(s): it creeps, rocks, has backlash, drags and stiffens.
+"""Structural errors in addition to G(s): creep, soft modes, stiffness, friction, backlash.
 
 ``slide → G(s) → creep, soft modes → stiffness → friction → backlash → probe``
 
-All but creep and soft modes act at once, on the deflection or on the position, so they are as
-fine in time as G's own output is. Not imitated: backlash and friction within the servo loop,
-stiffness that changes the frequency of a mode (it scales the whole deflection), temperature.
+All except creep and soft modes act without memory in time, on the deflection or the position. Not
+imitated: backlash and friction within the servo loop, stiffness that changes the frequency of a
+mode (it scales the whole deflection), temperature.
 """
 
 from __future__ import annotations
@@ -24,20 +24,26 @@ from omsm_ros.twin.plant import Movement
 from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.trajectory import Trajectory
 
-# What follows a motion and depends on where it turned last: backlash and pre-sliding friction.
-#
-# Between two reversals both have a closed form, so only the reversals are walked through.
-
-# A change smaller than this between two steps is rounding, not a reversal [m].
+# A smaller change between two steps is rounding, not a reversal [m].
 _STILL_M = 1e-16
+# Time in which the motion is faded in, so that it does not excite a soft mode.
+_SPIN_UP_S = 4.0
+# Two relaxations per decade approximate logarithmic creep to 0.5 %.
+_RELAXATIONS_PER_DECADE = 2
+# Shortest time constant of creep [s].
+_SHORTEST_RELAXATION_S = 1e-4
+# Largest step for creep and soft modes, absolute and over their time constant: linear
+# interpolation is then exact to 1e-4 of these effects.
+_LONGEST_SLOW_STEP_S = 0.25e-3
+_SLOW_STEPS = 30
 
 
 @dataclass(frozen=True, eq=False)
 class BacklashOutput(Trajectory):
-    """A motion behind backlash, as exact between its values as that of what drives it.
+    """Motion behind backlash, as exact between its values as the motion of its driver.
 
-    driver: what drives it;  held: where it stays until it is driven on, (n,) [m]
-    half_width: of the play on either side [m]
+    driver: driving motion;  held: position while it is not driven, (n,) [m]
+    half_width: half of the backlash [m]
     """
 
     driver: Trajectory
@@ -45,7 +51,7 @@ class BacklashOutput(Trajectory):
     half_width: float
 
     def at(self, time: FloatArray) -> FloatArray:
-        """Return the position [m] at ``time`` [s], of its shape; a cubic would round its kinks."""
+        """Return the position [m] at ``time`` [s], of its shape, with sharp kinks."""
         driver = self.driver.at(time)
         following = np.ceil((time - self.start) / self.step).astype(np.int64)
         held = self.held[np.minimum(following, len(self.held) - 1)]
@@ -54,7 +60,7 @@ class BacklashOutput(Trajectory):
 
 
 def backlash(driver: Trajectory, width: float) -> BacklashOutput:
-    """Return what follows ``driver`` through a gap of ``width`` [m], at first in its middle."""
+    """Return the motion behind a backlash of ``width`` [m], at first in its middle."""
     position, half = driver.values, width / 2
     runs, state, states = list(_monotone_runs(position)), position[0], []
     for _, last, up in runs:
@@ -81,10 +87,10 @@ def friction(position: FloatArray, presliding: float) -> FloatArray:
 
 
 def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
-    """Yield pieces ``first:last`` in which the position only rises (True) or only falls."""
+    """Yield slices ``first:last`` in which the position only rises (True) or only falls."""
     change = np.diff(position, prepend=position[0])
     moving = abs(change) > _STILL_M
-    # At rest the direction is that of the last move.
+    # At standstill the direction is that of the last move.
     latest = np.maximum.accumulate(np.where(moving, np.arange(len(position)), 0))
     up = change[latest] > 0
     cuts = np.flatnonzero(up[1:] != up[:-1]) + 1
@@ -93,21 +99,9 @@ def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
         yield first, last, bool(up[first])
 
 
-# The machine comes to its motion within this time, so that a soft mode is not struck.
-_SPIN_UP_S = 4.0
-# Two relaxations a decade lie within 0.5 % of a straight line in the logarithm of time.
-_RELAXATIONS_PER_DECADE = 2
-# What is faster than this is no creep [s].
-_SHORTEST_RELAXATION_S = 1e-4
-# Creep and soft modes are computed in steps of this at most, and of this part of their own time:
-# the straight lines between are then within 1e-4 of what is itself 1e-3 of the motion.
-_LONGEST_SLOW_STEP_S = 0.25e-3
-_SLOW_STEPS = 30
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Creep:
-    """A part of each move comes late: ``1 - ε + ε / (1 + sτ)``.
+    """Creep of a share of each move: ``1 - ε + ε / (1 + sτ)``.
 
     fraction: ε of the move [1];  time_constant_s: τ
     """
@@ -121,7 +115,7 @@ class Creep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogCreep:
-    """Creep in proportion to the logarithm of time, as piezos and grease have it.
+    """Creep proportional to the logarithm of time, as of piezos and grease.
 
     fraction_per_decade: of the move, in each decade from shortest_s to longest_s [1]
     """
@@ -140,7 +134,7 @@ class LogCreep:
 
     @property
     def relaxations(self) -> tuple[Creep, ...]:
-        """The same as a row of equal relaxations, their time constants in equal ratios."""
+        """Equal relaxations with time constants in equal ratios that approximate the creep."""
         decades = np.log10(self.longest_s / self.shortest_s)
         count = max(round(decades * _RELAXATIONS_PER_DECADE), 0) + 1
         each = self.fraction_per_decade / _RELAXATIONS_PER_DECADE
@@ -150,9 +144,9 @@ class LogCreep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SoftMode:
-    """A weak mode of base or isolator: ``1 - p + p ω² / (s² + 2ζω s + ω²)``.
+    """Weak mode of base or isolator: ``1 - p + p ω² / (s² + 2ζω s + ω²)``.
 
-    participation: p, its part of the motion at rest [1]
+    participation: p, static share of the motion [1]
     """
 
     frequency_hz: float
@@ -164,13 +158,13 @@ class SoftMode:
 
     @property
     def omega(self) -> float:
-        """[rad/s]"""
+        """Angular frequency [rad/s]."""
         return 2 * np.pi * self.frequency_hz
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Friction:
-    """Pre-sliding drag (Dahl 1968): the probe is held back by up to ``drag_m``.
+    """Pre-sliding friction (Dahl 1968) that retards the probe by up to ``drag_m``.
 
     dF/dz = (1 - F sgn ż) / presliding_m, F from -1 to 1
     """
@@ -184,7 +178,7 @@ class Friction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StructureErrors:
-    """Between carriage and probe; nothing by default.
+    """Errors between slide and probe; none by default.
 
     creep, log_creep, soft_modes: linear, slow
     compliance_per_m_of_z, compliance_per_m_of_x: the deflection ``slide - probe`` grows by
@@ -208,16 +202,16 @@ class StructureErrors:
 
     @property
     def relaxations(self) -> tuple[Creep, ...]:
-        """Every relaxation of both laws of creep."""
+        """All relaxations of both laws of creep."""
         return self.creep + (self.log_creep.relaxations if self.log_creep else ())
 
     @property
     def lead_s(self) -> float:
-        """How long the machine must have been moving before time 0."""
+        """Duration of the motion before time 0."""
         return _SPIN_UP_S if self.relaxations or self.soft_modes else 0.0
 
     def response(self, s: ComplexArray) -> ComplexArray:
-        """Return creep and soft modes at complex ``s`` [rad/s]; what is not linear is not in it."""
+        """Return the response of creep and soft modes, the linear part, at ``s`` [rad/s]."""
         result = np.ones_like(s)
         for creep in self.relaxations:
             result += creep.fraction * (1 / (1 + s * creep.time_constant_s) - 1)
@@ -228,9 +222,9 @@ class StructureErrors:
 
 
 def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Movement:
-    """Return what becomes of the probe's motion ``moved`` in a structure with ``errors``.
+    """Return the motion ``moved`` with the ``errors`` of the structure.
 
-    slide_x: position of X [m], on any grid as long as that of ``moved``
+    slide_x: position of X [m], on any grid that covers ``moved``
     """
     if is_default(errors):
         return moved
@@ -251,7 +245,7 @@ def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Mov
 
 
 def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
-    """Return what creep and soft modes add to the motion of the probe (n,) [m]."""
+    """Return the effect of creep and soft modes on the motion of the probe (n,) [m]."""
     if not errors.lead_s:
         return np.zeros(1)
     every = max(int(_slow_step(errors) / probe.step), 1)
@@ -271,14 +265,14 @@ def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
 
 
 def _slow_step(errors: StructureErrors) -> float:
-    """Step [s] in which nothing slow turns noticeably."""
+    """Return the step [s] for creep and soft modes."""
     times = [1 / mode.omega for mode in errors.soft_modes]
     times += [creep.time_constant_s for creep in errors.relaxations]
     return min(_LONGEST_SLOW_STEP_S, min(times) / _SLOW_STEPS)
 
 
 def _with_spin_up(probe: Trajectory) -> FloatArray:
-    """Return the motion about its mean, coming up smoothly from rest there before time 0."""
+    """Return the motion about its mean, faded in smoothly before time 0."""
     before = max(round(-probe.start / probe.step), 1)
     mean = probe.values[:before].mean()
     moving = probe.values - mean
@@ -287,7 +281,7 @@ def _with_spin_up(probe: Trajectory) -> FloatArray:
 
 
 def _through(ratio: tuple[list[float], list[float]], values: FloatArray, step: float) -> FloatArray:
-    """Return ``values``, at rest before and joined by lines, through a continuous filter."""
+    """Return linearly interpolated ``values``, zero before, after a continuous filter."""
     numerator, denominator, _ = signal.cont2discrete(ratio, step, method="foh")
     return np.asarray(signal.lfilter(numerator.ravel(), denominator, values))
 

@@ -1,4 +1,4 @@
-"""A simulated signal that can be looked at when a device looks, not only when it was computed."""
+"""Simulated signal that can be evaluated between its computed values."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import numpy as np
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 
-# An instant this close to the grid, in steps, is on it: what rounding leaves of k · period.
+# Distance from the grid, in steps, that is rounding of k · period.
 _ON_THE_GRID = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """``values`` (n,) at ``start`` [s] and every ``step`` [s] after it."""
+    """Signal with ``values`` (n,) at ``start`` [s] and every ``step`` [s] after it."""
 
     start: float
     step: float
@@ -27,7 +27,7 @@ class Trajectory:
         return self.start + np.arange(len(self.values), dtype=np.float64) * self.step
 
     def at(self, time: FloatArray) -> FloatArray:
-        """Return the value at ``time`` [s], of its shape: on the grid itself, else a cubic of four.
+        """Return the value at ``time`` [s], of its shape, by a cubic between the grid points.
 
         Raises ConfigurationError for a time before the start or after the end.
         """

@@ -1,4 +1,4 @@
-"""How far a correction is from the truth that only the twin knows."""
+"""Compare a correction with the true values of a simulated recording."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def spread(error: FloatArray, weight: FloatArray | None = None) -> ErrorFigures:
 
 @dataclass(frozen=True, slots=True)
 class TruthComparison:
-    """Of the corrected points only; rms of the dynamic errors is weighted by area.
+    """Errors at the corrected points; rms of the dynamic errors is weighted by area.
 
     dynamic_error_before: true motion of the probe minus the encoder
     dynamic_error_after: true motion of the probe minus the filtered encoder
@@ -44,7 +44,7 @@ class TruthComparison:
 def compare_with_truth(
     recording: Recording, sample: ArrayLike, height: FloatArray, dynamic_error: FloatArray
 ) -> TruthComparison:
-    """Compare corrected points, each array (n,), with the truth of the recording they came from.
+    """Compare corrected points, each array (n,), with the true values of their recording.
 
     sample: trigger counter;  height, dynamic_error: as in ``cloud.ply`` [m]
     """
@@ -57,7 +57,7 @@ def compare_with_truth(
     encoder = recording.axes.z[index]
     filtered = encoder - dynamic_error
     motion = recording.probe_motion[index]
-    # A spiral of constant feed and speed samples a ring in proportion to 1, its area to r.
+    # In a spiral of constant feed and speed a point stands for an area proportional to its radius.
     radius = np.abs(recording.axes.x[index])
     return TruthComparison(
         dynamic_error_before=spread(motion - encoder, radius),

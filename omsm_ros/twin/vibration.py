@@ -1,7 +1,7 @@
-"""Lines of vibration between workpiece and probe, free running or in step with the spindle.
+"""Lines of vibration between workpiece and probe, free or synchronous with the spindle.
 
-A line above half the rate folds when the probe samples it, as it does in reality. Not imitated:
-broadband vibration (see ``ProbeErrors.noise_m``), a line whose frequency wanders.
+A line above half the sampling rate appears at its alias. Not imitated: broadband vibration (see
+``ProbeErrors.noise_m``), lines with a variable frequency.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from omsm_ros.twin.record_checks import check_numbers
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VibrationLine:
-    """``amplitude_m · sin(2π frequency_hz t + per_turn · c + phase_rad)``.
+    """Line ``amplitude_m · sin(2π frequency_hz t + per_turn · c + phase_rad)``.
 
     amplitude_m: half of peak to valley
-    frequency_hz: free running;  per_turn: so often a turn of the spindle, in step with it
-    phase_rad: None takes one by the seed
+    frequency_hz: of a free line;  per_turn: waves a turn of a synchronous line
+    phase_rad: None takes a random phase
     """
 
     amplitude_m: float
@@ -44,29 +44,29 @@ class VibrationLine:
         return np.asarray(self.amplitude_m * np.sin(turning), np.float64)
 
     def turn(self, duration_s: float, spindle_rad: FloatArray) -> FloatArray:
-        """Return how far its phase turns [rad] while the spindle turns by so much (n,)."""
+        """Return the change of its phase [rad] while the spindle turns by ``spindle_rad`` (n,)."""
         return 2 * np.pi * self.frequency_hz * duration_s + self.per_turn * spindle_rad
 
 
 @dataclass(frozen=True)
 class Vibration:
-    """Several lines, each with its phase [rad]."""
+    """Several lines with their phases [rad]."""
 
     lines: Sequence[VibrationLine]
     phases: Sequence[float]
 
     @classmethod
     def of(cls, lines: Sequence[VibrationLine], random: np.random.Generator) -> Vibration:
-        """Return the lines with phases by ``random`` where none is given."""
+        """Return the lines with random phases for those without one."""
         return cls(lines, random.uniform(0.0, 2 * np.pi, len(lines)).tolist())
 
     def height(
         self, middle: FloatArray, c: FloatArray, exposure_s: float, turned: FloatArray
     ) -> FloatArray:
-        """Return the sum of all lines [m], each the mean over an exposure.
+        """Return the sum of all lines, averaged over exposures [m].
 
         middle: of the exposures (n,) [s];  c: spindle angle then (n,) [rad]
-        turned: by the spindle within an exposure (n,) [rad]
+        turned: rotation of the spindle within an exposure (n,) [rad]
         """
         total = np.zeros_like(middle)
         for line, phase in zip(self.lines, self.phases, strict=True):

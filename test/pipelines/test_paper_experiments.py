@@ -40,7 +40,7 @@ def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
     facts = run_experiment("vibration", tmp_path / "v")
     quiet, shaken = facts["spectrum"]["scans"]
     assert [p["kind"] for p in quiet["peaks"]] == ["on the part"]
-    aliased = next(p for p in shaken["peaks"] if p["kind"] == "folded vibration")
+    aliased = next(p for p in shaken["peaks"] if p["kind"] == "aliased vibration")
     assert aliased["true_frequency"] == pytest.approx(680.0, abs=0.01)
     assert aliased["frequency"] == pytest.approx(320.0, abs=0.05)
     assert json.loads((tmp_path / "v/experiment.json").read_text())["experiment"] == "vibration"

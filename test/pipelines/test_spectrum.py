@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.kinematics.trajectories import Circle
-from omsm_ros.core.ripple.source_hypotheses import ARTEFACT, FOLDED, KINDS, PART
+from omsm_ros.core.ripple.source_hypotheses import ALIASED, ARTEFACT, KINDS, PART
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
@@ -62,10 +62,10 @@ def test_the_marks_the_folded_vibration_and_the_image(result):
         assert peak["kind"] == PART
         assert peak["true_wavelength"] == pytest.approx(15e-6, rel=1e-3)
     found = {round(peak["frequency"]): peak for peak in third["peaks"]}
-    assert found[320]["kind"] == FOLDED
+    assert found[320]["kind"] == ALIASED
     assert found[320]["true_frequency"] == pytest.approx(680.0, abs=0.01)
     assert found[262]["kind"] == ARTEFACT
-    assert facts["counts"] == {k: {PART: 2, FOLDED: 1, ARTEFACT: 1}.get(k, 0) for k in KINDS}
+    assert facts["counts"] == {k: {PART: 2, ALIASED: 1, ARTEFACT: 1}.get(k, 0) for k in KINDS}
 
 
 def test_the_sampling_is_that_of_table_1(result):
@@ -97,7 +97,7 @@ def test_the_band_stop_says_what_it_did_and_its_cloud_has_it(result):
 def test_the_page_names_every_line(result):
     out, _ = result
     page = (out / "report.html").read_text()
-    for text in (PART, FOLDED, ARTEFACT, "Felt by the accelerometer", "Sampling of the part"):
+    for text in (PART, ALIASED, ARTEFACT, "Accelerometer lines", "Sampling of the part"):
         assert text in page
     assert page.count("data:image/png") == 4
 

@@ -1,4 +1,10 @@
-"""A calibration from scans of one part, with or without a step test before."""
+"""Make a calibration from scans of one part, with or without a step test, and test for latency.
+
+Reversal is self-calibration with a step test and two directions instead of two speeds: a late
+reading belongs to a place earlier on the path, so reversing the spindle shifts it to the other
+side; a mechanical lag of Z does not. On a surface that Z follows, an error of the delay of the
+calibration has the same effect, so the result is not better than that delay.
+"""
 
 from __future__ import annotations
 
@@ -31,24 +37,21 @@ from omsm_ros.core.calibration.calibration import (
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import DataError
-from omsm_ros.readable import plain, quantity
+from omsm_ros.errors import DataError, Notice
 from omsm_ros.units import RPM_RAD_S
 
-SCOPE = (
-    "identified on a surface that Z follows, where latency leaves no trace: the response is that "
-    "of the structure, for surfaces followed as closely; a step test would determine the latency"
-)
-# One clean run in a thousand.
+SCOPE = Notice("adjustment.latency_scope")
+"""Validity of a calibration whose latency is unknown."""
+# Significance of a conflict with the prior: one clean run in a thousand.
 _PRIOR_CONFLICT_P, _PRIOR_CONFLICT_SIGMAS = 1e-3, 3.0
-# A spindle keeps its speed to better than that.
+# Relative stability of the speed of a spindle.
 _SAME_SPEED = 0.01
-# The low-order model's own poles, well above what moved and well below Nyquist.
+# Poles of the low-order model over the sampling rate, above the excitation and below Nyquist.
 _POLE_SHARE_OF_RATE = 0.2
 
 
 def unit_calibration(sample_period: float, static_gain: float = 1.0) -> Calibration:
-    """Return the calibration that corrects nothing, for data of ``sample_period`` [s]."""
+    """Return a calibration without correction, for data of ``sample_period`` [s]."""
     nothing = TransferFunction(np.ones(1), np.ones(1))
     return Calibration(
         dynamics=nothing,
@@ -61,9 +64,9 @@ def unit_calibration(sample_period: float, static_gain: float = 1.0) -> Calibrat
 
 
 def without_step_test(gain_uncertainty: float = UNINFORMATIVE_GAIN) -> Prior:
-    """Return what is known of a machine that was never tested: next to nothing.
+    """Return an uninformative prior, for a machine without a step test.
 
-    gain_uncertainty: of the static gain, as a share of it
+    gain_uncertainty: relative, of the static gain
     """
     return Prior(
         np.diag([UNINFORMATIVE_S, UNINFORMATIVE_CURVATURE_S2, gain_uncertainty, UNINFORMATIVE_S])
@@ -72,7 +75,7 @@ def without_step_test(gain_uncertainty: float = UNINFORMATIVE_GAIN) -> Prior:
 
 
 def after_step_test(calibration: Calibration) -> Prior:
-    """Return what a step test leaves open: its lag, curvature and gain within its covariance."""
+    """Return the prior after a step test: the covariance of its lag, curvature and gain."""
     jacobian = slow_motion_jacobian(calibration.dynamics)
     covariance = np.zeros((DYNAMIC, DYNAMIC))
     covariance[:GAIN, :GAIN] = jacobian @ calibration.covariance @ jacobian.T
@@ -83,10 +86,10 @@ def after_step_test(calibration: Calibration) -> Prior:
 
 
 def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
-    """Return ``calibration`` with what the scans corrected with it add to it.
+    """Return ``calibration`` updated with the result of scans that were corrected with it.
 
-    What they say of lag and curvature narrows the covariance Σ of all parameters: with J the
-    Jacobian of the two, and K = Σ Jᵀ (J Σ Jᵀ)⁻¹, to ``Σ - K (J Σ Jᵀ - P) Kᵀ``, P what is left.
+    The covariance Σ of all parameters becomes ``Σ - K (J Σ Jᵀ - P) Kᵀ``, with J the Jacobian of
+    lag and curvature, K = Σ Jᵀ (J Σ Jᵀ)⁻¹, and P the covariance of both after the scans.
     """
     g, sigma = _moved(calibration, float(found.values[LAG]), float(found.values[CURVATURE]))
     jacobian = slow_motion_jacobian(g)
@@ -94,7 +97,7 @@ def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
     gain = sigma @ jacobian.T @ _inverse_of_varying(prior)
     remaining = found.covariance[:GAIN, :GAIN].copy()
     if len(g.numerator) <= CURVATURE + 1:
-        # A numerator of the first degree has no room for the curvature: it stays, and counts.
+        # A numerator of first degree cannot hold the curvature, so it adds to the uncertainty.
         remaining[CURVATURE, CURVATURE] += float(found.values[CURVATURE]) ** 2
     change = prior - remaining
     covariance = sigma - gain @ change @ gain.T
@@ -122,8 +125,8 @@ def from_scans_alone(
 ) -> Calibration:
     """Return a calibration of low order from scans corrected with :func:`unit_calibration`.
 
-    ``N/D e^{-τs}`` with two fast poles, an octave apart, and N such that the lag and the curvature
-    are those found.
+    ``N/D e^{-τs}`` with two fast poles, an octave apart, and N from the estimated lag and
+    curvature.
     """
     latency = max(float(found.values[LATENCY]), 0.0)
     total, curvature = float(found.values[LAG]), float(found.values[CURVATURE])
@@ -147,9 +150,9 @@ def from_scans_alone(
         "noise_m": found.agreement.noise,
         "low_frequency_delay_s": dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
-        "warnings": [] if found.known[LATENCY] else [SCOPE],
+        "warnings": [] if found.known[LATENCY] else [str(SCOPE)],
         "reasons": _early_reason(total, float(np.sqrt(found.covariance[LAG, LAG]))),
-        "verdict": f"accepted up to {quantity(trusted, 'Hz')}",
+        "verdict": str(Notice("adjustment.accepted", frequency=trusted)),
     }
     return Calibration(
         dynamics=dynamics,
@@ -165,10 +168,10 @@ def from_scans_alone(
 def _moved(
     calibration: Calibration, lag: float, curvature: float
 ) -> tuple[TransferFunction, FloatArray]:
-    """Return G with its slow motion changed by ``1 - lag s + curvature s²``, and its covariance.
+    """Return G multiplied by ``1 - lag s + curvature s²`` at low frequency, and its covariance.
 
-    Only the numerator changes, so the poles stay where they are. It grows to the first degree
-    where the denominator allows it, to hold the lag, and no further, to stay a small model.
+    Only the numerator changes. It is extended to the first degree, if the denominator allows it,
+    to hold the lag.
     """
     g = calibration.dynamics
     degree = len(g.numerator) - 1
@@ -187,7 +190,7 @@ def _moved(
 def _latency(found: SelfCalibration, lag: float) -> Latency:
     source = REVERSAL if _same(np.abs(found.speeds)) else SPEEDS
     _, structure = found.structure
-    # What the lag of Z, in the covariance of the dynamics, does not hold already.
+    # The part of the uncertainty that the covariance of the dynamics does not contain.
     structural_uncertainty = float(np.sqrt(max(structure**2 - found.covariance[LAG, LAG], 0.0)))
     if not found.known[LATENCY]:
         return Latency(
@@ -196,17 +199,17 @@ def _latency(found: SelfCalibration, lag: float) -> Latency:
             beside_z_s=structural_uncertainty,
             share=None,
             source=source,
-            reason=SCOPE,
+            reason=str(SCOPE),
         )
     delay = max(float(found.values[LATENCY]), 0.0)
-    rpm = ", ".join(f"{speed / RPM_RAD_S:.4g}" for speed in found.speeds)
+    speeds = [f"{speed / RPM_RAD_S:.4g}" for speed in found.speeds]
     return Latency(
         delay_s=delay,
         uncertainty_s=float(np.sqrt(found.covariance[LATENCY, LATENCY])),
         beside_z_s=structural_uncertainty,
         share=latency_share_of(delay, lag),
         source=source,
-        reason=f"{len(found.speeds)} scans of one part at {rpm} rpm",
+        reason=str(Notice("adjustment.origin", scans=len(speeds), speeds=speeds)),
     )
 
 
@@ -230,75 +233,58 @@ def _entries(found: SelfCalibration) -> dict[str, object]:
                 }
                 for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
             ],
-            "not_told": undetermined(found),
+            "not_told": [*map(str, undetermined(found))],
         },
     }
 
 
-def undetermined(found: SelfCalibration) -> list[str]:
-    """Return what the scans did not determine, why, and what would."""
-    words = []
+def undetermined(found: SelfCalibration) -> list[Notice]:
+    """Return the parameters that the scans did not determine, and how to determine them."""
+    notices = []
     if not found.known[LATENCY]:
-        words.append(
-            "latency: where Z follows the surface it leaves no trace; a step test "
-            "(--calibration) together with these scans determines it"
-        )
+        notices.append(Notice("adjustment.latency_undetermined"))
     if not found.known[CURVATURE]:
-        words.append(
-            "curvature of the gain: the scans run equally fast, so it passes for the surface; "
-            "scan at another speed"
-        )
-    words.append(
-        "a gain common to all speeds: it scales the surface in every scan alike; only a "
-        "reference determines it"
-    )
-    return words
+        notices.append(Notice("adjustment.curvature_undetermined"))
+    return [*notices, Notice("adjustment.gain_undetermined")]
 
 
 def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str, object]:
-    """Return the certificate with the scans' own reasons for and against."""
+    """Return the certificate with the reasons that the scans add, rejected if there are any."""
     reasons = []
     if not found.agreement.holds:
         reasons.append(
-            f"the scans contradict each other by {quantity(found.agreement.disagreement, 'm')} "
-            f"rms, {plain(found.agreement.ratio, 2)} times what noise explains; the part moved, or "
-            "something else than speed changed between them: let the machine settle and repeat"
+            Notice(
+                "adjustment.scans_disagree",
+                disagreement=found.agreement.disagreement,
+                ratio=found.agreement.ratio,
+            )
         )
     if stats.chi2.sf(found.prior_conflict, GAIN) < _PRIOR_CONFLICT_P:
-        shift = quantity(float(found.values[LAG]), "s")
+        shift = float(found.values[LAG])
         reasons.append(
-            f"scans and step test contradict each other: the lag would have to change by "
-            f"{shift}, beyond what the step test allows (χ² {found.prior_conflict:.0f} of 2); "
-            "repeat the step test with the settings of the scans"
+            Notice("adjustment.step_test_conflict", shift=shift, chi2=found.prior_conflict)
         )
     latency, spread = (
         float(v) for v in (found.values[LATENCY], found.covariance[LATENCY, LATENCY])
     )
     if latency < -_PRIOR_CONFLICT_SIGMAS * np.sqrt(spread):
-        reasons.append(
-            f"the probe would have to be {quantity(-latency, 's')} early: the structure "
-            "lags more in the scans than in the step test; repeat the step test"
-        )
+        reasons.append(Notice("adjustment.negative_latency", latency=-latency))
     before = certificate.get("reasons")
-    all_reasons = [*(before if isinstance(before, list) else []), *reasons]
+    all_reasons = [*(before if isinstance(before, list) else []), *map(str, reasons)]
     if not all_reasons:
         return certificate
     return certificate | {"reasons": all_reasons, "verdict": REJECTED}
 
 
 def _early_reason(lag: float, uncertainty: float) -> list[str]:
-    """Return the reason against scans alone whose Z would have to follow the probe."""
+    """Return the reason to reject scans without a step test for a significantly negative lag."""
     if lag >= -_PRIOR_CONFLICT_SIGMAS * uncertainty:
         return []
-    return [
-        f"Z would have to move {quantity(-lag, 's')} after what the probe sees of it: the sign of "
-        "the distance (--polarity), the static gain (--static-gain) or the encoder's latch is not "
-        "as stated; make a step test, and give it (--calibration)"
-    ]
+    return [str(Notice("adjustment.negative_lag", lag=-lag))]
 
 
 def _highest_excited(found: SelfCalibration) -> float:
-    """Return the highest frequency [Hz] at which the surface shows G off by the usual limits."""
+    """Return the highest frequency [Hz] at which the surface shows errors of G at the limits."""
     known = found.agreement.noise * np.sqrt(2 / found.points)
     limits = ResponseLimits()
     excited = found.amplitudes * min(limits.gain, limits.phase) > COVERAGE_FACTOR * known
@@ -314,25 +300,14 @@ def _inverse_of_varying(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.pinv(correlation, hermitian=True) * scale * scale[:, np.newaxis])
 
 
-# Is the lag latency, or mechanics? Two scans in opposite directions decide.
-#
-# A late probe looks where the workpiece was a moment ago: each height belongs to a point
-# ``lag`` earlier on the path, and turning the spindle the other way shifts it to the other
-# side. A mechanical lag of Z alone does not. It is :func:`self_calibrate` with a step test
-# before it, and two directions for two speeds.
-#
-# Where Z follows the surface, an error of the calibration's own delay leaves the same mark. The
-# estimate cannot be better than that delay is known.
-
-
 @dataclass(frozen=True)
 class Reversal:
-    """What scans in opposite directions say: how late the probe's reading is against X and C.
+    """Lag of the readings of the probe relative to X and C, from scans in opposite directions.
 
     lag, uncertainty: [s], k = 1;  lag_of_z: of the calibration at low frequency [s]
-    residual: rms that lag and surface leave [m];  used: points fitted
-    latency: True if the lag of Z is latency, False if mechanical, None if neither within 3 u
-    calibration: with what was found in it
+    residual: rms [m];  used: number of fitted points
+    latency: True if the lag of Z is latency, False if mechanical, None if undecided (3 u)
+    calibration: updated with the result
     """
 
     lag: float
@@ -347,17 +322,17 @@ class Reversal:
 def reversal(
     scans: Sequence[ScanColumns], calibration: Calibration, harmonics: int = DEFAULT_HARMONICS
 ) -> Reversal:
-    """Return the lag of the probe against X and C from scans in opposite directions.
+    """Return the lag of the probe relative to X and C from scans in opposite directions.
 
     scans: corrected with ``calibration``, two or more, of one surface
     harmonics: of the surface in a turn; more for a rougher surface
 
-    Raises DataError if the scans turn the same way, are too short, or the surface has no
+    Raises DataError for scans in one direction, scans that are too short, or a surface without
     slope along the path.
     """
     turns = [float(scan.angular_rate.sum()) for scan in scans]
     if len(scans) > 1 and not min(turns) < 0 < max(turns):
-        raise DataError("both scans turn the same way; reverse the spindle for one of them")
+        raise DataError("adjustment.one_direction")
     found = self_calibrate(scans, after_step_test(calibration), harmonics)
     lag, of_z = float(found.values[LATENCY]), calibration.dynamics.low_frequency_delay
     uncertainty = float(found.covariance[LATENCY, LATENCY] ** 0.5)

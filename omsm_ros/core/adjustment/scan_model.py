@@ -1,13 +1,19 @@
-"""What scans of one part have in common, and in what they may differ.
+"""Model of several scans of one part: a common surface, and parameters in which scans differ.
 
-``h = S(P(t - τ)) + δ Dz - κ D²z + ε d + what is the scan's own``, D = d/dt, with h the height
-after a correction that is to be judged: its lag is wrong by δ, its curvature (of the gain, in
-s²) by κ, its static gain by the share ε, and the probe is late against the slides by τ.
-Of its own each scan but the first has a drift, its clocking, and shift and tilt of the part.
+``h = S(P(t - τ)) + δ Dz - κ D²z + ε d + terms of the scan``, D = d/dt, with h the height after a
+correction: its lag is wrong by δ, its curvature (of the gain, in s²) by κ, its static gain by the
+share ε, and the probe is late relative to the slides by τ. Each scan except the first has its own
+drift, clocking, shift and tilt of the part.
 
-To first order two speeds or directions separate ``δ - τ`` from S, for its mark grows with the
-speed; a following error, or knowledge of G from a step test, separates δ from τ. Clocking leaves
-the same mark as a lag at a steady speed: how well C repeats limits what is identifiable.
+To first order two speeds or directions separate ``δ - τ`` from S, because its effect is
+proportional to the speed; a following error, or a step test, separates δ from τ. At constant speed
+clocking has the effect of a lag, so the repeatability of C limits the result.
+
+S is ``S(r, θ) = Σ_jm B_j(r) (a_jm cos mθ + b_jm sin mθ)`` with cubic B-splines of the radius. In
+one interval of radius only four splines differ from zero, so the normal equations are gathered by
+interval. They are ``y = B a + X p + e``, with B the terms of the surface and X the columns of the
+parameters p. With ``C = (BᵀB)⁻¹ BᵀX`` the columns ``X - B C`` are independent of the surface. Rows
+are computed from the scans in portions, so memory holds the normal equations and one portion.
 """
 
 from __future__ import annotations
@@ -23,15 +29,24 @@ from omsm_ros.core.adjustment.scan_reader import ScanColumns
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import DataError
 
-# A smooth surface of unknown shape: cubic B-splines of radius times harmonics of the angle.
-#
-# ``S(r, θ) = Σ_jm B_j(r) (a_jm cos mθ + b_jm sin mθ)``. Within one interval of radius only four
-# splines differ from zero, so the normal equations are gathered interval by interval.
-
-# B-splines of the third degree over one interval, ascending powers of u in 0…1, a row each.
+# Cubic B-splines over one interval, ascending powers of u in 0…1, one row each.
 _SPLINES = np.array([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]]) / 6
 _SLOPES = _SPLINES[:, 1:] * np.arange(1, 4)
 SUPPORT = len(_SPLINES)
+# Ridge over the largest diagonal element, which keeps a term without points at zero.
+_RIDGE = 1e-12
+# Points at a time, whose terms (4 MB) fit the cache.
+_PORTION = 5_000
+LAG, CURVATURE, GAIN, LATENCY = range(4)
+DYNAMIC = 4
+CLOCKING = 0
+OWN = ("clocking", "shift_x", "shift_y", "tilt_x", "tilt_y")
+# Least radius over the largest; nearer to the axis the points do not resolve the harmonics.
+_INNER_SHARE = 0.01
+# Intervals of radius (half a millimetre on a part of 25 mm), with at least two turns in each.
+_MOST_INTERVALS, _TURNS_AN_INTERVAL, _LEAST_INTERVALS = 24, 2, 3
+# Intervals of the drift over time: half a minute of four minutes, and at least five turns.
+_MOST_DRIFT_INTERVALS, _TURNS_A_DRIFT = 8, 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,26 +63,26 @@ class PolarBasis:
 
     @property
     def waves(self) -> int:
-        """Functions of the angle: 1, cos θ … cos Mθ, sin θ … sin Mθ."""
+        """Number of functions of the angle: 1, cos θ … cos Mθ, sin θ … sin Mθ."""
         return 2 * self.harmonics + 1
 
     @property
     def size(self) -> int:
-        """Terms of the surface, spline by spline."""
+        """Number of terms of the surface, spline by spline."""
         return (self.intervals + SUPPORT - 1) * self.waves
 
     @property
     def width(self) -> float:
-        """Of one interval [m]."""
+        """Width of one interval [m]."""
         return (self.outer - self.inner) / self.intervals
 
     def interval(self, radius: FloatArray) -> IntArray:
-        """Return the interval in which ``radius`` (n,) [m] lies, (n,)."""
+        """Return the interval of each ``radius`` (n,) [m], (n,)."""
         place = ((radius - self.inner) / self.width).astype(np.int64)
         return np.asarray(np.clip(place, 0, self.intervals - 1), np.int64)
 
     def terms(self, interval: int) -> slice:
-        """Return where the terms that differ from zero in ``interval`` stand among all."""
+        """Return the slice of the terms that differ from zero in ``interval``."""
         return slice(interval * self.waves, (interval + SUPPORT) * self.waves)
 
     def amplitudes(self, coefficients: FloatArray) -> FloatArray:
@@ -81,7 +96,7 @@ class PolarBasis:
         return np.asarray(np.sqrt(power[: self.harmonics] + power[self.harmonics :]))
 
     def rows(self, interval: int, radius: FloatArray, angle: FloatArray) -> PolarRows:
-        """Return the terms of ``interval`` at points (n,) in it, or just beside it."""
+        """Return the terms of ``interval`` at points (n,) in it or near it."""
         u = (radius - self.inner) / self.width - interval
         powers = u[:, np.newaxis] ** np.arange(4)
         wave = np.exp(1j * angle)
@@ -135,19 +150,6 @@ def _turned(shape: FloatArray) -> FloatArray:
     return np.concatenate([np.zeros((SUPPORT, 1)), order * sines, -order * cosines], axis=1)
 
 
-# Least squares with a surface common to all scans, eliminated.
-#
-# ``y = B a + X p + e``: B are the terms of the surface, X a few columns whose parameters p are
-# asked for. With ``C = (BᵀB)⁻¹ BᵀX`` the columns free of the surface are ``X - B C``; the
-# surface may take any shape without touching p. Rows are made anew from the scans in portions,
-# so memory holds the normal equations and one portion.
-
-# Keeps a term that no point sees at zero; of the others it takes 1e-12 of their size.
-_RIDGE = 1e-12
-# The terms of a portion, 4 MB, stay in the cache.
-_PORTION = 5_000
-
-
 @dataclass(frozen=True, eq=False)
 class IntervalRows:
     """Points of one interval of radius: which (n,), and the surface's terms there."""
@@ -158,14 +160,14 @@ class IntervalRows:
 
 
 Columns = Callable[[IntervalRows], tuple[FloatArray, FloatArray]]
-"""From a portion of n points to X (n, p) and y (n,)."""
+"""Function of a portion of n points that returns X (n, p) and y (n,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReducedNormalEquations:
-    """Of the parameters alone.
+    """Normal equations of the parameters, with the surface eliminated.
 
-    matrix, right, square: (p, p), (p,) and yᵀy, the surface eliminated
+    matrix, right, square: (p, p), (p,) and yᵀy
     shares: C (terms, p);  surface: coefficients when p = 0, (terms,)
     """
 
@@ -176,11 +178,11 @@ class ReducedNormalEquations:
     surface: FloatArray
 
     def misfit(self, parameters: FloatArray) -> float:
-        """Return the sum of squares that ``parameters`` (p,) and the best surface leave."""
+        """Return the residual sum of squares of ``parameters`` (p,) with the best surface."""
         return float(self.square + parameters @ (self.matrix @ parameters - 2 * self.right))
 
     def surface_of(self, parameters: FloatArray) -> FloatArray:
-        """Return the coefficients of the surface (terms,) that goes with ``parameters`` (p,)."""
+        """Return the coefficients of the best surface (terms,) for ``parameters`` (p,)."""
         return np.asarray(self.surface - self.shares @ parameters)
 
 
@@ -189,8 +191,8 @@ def portions(
 ) -> Iterator[IntervalRows]:
     """Yield all points in portions of one interval each.
 
-    order: points sorted by their interval, in time within it;  interval: of each point
-    radius, angle: where each point lies [m], [rad]
+    order: points sorted by interval and time;  interval: of each point
+    radius, angle: of each point [m], [rad]
     """
     edges = np.searchsorted(interval[order], np.arange(basis.intervals + 1))
     for number, (first, last) in enumerate(pairwise(edges)):
@@ -202,7 +204,7 @@ def portions(
 def normal_equations(
     basis: PolarBasis, parts: Iterator[IntervalRows], columns: Columns
 ) -> ReducedNormalEquations:
-    """Gather ``parts`` and eliminate the surface."""
+    """Return the normal equations of all ``parts`` with the surface eliminated."""
     size = basis.size
     of_surface, mixed, own = np.zeros((size, size)), np.zeros((size, 0)), np.zeros((0, 0))
     for part in parts:
@@ -227,54 +229,33 @@ def normal_equations(
     )
 
 
-LAG, CURVATURE, GAIN, LATENCY = range(4)
-DYNAMIC = 4
-CLOCKING = 0
-OWN = ("clocking", "shift_x", "shift_y", "tilt_x", "tilt_y")
-# Nearer to the axis a degree is less than the spacing of points, and no harmonic is seen.
-_INNER_SHARE = 0.01
-# Half a millimetre on a part of 25 mm; there are at least two turns in an interval.
-_MOST_INTERVALS, _TURNS_AN_INTERVAL, _LEAST_INTERVALS = 24, 2, 3
-# Thermal drift, as slow as half a minute over four minutes, and slower than a few turns.
-_MOST_DRIFT_INTERVALS, _TURNS_A_DRIFT = 8, 5
-
-
 @dataclass(frozen=True, slots=True)
 class ScanPlacement:
-    """Where the surface is evaluated: latency [s], and clocking of each scan [rad], (scans,)."""
+    """Point of linearisation: latency [s], and clocking of each scan [rad], (scans,)."""
 
     latency: float
     clocking: FloatArray
 
 
 class ScanModel:
-    """All points of all scans, and the columns of the parameters at each.
+    """Points of all scans, with the columns of the parameters.
 
-    Parameters: lag, curvature, gain, latency; then of each scan but the first: clocking, shift
-    and tilt, and its drift over time.
+    Parameters: lag, curvature, gain, latency; then for each scan except the first: clocking, shift
+    and tilt, and drift over time.
 
-    Raises DataError for fewer than two scans.
+    Raises DataError for fewer than two scans, or scans without a common ring.
     """
 
     def __init__(self, scans: Sequence[ScanColumns], harmonics: int) -> None:
         if len(scans) < 2:
-            raise DataError(
-                f"{len(scans)} scan, expected two or more of one part, at different speeds or "
-                "in opposite directions"
-            )
+            raise DataError("adjustment.one_scan", scans=len(scans))
         outer = min(float(np.max(s.radius)) for s in scans)
         inner = max(_INNER_SHARE * outer, *(float(np.min(s.radius)) for s in scans))
         if not inner < outer:
-            raise DataError(
-                f"the scans share no ring: one begins at a radius of {inner!r} m, another ends at "
-                f"{outer!r} m; scan the same part of the surface"
-            )
+            raise DataError("adjustment.no_common_ring", inner=inner, outer=outer)
         within = [(s.radius >= inner) & (s.radius <= outer) for s in scans]
         if not all(map(np.any, within)):
-            raise DataError(
-                f"a scan has no points between radii of {inner!r} and {outer!r} m, which the scans "
-                "share; scan the same part of the surface"
-            )
+            raise DataError("adjustment.no_points_in_ring", inner=inner, outer=outer)
         self.number = len(scans)
         self.scan: IntArray = np.repeat(
             np.arange(len(scans)), [np.count_nonzero(w) for w in within]
@@ -299,11 +280,11 @@ class ScanModel:
     def speeds(self) -> list[float]:
         """Median spindle speed of each scan [rad/s], with the sign of its C."""
         rate = self._column["angular_rate"]
-        # The probe goes round the part against the turn of C.
+        # The probe moves over the part against the rotation of C.
         return [-float(np.median(rate[self.scan == k])) for k in range(self.number)]
 
     def own(self, scan: int) -> slice:
-        """Return where clocking, shift and tilt of ``scan`` (1, 2, …) are among the parameters."""
+        """Return the slice of clocking, shift and tilt of ``scan`` (1, 2, …)."""
         begin = DYNAMIC + sum(len(OWN) + self._drifts[k].size for k in range(1, scan))
         return slice(begin, begin + len(OWN))
 
@@ -321,7 +302,7 @@ class ScanModel:
         return np.asarray(self._column["angle"][part.points])
 
     def portions(self, place: ScanPlacement, every: int) -> Iterator[IntervalRows]:
-        """Yield one point in ``every``, the surface's terms evaluated at ``place``."""
+        """Yield one of ``every`` points, with the terms of the surface at ``place``."""
         column = self._column
         radius = column["radius"] - place.latency * column["radial_rate"]
         turned = place.latency * column["angular_rate"] + place.clocking[self.scan]
@@ -333,7 +314,7 @@ class ScanModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Return X (n, parameters) and y (n,) of the points of ``part``.
 
-        surface: coefficients from before, for its slopes; None leaves out what needs them
+        surface: coefficients for its slopes; None leaves out the columns that need them
         """
         column = {name: values[part.points] for name, values in self._column.items()}
         scan = self.scan[part.points]
@@ -341,7 +322,7 @@ class ScanModel:
         y = column["height"].copy()
         x[:, LAG] = column["motion_rate"]
         x[:, CURVATURE] = -column["motion_acceleration"]
-        # ε d = ε (S - H(z)), and εS is a surface too.
+        # ε d = ε (S - H(z)), and εS is absorbed by the surface.
         x[:, GAIN] = -column["motion"]
         position = column["radius"] * np.exp(1j * column["angle"])
         for k in range(1, self.number):
@@ -355,7 +336,7 @@ class ScanModel:
         here = surface[self.basis.terms(part.interval)]
         radial, angular = part.rows.derivatives(here)
         x[:, LATENCY] = -(radial * column["radial_rate"] + angular * column["angular_rate"])
-        # Both were taken at ``place``; with what they did there added, they are counted from zero.
+        # The values are linearised at ``place``; this offset makes the parameters absolute.
         y += x[:, LATENCY] * place.latency - angular * place.clocking[scan]
         gradient = (radial + 1j * angular / column["radius"]) * position / column["radius"]
         for k in range(1, self.number):
@@ -368,7 +349,7 @@ class ScanModel:
 
 @dataclass(frozen=True)
 class _Drift:
-    """A cubic spline of time over ``duration`` [s], its constant included."""
+    """Cubic spline over ``duration`` [s], including its constant."""
 
     duration: float
     intervals: int
@@ -390,5 +371,5 @@ def _turns(scan: ScanColumns) -> float:
     period = float(np.median(np.diff(scan.time)))
     turns = float(np.sum(np.abs(scan.angular_rate))) * period / (2 * np.pi)
     if not np.isfinite(turns):
-        raise DataError("the pace of C is not known at every point of a scan; record it again")
+        raise DataError("adjustment.unknown_speed")
     return turns

@@ -1,7 +1,7 @@
-"""A scan as self-calibration and reversal see it: heights, where on the part, how Z moved.
+"""Read a scan for self-calibration and reversal: heights, places on the part, motion of Z.
 
-Axes hardly ever drop out, so velocities are taken from them alone, by a local polynomial
-(Savitzky-Golay); a reading that is missing costs its own point only, an axis' its neighbours too.
+Velocities follow from the axes by a local polynomial (Savitzky-Golay). A missing reading costs one
+point, a missing axis sample its neighbours too.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from omsm_ros.core.streams.blocks import AxisBlock, BoolArray, FloatArray, unint
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.errors import DataError
 
-# One turn a second at 1 kHz; fewer points do not determine a surface.
+# A turn of one second at 1 kHz; fewer points do not determine a surface.
 _LEAST_POINTS = 1000
-# Of one scan: 72 bytes each; a portion of them at a time is made into rows of the fit.
+# Points of a scan that are kept, 72 bytes each.
 _MOST_POINTS = 500_000
-# A fourth-order polynomial over ±12 ms: at the 12th harmonic of a turn a second the velocity
-# is 1 % short, of an amplitude that is nanometres; at the second harmonic it is exact to 2e-6.
+# Window of the fourth-order polynomial: the velocity is 1 % low at 12 Hz, where amplitudes are
+# nanometres, and exact to 2e-6 at 2 Hz.
 _HALF_WINDOW_S = 12e-3
 _POLYNOMIAL = 4
-# Enough for a steady pace, few enough to be held.
+# Points that are processed at a time.
 _PORTION_SAMPLES = 20_000
 _COLUMNS = ("time", "radius", "angle", "radial_rate", "angular_rate", "height", "motion_rate",
             "motion_acceleration", "motion")  # fmt: skip
@@ -35,11 +35,11 @@ _COLUMNS = ("time", "radius", "angle", "radial_rate", "angular_rate", "height", 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanColumns:
-    """A scan, each array (n,), in the order of time.
+    """Points of a scan in the order of time, each array (n,).
 
     time: since the first sample [s];  radius, angle: on the part [m], [rad]
     radial_rate, angular_rate: of the slides over the part [m/s], [rad/s]
-    height: H(z) plus true distance [m];  motion: H(z) [m]
+    height: H(z) plus distance [m];  motion: H(z) [m]
     motion_rate, motion_acceleration: of the Z encoder [m/s], [m/s²]
     """
 
@@ -58,9 +58,9 @@ class ScanColumns:
 
 
 class ScanReader:
-    """Gathers a scan that comes in portions, in bounded memory.
+    """Collects a scan that comes in portions, in bounded memory.
 
-    points: how many came;  used: how many, evenly chosen, are kept to be fitted
+    points: number received;  used: number kept for the fit, evenly chosen
     """
 
     def __init__(self, sample_period: float) -> None:
@@ -79,37 +79,33 @@ class ScanReader:
 
     @property
     def used(self) -> int:
-        """Points that are kept."""
+        """Number of points kept."""
         return len(self._kept)
 
     def add_axes(self, block: AxisBlock) -> None:
-        """Take in the next axis block, before the points that come of it."""
+        """Add an axis block, before the points that are computed from it."""
         if self._first is None:
             self._first = block.first_sample
         self._axes += _known_parts(block)
 
     def add(self, points: SurfacePoints) -> None:
-        """Take in the next points, corrected with no geometry and no lateral lag."""
+        """Add points that were corrected without geometry and without latency."""
         self.points += len(points)
         self._points.append(points)
         if sum(map(len, self._points)) > _PORTION_SAMPLES:
             self._keep_complete(last=False)
 
     def columns(self) -> ScanColumns:
-        """Return the points kept, once all have come.
-
-        Raises DataError for a scan that is too short.
-        """
+        """Return the kept points at the end of the scan; raise DataError for a short scan."""
         self._keep_complete(last=True)
         if self.used < _LEAST_POINTS:
             raise DataError(
-                f"scan of {self.points} points, {self.used} of them with all their neighbours; "
-                f"expected {_LEAST_POINTS} or more: record a longer scan"
+                "adjustment.short_scan", points=self.points, used=self.used, least=_LEAST_POINTS
             )
         return ScanColumns(**dict(zip(_COLUMNS, self._kept.rows().T, strict=True)))
 
     def _keep_complete(self, *, last: bool) -> None:
-        """Keep the points whose neighbourhood is known; those at the ends of a run have none."""
+        """Keep the points with known neighbours, which the ends of a run do not have."""
         points = join_points(self._points)
         if not self._axes or not len(points):
             return
@@ -118,7 +114,7 @@ class ScanReader:
             known = (points.sample >= begin + self._half) & (points.sample < end - self._half)
             if known.any():
                 self._keep(run, points, known)
-        # A point of the newest run may still wait for the axes that follow it.
+        # Points at the end of the newest run wait for the following axis samples.
         waits = (points.sample >= end - self._half) & (not last)
         self._points = [points.part(slice(int(np.argmax(waits)), None))] if waits.any() else []
         needed = points.sample[-1] - 2 * self._half
@@ -150,7 +146,7 @@ class ScanReader:
 
 
 def _known_parts(block: AxisBlock) -> Iterator[AxisBlock]:
-    """Yield what lies between samples that were lost: a gap, whichever way they went missing."""
+    """Yield the parts of ``block`` between lost samples."""
     columns = {name: getattr(block, name) for name in "xyzbc"}
     known = np.all(np.isfinite([*columns.values()]), axis=0)
     edges = [0, *(np.flatnonzero(np.diff(known)) + 1), len(block)]
@@ -164,7 +160,7 @@ def _known_parts(block: AxisBlock) -> Iterator[AxisBlock]:
 
 
 def read_scan(axes: AxisBlock, points: SurfacePoints) -> ScanColumns:
-    """Return the scan behind ``points``, which all come of one block."""
+    """Return the scan behind ``points`` that were computed from one block."""
     reader = ScanReader(axes.sample_period)
     reader.add_axes(axes)
     reader.add(points)

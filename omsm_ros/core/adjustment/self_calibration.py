@@ -1,10 +1,9 @@
-"""What do scans of one part, at different speeds or directions, say of the dynamics?
+"""Estimate the dynamics from scans of one part at different speeds or directions.
 
-The surface is common to all scans and eliminated (:mod:`eliminated_surface`); what grows with
-the speed, or turns with the direction, remains (:mod:`scan_model`). Gauss-Newton on latency
-and clocking; all else is linear. The covariance comes from the residuals of whole rings of
-the part, all scans together, so that texture, vibration and spindle error, which are the same
-at the same place or last for turns, do not pass for knowledge.
+The surface is common to all scans and is eliminated; effects that depend on speed or direction
+remain, see :mod:`omsm_ros.core.adjustment.scan_model`. Gauss-Newton on latency and clocking; all
+other parameters are linear. The covariance follows from the residuals of whole rings of the part,
+because texture, vibration and spindle error are correlated within a ring and between scans.
 """
 
 from __future__ import annotations
@@ -29,28 +28,61 @@ from omsm_ros.core.adjustment.scan_model import (
 from omsm_ros.core.adjustment.scan_reader import ScanColumns
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError
+from omsm_ros.units import RPM_RAD_S
 
-# Do scans of one part agree, once all is fitted in which they may differ?
-#
-# What remains in each scan is averaged over rings and harmonics of the angle. Noise leaves of
-# it what its number of points predicts; a part that moved, or dynamics that are not those of
-# the model, leave more.
-
-# Coarser than the surface's own terms, and as far as dynamics of slow axes reach.
+# Rings and harmonics of the residuals, coarser than the terms of the surface.
 RINGS, HARMONICS = 12, 8
-# Twice what noise predicts: clean scans of the twin give 0.5 to 1.1, for the fit takes its part.
+# Twice the power that noise predicts; clean scans of the twin give 0.5 to 1.1.
 _GREATEST_RATIO = 2.0
-# What is smaller than this does not matter to any accuracy asked of the method.
+# A smaller disagreement is below the accuracy of the method.
 _LEAST_DISAGREEMENT_M = 2e-9
+# Rings for the covariance of the parameters, at least a turn wide.
+_MOST_RINGS, _LEAST_RINGS = 60, 12
+# The off-axis mirror of the paper has 2 nm in the sixth harmonic, and 4 pm in the eighth.
+DEFAULT_HARMONICS = 12
+# A tenth of a second of arc, the repeatability of the index of a good rotary encoder.
+DEFAULT_CLOCKING_RAD = 5e-7
+# Motion of a part that stays on the chuck, by warming. On an off-axis paraboloid shift and tilt
+# together look like clocking, so these limit the result.
+DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
+# Standard deviation of a prior without information that keeps the matrix regular.
+_FREE = 1e6
+# Start value of the noise, replaced after the first step.
+_NOISE_M = 10e-9
+# Change over the standard deviation of the prior that counts as harmless: some nanoseconds, below
+# what a step test resolves.
+_HARMLESS = 0.03
+# Lower bounds of stated uncertainties, far below any effect: picometres and picoradians; and for
+# lag [s], curvature [s²], gain and latency [s].
+_LEAST_STATED = 1e-12
+_FLOOR = np.array([1e-9, 1e-13, 1e-9, 1e-9])
+# A clocking uncertainty above this means a part that was mounted again.
+_REMOUNTED_RAD = 1e-4
+# Parameters without which the others are still determined; the least important first.
+_MAY_REMAIN_UNDETERMINED = (LATENCY, CURVATURE)
+# Convergence is quadratic; 10 ns are 0.02 nm on a scan with 2 mm/s.
+_ITERATIONS = 6
+_CONVERGED_S = 1e-8
+# Points of the iteration; they give a lag to a microsecond.
+_ENOUGH_POINTS = 40_000
+# A parameter is determined by the scans if they narrow its prior to this share.
+_KNOWN = 0.01
+# A larger uncertainty of the lag rests on terms that are not modelled.
+_USEFUL_S = 20e-6
+# Standard uncertainties without a step test: a lag longer than any that is searched; the curvature
+# of a mode at 2.5 Hz with a thousandth of the motion has 4e-6 s²; the gain of a probe to 1 %.
+UNINFORMATIVE_S = 10e-3
+UNINFORMATIVE_CURVATURE_S2 = 1e-4
+UNINFORMATIVE_GAIN = 1e-2
 
 
 @dataclass(frozen=True)
 class ScanConsistency:
-    """How far the scans differ where they should not.
+    """Agreement of the scans after the fit.
 
-    ratio: mean square of what is left in rings and harmonics over what noise predicts [1]
-    disagreement: rms over the part of what is left beyond noise [m]
-    noise: of a reading, from one to the next [m]
+    ratio: mean square of the residuals in rings and harmonics over the prediction from noise [1]
+    disagreement: rms of the residuals in excess of noise [m]
+    noise: of a reading, from successive differences [m]
     """
 
     ratio: float
@@ -59,12 +91,12 @@ class ScanConsistency:
 
     @property
     def holds(self) -> bool:
-        """False if the scans contradict each other by more than noise, and visibly."""
+        """False if the scans differ significantly and by more than 2 nm."""
         return self.ratio < _GREATEST_RATIO or self.disagreement < _LEAST_DISAGREEMENT_M
 
 
 class ScanConsistencySums:
-    """Gathers residuals of ``scans`` scans between the radii ``inner`` and ``outer`` [m]."""
+    """Collects residuals of ``scans`` scans between the radii ``inner`` and ``outer`` [m]."""
 
     def __init__(self, scans: int, inner: float, outer: float) -> None:
         self._inner, self._width = inner, (outer - inner) / RINGS
@@ -73,7 +105,7 @@ class ScanConsistencySums:
         self._jumps, self._jump_count = 0.0, 0
 
     def add(self, scan: int, radius: FloatArray, angle: FloatArray, residual: FloatArray) -> None:
-        """Take in points (n,) of one scan, in the order of time."""
+        """Add points (n,) of one scan, in the order of time."""
         ring: IntArray = np.clip((radius - self._inner) // self._width, 0, RINGS - 1).astype(int)
         wave = np.exp(-1j * angle)
         turned = residual.astype(np.complex128)
@@ -86,32 +118,23 @@ class ScanConsistencySums:
         self._jump_count += max(len(residual) - 1, 0)
 
     def result(self) -> ScanConsistency:
-        """Weigh all that came."""
+        """Return the agreement of all residuals."""
         variance = self._jumps / max(2 * self._jump_count, 1)
         seen = self._counts > 0
         count = self._counts[seen][:, np.newaxis]
         power = abs(self._sums[seen]) ** 2
-        # The sum of n values of white noise times cos and sin has the variance n in all.
+        # The power of n values of white noise at a harmonic is n times their variance.
         ratio = float(np.mean(power / (count * variance))) if variance > 0 else 0.0
         excess = np.maximum(2 * (power - count * variance) / count**2, 0.0)
         mean_square = np.average(np.sum(excess, axis=1), weights=count[:, 0])
         return ScanConsistency(ratio, float(np.sqrt(mean_square)), float(np.sqrt(variance)))
 
 
-# How far do residuals let parameters vary, if a whole ring of the part varies as one?
-#
-# Points next to each other, and the same place in all scans, share texture, vibration and
-# spindle error; as independent points they would pass for more knowledge than they are.
-
-# Enough for a covariance of the parameters, few enough to be turns apart.
-_MOST_RINGS, _LEAST_RINGS = 60, 12
-
-
 class RingScores:
-    """Gathers residuals portion by portion, at the end of a fit.
+    """Collects scores of residuals by ring, for a covariance that is robust to correlation.
 
-    shares: the surface's terms in each column, from the normal equations
-    square: sum of the squared residuals so far;  agreement: of the scans with each other
+    shares: of the terms of the surface in each column, from the normal equations
+    square: sum of squared residuals so far;  agreement: of the scans
     """
 
     def __init__(self, model: ScanModel, shares: FloatArray) -> None:
@@ -131,7 +154,7 @@ class RingScores:
         parameters: FloatArray,
         surface: FloatArray,
     ) -> None:
-        """Take in a portion: its columns x (n, parameters) and heights y (n,), and the solution."""
+        """Add a portion with columns x (n, parameters), heights y (n,), and the solution."""
         model, basis = self._model, self._model.basis
         terms, here = part.rows.matrix(), basis.terms(part.interval)
         residual = y - x @ parameters - terms @ surface[here]
@@ -162,48 +185,15 @@ class RingScores:
         return float(np.sqrt(max(mean_square, 0.0)))
 
 
-# The paper's off-axis mirror has 2 nm in the sixth harmonic, and 4 pm in the eighth.
-DEFAULT_HARMONICS = 12
-# A tenth of a second of arc: what the index of a good rotary encoder repeats to.
-DEFAULT_CLOCKING_RAD = 5e-7
-# A part that stays on the chuck moves by warming alone; on an off-axis paraboloid a shift and
-# a tilt together look like clocking, so what is allowed here limits what can be determined.
-DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
-# A prior as wide as this is none, yet the matrix stays regular.
-_FREE = 1e6
-# Where the noise is looked for; the residuals tell it after one step.
-_NOISE_M = 10e-9
-# Of the prior's standard deviation. Two scans of one speed, or of opposite ones, hardly tell lag
-# from surface: they move it by a few ns, more than they should and less than anybody could see.
-_HARMLESS = 0.03
-# Keep what is exactly known from dividing by zero: picometres and picoradians; ns, as². Far below
-# any effect.
-_LEAST_STATED = 1e-12
-_FLOOR = np.array([1e-9, 1e-13, 1e-9, 1e-9])
-# No encoder repeats as badly; who states so means a part mounted by hand.
-_REMOUNTED_RAD = 1e-4
 _NONE: BoolArray = np.zeros(DYNAMIC, np.bool_)
-# Without them the rest is still worth having; the one that costs least goes first.
-_MAY_REMAIN_UNDETERMINED = (LATENCY, CURVATURE)
-# Each step squares the error that is left; 10 ns are 0.02 nm on the paper's scan.
-_ITERATIONS = 6
-_CONVERGED_S = 1e-8
-# They tell a lag to a microsecond, and what a step leaves is of second order in that.
-_ENOUGH_POINTS = 40_000
-# What the scans narrow to less than this part of what was assumed is known from them.
-_KNOWN = 0.01
-# Worse than this, 40 nm on the paper's scan, it rests on terms that are not modelled.
-_USEFUL_S = 20e-6
-# A lag known no better than this is no knowledge: longer than any that is looked for.
-_LONGEST_LAG_S = 10e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known before: covariance of lag [s], curvature [s²], gain [1], latency [s], (4, 4).
+    """Prior covariance of lag [s], curvature [s²], gain [1] and latency [s], (4, 4).
 
-    clocking, shift, tilt: of the part from scan to scan, standard uncertainties [rad], [m], [rad];
-        10 for a clocking that nobody knows, because the part was mounted anew
+    clocking, shift, tilt: standard uncertainties of the part from scan to scan [rad], [m], [rad];
+        a clocking of 10 rad for a part that was mounted again
     """
 
     covariance: FloatArray
@@ -212,26 +202,19 @@ class Prior:
     tilt: float = DEFAULT_TILT_RAD
 
 
-UNINFORMATIVE_S = _LONGEST_LAG_S
-# A mode at 2.5 Hz with a thousandth of the motion has 4e-6 s².
-UNINFORMATIVE_CURVATURE_S2 = 1e-4
-# The paper's probe is 0.8 % off.
-UNINFORMATIVE_GAIN = 1e-2
-
-
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """What the scans determine, in the names of :mod:`scan_model`.
+    """Result of self-calibration.
 
     values, covariance: of lag, curvature, gain, latency, with the prior, (4,) and (4, 4); the
-        gain stays as it was, and its uncertainty counts
+        gain keeps its prior value and uncertainty
     known: which of them the scans or the prior determine, (4,);  speeds: of the scans [rad/s]
-    residual: rms [m];  followed: standard uncertainty that the four leave on the heights of
-        this surface, rms [m];  agreement: of the scans with each other
+    residual: rms [m];  agreement: of the scans with each other
+    followed: rms standard uncertainty of the heights of this surface from the four parameters [m]
     prior_conflict: χ² of lag and curvature against the prior, 2 degrees of freedom
-    own, own_uncertainty: clocking [rad], shift [m] and tilt [rad] of each scan but the first
+    own, own_uncertainty: clocking [rad], shift [m] and tilt [rad] of each scan except the first
     amplitudes: rms over the part of each harmonic of the surface, from 1 [m]
-    points: fitted
+    points: number of fitted points
     """
 
     values: FloatArray
@@ -249,7 +232,7 @@ class SelfCalibration:
 
     @property
     def structure(self) -> tuple[float, float]:
-        """Lag less latency, as far as the correction had it wrong, and its uncertainty [s]."""
+        """Error of lag less latency in the correction, and its uncertainty [s]."""
         direction = np.zeros(DYNAMIC)
         direction[LAG], direction[LATENCY] = 1.0, -1.0
         variance = float(direction @ self.covariance @ direction)
@@ -259,41 +242,32 @@ class SelfCalibration:
 def self_calibrate(
     scans: Sequence[ScanColumns], prior: Prior, harmonics: int = DEFAULT_HARMONICS
 ) -> SelfCalibration:
-    """Return what two or more scans of one part say of the dynamics.
+    """Return the estimate of the dynamics from two or more scans of one part.
 
-    Raises DataError where they say nothing: one speed and direction, a surface
-    without slope along the path, a part that was re-mounted, or no noise at all.
+    Raises DataError where they determine nothing: one speed and direction, a surface without slope
+    along the path, a part that was mounted again, or data without noise.
     """
     model = ScanModel(scans, harmonics)
     fit = _Fit(model, prior)
-    if not fit.tells:
-        raise DataError(_undetermined(model, prior))
+    if not fit.determined:
+        raise _undetermined(model, prior)
     for index in _MAY_REMAIN_UNDETERMINED:
         if fit.unknown[index]:
             fit = fit.without(index)
     return fit.result()
 
 
-def _undetermined(model: ScanModel, prior: Prior) -> str:
-    speeds = ", ".join(f"{s * 30 / np.pi:.1f}" for s in model.speeds)
+def _undetermined(model: ScanModel, prior: Prior) -> DataError:
     if prior.clocking > _REMOUNTED_RAD:
-        return (
-            "a part that was mounted anew is turned by an unknown angle, which looks as a lag "
-            "does; scan it at both speeds without taking it off, or state how well it was clocked"
-        )
+        return DataError("adjustment.remounted_part")
+    speeds = [f"{speed / RPM_RAD_S:.1f}" for speed in model.speeds]
     if np.ptp(model.speeds) < _KNOWN * max(map(abs, model.speeds)):
-        return (
-            f"the scans all run at {speeds} rpm, so a lag is the same in each and passes for the "
-            "surface; scan at another speed, or in the other direction"
-        )
-    return (
-        f"the scans at {speeds} rpm do not show a lag: the surface does not change along the path; "
-        "scan one that is not symmetric about the spindle"
-    )
+        return DataError("adjustment.equal_speeds", speeds=speeds)
+    return DataError("adjustment.symmetric_surface", speeds=speeds)
 
 
 class _Fit:
-    """Gauss-Newton with a prior; linear but for latency and clocking."""
+    """Gauss-Newton fit with a prior; nonlinear in latency and clocking only."""
 
     def __init__(self, model: ScanModel, prior: Prior, omitted: BoolArray = _NONE) -> None:
         self._model, self._prior, self._omitted = model, prior, omitted
@@ -306,21 +280,21 @@ class _Fit:
         self._iterate()
 
     def without(self, index: int) -> _Fit:
-        """Return the same fit with one of the four held, which the scans do not determine."""
+        """Return the fit with one of the four dynamic parameters held at its prior."""
         covariance = _with_fixed(self._prior.covariance, index)
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
         return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
 
     @property
-    def tells(self) -> bool:
-        """False if the scans leave lag less latency as open as it was."""
+    def determined(self) -> bool:
+        """True if the scans determine lag less latency."""
         inverse, two = _inverse(self._matrix), [LAG, LATENCY]
         (lag, mixed), (_, latency) = inverse[np.ix_(two, two)]
         return bool(lag - 2 * mixed + latency < _USEFUL_S**2)
 
     @property
     def unknown(self) -> BoolArray:
-        """Which of the four neither the prior nor the scans determine, (4,)."""
+        """Which of the four parameters neither the prior nor the scans determine, (4,)."""
         inverse = _inverse(self._matrix)
         posterior = np.diag(inverse + self._by_gain(inverse))[:DYNAMIC]
         assumed = np.diag(self._prior.covariance)
@@ -331,12 +305,12 @@ class _Fit:
         )
         limit = _KNOWN**2 * assumed
         if uninformative[LAG]:
-            # Without a step test latency shows in third order of the following error alone.
+            # Without a step test latency has a third-order effect of the following error only.
             limit[LATENCY] = _USEFUL_S**2
         return np.asarray(self._omitted | (uninformative & (posterior > limit)))
 
     def _iterate(self) -> None:
-        """Converge on some of the points; for that is only to know where to linearise."""
+        """Converge on a selection of the points, to find the point of linearisation."""
         every = max(len(self._model) // _ENOUGH_POINTS, 1)
         for _ in range(_ITERATIONS):
             before, started = self._place.latency, self._surface is not None
@@ -355,17 +329,14 @@ class _Fit:
         parameters = _inverse(self._matrix) @ equations.right * (every / self._variance)
         self._variance = every * equations.misfit(parameters) / len(model)
         if not self._variance > 0:
-            raise DataError(
-                "the scans show one surface to the last digit, without any noise, so nothing "
-                "tells how sure a lag is; check that the probe was connected and saw the part"
-            )
+            raise DataError("adjustment.no_noise")
         self._surface = equations.surface_of(parameters)
         self._equations, self._parameters = equations, parameters
         clocking = [parameters[model.own(k).start + CLOCKING] for k in range(1, model.number)]
         self._place = ScanPlacement(float(parameters[LATENCY]), np.array([0.0, *clocking]))
 
     def result(self) -> SelfCalibration:
-        """Return the residuals, covariance by rings, and what is said of the scans."""
+        """Return the result from all points, with the covariance by rings."""
         self._step(every=1)
         model, parameters = self._model, self._parameters
         seen = RingScores(model, self._equations.shares)
@@ -402,10 +373,10 @@ class _Fit:
         )
 
     def _by_gain(self, inverse: FloatArray) -> FloatArray:
-        """Return what an uncertain gain adds to the covariance, (parameters, parameters).
+        """Return the effect of the uncertain gain on the covariance, (parameters, parameters).
 
-        It is not estimated: on a surface that Z follows it shows in third order of the following
-        error only, where other terms that are not modelled show too.
+        The gain is not estimated: on a surface that Z follows its effect is of third order in the
+        following error, like other terms that are not modelled.
         """
         column = self._matrix[:, GAIN].copy()
         column[GAIN] = 0.0
@@ -417,7 +388,7 @@ class _Fit:
 def _inverse(matrix: FloatArray) -> FloatArray:
     """Return the inverse of a positive matrix whose rows have different units.
 
-    A direction that is lost in rounding is as little known as rounding lets one say.
+    Eigenvalues are bounded from below by rounding.
     """
     scale = 1 / np.sqrt(np.diag(matrix))
     values, vectors = np.linalg.eigh(matrix * scale * scale[:, np.newaxis])
@@ -439,7 +410,7 @@ def _precision(model: ScanModel, prior: Prior) -> FloatArray:
 
 
 def _with_fixed(covariance: FloatArray, index: int) -> FloatArray:
-    """Return the same with one quantity at its value."""
+    """Return the covariance with zero uncertainty of one parameter."""
     held = covariance.copy()
     held[index], held[:, index] = 0.0, 0.0
     return held
@@ -448,17 +419,18 @@ def _with_fixed(covariance: FloatArray, index: int) -> FloatArray:
 def _prior_conflict(
     values: FloatArray, prior: FloatArray, inverse: FloatArray, covariance: FloatArray
 ) -> float:
-    """Return χ² of lag and curvature against what was known before, harmless moves set aside.
+    """Return χ² of lag and curvature against the prior, insensitive to harmless changes.
 
-    values: (2,);  prior: (2, 2);  inverse, covariance: of the normal matrix with the prior in it,
-        and by rings, (2, 2)
-    With P the inverse of the normal matrix and Λ the precision of the prior the values move by
-    ``P (H x + noise)``, x spread as the prior says: variance ``Λ⁻¹ - 2 P + covariance``.
+    values: (2,);  prior: (2, 2);  inverse: of the normal matrix including the prior (2, 2)
+    covariance: by rings (2, 2)
+
+    With P the inverse of the normal matrix and Λ the precision of the prior, the values change by
+    ``P (H x + noise)`` with x distributed as the prior: variance ``Λ⁻¹ - 2 P + covariance``.
     """
     known = prior + np.diag(_FLOOR[:GAIN] ** 2)
     unit = np.sqrt(np.diag(known))
     expected = (known - 2 * inverse + covariance) / (unit * unit[:, np.newaxis])
     spread, directions = np.linalg.eigh(expected)
     moved = directions.T @ (values / unit)
-    # Scans that tell next to nothing move nothing, or by less than a step test would notice.
+    # The floor keeps χ² small where scans with little information change the values slightly.
     return float(np.sum(moved**2 / (np.maximum(spread, 0.0) + _HARMLESS**2)))

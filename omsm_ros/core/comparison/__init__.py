@@ -1,1 +1,1 @@
-"""Do two measurements of one part agree? The same places, the difference, what it is worth."""
+"""Compare two measurements of one part: match, subtract, test the agreement."""

@@ -1,4 +1,4 @@
-"""What an accelerometer feels: lines of acceleration, and the height that each may move."""
+"""Lines and levels of measured acceleration, and the height error that they may cause."""
 
 from __future__ import annotations
 
@@ -17,15 +17,21 @@ from omsm_ros.core.streams.blocks import SAME_PERIOD, AccelerationBlock, FloatAr
 from omsm_ros.errors import ConfigurationError, DataError
 
 AXES = ("x", "y", "z")
-# As few frequencies as a floor of noise can be found among.
+PROBE, SLIDE = "probe", "carriage"
+"""Where the accelerometer is mounted: on the probe, unseen by the encoder, or on its slide."""
+
+# Fewest samples for an estimate of the noise floor.
 _LEAST_SAMPLES = 256
+# A line is spread over ±4 resolutions by the window; four times as many make a band.
+_LEAST_RESOLUTIONS = 16
+_LOBE = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccelerationLine:
-    """A line of acceleration.
+    """Spectral line of acceleration.
 
-    axis: x, y or z;  frequency: [Hz], its standard uncertainty
+    axis: x, y or z;  frequency, frequency_uncertainty (k = 1): [Hz]
     acceleration: amplitude [m/s²];  significance: [σ]
     """
 
@@ -37,16 +43,15 @@ class AccelerationLine:
 
     @property
     def displacement(self) -> float:
-        """Amplitude of the motion that such an acceleration is [m]: ``a / ω²``."""
+        """Amplitude of the motion with this acceleration [m]: ``a / ω²``."""
         return self.acceleration / (2 * np.pi * self.frequency) ** 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccelerationLines:
-    """All lines of an accelerometer, and how far it reaches.
+    """All lines of an accelerometer.
 
-    highest: half its rate [Hz]: a line from beyond would be felt at its folded image
-    duration: of the record [s]
+    highest: half its rate [Hz], beyond which lines appear at their alias;  duration: [s]
     """
 
     lines: tuple[AccelerationLine, ...]
@@ -57,27 +62,22 @@ class AccelerationLines:
 def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[str, FloatArray]]:
     """Return the period [s] and the longest gapless run (n,) of each axis [m/s²].
 
-    Raises DataError for blocks of several periods, or too few samples.
+    Raises DataError for blocks of several periods, or fewer than 256 samples.
     """
     periods = {block.sample_period for block in blocks}
     if not periods or max(periods) - min(periods) > SAME_PERIOD * max(periods):
-        raise DataError(
-            f"acceleration with sample periods {sorted(periods)!r} s, expected one; record again"
-        )
+        raise DataError("ripple.acceleration_periods", periods=sorted(periods))
     run = max(uninterrupted(blocks), key=lambda run: sum(map(len, run)))
     axes = {axis: np.concatenate([getattr(b, axis) for b in run]) for axis in AXES}
     if len(axes["z"]) < _LEAST_SAMPLES:
-        raise DataError(
-            f"acceleration of {len(axes['z'])} samples on end, expected {_LEAST_SAMPLES} or more; "
-            "record longer"
-        )
+        raise DataError("ripple.short_acceleration", samples=len(axes["z"]), least=_LEAST_SAMPLES)
     return min(periods), axes
 
 
 def acceleration_lines(period: float, axes: dict[str, FloatArray]) -> AccelerationLines:
-    """Return the lines of accelerations (n,) by axis, every ``period`` [s], NaN where lost.
+    """Return the lines of accelerations (n,) by axis, sampled every ``period`` [s], NaN where lost.
 
-    Of lines of one frequency on several axes the strongest is kept.
+    Of lines with one frequency on several axes the strongest is kept.
     """
     found: list[AccelerationLine] = []
     for axis, values in axes.items():
@@ -112,25 +112,15 @@ def _lines(period: float, axis: str, values: FloatArray) -> list[AccelerationLin
     ]
 
 
-# The spectrum of acceleration as it comes: levels by band and axis, and the height they move.
-
-PROBE, SLIDE = "probe", "carriage"
-"""Where the accelerometer sits: what it feels the encoder does not see, or sees."""
-
-# A line is spread over ±4 resolutions by the window; four times as many make a band.
-_LEAST_RESOLUTIONS = 16
-_LOBE = 4
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VibrationLevels:
-    """What shakes, averaged over the last windows.
+    """Vibration averaged over the last windows.
 
-    bands: (from, to) [Hz];  rms: of each axis [m/s²], one value a band
+    bands: (from, to) [Hz];  rms: of each axis [m/s²], one value for each band
     line: strongest of all axes: axis, frequency [Hz], amplitude [m/s²]
-    effect: on a height, rms, one value a band [m]; None where it is not known
-    total_effect: of all bands together [m];  windows: averaged so far
-    height_line: what moves the height most: frequency [Hz], amplitude [m]
+    effect: rms effect on the height for each band [m]; None if unknown
+    total_effect: of all bands [m];  windows: number averaged so far
+    height_line: strongest line in the height: frequency [Hz], amplitude [m]
     """
 
     bands: tuple[tuple[float, float], ...]
@@ -142,7 +132,7 @@ class VibrationLevels:
     height_line: tuple[float, float] | None = None
 
     def entry(self) -> dict[str, Any]:
-        """Return JSON values, in SI: ``height`` is the effect by band, ``height_total`` of all."""
+        """Return JSON values in SI units, with the effect by band as ``height``."""
         axis, frequency, amplitude = self.line
         return {
             "bands": [list(band) for band in self.bands],
@@ -151,22 +141,22 @@ class VibrationLevels:
             "height": None if self.effect is None else list(self.effect),
             "height_total": self.total_effect,
             "windows": self.windows,
-        } | self._height_line_entry()
-
-    def _height_line_entry(self) -> dict[str, Any]:
-        if self.height_line is None:
-            return {}
-        frequency, amplitude = self.height_line
-        return {"height_line": {"frequency": frequency, "amplitude": amplitude}}
+        } | (
+            {}
+            if self.height_line is None
+            else {
+                "height_line": dict(zip(("frequency", "amplitude"), self.height_line, strict=True))
+            }
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MonitorOptions:
-    """How to look.
+    """Settings of the vibration monitor.
 
     edges: of the bands, rising [Hz];  window: length of a spectrum [s]
-    averages: spectra over which levels are averaged
-    mount: ``probe`` or ``slide``;  axis: along which a height is measured
+    averages: number of spectra over which levels are averaged
+    mount: PROBE or SLIDE;  axis: along which a height is measured
     """
 
     edges: tuple[float, ...] = (5.0, 50.0, 150.0, 500.0, 2000.0)
@@ -180,21 +170,23 @@ class MonitorOptions:
         least = _LEAST_RESOLUTIONS / self.window
         if not rising or not self.edges[0] > 0 or self.edges[1] - self.edges[0] < least:
             raise ConfigurationError(
-                f"bands {self.edges!r} Hz, expected two or more rising edges above zero, the "
-                f"first {least:g} Hz or more wide for a window of {self.window:g} s"
+                "ripple.monitor_bands", edges=self.edges, least=least, window=self.window
             )
         if self.mount not in (PROBE, SLIDE) or self.axis not in AXES:
             raise ConfigurationError(
-                f"accelerometer on {self.mount!r}, height along {self.axis!r}; expected "
-                f"{PROBE!r} or {SLIDE!r}, and one of {AXES!r}"
+                "ripple.monitor_mount",
+                mount=self.mount,
+                axis=self.axis,
+                mounts=(PROBE, SLIDE),
+                axes=AXES,
             )
 
 
 @dataclass
 class RunningSpectrum:
-    """Takes blocks, keeps the average of half overlapping windows (Welch 1967).
+    """Average spectrum of blocks over half overlapping windows (Welch 1967).
 
-    received, lost: samples;  restarts: where the counter did not go on or the period changed
+    received, lost: samples;  restarts: number of gaps of the counter or changes of the period
     """
 
     options: MonitorOptions
@@ -208,7 +200,7 @@ class RunningSpectrum:
     _windows: int = 0
 
     def push(self, block: AccelerationBlock) -> None:
-        """Take the next block."""
+        """Add a block."""
         self.received += len(block)
         if block.first_sample != self._next or block.sample_period != self._period:
             self.restarts += self._next >= 0
@@ -244,10 +236,10 @@ class RunningSpectrum:
             self._mean[axis] = Density(new.frequency, np.asarray(mixed), new.step)
 
     def levels(self, response: TransferFunction | None = None) -> VibrationLevels | None:
-        """Return the levels now; None before the first window is full.
+        """Return the present levels, None before the first window is full.
 
-        response: from encoder to probe, as identified; needed for the effect of a vibration that
-            the encoder sees, ``|1 - G| a / ω²`` (Eq. 5). What it does not see is ``a / ω²``.
+        response: identified, from encoder to probe; the effect of a vibration is ``|1 - G| a / ω²``
+            (Eq. 5) on the slide, where the encoder sees it, and ``a / ω²`` on the probe
         """
         if not self._mean:
             return None
@@ -286,7 +278,7 @@ class RunningSpectrum:
 
 
 def _by_band(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple[float, ...]:
-    """Return the rms by band. What lies on an edge counts once, in the band above it."""
+    """Return the rms by band; a frequency on an edge counts in the band above it."""
     inner = [np.nextafter(high, 0) for _, high in bands[:-1]] + [bands[-1][1]]
     return tuple(
         spectrum.power(low, high) ** 0.5 for (low, _), high in zip(bands, inner, strict=True)
@@ -303,9 +295,9 @@ def _strongest(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple
 
 @dataclass
 class Alarm:
-    """Raised at ``limit``, ended below ``release`` of it: it does not flutter about the limit.
+    """Alarm with hysteresis: raised at ``limit``, ended below the share ``release`` of it.
 
-    raised: now;  times: how often it was raised
+    raised: present state;  times: number of times it was raised
     """
 
     limit: float
@@ -315,13 +307,10 @@ class Alarm:
 
     def __post_init__(self) -> None:
         if not (self.limit > 0 and 0 < self.release <= 1):
-            raise ConfigurationError(
-                f"alarm at {self.limit!r}, ended at {self.release!r} of it; expected a positive "
-                "limit and a share up to 1"
-            )
+            raise ConfigurationError("ripple.alarm_limits", limit=self.limit, release=self.release)
 
     def update(self, value: float | None) -> bool:
-        """Return whether it is raised after ``value``; what is not known changes nothing."""
+        """Return whether it is raised after ``value``; None changes nothing."""
         if value is not None:
             if not self.raised and value >= self.limit:
                 self.raised, self.times = True, self.times + 1

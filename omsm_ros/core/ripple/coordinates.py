@@ -1,7 +1,7 @@
-"""In what is a line periodic? Over time, path, radius, turns: how far each decides.
+"""Coordinates of a scan in which a line may be periodic: time, path, radius and turns.
 
-A scan at a steady pace cannot: its coordinates are proportional. Where the pace changes, a line
-is sharp in its own coordinate only.
+In a scan at constant pace the coordinates are proportional and cannot be distinguished. Where the
+pace changes, a line is sharp in its own coordinate only.
 """
 
 from __future__ import annotations
@@ -16,24 +16,39 @@ from omsm_ros.core.ripple.density import noise_floor
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
 
-# The Fourier sum of samples that are not evenly spaced.
-#
-# ``F(k Δν) = Σ_j y_j exp(-2πi k Δν u_j)`` by spreading each sample over a fine grid with a
-# Kaiser-Bessel kernel, one FFT, and division by the kernel's transform (Greengard and Lee,
-# SIAM Review 46, 2004; kernel of Fessler and Sutton, IEEE Trans. Signal Process. 51, 2003).
-
-# Eight neighbours and twice the grid: an error of 1e-7 of the largest line.
+# Width of the kernel and density of the grid, for an error of 1e-7 of the largest line.
 _WIDTH = 8
 _OVERSAMPLING = 2
 _BETA = np.pi * np.sqrt((_WIDTH / _OVERSAMPLING * (_OVERSAMPLING - 0.5)) ** 2 - 0.8)
+
+# Frequencies per resolution (one over the range); with one, a line in the middle between two would
+# lose 60 % of its power.
+OVERSAMPLING = 2
+# Coordinates that differ by less than this part of a wave are proportional.
+_SAME_WAVES = 0.05
+# Frequencies over an uneven coordinate: 8 MB.
+_MOST_FREQUENCIES = 2**19
+# Fewer waves are form or drift.
+LEAST_WAVES = 5
+# Samples for the comparison of a line in two coordinates.
+_MOST_COMPARED = 4096
+# Range and step of the search on a curved path, in resolutions and steps of one; a quarter of a
+# resolution off, a line has 95 % of its power.
+_SEARCHED_BINS, _STEPS_IN_A_BIN = 12, 4
+# A smaller range is no motion of an axis.
+_LEAST_MOVED_M = 1e-9
 
 
 def fourier_sum(
     place: FloatArray, values: FloatArray, spacing: float, count: int
 ) -> NDArray[np.complex128]:
-    """Return F at 0, ``spacing``, … (count,), of ``values`` (n,) at ``place`` (n,).
+    """Return ``F(k Δν) = Σ_j y_j exp(-2πi k Δν u_j)`` (count,) of values y at places u, each (n,).
 
     spacing: Δν [1/unit of place], at most one over the range of ``place``
+
+    Each sample is spread over a fine grid with a Kaiser-Bessel kernel; the FFT is divided by the
+    transform of the kernel (Greengard and Lee, SIAM Review 46, 2004; kernel of Fessler and Sutton,
+    IEEE Trans. Signal Process. 51, 2003).
     """
     grid = _even(_OVERSAMPLING * 2 * count)
     position = (place - place[0]) * spacing * grid
@@ -44,7 +59,7 @@ def fourier_sum(
         weight = _kernel(position - cell)
         total += np.bincount(cell % grid, values * weight, minlength=grid)
     spectrum = np.fft.rfft(total)[:count]
-    # The sum started at place[0], not at zero; magnitudes do not care, phases are turned back.
+    # The grid starts at place[0], so the phases are shifted back to zero.
     k = np.arange(count)
     turned = np.exp(-2j * np.pi * spacing * place[0] * k)
     return np.asarray(spectrum * turned / _kernel_transform(k / grid), np.complex128)
@@ -66,32 +81,12 @@ def _even(count: int) -> int:
     return 1 << (count - 1).bit_length()
 
 
-# Frequencies looked at in a resolution (one over the range): half-way between two that are one
-# apart a line would lose 60 % of its power.
-OVERSAMPLING = 2
-# A coordinate that departs from proportion by less than this part of a wave is the same.
-_SAME_WAVES = 0.05
-# Of a spectrum over a coordinate that is not even: 8 MB.
-_MOST_FREQUENCIES = 2**19
-# Fewer waves are form or drift, not a line.
-LEAST_WAVES = 5
-# Samples that decide whether a line in one coordinate may be one in another.
-_MOST_COMPARED = 4096
-# So far from the mean pace, in resolutions, where a path is curved; at a quarter of one a line has
-# 95 % of its power.
-_SEARCHED_BINS, _STEPS_IN_A_BIN = 12, 4
-# Less is no motion of an axis.
-_LEAST_MOVED_M = 1e-9
-
-
 @dataclass(frozen=True, eq=False)
 class Coordinate:
-    """One of them, over a scan.
+    """One coordinate over a scan.
 
-    values: (n,);  pace: its mean speed [1/s of its unit]
-    like: the coordinate to which it is proportional, so that a line in one is one in the other;
-        its own name if there is none before it
-    highest: frequency that is looked at
+    values: (n,);  pace: mean speed [unit/s];  highest: frequency that is searched [1/unit]
+    like: the earlier coordinate to which it is proportional, or its own name
     """
 
     name: str
@@ -102,17 +97,17 @@ class Coordinate:
 
     @property
     def resolution(self) -> float:
-        """One over its range."""
+        """One over the range of its values."""
         return 1.0 / float(np.ptp(self.values))
 
     @property
     def proportional_to_time(self) -> bool:
-        """True where the pace is steady."""
+        """True where the pace is constant."""
         return self.like == TIME
 
 
 def coordinates_of(signal: ScanSignal) -> dict[str, Coordinate]:
-    """Return those in which the scan has moved on, by name."""
+    """Return the coordinates in which the scan moves, by name."""
     found: dict[str, Coordinate] = {}
     for name in (TIME, PATH, TURN, RADIUS):
         values = signal.coordinate(name)
@@ -142,7 +137,7 @@ def _coordinate(
 
 
 def _proportional(values: FloatArray, other: FloatArray) -> float:
-    """Return how far ``values`` departs from proportion to ``other``, in its own unit."""
+    """Return the largest deviation of ``values`` from a linear function of ``other``."""
     slope, start = np.polyfit(other - other[0], values, 1)
     return float(np.max(abs(values - slope * (other - other[0]) - start)))
 
@@ -150,9 +145,9 @@ def _proportional(values: FloatArray, other: FloatArray) -> float:
 def power_over(
     signal: ScanSignal, values: FloatArray, coordinate: Coordinate
 ) -> tuple[FloatArray, float]:
-    """Return squared amplitudes of ``values`` (n,) at steps of a frequency, and that step.
+    """Return squared amplitudes of ``values`` (n,) at equally spaced frequencies, and their step.
 
-    Over time it is the Fourier sum on the trigger's own grid; missing samples count as zero.
+    Over time this is the FFT on the grid of the trigger; missing samples count as zero.
     """
     count = len(values)
     if coordinate.name == TIME:
@@ -175,10 +170,10 @@ def floor_of(power: FloatArray) -> FloatArray:
 
 
 def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[float, float]:
-    """Return how much of the power of a line of ``one`` a line of ``other`` takes, and where.
+    """Return the share of the power of a line in ``one`` that a line in ``other`` has, and where.
 
-    The share [1], largest over its frequencies, and that frequency, in the unit of ``other``;
-    ``frequency`` in that of ``one``.
+    The share [1] is the largest over the frequencies [1/unit of other]; ``frequency``: of the line
+    in ``one``.
     """
     every = max(len(one.values) // _MOST_COMPARED, 1)
     phase = frequency * one.values[::every]
@@ -187,7 +182,7 @@ def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[flo
     reach = _SEARCHED_BINS * _STEPS_IN_A_BIN
     step = other.resolution / _STEPS_IN_A_BIN
     tried = guess + step * np.arange(-reach, reach + 1)
-    # From one frequency to the next every sample turns by the same angle.
+    # From one frequency to the next each sample turns by a constant angle.
     turning = np.exp(2j * np.pi * (phase - tried[0] * place))
     turn = np.exp(-2j * np.pi * step * place)
     share = np.empty(len(tried))

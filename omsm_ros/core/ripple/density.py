@@ -1,4 +1,4 @@
-"""Power spectral density: over time or along the path, one-sided, Parseval holds."""
+"""One-sided power spectral density, its noise floor, band-stop filter and alias frequencies."""
 
 from __future__ import annotations
 
@@ -12,6 +12,23 @@ from scipy import ndimage, signal, special
 from omsm_ros.core.lti.discretisation import BLACKMAN_HARRIS
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, DataError
+
+# Order of each of the two passes of the band-stop filter; together -6 dB at the edges.
+_ORDER = 4
+# Amplitude at which the transient at an end counts as decayed.
+_RUNG_OUT = 1e-3
+# The power of noise at one frequency is exponentially distributed.
+_MEDIAN_OVER_MEAN = float(np.log(2))
+# Frequencies to either side of a median: 24 powers give it to 30 %, 800 to 5 %.
+_NARROWEST, _WIDEST = 12, 400
+# Half-width over frequency: noise that falls with its square changes fourfold within an octave.
+_RELATIVE_WIDTH = 0.25
+# Medians over a logarithmic grid; 3.5 % apart for a million frequencies.
+_BANDS = 400
+# Logarithm of a probability below which rounding of 1 - p matters.
+_RARE = -30.0
+# Zero power has no logarithm.
+_LEAST_RATIO = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +50,9 @@ class Density:
 
 
 def window(count: int) -> FloatArray:
-    """Return the window (n,), scaled to a mean square of one.
+    """Return a Blackman-Harris window (n,), scaled to a mean square of one.
 
-    Side lobes below 1e-9 of the power, so that millimetres of travel hide no nanometre.
+    Its side lobes below 1e-9 of the power separate nanometres from millimetres of travel.
     """
     phase = 2 * np.pi * np.arange(count) / count
     shape = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
@@ -43,33 +60,29 @@ def window(count: int) -> FloatArray:
 
 
 def density(values: FloatArray, step: float) -> Density:
-    """Return the density of ``values`` (n,) every ``step`` [s] or [m], as they are.
+    """Return the density of ``values`` (n,) every ``step`` [s] or [m], with their mean.
 
-    ``Σ S(f) Δf = Σ (w x)² / n`` exactly, w the window. A line of amplitude a has the power a²/2,
-    spread over the window's main lobe of ±4 bins. Take the mean out before. Raises DataError for
-    fewer than 16 values.
+    ``Σ S(f) Δf = Σ (w x)² / n`` exactly, with the window w. A line of amplitude a has the power
+    a²/2, spread over the main lobe of ±4 bins. Raises DataError for fewer than 16 values.
     """
     count = len(values)
     if count < 16:
-        raise DataError(f"spectrum of {count} values, expected 16 or more; record longer")
+        raise DataError("ripple.short_spectrum", count=count, least=16)
     power = abs(np.fft.rfft(values * window(count))) ** 2 * step / count
-    # All frequencies but zero and Nyquist stand for their negative as well.
+    # One-sided: all frequencies except zero and Nyquist count twice.
     power[1 : (count + 1) // 2] *= 2
     spacing = 1.0 / (count * step)
     return Density(np.asarray(np.arange(len(power)) * spacing), np.asarray(power), spacing)
 
 
 def evenly(place: FloatArray, values: FloatArray, step: float) -> FloatArray:
-    """Return values (n,) at increasing ``place`` (n,), linear in between, every ``step``.
-
-    For looking at: where samples are further apart than ``step`` the fine part is not measured.
-    """
+    """Return values (n,) at increasing ``place`` (n,), interpolated linearly to every ``step``."""
     count = int((place[-1] - place[0]) / step) + 1
     return np.asarray(np.interp(place[0] + step * np.arange(count), place, values))
 
 
 def smoothed(spectrum: Density, bins: int = 600) -> tuple[FloatArray, FloatArray]:
-    """Return frequency and mean density in at most ``bins`` bands of equal ratio, for drawing."""
+    """Return frequency and mean density in at most ``bins`` bands of equal ratio, for plots."""
     used = spectrum.frequency > 0
     frequency, level = spectrum.frequency[used], spectrum.density[used]
     edges = np.geomspace(frequency[0], frequency[-1] * (1 + 1e-9), bins + 1)
@@ -80,21 +93,13 @@ def smoothed(spectrum: Density, bins: int = 600) -> tuple[FloatArray, FloatArray
     return mean[0], mean[1]
 
 
-# A band taken out of a scan without moving what is left: forward and backward, so no phase.
-
-# Of each of the two passes; -3 dB each at the edges of the band, so -6 dB together.
-_ORDER = 4
-# From where on the ringing of an end is below a thousandth.
-_RUNG_OUT = 1e-3
-
-
 @dataclass(frozen=True, eq=False)
 class BandStopped:
-    """A scan without its band.
+    """Result of a band-stop filter.
 
-    removed: what was taken out (n,) [m];  rms_before, rms_after: of the heights without form [m]
-    settling: how far from either end the filter still rings [s]
-    frequency, response: of the two passes together (m,) [Hz], [1]; it is real, its phase zero
+    removed: part of the heights (n,) [m];  rms_before, rms_after: of the heights without form [m]
+    settling: duration of the transient at either end [s]
+    frequency, response: of both passes together (m,) [Hz], [1], with zero phase
     """
 
     removed: FloatArray
@@ -106,19 +111,19 @@ class BandStopped:
 
     @property
     def rms_removed(self) -> float:
-        """Of what was removed [m]."""
+        """Root mean square of the removed part [m]."""
         return float(np.sqrt(np.mean(self.removed**2)))
 
 
 def band_stop(
     sample: IntArray, values: FloatArray, period: float, bands: Sequence[tuple[float, float]]
 ) -> BandStopped:
-    """Take ``bands`` (from, to) [Hz] out of ``values`` (n,) [m], the heights without form.
+    """Remove ``bands`` (from, to) [Hz] from ``values`` (n,) [m], the heights without form.
 
-    sample: trigger counts (n,);  period: of the trigger [s]. Missing samples are bridged by
-    straight lines, in the filter only. A Butterworth filter of fourth order runs forward and
-    backward: its response is the square of the magnitude of one pass. Raises ConfigurationError
-    for a band that is no band below half the rate.
+    sample: trigger counts (n,);  period: of the trigger [s]
+
+    A Butterworth filter of fourth order runs forward and backward, so that its phase is zero. It
+    interpolates missing samples. Raises ConfigurationError for a band beyond half the rate.
     """
     count = int(sample[-1] - sample[0]) + 1
     even = np.interp(np.arange(count), sample - sample[0], values)
@@ -145,40 +150,21 @@ def band_stop(
 def _sections(low: float, high: float, period: float) -> FloatArray:
     nyquist = 0.5 / period
     if not 0 < low < high < nyquist:
-        raise ConfigurationError(
-            f"band from {low!r} to {high!r} Hz cannot be stopped, expected 0 < from < to < "
-            f"{nyquist:g} Hz, half the sampling rate"
-        )
+        raise ConfigurationError("ripple.stop_band", low=low, high=high, nyquist=nyquist)
     return np.asarray(signal.butter(_ORDER, (low, high), "bandstop", fs=1 / period, output="sos"))
 
 
 def _padding(sections: FloatArray) -> int:
-    """Return the samples until an end has rung out, by the slowest pole."""
+    """Return the number of samples of the transient, from the slowest pole."""
     poles = np.concatenate([np.roots(section[3:]) for section in sections])
     slowest = float(np.max(abs(poles)))
     return int(np.ceil(np.log(_RUNG_OUT) / np.log(min(slowest, 1 - 1e-9))))
 
 
-# How strong is a spectrum where there is no line, and how unlikely is one by chance?
-
-# Median of the power of noise over its mean: power of one frequency is exponentially distributed.
-_MEDIAN_OVER_MEAN = float(np.log(2))
-# Frequencies to either side: a median of 24 such powers is known to 30 %, of 800 to 5 %.
-_NARROWEST, _WIDEST = 12, 400
-# Half-width over frequency: noise that falls with its square changes fourfold within an octave.
-_RELATIVE_WIDTH = 0.25
-# Evenly over the logarithm: in a million frequencies, 3.5 % apart.
-_BANDS = 400
-# Logarithm of a chance that is so small.
-_RARE = -30.0
-# No power at all has no logarithm.
-_LEAST_RATIO = 1e-15
-
-
 def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
-    """Return the mean power of the noise at each frequency (m,), free of lines, from a median.
+    """Return the mean power of the noise at each frequency (m,), from running medians.
 
-    power: of equally spaced frequencies from zero (m,);  oversampling: of them in a resolution
+    power: at equally spaced frequencies from zero (m,);  oversampling: frequencies per resolution
     """
     count = len(power)
     narrow, broad = _NARROWEST * oversampling, _WIDEST * oversampling
@@ -190,7 +176,7 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
         half = int(np.clip(_RELATIVE_WIDTH * centre, narrow, broad))
         low, high = max(centre - half, 0), min(centre + half + 1, count)
         level[place] = np.median(power[low:high])
-    # A band with many lines is the worse for its neighbours' sake; it must not hide them.
+    # A band with many lines must not raise the floor of its neighbours.
     level = np.minimum(level, ndimage.median_filter(level, 5, mode="nearest") * 4)
     tiny = np.finfo(float).tiny
     logs = np.interp(np.arange(count), centres, np.log(np.maximum(level, tiny)))
@@ -198,16 +184,16 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
 
 
 def significance(ratio: FloatArray, tried: float) -> FloatArray:
-    """Return by how many σ a line stands out, of the shape of ``ratio``.
+    """Return the significance of a line [σ], of the shape of ``ratio``.
 
-    ratio: its power over the mean power of noise at one frequency;  tried: how many independent
-        frequencies were looked at
+    ratio: power of the line over the mean power of noise at one frequency
+    tried: number of independent frequencies searched
 
-    The probability that noise alone gives such a line anywhere, ``1 - (1 - exp(-ratio))^tried``,
-    as the σ beyond which a normal variable lies with it, one-sided.
+    The probability of such a line from noise alone, ``1 - (1 - exp(-ratio))^tried``, as the
+    quantile of the normal distribution, one-sided.
     """
     power, tried = np.asarray(ratio, np.float64), max(tried, 1.0)
-    # Where it is small it is the chance of one times their number, and rounding is larger.
+    # A small probability is ``tried`` times that of one frequency, without loss by rounding.
     small = np.log(tried) - power
     none = tried * np.log1p(-np.exp(-np.clip(power, _LEAST_RATIO, np.log(tried) - _RARE)))
     log_any = np.where(small < _RARE, small, np.log(-np.expm1(none)))
@@ -215,23 +201,19 @@ def significance(ratio: FloatArray, tried: float) -> FloatArray:
 
 
 def ratio_at(sigma: float, tried: float) -> float:
-    """Return the ratio of powers whose significance is ``sigma``, the inverse of the above."""
+    """Return the ratio of powers with a significance of ``sigma``, the inverse of the above."""
     tried, log_any = max(tried, 1.0), float(special.log_ndtr(-sigma))
     if log_any < _RARE:
         return float(np.log(tried)) - log_any
     return -float(np.log(-np.expm1(special.log_ndtr(sigma) / tried)))
 
 
-# Where a vibration beyond the Nyquist frequency turns up in sampled data.
-
-
 def aliased_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:
-    """Return the apparent frequency [Hz] of ``frequency`` [Hz] sampled at ``sample_rate`` [Hz].
+    """Return the alias [Hz] of ``frequency`` [Hz] sampled at ``sample_rate`` [Hz], of its shape.
 
-    ``|f - fs · NINT(f / fs)|`` with halves rounded up, as the paper has it; of the shape of
-    ``frequency``.
+    ``|f - fs · NINT(f / fs)|`` with halves rounded up, as in the paper.
     """
     if not sample_rate > 0:
-        raise DataError(f"sample_rate {sample_rate!r} Hz is not positive")
+        raise DataError("ripple.sample_rate", rate=sample_rate)
     f = np.asarray(frequency, np.float64)
     return np.abs(f - sample_rate * np.floor(f / sample_rate + 0.5))

@@ -1,8 +1,8 @@
-"""What is no ripple: the part's form, its tilt and the drift, millimetres above nanometres.
+"""Remove form, tilt and drift from the heights of a scan, to leave its ripple.
 
-On a turned part Zernike polynomials over the scanned disc, of no higher degree than the data
-ask for, beside what repeats with the spindle alike at every radius, which no figure of a part
-can do at its centre. Elsewhere polynomials of time.
+On a turning part: Zernike polynomials over the scanned disc, of the degree that the data need, and
+harmonics of the spindle with the same amplitude at every radius, which no form has at its centre.
+Otherwise: polynomials of time.
 """
 
 from __future__ import annotations
@@ -20,42 +20,42 @@ from omsm_ros.core.ripple.scan_signal import ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
 
 Waves: TypeAlias = "Callable[[np.ndarray], FloatArray]"
-"""Columns (m, q) of what is to be fitted beside the form, at the samples (m,) asked for."""
+"""Columns (m, q) to fit together with the form, at the samples (m,) asked for."""
 
-# Fewer turns do not show what repeats with the turn.
+# Harmonics of the spindle need more than a turn.
 LEAST_TURNS = 1.5
-# Harmonics of a turn that may be the spindle's beside the figure's.
+# Highest harmonic of the spindle that is separated from form.
 HIGHEST_ORDER = 12
-# One wave a turn is how the part sits on the chuck.
+# One wave a turn is the mounting of the part.
 LOWEST_ORDER = 2
-# On one circle two waves are its astigmatism, too.
+# On one circle, two waves a turn are astigmatism as well.
 LOWEST_ON_CIRCLE = 3
-# In time a scan that turns may drift as a cubic; what bends more is looked for as a line.
+# Degree of the drift over time in a scan that turns; faster changes are searched as lines.
 _DRIFT_DEGREE = 3
-# Even, for symmetric form is; as Zernike terms are written. The high ones only where they are worth
-# it, for the columns grow with the square.
+# Even degrees of Zernike terms. The number of columns grows with their square, so degrees above
+# the usual one are tried on demand.
 _DEGREES = range(2, 15, 2)
 _USUAL_DEGREE = 6
-# A higher degree has to take away this share of what is left, or it fits noise and lines; less
-# where the lines are known and taken out before.
+# Least share of the residual power that a higher degree must remove, or it fits noise and lines;
+# less once the lines are known and subtracted.
 _WORTH, _WORTH_WITHOUT_LINES = 0.2, 0.05
-# Even samples that determine the form; it is smooth, and the rest would only cost time.
+# Samples that determine the smooth form.
 _MOST_FITTED = 100_000
 # Samples at a time: 150 columns of them are 20 MB.
 _CHUNK = 16_384
-# So many times what an order and a figure make together, one of them is no longer known.
+# An order that exceeds the sum of itself and the form by this factor is not determined.
 _AGAINST = 1.5
-# Nearer to a whole number of waves a turn, in resolutions, it is one.
+# Distance from a whole number of waves a turn, in resolutions, that counts as whole.
 _OWNED = 0.6
-# Radii within this part of the largest are one circle.
+# Radii within this share of the largest are one circle.
 _CIRCLE = 0.02
-# Directions that the scan determines worse than this, of its best, stay at zero.
+# Eigenvalues below this share of the largest are not determined by the scan.
 _LEAST_DETERMINED = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
 class SpindleOrder:
-    """``cosine · cos(2π order · turn) + sine · sin(…)`` [m], alike at every radius.
+    """Harmonic ``cosine · cos(2π order · turn) + sine · sin(…)`` [m] of the spindle.
 
     uncertainty: standard, of cosine and of sine [m]
     """
@@ -67,17 +67,17 @@ class SpindleOrder:
 
     @property
     def amplitude(self) -> float:
-        """Half of peak to valley [m]."""
+        """Amplitude, half of peak to valley [m]."""
         return float(np.hypot(self.cosine, self.sine))
 
 
 @dataclass(frozen=True, eq=False)
 class FormRemoved:
-    """A scan without its form.
+    """Scan without its form.
 
-    residual: what is left (n,) [m];  degree: of the polynomials;  removed: rms of the form [m]
-    orders: what repeats with the spindle, taken out as well
-    on_circle: True where figure and spindle are not separable, for there is one radius
+    residual: (n,) [m];  degree: of the polynomials;  removed: rms of the form [m]
+    orders: harmonics of the spindle, also removed
+    on_circle: True for a single radius, where form and spindle are not separable
     """
 
     residual: FloatArray
@@ -88,7 +88,7 @@ class FormRemoved:
 
 
 class FormFit:
-    """Form and orders of one scan, fitted once or again after its lines have become known."""
+    """Fit of form and spindle harmonics of one scan, repeated once its lines are known."""
 
     def __init__(self, signal: ScanSignal) -> None:
         self._signal = signal
@@ -102,13 +102,13 @@ class FormFit:
         return _Basis.of(self._signal).up_to(self._degree)
 
     def _enough(self, values: FloatArray, worth: float) -> int:
-        """Return the degree beyond which nothing worth it is removed; few parts need a high one."""
+        """Return the degree beyond which less than the share ``worth`` is removed."""
         for top in (_USUAL_DEGREE, max(_DEGREES)):
             basis = _Basis.of(self._signal).up_to(top)
             gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
             energy = float(np.sum(values[self._chosen] ** 2))
             degree = _enough(basis, gram, moment, energy, worth)
-            # Of what that leaves, for rounding of millimetres would look like form of its own.
+            # The residual is fitted again, because rounding of millimetres would look like form.
             kept = basis.within(degree)
             some = self._some()
             columns = basis.columns(self._signal, some)
@@ -120,24 +120,24 @@ class FormFit:
         return degree
 
     def _some(self) -> np.ndarray:
-        """Return the samples that show whether a degree is worth it: drawn, to fold nothing."""
+        """Return a random selection of samples, which has no aliases, to test a degree."""
         drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
         return np.asarray(self._chosen[np.sort(drawn)])
 
     def refine(self, heights: FloatArray) -> None:
-        """Choose the degree again, once the ``heights`` of all lines (n,) [m] are known."""
+        """Choose the degree again with the ``heights`` of all lines (n,) [m] subtracted."""
         bare = self._height - heights
         self._degree = max(self._degree, self._enough(bare, _WORTH_WITHOUT_LINES))
 
     def without(self, waves: Waves | None = None) -> FormRemoved:
-        """Take form, drift and orders out, as they are beside ``waves``, which stay in."""
+        """Remove form, drift and orders, fitted together with ``waves``, which are kept."""
         basis, signal, chosen = self._basis, self._signal, self._chosen
         own = len(basis.names)
         gram, moment = _normal_equations(basis, signal, self._height, chosen, waves)
         inverse = _inverse(gram)
         solution = np.zeros(len(gram))
         residual = self._height
-        for _ in range(2):  # the second takes out what rounding left of millimetres
+        for _ in range(2):  # the second pass removes rounding errors of millimetres
             solution += inverse @ moment
             residual = self._height - _evaluated(basis, signal, solution[:own])
             bare = (
@@ -155,9 +155,9 @@ class FormFit:
         )
 
     def owned(self) -> list[tuple[float, float]]:
-        """Return waves a turn that belong to form and orders, and how many resolutions about each.
+        """Return the waves a turn of form and orders, and the width of each in resolutions.
 
-        A harmonic with q radial functions reaches q/2 resolutions to either side.
+        A harmonic with q radial functions extends q/2 resolutions to either side.
         """
         if self._signal.turns < LEAST_TURNS:
             return []
@@ -167,13 +167,13 @@ class FormFit:
 
 
 def without_form(signal: ScanSignal) -> FormRemoved:
-    """Take form, drift and what repeats with the spindle out of the heights of ``signal``."""
+    """Remove form, drift and spindle harmonics from the heights of ``signal``."""
     return FormFit(signal).without()
 
 
 @dataclass(frozen=True, eq=False)
 class _Basis:
-    """Names of the columns: (kind, degree, harmonic); kinds are drift, order and form."""
+    """Columns of the fit, named by kind (drift, order or form), degree and harmonic."""
 
     names: tuple[tuple[str, int, int], ...]
     on_circle: bool
@@ -199,16 +199,16 @@ class _Basis:
         return cls(tuple(names), on_circle, largest)
 
     def up_to(self, degree: int) -> _Basis:
-        """Return only the columns that a fit of ``degree`` has."""
+        """Return the columns of a fit of ``degree``."""
         kept = tuple(name for name in self.names if self.degree(name) <= degree)
         return replace(self, names=kept)
 
     def within(self, degree: int) -> np.ndarray:
-        """Return the places of the columns that a fit of ``degree`` has, (q,)."""
+        """Return the indices of the columns of a fit of ``degree``, (q,)."""
         return np.flatnonzero([self.degree(name) <= degree for name in self.names])
 
     def degree(self, name: tuple[str, int, int]) -> int:
-        """Return the degree from which on the fit has a column; without turns, of time."""
+        """Return the lowest degree of a fit that includes the column ``name``."""
         kind, n, _ = name
         free = kind == "order" or (kind == "drift" and n <= _DRIFT_DEGREE and self._turning)
         return 0 if free else n
@@ -275,7 +275,7 @@ def _waves_of(waves: Waves, signal: ScanSignal, solution: FloatArray) -> FloatAr
 def _enough(
     basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
 ) -> int:
-    """Return the degree beyond which nothing worth it is taken away."""
+    """Return the degree after which the next one removes less than the share ``worth``."""
     highest = max(map(basis.degree, basis.names))
     left, kept = energy, 0
     for degree in (d for d in _DEGREES if d <= highest):
@@ -291,9 +291,9 @@ def _enough(
 def _worthwhile_degree(
     basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float, degree: int
 ) -> int:
-    """Return a higher degree that is worth all those up to it, ``degree`` if none is.
+    """Return the highest degree that is worth all degrees up to it, or ``degree``.
 
-    Six lobes are nothing to the fourth degree, and all to the sixth.
+    A form with six lobes, for example, needs the sixth degree although the fourth removes nothing.
     """
     highest = max(map(basis.degree, basis.names))
     left = energy
@@ -328,10 +328,10 @@ def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> Float
 def _orders(
     basis: _Basis, solution: FloatArray, spread: FloatArray, mean: FloatArray
 ) -> Iterator[SpindleOrder]:
-    """Yield the orders that stand by themselves; ``mean``: of products of columns (p, p).
+    """Yield the orders that are separable from form; ``mean``: products of columns (p, p).
 
-    Where the radius changes little, an order and a figure of the same harmonic may grow large
-    against each other: neither is known then, and the order counts as form.
+    Where the radius changes little, an order and a form of the same harmonic may both become large
+    with opposite signs; the order then counts as form.
     """
     found = {name: place for place, name in enumerate(basis.names) if name[0] == "order"}
     lowest = LOWEST_ON_CIRCLE if basis.on_circle else LOWEST_ORDER

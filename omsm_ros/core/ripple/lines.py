@@ -1,8 +1,8 @@
-"""The lines of a scan: found one after the other, fitted together.
+"""Find the spectral lines of a scan one after the other and fit them together.
 
-The strongest line in any coordinate is taken, all lines so far are fitted at once (frequency,
-cosine, sine: Gauss-Newton), and the search goes on in what they leave: lines closer than a
-window's main lobe come apart, and a strong one hides no weak one.
+The strongest line in any coordinate is added, all lines are fitted (frequency, cosine and sine by
+Gauss-Newton), and the search continues in the residual. This separates lines closer than the main
+lobe of a window, and weak lines from the side lobes of strong ones.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ from omsm_ros.core.ripple.spectral_line import (
 )
 from omsm_ros.core.streams.blocks import FloatArray
 
-# Noise alone shows such a line in one spectrum of 740.
+# Noise alone exceeds it in one spectrum of 740.
 LEAST_SIGMA = 3.0
-# Of three columns each; a machine shows ten or twenty, and each further one costs a fit of all.
+# A machine shows ten to twenty lines.
 MOST_LINES = 40
-# Of the strongest that is left: weaker ones may be its side lobes.
+# Peaks below this share of the strongest may be its side lobes.
 _TAKEN_TOGETHER = 0.3
-# Resolutions from a strong line, within which a weaker peak may be its side lobe.
+# Distance in resolutions within which a weaker peak may be a side lobe.
 _APART_BINS = 8
-# Samples from one place to the next at which the rings are looked at.
+# Samples between the places at which the rings are evaluated.
 _STRIDE = 50
-# A line and its like in another coordinate, of which that one takes more of the power.
+# Share of power and distance in resolutions of the image of a line in another coordinate.
 _SHADOW, _SHADOW_BINS = 0.3, 30
-# A line may be one in another coordinate unless that takes this much off its likelihood (5 σ),
-# and more of its power than jitter and encoders do.
+# Loss of log-likelihood (5 σ) and of power (more than jitter and encoders cause) from which a line
+# is excluded in another coordinate.
 _LOST_RATIO, _LOST_SHARE = 12.5, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class LineSpectrum:
-    """The lines of a signal, strongest first, and the noise about them.
+    """Lines of a signal, strongest first, and its noise.
 
-    residual: without the lines (n,);  noise: its rms
+    residual: without the lines (n,);  noise: rms of the residual
     amplitude_floor: σ of an amplitude over time at ``floor_frequency`` (m,) [Hz]
     """
 
@@ -78,8 +78,8 @@ def find_lines(
 ) -> LineSpectrum:
     """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ.
 
-    known: lines found before, to start with
-    owned: waves a turn that are no lines of their own, and how many resolutions about each
+    known: lines to start with
+    owned: waves a turn of form and orders, which are no lines, with their width in resolutions
     """
     coordinates = coordinates_of(signal)
     searched = [c for c in coordinates.values() if c.like == c.name]
@@ -91,7 +91,7 @@ def find_lines(
         new = _strongest(signal, residual, searched, lines, taken)
         if not new:
             break
-        for line in new:  # what moved away in the fit is not found again
+        for line in new:  # a line that moves in the fit must not be found again
             taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
         new = [line for line in new if not _is_shadow(line, lines, coordinates)]
         if not new:
@@ -111,7 +111,7 @@ def _strongest(
     known: Sequence[SpectralLine],
     taken: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[SpectralLine]:
-    """Return the strongest lines left, all of one coordinate."""
+    """Return the strongest lines of the ``residual``, all in one coordinate."""
     best: tuple[float, list[SpectralLine]] = (0.0, [])
     for coordinate in searched:
         power, spacing = power_over(signal, residual, coordinate)
@@ -125,7 +125,6 @@ def _strongest(
             ratio[max(int(np.ceil(place - half)), 0) : max(int(place + half) + 1, 0)] = 0.0
         peaks = _peaks(ratio, ratio_at(LEAST_SIGMA, tried))
         if len(peaks) and power[peaks[0]] > best[0]:
-            # An amplitude only to start with; the fit gives phase and frequency.
             strong = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
             places = _spaced(strong, MOST_LINES - len(known))
             new = [start(coordinate, k * spacing, residual) for k in places]
@@ -136,13 +135,13 @@ def _strongest(
 def _reserved(
     coordinates: dict[str, Coordinate], owned: Sequence[tuple[float, float]]
 ) -> dict[str, list[tuple[float, float]]]:
-    """Return frequencies of ``owned`` waves a turn, over turns, over time, and along all rings."""
+    """Return the frequencies of ``owned`` waves a turn over turns, time and path."""
     turn, path = coordinates.get(TURN), coordinates.get(PATH)
     if turn is None:
         return {}
     found = {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
     if path is not None:
-        # So many turns are in a metre of the innermost ring, and of the outermost.
+        # Turns per metre of the innermost and the outermost ring.
         along = abs(np.diff(path.values[::_STRIDE]))
         ring = abs(np.diff(turn.values[::_STRIDE]))[along > 0] / along[along > 0]
         most, least = float(np.max(ring)), float(np.min(ring))
@@ -161,7 +160,7 @@ def _is_shadow(
 ) -> bool:
     """Return True for the image of a known line in another coordinate.
 
-    A fit of both would let them grow against each other.
+    A fit of both would be nearly singular.
     """
     own = coordinates[new.coordinate]
     for line in known:
@@ -180,7 +179,7 @@ def _free(
     coordinates: dict[str, Coordinate],
     reserved: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[SpectralLine]:
-    """Return ``lines`` without those that have moved to where form and orders are."""
+    """Return ``lines`` without those that have moved to frequencies of form and orders."""
     return [
         line
         for line in lines
@@ -192,7 +191,7 @@ def _free(
 
 
 def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
-    """Return the places of local maxima above ``least``, largest first."""
+    """Return the indices of local maxima above ``least``, largest first."""
     inner = ratio[1:-1]
     top = (inner >= ratio[:-2]) & (inner > ratio[2:]) & (inner > least)
     places = np.flatnonzero(top) + 1
@@ -202,7 +201,7 @@ def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
 
 
 def _spaced(places: np.ndarray, most: int) -> list[int]:
-    """Return the first ``most`` of ``places`` that are apart from those before."""
+    """Return the first ``most`` of ``places`` with a distance from those before."""
     kept: list[int] = []
     for place in places:
         if len(kept) >= most:
@@ -218,7 +217,7 @@ def _judged(
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
 ) -> LineSpectrum:
-    """Return the lines with their uncertainties, those that stand out of what all of them leave."""
+    """Return the lines that are significant in the final residual, with their uncertainties."""
     floors = {}
     for name in {TIME, *(line.coordinate for line in lines)}:
         power, spacing = power_over(signal, residual, coordinates[name])
@@ -257,7 +256,7 @@ def _judged(
 def _possible(
     line: SpectralLine, ratio: float, coordinates: dict[str, Coordinate]
 ) -> dict[str, float]:
-    """Return the coordinates in which the data allow it to be a line, with the frequency there."""
+    """Return the frequency of the line in each coordinate in which the data allow it."""
     own = coordinates[line.coordinate]
     found = {line.coordinate: line.frequency}
     for name, other in coordinates.items():

@@ -1,9 +1,9 @@
-"""What is each line of a scan: on the part, a vibration, folded, the spindle, an artefact?
+"""Attribute the lines of scans to their sources: part, vibration, spindle or sampling.
 
-A kind is named only where some scan separates it from all others: its line is there, where no other
-kind would put it, and is missing in no scan that would have to show it; or where the accelerometer
-feels it; or where the scan's own pace changed, so that it is sharp in one kind only. Else it is
-undecided.
+A source is named only if a scan separates it from all others: its line is present where no other
+source would put it, and is missing in no scan that would have to show it; or if the accelerometer
+measures it; or if the pace of the scan changed and the line is sharp in one coordinate only.
+Otherwise it is undecided.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from omsm_ros.core.ripple.form_removal import FormFit, FormRemoved, SpindleOrder
 from omsm_ros.core.ripple.lines import LEAST_SIGMA, LineSpectrum, find_lines
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.source_hypotheses import (
+    ALIASED,
     ARTEFACT,
-    FOLDED,
     PART,
     SYNCHRONOUS,
     UNDECIDED,
@@ -39,51 +39,41 @@ from omsm_ros.core.ripple.source_hypotheses import (
     whole_order,
 )
 from omsm_ros.core.ripple.spectral_line import SpectralLine, sum_of, texture, waves_of
-from omsm_ros.readable import count, quantity
+from omsm_ros.errors import Notice
 
-# The words in which the ripple guard says what it saw, and what would decide.
-
-RATE = "an accelerometer, or a scan at another sampling rate, tells"
-# A line of fifty waves is one wave elsewhere at another pace; by less it may not have moved.
+# Relative change of pace that moves a line of fifty waves by one; a smaller one decides nothing.
 _SAME_PACE = 0.02
-
-
-def along(coordinate: str) -> str:
-    """Return in words along what a wavelength is measured."""
-    return {PATH: "along the path", RADIUS: "from ring to ring"}.get(
-        coordinate, f"over {coordinate}"
-    )
-
-
-def images(frequency: float, rate: float) -> str:
-    """Return the lowest frequencies beyond ``rate`` / 2 [Hz] that fold to ``frequency``."""
-    return ", ".join(hertz(f) for f in (rate - frequency, rate + frequency)) + ", …"
-
-
-def hertz(frequency: float) -> str:
-    """Return a frequency [Hz] in words; lines differ in their sixth digit."""
-    return quantity(frequency, "Hz", 6)
+# Limits of the amplitude of a line over a/ω² of the acceleration that causes it.
+_LEAST_AMPLITUDE_RATIO, _GREATEST_AMPLITUDE_RATIO = 0.1, 30.0
+# Uncertainty of the frequency of an order, in resolutions.
+_OF_AN_ORDER = 0.25
+# Distance in resolutions below which a line and an order are not fitted separately.
+_LEAKS_BINS = 1.5
+# The first pass corrects the frequencies of the lines, the second their amplitudes.
+_TURNS_OF_FITTING = 2
+# Expected number of chance coincidences with acceleration lines that is accepted.
+_GREATEST_CHANCE = 0.1
 
 
 def missing_evidence(
     scans: Sequence[StudiedScan], own: int, line: SpectralLine, kinds: set[str]
-) -> str:
-    """Return what would decide between the kinds that are left."""
-    scan, found = scans[own], []
+) -> Notice:
+    """Return the measurement that would decide between the remaining ``kinds``."""
+    scan = scans[own]
     others = [s for k, s in enumerate(scans) if k != own]
     if not any(_other_pace(scan, s, line) for s in others):
-        found.append("a second scan of the part at another speed or feed")
+        scan_needed = Notice("ripple.second_scan")
     elif PART in kinds or SYNCHRONOUS in kinds:
-        found.append("a further scan at yet another speed")
+        scan_needed = Notice("ripple.further_scan")
     else:
-        found.append("a slower scan that resolves finer texture")
+        scan_needed = Notice("ripple.slower_scan")
     if scan.acceleration_lines is None:
-        found.append("an accelerometer in the bag")
-    return "needs " + " or ".join(found)
+        return Notice("ripple.needs_scan_or_accelerometer", scan=scan_needed)
+    return Notice("ripple.needs_scan", scan=scan_needed)
 
 
 def _other_pace(scan: StudiedScan, other: StudiedScan, line: SpectralLine) -> bool:
-    """Return True if any coordinate of the line runs at another pace in ``other``."""
+    """Return True if a coordinate of the line has another pace in ``other``."""
     for name in line.possible:
         if name != TIME and name in other.coordinates:
             here, there = scan.coordinates[name].pace, other.coordinates[name].pace
@@ -92,33 +82,21 @@ def _other_pace(scan: StudiedScan, other: StudiedScan, line: SpectralLine) -> bo
     return False
 
 
-# What an accelerometer feels moves the height by this part of a/ω² at least, and at most.
-_LEAST_AMPLITUDE_RATIO, _GREATEST_AMPLITUDE_RATIO = 0.1, 30.0
-# In resolutions: as uncertain is the frequency of a line that is taken for an order.
-_OF_AN_ORDER = 0.25
-# So near, in resolutions, a line and an order are not fitted apart.
-_LEAKS_BINS = 1.5
-# The first makes a line's frequency right, the second its amplitude.
-_TURNS_OF_FITTING = 2
-# So many felt lines would agree with a line of the scan by chance that they say nothing.
-_GREATEST_CHANCE = 0.1
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamedLine:
-    """A line and what it is.
+    """Spectral line and its source.
 
-    kind: one of :data:`omsm_ros.core.ripple.source_hypotheses.KINDS`;  evidence: what says so
-    needs: what would decide, if undecided
-    frequency: true, of a vibration [Hz], None where it is not known or meant
-    wavelength: of what is on the part [m];  order: waves a turn, of the spindle
-    also: another kind that the same line holds besides
+    kind: one of :data:`omsm_ros.core.ripple.source_hypotheses.KINDS`;  evidence: for it
+    needs: measurement that would decide, if undecided
+    frequency: true frequency of a vibration [Hz], None if unknown
+    wavelength: of a texture on the part [m];  order: waves a turn of the spindle
+    also: another source that contributes to the line
     """
 
     line: SpectralLine
     kind: str
-    evidence: tuple[str, ...] = ()
-    needs: str = ""
+    evidence: tuple[Notice, ...] = ()
+    needs: Notice | None = None
     frequency: float | None = None
     wavelength: float | None = None
     order: int | None = None
@@ -130,10 +108,10 @@ def analyse_scan(
     acceleration_lines: AccelerationLines | None = None,
     textures: Sequence[tuple[float, float]] = (),
 ) -> StudiedScan:
-    """Take form and lines of one scan apart.
+    """Separate form and lines of one scan.
 
-    textures: waves along the path [1/m] that are known to be there, too fine to be searched for,
-        and how well they are known
+    textures: frequencies along the path [1/m] that are known from other scans and too high to be
+        searched, with their uncertainties
     """
     formless, spectrum = _apart(signal, textures)
     return StudiedScan(
@@ -148,10 +126,10 @@ def analyse_scan(
 def analyse_scans(
     scans: Sequence[tuple[ScanSignal, AccelerationLines | None]],
 ) -> list[StudiedScan]:
-    """Study scans of one part: first each by itself, then with the textures of the others.
+    """Analyse scans of one part: first each by itself, then with the textures of the others.
 
-    Where the pace changes, a texture finer than twice the sampling distance has no image that
-    is a line; it is seen all the same, where one knows to look.
+    Where the pace changes, the alias of a texture finer than twice the sampling distance is no
+    line; a fit at its known frequency still shows it.
     """
     studied = [analyse_scan(signal, acceleration_lines) for signal, acceleration_lines in scans]
     return [
@@ -163,7 +141,7 @@ def analyse_scans(
 
 
 def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float, float]]:
-    """Return waves that ``one`` cannot resolve and their uncertainty, the best known first."""
+    """Return textures beyond the resolution of ``one`` with their uncertainty, that rising."""
     path = one.coordinates.get(PATH)
     if path is None or path.proportional_to_time:
         return []
@@ -183,7 +161,7 @@ def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float
 def _apart(
     signal: ScanSignal, textures: Sequence[tuple[float, float]]
 ) -> tuple[FormRemoved, LineSpectrum]:
-    """Form and lines, fitted beside each other: a line near an order leaks into it."""
+    """Return form and lines, fitted together because a line near an order leaks into it."""
     form = FormFit(signal)
     formless = form.without()
     known = [texture(signal, formless.residual, wave, spread) for wave, spread in textures]
@@ -200,7 +178,7 @@ def _apart(
 
 
 def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[SpectralLine]:
-    """Return the significant orders as lines over turns, and over what is proportional to turns."""
+    """Return the significant orders as lines over turns and proportional coordinates."""
     coordinates = spectrum.coordinates
     for found in formless.orders:
         ratio = np.array(found.amplitude**2 / (2 * found.uncertainty**2))
@@ -218,7 +196,6 @@ def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[Spec
             frequency=float(found.order),
             cosine=found.cosine,
             sine=found.sine,
-            # A line so near to a whole number of waves a turn is taken for one.
             frequency_uncertainty=_OF_AN_ORDER * turn.resolution,
             amplitude_uncertainty=found.uncertainty,
             significance=sigma,
@@ -227,7 +204,7 @@ def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[Spec
 
 
 def _near_stronger_line(order: SpindleOrder, spectrum: LineSpectrum, turn: Coordinate) -> bool:
-    """Return True if a stronger line is so near that the order may be its leakage."""
+    """Return True if the order may be leakage of a stronger line."""
     return any(
         abs(line.possible[TURN] - order.order) < _LEAKS_BINS * turn.resolution
         and line.amplitude > order.amplitude
@@ -237,7 +214,7 @@ def _near_stronger_line(order: SpindleOrder, spectrum: LineSpectrum, turn: Coord
 
 
 def name_lines(scans: Sequence[StudiedScan]) -> list[list[NamedLine]]:
-    """Say of each line of each scan what it is, in the order of the scans and of their lines."""
+    """Return the source of each line of each scan, in the order of the scans and their lines."""
     evidence = attribution_evidence(scans)
     done = attribute_lines(scans, evidence)
     named = {key: _named(done, key, found) for key, found in evidence.items()}
@@ -247,75 +224,81 @@ def name_lines(scans: Sequence[StudiedScan]) -> list[list[NamedLine]]:
 
 def _named(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
     scan, line = done.scans[key[0]], evidence.line
-    claim = done.claim.get(key)
-    own = None if claim is None else _by_claim(done, key, claim)
+    source = done.claim.get(key)
+    own = None if source is None else _by_other_scans(done, key, source)
     also = done.also.get(key)
-    if own is not None and claim is not None and also is not None:
-        second = _by_claim(done, key, also)
-        text = (
-            f"coincides here with a line that is {second.kind}: elsewhere this has "
-            f"{quantity(unexplained_partner_amplitude(done, [claim]), 'm')}, "
-            f"the other {quantity(unexplained_partner_amplitude(done, [also]), 'm')}"
+    if own is not None and source is not None and also is not None:
+        second = _by_other_scans(done, key, also)
+        text = Notice(
+            "ripple.coincident_lines",
+            kind=second.kind,
+            amplitude=unexplained_partner_amplitude(done, [source]),
+            other=unexplained_partner_amplitude(done, [also]),
         )
         own = replace(own, evidence=(*own.evidence, text), also=second.kind)
-    one = _matching_acceleration_lines(scan, line)
-    if one is None:
-        return own or _name_from_single_scan(done, key, evidence)
-    acceleration_as = _acceleration_text(scan, line, one)
-    if own is None or claim is None or own.kind == VIBRATION or own.kind == FOLDED:
-        return acceleration_as
-    size = unexplained_partner_amplitude(done, [claim])
-    if size > one.displacement and size > 0.5 * line.amplitude:
-        return replace(
-            own, evidence=(*own.evidence, *acceleration_as.evidence), also=acceleration_as.kind
-        )
-    text = f"coincides here with {quantity(size, 'm')} {own.kind}"
-    return replace(acceleration_as, evidence=(*acceleration_as.evidence, text), also=own.kind)
+    measured = _matching_acceleration_line(scan, line)
+    if measured is None:
+        return own or _by_single_scan(done, key, evidence)
+    vibration = _by_acceleration(scan, line, measured)
+    if own is None or source is None or own.kind in (VIBRATION, ALIASED):
+        return vibration
+    size = unexplained_partner_amplitude(done, [source])
+    if size > measured.displacement and size > 0.5 * line.amplitude:
+        return replace(own, evidence=(*own.evidence, *vibration.evidence), also=vibration.kind)
+    text = Notice("ripple.coincident_source", amplitude=size, kind=own.kind)
+    return replace(vibration, evidence=(*vibration.evidence, text), also=own.kind)
 
 
-def _by_claim(done: Attribution, key: Key, claim: SourceHypothesis) -> NamedLine:
+def _by_other_scans(done: Attribution, key: Key, source: SourceHypothesis) -> NamedLine:
     scans, line = done.scans, done.evidence[key].line
-    where = ", ".join(scans[own].signal.name for own, _ in claim.partners)
-    h = claim.hypothesis
-    if claim.kind == PART:
-        text = f"the same wavelength {along(h.coordinate)} in {where}"
+    names = [scans[own].signal.name for own, _ in source.partners]
+    h = source.hypothesis
+    if source.kind == PART:
+        code = "ripple.same_wavelength_on_path"
+        if h.coordinate == RADIUS:
+            code = "ripple.same_wavelength_on_radius"
+        text = Notice(code, scans=names)
         return NamedLine(line=line, kind=PART, evidence=(text,), wavelength=1 / h.frequency)
-    if claim.kind == ARTEFACT:
-        text = (
-            f"{where} resolves a texture of {quantity(1 / h.frequency, 'm', 4)}, shorter than "
-            "twice the sampling distance here; its image is seen at this place"
-        )
+    if source.kind == ARTEFACT:
+        text = Notice("ripple.aliased_texture", scans=names, wavelength=1 / h.frequency)
         return NamedLine(line=line, kind=ARTEFACT, evidence=(text,), wavelength=1 / h.frequency)
-    if claim.kind == SYNCHRONOUS:
-        texts = [f"{round(h.frequency)} waves a turn in {where} as well, at another speed"]
-        if scans[key[0]].formless.on_circle:
-            texts.append("on one circle a figure of the part of that order looks the same")
+    if source.kind == SYNCHRONOUS:
         order = round(h.frequency)
+        texts = [Notice("ripple.same_order", order=order, scans=names)]
+        if scans[key[0]].formless.on_circle:
+            texts.append(Notice("ripple.order_or_form_on_circle"))
         return NamedLine(line=line, kind=SYNCHRONOUS, evidence=tuple(texts), order=order)
-    return _noise_effects(done, key, claim, where)
+    return _vibration_in_other_scans(done, key, source, names)
 
 
-def _noise_effects(done: Attribution, key: Key, claim: SourceHypothesis, where: str) -> NamedLine:
-    scans, line, h = done.scans, done.evidence[key].line, claim.hypothesis
+def _vibration_in_other_scans(
+    done: Attribution, key: Key, source: SourceHypothesis, names: list[str]
+) -> NamedLine:
+    scans, line, h = done.scans, done.evidence[key].line, source.hypothesis
     rate = scans[key[0]].signal.rate
-    rates = {round(scans[own].signal.rate, 6) for own, _ in claim.partners} - {round(rate, 6)}
+    rates = {round(scans[own].signal.rate, 6) for own, _ in source.partners} - {round(rate, 6)}
     if not rates:
-        text = f"the same frequency in {where}, at another speed over the part"
-        return NamedLine(
-            line=line, kind=VIBRATION, evidence=(text, _self_or_alias_text(line, rate))
-        )
-    sampled = ", ".join(quantity(r, "Hz", 4) for r in sorted(rates))
-    text = f"seen in {where}, sampled at {sampled}, where {hertz(h.frequency)} would be seen"
-    kind = FOLDED if h.frequency > rate / 2 else VIBRATION
-    return NamedLine(line=line, kind=kind, evidence=(text,), frequency=h.frequency)
+        text = Notice("ripple.same_frequency", scans=names)
+        return NamedLine(line=line, kind=VIBRATION, evidence=(text, _or_alias(line, rate)))
+    sampled = [Notice("ripple.rate", rate=r) for r in sorted(rates)]
+    text = Notice("ripple.other_rates", scans=names, rates=sampled, frequency=h.frequency)
+    return NamedLine(
+        line=line, kind=_vibration(h.frequency, rate), evidence=(text,), frequency=h.frequency
+    )
 
 
-def _self_or_alias_text(line: SpectralLine, rate: float) -> str:
-    return f"itself or the image of {images(line.possible[TIME], rate)}: {RATE}"
+def _vibration(frequency: float, rate: float) -> str:
+    return ALIASED if frequency > rate / 2 else VIBRATION
 
 
-def _matching_acceleration_lines(scan: StudiedScan, line: SpectralLine) -> AccelerationLine | None:
-    """Return what the accelerometer feels that would be seen at this line, and is of its size."""
+def _or_alias(line: SpectralLine, rate: float) -> Notice:
+    """Return that the line may be an alias, with the lowest frequencies beyond half the rate."""
+    seen = line.possible[TIME]
+    return Notice("ripple.or_alias", first=rate - seen, second=rate + seen)
+
+
+def _matching_acceleration_line(scan: StudiedScan, line: SpectralLine) -> AccelerationLine | None:
+    """Return the acceleration line that matches in frequency and amplitude, or None."""
     if scan.acceleration_lines is None or TIME not in line.possible:
         return None
     seen, rate = line.possible[TIME], scan.signal.rate
@@ -332,53 +315,58 @@ def _matching_acceleration_lines(scan: StudiedScan, line: SpectralLine) -> Accel
     return min(near, key=lambda one: abs(np.log(one.displacement / line.amplitude)), default=None)
 
 
-def _acceleration_text(scan: StudiedScan, line: SpectralLine, one: AccelerationLine) -> NamedLine:
+def _by_acceleration(scan: StudiedScan, line: SpectralLine, one: AccelerationLine) -> NamedLine:
     rate = scan.signal.rate
     texts = [
-        f"the accelerometer feels {quantity(one.acceleration, 'm/s²')} along {one.axis} at "
-        f"{hertz(one.frequency)} ({count(round(one.significance))} σ), "
-        f"{quantity(one.displacement, 'm')} "
-        "of motion"
+        Notice(
+            "ripple.acceleration",
+            acceleration=one.acceleration,
+            axis=one.axis,
+            frequency=one.frequency,
+            significance=round(one.significance),
+            displacement=one.displacement,
+        )
     ]
-    alias_count = one.frequency > rate / 2
-    if alias_count:
+    kind = _vibration(one.frequency, rate)
+    if kind == ALIASED:
         seen = float(aliased_frequency(one.frequency, rate))
-        texts.append(f"sampled at {quantity(rate, 'Hz', 4)} it is seen at {hertz(seen)}")
-    kind = FOLDED if alias_count else VIBRATION
+        texts.append(Notice("ripple.aliased_at", rate=rate, frequency=seen))
     return NamedLine(line=line, kind=kind, evidence=tuple(texts), frequency=one.frequency)
 
 
-def _name_from_single_scan(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
-    """Name a line from one scan alone: its pace changed, and the line is sharp in one kind only."""
+def _by_single_scan(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
+    """Return the source from one scan whose pace changed, if the line fits one kind only."""
     scan, line = done.scans[key[0]], evidence.line
     kinds = {t.kind for t in evidence.tested if t.alive}
     if set(line.possible) == {PATH}:
-        text = f"sharp {along(line.coordinate)}, spread over time, for the pace changed"
+        text = Notice("ripple.sharp_on_path")
         return NamedLine(line=line, kind=PART, evidence=(text,), wavelength=1 / line.frequency)
     if TIME not in line.possible and set(line.possible) <= {TURN} and SYNCHRONOUS in kinds:
         order = whole_order(scan, line)
-        text = f"{order} waves a turn, spread over time, for the spindle's speed changed"
+        text = Notice("ripple.sharp_on_turns", order=order)
         return NamedLine(line=line, kind=SYNCHRONOUS, evidence=(text,), order=order)
     if set(line.possible) == {TIME} and len(scan.coordinates) > 1:
-        text = "sharp over time, spread over path and turns, for the pace changed"
+        text = Notice("ripple.sharp_on_time")
         return NamedLine(
-            line=line, kind=VIBRATION, evidence=(text, _self_or_alias_text(line, scan.signal.rate))
+            line=line, kind=VIBRATION, evidence=(text, _or_alias(line, scan.signal.rate))
         )
     against = tuple(
-        f"not {t.kind}: missing in {', '.join(done.scans[k].signal.name for k in t.absent)}"
+        Notice(
+            "ripple.missing_in", kind=t.kind, scans=[done.scans[k].signal.name for k in t.absent]
+        )
         for t in evidence.tested
         if not t.alive
     )
-    asked = missing_evidence(done.scans, key[0], line, kinds)
+    needs = missing_evidence(done.scans, key[0], line, kinds)
     if is_ring_or_spindle(evidence.tested):
-        asked = "needs a scan with another feed per turn"
-    return NamedLine(line=line, kind=UNDECIDED, evidence=against, needs=asked)
+        needs = Notice("ripple.needs_other_feed")
+    return NamedLine(line=line, kind=UNDECIDED, evidence=against, needs=needs)
 
 
 def _with_true_frequency(
     scans: Sequence[StudiedScan], named: dict[Key, NamedLine], key: Key
 ) -> NamedLine:
-    """Return a vibration whose true frequency another scan has decided."""
+    """Return a vibration with its true frequency, where another scan shows it."""
     own = named[key]
     if own.kind != VIBRATION or own.frequency is not None:
         return own
@@ -388,8 +376,9 @@ def _with_true_frequency(
         if other == key[0] or row.frequency is None:
             continue
         if abs(float(aliased_frequency(row.frequency, rate)) - seen) <= 1 / scan.signal.duration:
-            text = f"{scans[other].signal.name} tells its frequency: {hertz(row.frequency)}"
-            kind = FOLDED if row.frequency > rate / 2 else VIBRATION
+            name = scans[other].signal.name
+            text = Notice("ripple.true_frequency", scan=name, frequency=row.frequency)
+            kind = _vibration(row.frequency, rate)
             both = (own.evidence[0], text)
             return replace(own, kind=kind, frequency=row.frequency, evidence=both)
     return own

@@ -1,4 +1,4 @@
-"""A scan as its spectra see it: height over time, path, radius and turns of the spindle."""
+"""Heights of a scan over time, path, radius and turns of the spindle."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from omsm_ros.errors import DataError
 
 TIME, PATH, RADIUS, TURN = "time", "path", "radius", "turn"
 
-# As few frequencies as a floor of noise can be found among.
+# Fewest points for an estimate of the noise floor.
 _LEAST_POINTS = 256
-# Below a hundredth of a turn the spindle is at rest but for its encoder's noise.
+# A smaller rotation is noise of the spindle encoder [turns].
 _LEAST_TURN = 0.01
-# Feed and spindle keep their pace over such a part of a scan; it averages an encoder's noise.
+# Parts of a scan over which feed and speed are constant, to average encoder noise.
 _STRETCHES = 200
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScanSignal:
-    """A scan, each array (n,), in the order of time; samples without a reading are not in it.
+    """Readings of a scan in the order of time, each array (n,), without lost samples.
 
-    period: from reading to reading where none is lost [s];  sample: their count from the first
-    height: of the surface [m];  path: how far the probe has gone over the part [m]
+    period: from reading to reading [s];  sample: count from the first
+    height: of the surface [m];  path: travel of the probe over the part [m]
     radius: from the spindle axis [m];  turn: of the spindle [turns]
     """
 
@@ -43,22 +43,22 @@ class ScanSignal:
 
     @property
     def rate(self) -> float:
-        """Samples a second [Hz]."""
+        """Sampling rate [Hz]."""
         return 1.0 / self.period
 
     @property
     def time(self) -> FloatArray:
-        """Since the first sample [s], (n,)."""
+        """Time since the first sample [s], (n,)."""
         return np.asarray(self.sample * self.period, np.float64)
 
     @property
     def duration(self) -> float:
-        """From the first sample to the end of the last [s]."""
+        """Time from the first sample to the end of the last [s]."""
         return float((self.sample[-1] - self.sample[0] + 1) * self.period)
 
     @property
     def turns(self) -> float:
-        """By which the spindle has turned."""
+        """Range of the rotation of the spindle [turns]."""
         return float(np.ptp(self.turn))
 
     def coordinate(self, name: str) -> FloatArray:
@@ -77,16 +77,19 @@ def scan_signal(
     readings: trigger counts (n,) and heights (n,) [m]
     axes: trigger counts (m,), slides x, y [m] and spindle c [rad], each (m,)
 
-    Where the trigger starts anew, the longest run is taken. The axes are interpolated where they
-    have gaps. Raises DataError for a scan of too few points.
+    Where the trigger restarts the longest run is used. Gaps of the axes are interpolated. Raises
+    DataError for fewer than 256 points.
     """
     sample, height = _longest_run(*readings)
     count, x, y, c = _longest_run(*axes)
     known = np.isfinite(x) & np.isfinite(y) & np.isfinite(c)
     if len(sample) < _LEAST_POINTS or np.count_nonzero(known) < _LEAST_POINTS:
         raise DataError(
-            f"scan {name!r} has {len(sample)} readings and {np.count_nonzero(known)} positions "
-            f"on end, expected {_LEAST_POINTS} or more of each; record a longer scan"
+            "ripple.short_scan",
+            name=name,
+            readings=len(sample),
+            positions=int(np.count_nonzero(known)),
+            least=_LEAST_POINTS,
         )
     count, x, y, c = (values[known] for values in (count, x, y, c))
     turn = unwrapped_angle(count, c) / (2 * np.pi)
@@ -94,10 +97,9 @@ def scan_signal(
     sample, height = sample[inside], height[inside]
     if len(sample) < _LEAST_POINTS:
         raise DataError(
-            f"scan {name!r} has {len(sample)} readings between the trigger numbers of its "
-            f"positions, expected {_LEAST_POINTS} or more; record both from the same triggers"
+            "ripple.disjoint_counts", name=name, readings=len(sample), least=_LEAST_POINTS
         )
-    # Read at every other trigger, a line would be two: itself and its image within half the rate.
+    # The period is that of the readings, or a line would have an alias below half the rate.
     every = int(np.gcd.reduce(np.diff(sample)))
     columns = (track(x, y, turn), np.hypot(x, y), turn)
     path, radius, turn = (np.interp(sample, count, values) for values in columns)
@@ -113,10 +115,10 @@ def scan_signal(
 
 
 def unwrapped_angle(count: IntArray, angle: FloatArray) -> FloatArray:
-    """Return an encoder's angle (n,) [rad] counted on over its turns.
+    """Return the angle (n,) [rad] of an encoder, unwrapped over its turns.
 
-    An encoder that starts anew each turn is recognised by its range; over a gap of the trigger
-    ``count`` (n,) the spindle is taken to have kept its median pace.
+    An encoder that restarts each turn is recognised by its range. Over a gap of the trigger
+    ``count`` (n,) the median speed of the spindle is assumed.
     """
     step, gap = np.diff(angle), np.diff(count)
     if np.ptp(angle) > 2 * np.pi * 1.001 or not np.any(abs(step) > np.pi):
@@ -129,12 +131,12 @@ def unwrapped_angle(count: IntArray, angle: FloatArray) -> FloatArray:
 
 
 def track(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return how far the probe has gone over the part [m], (n,).
+    """Return the travel of the probe over the part [m], (n,).
 
     x, y: of the slides [m];  turn: of the spindle [turns]
 
-    Noise of the encoders does not add up: on a turning part ``ds = √(r² + (dr/dc)²) dc`` with
-    dr/dc smooth; else every step is taken along the smooth direction of the motion.
+    Encoder noise must not accumulate: on a turning part ``ds = √(r² + (dr/dc)²) dc`` with a smooth
+    dr/dc; otherwise each step is projected on the smooth direction of the motion.
     """
     if np.ptp(turn) > _LEAST_TURN:
         angle = 2 * np.pi * turn
@@ -156,7 +158,7 @@ def track(x: FloatArray, y: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the middles of stretches, and the slope of ``values`` over ``over`` there."""
+    """Return the middles of parts of the scan, and the slope of ``values`` over ``over`` there."""
     parts = min(_STRETCHES, len(over) // 8)
     cuts = np.linspace(0, len(over), parts + 1).astype(np.int64)
     length = np.diff(cuts)
@@ -167,7 +169,7 @@ def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def _longest_run(count: IntArray, *columns: FloatArray) -> tuple[IntArray, ...]:
-    """Return the longest part in which the trigger's count only rises."""
+    """Return the longest part with a rising trigger count."""
     cuts = np.r_[0, np.flatnonzero(np.diff(count) <= 0) + 1, len(count)]
     longest = int(np.argmax(np.diff(cuts)))
     part = slice(cuts[longest], cuts[longest + 1])
@@ -176,10 +178,10 @@ def _longest_run(count: IntArray, *columns: FloatArray) -> tuple[IntArray, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """How finely a scan samples the part at one radius.
+    """Sampling of the part at one radius.
 
-    radius: [m];  distance: between samples along the path [m] (the paper's Table 1)
-    shortest_wavelength: that is not confused with its folded image, twice the distance [m]
+    radius: [m];  distance: between samples along the path [m] (Table 1 of the paper)
+    shortest_wavelength: without aliasing, twice the distance [m]
     """
 
     radius: float
@@ -188,7 +190,7 @@ class Sampling:
 
 
 def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
-    """Return the sampling at ``places`` radii, outermost first; one place on a circle."""
+    """Return the sampling at ``places`` radii, outermost first; at one radius on a circle."""
     samples = np.diff(signal.sample)
     distance = abs(np.diff(signal.path)) / samples
     middle = 0.5 * (signal.radius[1:] + signal.radius[:-1])

@@ -1,7 +1,10 @@
-"""Where would a line be seen in another scan, if it were on the part, a vibration, the spindle?
+"""Test hypotheses on the sources of lines against all scans, and select the sources.
 
-A line is the same wavelength over the part (along the path, or from ring to ring), the same
-frequency in time, or the same number a turn. Each says where to look in every other scan.
+A texture on the part has the same wavelength in every scan (along the path or from ring to ring), a
+vibration the same frequency, a spindle error the same number of waves a turn. Each hypothesis
+predicts the frequency of the line in every other scan. Lines found there are its partners. Sources
+are selected one after the other, those with most partners first; a line that is explained by one
+source is no evidence for another.
 """
 
 from __future__ import annotations
@@ -20,31 +23,33 @@ from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSigna
 from omsm_ros.core.ripple.spectral_line import SpectralLine
 
 PART, VIBRATION, SYNCHRONOUS = "on the part", "vibration", "synchronous spindle error"
-FOLDED, ARTEFACT, UNDECIDED = "folded vibration", "artefact of sampling", "undecided"
-KINDS = (PART, VIBRATION, FOLDED, SYNCHRONOUS, ARTEFACT, UNDECIDED)
+ALIASED, ARTEFACT, UNDECIDED = "aliased vibration", "artefact of sampling", "undecided"
+KINDS = (PART, VIBRATION, ALIASED, SYNCHRONOUS, ARTEFACT, UNDECIDED)
 
-# Harmonics of a turn that bearings, motor and drawbar make; more waves a turn are texture.
+# Highest harmonic of bearings, motor and drawbar; more waves a turn are texture.
 HIGHEST_SYNCHRONOUS = 500
-# With fewer turns everything is near a whole number of waves a turn.
+# Fewer turns do not resolve whole numbers of waves a turn.
 _LEAST_TURNS = 4.0
-# A vibration from 0 to so many times the sampling rate is looked for behind its image.
+# A vibration is searched up to this multiple of the sampling rate.
 _MOST_ALIASES = 5
-# Mains keep their frequency to 2e-4 (ENTSO-E: ±10 mHz of 50 Hz most of the time); a feed and a
-# radius are known to 1e-4.
+# Relative stability of frequencies: mains 2e-4 (ENTSO-E: ±10 mHz of 50 Hz most of the time), feed
+# and radius 1e-4.
 _STEADY = {TIME: 2e-4, PATH: 1e-4, RADIUS: 1e-4, TURN: 1e-5}
-# Standard uncertainties of a frequency; parts of a resolution that window and fit may leave.
+# Tolerance of a frequency: standard uncertainties, and parts of a resolution for window and fit.
 _TIMES_UNCERTAINTY, _OWN_BIN, _OTHER_BIN = 4.0, 0.3, 0.1
-# A place so wide that some line is likely to lie in it by chance tells nothing.
+# Largest expected number of chance coincidences within a tolerance.
 _GREATEST_CHANCE = 0.1
-# Expected amplitude over its σ, from which an absent line is really absent.
-_DETECTION_PROBABILITY_ = 9.0
-# The same line may be so many times as strong in another scan.
+# Expected amplitude over its σ from which a line that is not found is absent.
+_DETECTION_RATIO = 9.0
+# Largest ratio of the amplitudes of one line in two scans.
 _AMPLITUDES = 3.5
+# Ratio of the amplitudes of a partner and a line within which one source explains the partner.
+_EXPLAINED = (0.7, 1.4)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StudiedScan:
-    """A scan and all that was found in it; felt is None without an accelerometer.
+    """Scan with its lines; ``acceleration_lines`` is None without an accelerometer.
 
     lines: those of the spectrum and the orders that were found with the form
     """
@@ -57,20 +62,20 @@ class StudiedScan:
 
     @property
     def coordinates(self) -> dict[str, Coordinate]:
-        """Those in which it moves."""
+        """Coordinates in which the scan moves."""
         return self.spectrum.coordinates
 
     def resolution(self, coordinate: str) -> float:
-        """Return the unit of frequencies: Hz, 1/m or 1/turn."""
+        """Return the resolution of frequencies over ``coordinate`` [Hz], [1/m] or [1/turn]."""
         return self.coordinates[coordinate].resolution
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A line as one of a ``kind``, of a true ``frequency`` in ``coordinate``.
+    """Hypothesis that a line is of a ``kind``, with a true ``frequency`` over ``coordinate``.
 
-    uncertainty: of that frequency, with what the scan's length leaves open
-    alias_count: how often a vibration was folded before it was seen where it was
+    uncertainty: of that frequency, including the resolution of the scan
+    alias_count: zone of the alias of a vibration, 0 below half the sampling rate
     """
 
     kind: str
@@ -94,7 +99,7 @@ class ExpectedLine:
 
 
 def hypotheses_of(scan: StudiedScan, line: SpectralLine) -> Iterator[Hypothesis]:
-    """Yield what ``line`` of ``scan`` may be; of a vibration also what folds to it."""
+    """Yield the hypotheses for a ``line`` of ``scan``, including vibrations with this alias."""
     if TIME in line.possible:
         seen, spread = line.possible[TIME], spread_of(scan, line, TIME)
         rate = scan.signal.rate
@@ -111,7 +116,7 @@ def hypotheses_of(scan: StudiedScan, line: SpectralLine) -> Iterator[Hypothesis]
 
 
 def whole_order(scan: StudiedScan, line: SpectralLine) -> int | None:
-    """Return how many waves a turn the line has, if it is a whole number."""
+    """Return the waves a turn of the line if they are a whole number, else None."""
     if TURN not in line.possible or scan.signal.turns < _LEAST_TURNS:
         return None
     per_turn = line.possible[TURN]
@@ -124,7 +129,7 @@ def whole_order(scan: StudiedScan, line: SpectralLine) -> int | None:
 
 
 def spread_of(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
-    """Return how far the true frequency in ``coordinate`` may be from where the line was seen."""
+    """Return the tolerance of the frequency of the line over ``coordinate`` in other scans."""
     return (
         _TIMES_UNCERTAINTY * _own_uncertainty(scan, line, coordinate)
         + _OTHER_BIN * scan.resolution(coordinate)
@@ -133,13 +138,13 @@ def spread_of(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
 
 
 def _own_uncertainty(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
-    """Return the standard uncertainty of its frequency in ``coordinate``."""
+    """Return the standard uncertainty of its frequency over ``coordinate``."""
     share = scan.resolution(coordinate) / scan.resolution(line.coordinate)
     return line.frequency_uncertainty * share
 
 
 def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> ExpectedLine | None:
-    """Return where the line would be in ``scan``; None if the scan cannot show it."""
+    """Return where the line is expected in ``scan``, None if the scan cannot show it."""
     coordinate = scan.coordinates.get(hypothesis.coordinate)
     if coordinate is None:
         return None
@@ -155,14 +160,14 @@ def place_in(scan: StudiedScan, hypothesis: Hypothesis) -> ExpectedLine | None:
 
 
 def apart(one: ExpectedLine | None, other: ExpectedLine | None) -> bool:
-    """Return True if a scan in which two hypotheses have these places separates them."""
+    """Return True if a scan with these expected lines separates their hypotheses."""
     if one is None or other is None or one.coordinate != other.coordinate:
         return True
     return abs(one.frequency - other.frequency) > one.tolerance + other.tolerance
 
 
 def lines_at(scan: StudiedScan, place: ExpectedLine) -> SpectralLine | None:
-    """Return the line of ``scan`` at ``place``, the strongest if there are several."""
+    """Return the strongest line of ``scan`` at ``place``, None if there is none."""
     near = [
         line
         for line in scan.lines
@@ -174,14 +179,14 @@ def lines_at(scan: StudiedScan, place: ExpectedLine) -> SpectralLine | None:
 
 
 def chance_probability(scan: StudiedScan, place: ExpectedLine) -> float:
-    """Return how many lines of ``scan`` would lie at ``place`` if they lay anywhere."""
+    """Return the expected number of lines of ``scan`` at ``place`` by chance."""
     band = scan.coordinates[place.coordinate].highest
     count = sum(place.coordinate in line.possible for line in scan.lines)
     return count * 2 * place.tolerance / band
 
 
 def is_detected(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> bool | None:
-    """Return whether a line of ``amplitude`` [m] elsewhere is in ``scan``; None: undecidable."""
+    """Return whether ``scan`` shows a line of ``amplitude`` [m], None if it cannot decide."""
     place = place_in(scan, hypothesis)
     if place is None or chance_probability(scan, place) > _GREATEST_CHANCE:
         return None
@@ -199,22 +204,22 @@ def is_detected(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> 
 def _may_be_masked(
     scan: StudiedScan, hypothesis: Hypothesis, place: ExpectedLine, amplitude: float
 ) -> bool:
-    """Return True if the line could be there and not be found."""
+    """Return True if the line could be present without being found."""
     if hypothesis.kind == VIBRATION:
-        return False  # the machine may stand still: absence is no proof, and is never used as one
+        return False  # a vibration may stop, so that its absence is never used as evidence
     if place.coordinate == TIME:
         if place.frequency < (LEAST_WAVES + 1) * scan.resolution(TIME) or _near_form(scan, place):
             return True
         floor = scan.spectrum.sigma_at(place.frequency)
     elif place.aliased:
-        return True  # it is looked for only where another scan has found it
+        return True  # an alias is searched only where another scan has found its line
     else:
         floor = scan.spectrum.noise * np.sqrt(2 / len(scan.signal))
-    return amplitude * _least_share(scan, hypothesis) < _DETECTION_PROBABILITY_ * floor
+    return amplitude * _least_share(scan, hypothesis) < _DETECTION_RATIO * floor
 
 
 def _near_form(scan: StudiedScan, place: ExpectedLine) -> bool:
-    """Return True where taking out the form takes a line out as well."""
+    """Return True where the removal of the form removes a line as well."""
     turn = scan.coordinates.get(TURN)
     if turn is None:
         return False
@@ -227,29 +232,20 @@ def _near_form(scan: StudiedScan, place: ExpectedLine) -> bool:
 
 
 def _least_share(scan: StudiedScan, hypothesis: Hypothesis) -> float:
-    """Return the share of a texture's amplitude that an average over a sample period leaves."""
+    """Return the attenuation of a texture by averaging over a sample period."""
     coordinate = scan.coordinates[hypothesis.coordinate]
     return float(abs(np.sinc(hypothesis.frequency * coordinate.pace * scan.signal.period)))
 
 
-# Which kinds does each line have evidence for, and which explanation needs the fewest things?
-#
-# A claim says what a line is, and names its partners: the lines of other scans that are the same
-# thing there, where no other kind would put it. Claims are settled one after the other, those
-# with most partners first; what one of them explains is evidence for nothing else.
-
-# A partner of that size, over the line's own, is explained by it and by nothing besides.
-_EXPLAINED = (0.7, 1.4)
-
 Key = tuple[int, int]
-"""Place of a scan, and of a line in it."""
+"""Index of a scan, and of a line in it."""
 
 
 @dataclass(frozen=True, slots=True)
 class SourceHypothesis:
-    """A line is of this ``kind``; by its partners, and with none that is missing.
+    """Source of a line that its ``partners`` support and no scan contradicts.
 
-    texture: of an artefact, the line that another scan resolves
+    texture: for an artefact, the line in the scan that resolves it
     """
 
     kind: str
@@ -260,7 +256,7 @@ class SourceHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class TestedHypothesis:
-    """A hypothesis of a line: partners where it is there, scans in which it is missing."""
+    """Hypothesis with the partners that support it, and the scans in which it is missing."""
 
     hypothesis: Hypothesis
     present: tuple[Key, ...]
@@ -268,18 +264,18 @@ class TestedHypothesis:
 
     @property
     def kind(self) -> str:
-        """Of the hypothesis."""
+        """Kind of the hypothesis."""
         return self.hypothesis.kind
 
     @property
     def alive(self) -> bool:
-        """False if a scan that would have to show it does not; a vibration may come and go."""
+        """False if it is missing in a scan; a vibration may be missing."""
         return self.kind == VIBRATION or not self.absent
 
 
 @dataclass(frozen=True, eq=False)
 class LineEvidence:
-    """Of one line: all hypotheses as tested, and the claims that follow."""
+    """Tested hypotheses of one line, and the sources that they support."""
 
     line: SpectralLine
     tested: tuple[TestedHypothesis, ...]
@@ -333,7 +329,7 @@ def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
 def _claims(
     scans: Sequence[StudiedScan], tested: Sequence[TestedHypothesis]
 ) -> tuple[SourceHypothesis, ...]:
-    """Return hypotheses that a scan separates from all other kinds, and that none contradicts."""
+    """Return the hypotheses that a scan separates from all other kinds and none contradicts."""
     alive = [t for t in tested if t.alive]
     found = []
     for one in alive:
@@ -345,9 +341,9 @@ def _claims(
 
 
 def _is_rival(one: TestedHypothesis, other: TestedHypothesis) -> bool:
-    """Return True for another kind, unless it folds: what folds is no rival of what does not."""
+    """Return True for another kind that needs no aliasing."""
     if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
-        return False  # on circles of one radius a figure of the part repeats just so
+        return False  # on circles of one radius form of the part repeats in the same way
     return one.kind != other.kind and not other.hypothesis.alias_count
 
 
@@ -357,7 +353,7 @@ def _decides(scan: StudiedScan, one: TestedHypothesis, rivals: Sequence[TestedHy
 
 
 def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
-    """Return the claims with one vibration: that in most scans, then the lowest frequency."""
+    """Return the sources with one vibration: the one in most scans, then of lowest frequency."""
     shaken = [c for c in found if c.kind == VIBRATION]
     if not shaken:
         return found
@@ -368,7 +364,7 @@ def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
 def _images(
     scans: Sequence[StudiedScan], claims: dict[Key, tuple[SourceHypothesis, ...]]
 ) -> dict[Key, list[SourceHypothesis]]:
-    """Return lines to which a texture that another scan resolves folds in a scan too coarse."""
+    """Return the sources of aliases of a texture that another scan resolves, by line."""
     found: dict[Key, list[SourceHypothesis]] = {}
     for key, own in claims.items():
         for texture in own:
@@ -384,7 +380,7 @@ def _images(
 
 @dataclass
 class Attribution:
-    """What each line is, as far as it is decided; ``also`` what else it holds."""
+    """Selected source of each line, and in ``also`` a second source that contributes to it."""
 
     scans: Sequence[StudiedScan]
     evidence: dict[Key, LineEvidence]
@@ -392,10 +388,7 @@ class Attribution:
     also: dict[Key, SourceHypothesis] = field(default_factory=dict)
 
     def open_claims(self, key: Key) -> list[SourceHypothesis]:
-        """Return the claims of a line whose partners are not all explained as something else.
-
-        All of them if none is left: a line is something.
-        """
+        """Return the sources of a line with a partner that no other source explains, else all."""
         every = self.evidence[key].claims
         left = [c for c in every if any(self._may_be(p, c) for p in c.partners)]
         return left or list(every)
@@ -405,7 +398,7 @@ class Attribution:
         return settled is None or _family(settled.kind) == _family(claim.kind)
 
     def settle(self, key: Key, claim: SourceHypothesis) -> None:
-        """Decide, and with it what partners of its size are."""
+        """Select a source for ``key``, and for its partners of similar amplitude."""
         self.claim[key] = claim
         size = self.evidence[key].line.amplitude
         for partner in claim.partners:
@@ -419,7 +412,7 @@ class Attribution:
                 self._note_secondary_sources(partner, theirs)
 
     def _note_secondary_sources(self, key: Key, claim: SourceHypothesis) -> None:
-        """Note what else a line holds by what was decided of its partners before it."""
+        """Record a second source of a line whose partners were selected before."""
         for other in self.evidence[key].claims:
             if _family(other.kind) != _family(claim.kind) and any(
                 partner in self.claim
@@ -432,7 +425,7 @@ class Attribution:
     def _adopt_partner_claim(
         self, partner: Key, claim: SourceHypothesis, key: Key
     ) -> SourceHypothesis | None:
-        """Return ``partner``'s own claim to be what ``key`` is by ``claim``; it names ``key``."""
+        """Return the source of ``partner`` that is the same as ``claim`` and names ``key``."""
         own = [
             c
             for c in self.evidence[partner].claims
@@ -442,7 +435,7 @@ class Attribution:
 
 
 def attribute_lines(scans: Sequence[StudiedScan], evidence: dict[Key, LineEvidence]) -> Attribution:
-    """Settle all claims: lines of one kind first, with most partners, then the largest."""
+    """Select a source for all lines: first lines of one kind, with most partners, then largest."""
     done = Attribution(scans, evidence)
     while True:
         waiting = [
@@ -466,7 +459,7 @@ def _urgency(
 
 
 def _largest(done: Attribution, key: Key, claims: Sequence[SourceHypothesis]) -> SourceHypothesis:
-    """Return, of several things at one frequency, the one that is strongest where it is alone."""
+    """Return, of several sources at one frequency, the one with the strongest partners."""
     by_kind: dict[str, list[SourceHypothesis]] = {}
     for claim in claims:
         by_kind.setdefault(_family(claim.kind), []).append(claim)
@@ -478,7 +471,7 @@ def _largest(done: Attribution, key: Key, claims: Sequence[SourceHypothesis]) ->
 
 
 def unexplained_partner_amplitude(done: Attribution, claims: Sequence[SourceHypothesis]) -> float:
-    """Return the greatest amplitude of the partners that nothing else explains [m]."""
+    """Return the largest amplitude of the partners that no other source explains [m]."""
     found = [
         done.evidence[p].line.amplitude
         for c in claims
@@ -489,11 +482,11 @@ def unexplained_partner_amplitude(done: Attribution, claims: Sequence[SourceHypo
 
 
 def _family(kind: str) -> str:
-    """Return the kind; a texture that is folded is of the same family as one that is resolved."""
+    """Return the kind, with aliased texture counted as texture on the part."""
     return PART if kind == ARTEFACT else kind
 
 
 def is_ring_or_spindle(tested: Sequence[TestedHypothesis]) -> bool:
-    """Return True if a line may be rings on the part as well as the spindle, both with partners."""
+    """Return True if partners support both rings on the part and a spindle error."""
     kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.present}
     return (PART, RADIUS) in kinds and any(kind == SYNCHRONOUS for kind, _ in kinds)

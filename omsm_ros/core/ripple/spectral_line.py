@@ -1,4 +1,4 @@
-"""A line, and how several are fitted at once: frequency, cosine and sine, by Gauss-Newton."""
+"""Spectral lines and their joint fit of frequency, cosine and sine by Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from omsm_ros.core.ripple.scan_signal import PATH, ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
 
 CLOSEST = 0.6
-"""Closer than this, in resolutions, a line is another's side lobe; two cannot be fitted."""
+"""Least distance of two lines in resolutions; closer ones cannot be separated."""
 
-# From a quarter of a resolution off: two lines one resolution apart are then right to 1e-9 of one,
-# after three steps to 0.003, which leaves 0.4 % of their amplitude.
+# From a start a quarter of a resolution off, two lines one resolution apart converge to 1e-9 of a
+# resolution in four steps, to 0.003 in three.
 _FITTING_STEPS = 4
-# Frequencies to either side of where a known texture is looked for.
+# Frequencies to either side that are tried for a known texture.
 _MOST_TRIED = 200
-# Forty lines of three columns are 31 MB.
+# Samples at a time: forty lines of three columns are 31 MB.
 _CHUNK = 32_768
-# Of its power that a line in another coordinate takes, from which on that one is tried.
+# Share of power in another coordinate from which that coordinate is tried.
 _LIKE = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpectralLine:
-    """``cosine · cos(2π f u) + sine · sin(2π f u)``, u one coordinate of the scan.
+    """Line ``cosine · cos(2π f u) + sine · sin(2π f u)`` over a coordinate u of the scan.
 
-    coordinate: in which it is sharpest;  frequency: there [1/unit], its standard uncertainty
-    amplitude_uncertainty: of cosine and sine alike, from the noise floor beside the line [m]
-    significance: σ, see :func:`noise_floor.significance`
-    possible: every coordinate in which it may be a line, and the frequency there
+    coordinate: in which it is sharpest;  frequency, frequency_uncertainty (k = 1): there [1/unit]
+    amplitude_uncertainty: of cosine and sine, from the noise floor at the line [m]
+    significance: [σ], see :func:`omsm_ros.core.ripple.density.significance`
+    possible: frequency in each coordinate in which it may be a line
     """
 
     coordinate: str
@@ -46,7 +46,7 @@ class SpectralLine:
 
     @property
     def amplitude(self) -> float:
-        """Half of peak to valley [m]."""
+        """Amplitude, half of peak to valley [m]."""
         return float(np.hypot(self.cosine, self.sine))
 
 
@@ -58,7 +58,7 @@ def texture(
     step = 0.5 / float(np.ptp(place))
     reach = min(int(spread / step) + 1, _MOST_TRIED)
     tried = frequency + step * np.arange(-reach, reach + 1)
-    # From one frequency to the next every sample turns by the same angle.
+    # From one frequency to the next each sample turns by a constant angle.
     turning = values * np.exp(-2j * np.pi * tried[0] * place)
     turn = np.exp(-2j * np.pi * step * place)
     power = np.empty(len(tried))
@@ -71,7 +71,7 @@ def texture(
 
 
 def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> SpectralLine:
-    """Return a line to start a fit with: the Fourier sum of ``values`` (n,) at ``frequency``."""
+    """Return a start for a fit from the Fourier sum of ``values`` (n,) at ``frequency``."""
     phase = np.exp(-2j * np.pi * frequency * coordinate.values)
     mean = 2 * complex(values @ phase) / len(values)
     return SpectralLine(
@@ -82,7 +82,7 @@ def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> Spect
 def fitted(
     lines: list[SpectralLine], coordinates: dict[str, Coordinate], values: FloatArray
 ) -> list[SpectralLine]:
-    """Fit all ``lines`` at once to ``values`` (n,): amplitudes first, then frequencies as well."""
+    """Fit all ``lines`` together to ``values`` (n,): amplitudes first, then frequencies as well."""
     lines = _stepped(lines, coordinates, values, turning=False)
     for _ in range(_FITTING_STEPS):
         lines = _apart(_stepped(lines, coordinates, values, turning=True), coordinates)
@@ -95,9 +95,9 @@ def in_their_coordinates(
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
 ) -> list[SpectralLine]:
-    """Return all lines, each ``new`` one in the coordinate that takes most of its power.
+    """Return all lines, each ``new`` one in the coordinate that leaves the smallest residual.
 
-    Where the pace hardly changes, a spectrum's grid alone may make the wrong one look better.
+    Where the pace hardly changes, the grid of a spectrum may favour the wrong coordinate.
     """
     names = {(line.coordinate, round(line.frequency / _bin(line, coordinates))) for line in new}
     chosen = []
@@ -131,7 +131,7 @@ def _best_version(
 def waves_of(
     lines: Sequence[SpectralLine], coordinates: dict[str, Coordinate]
 ) -> Callable[[np.ndarray], FloatArray]:
-    """Return a function: cosine and sine of every line at given samples, to fit beside the form."""
+    """Return a function that gives cosine and sine of each line at samples (m,), (m, 2 · lines)."""
 
     def waves(chosen: np.ndarray) -> FloatArray:
         columns: list[FloatArray] = []
@@ -144,7 +144,7 @@ def waves_of(
 
 
 def _apart(lines: list[SpectralLine], coordinates: dict[str, Coordinate]) -> list[SpectralLine]:
-    """Return ``lines`` without the weaker of any two that are one."""
+    """Return ``lines`` without the weaker of any two that are too close to separate."""
     kept: list[SpectralLine] = []
     for line in sorted(lines, key=lambda one: -one.amplitude):
         bin_ = coordinates[line.coordinate].resolution
@@ -198,9 +198,9 @@ def _stepped(
 
 
 def _moved(line: SpectralLine, step: FloatArray, coordinate: Coordinate) -> SpectralLine:
-    """Return ``line`` moved by ``step``, half a resolution at most: beyond is another line.
+    """Return ``line`` after a ``step``, limited to half a resolution of frequency.
 
-    The derivative is taken about the middle of the scan, the phase at the coordinate's zero.
+    The step of frequency holds the phase at the middle of the scan.
     """
     cosine, sine = line.cosine + step[0], line.sine + step[1]
     if len(step) < 3:

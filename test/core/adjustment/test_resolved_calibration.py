@@ -39,7 +39,7 @@ def found_by(values: FloatArray = VALUES, **other: object) -> SelfCalibration:
         "residual": 10e-9,
         "followed": 1e-9,
         "agreement": ScanConsistency(ratio=1.0, disagreement=0.1e-9, noise=10e-9),
-        "surprise": 1.0,
+        "prior_conflict": 1.0,
         "own": np.array([[1e-7, 2e-7, 3e-7, 4e-7, 5e-7]]),
         "own_uncertainty": np.array([[1e-8, 2e-8, 3e-8, 4e-8, 5e-8]]),
         "amplitudes": np.array([1e-6, 1e-6, 1e-15]),
@@ -289,10 +289,10 @@ def test_equal_speeds_are_a_reversal(speeds: tuple[float, ...], source: str) -> 
 
 def test_what_the_scans_do_not_tell_is_said() -> None:
     (everything,) = undetermined(found_by())
-    assert "only a reference determines it" in everything
+    assert "only a reference determines it" in str(everything)
     known = np.array([True, False, True, False])
     words = undetermined(found_by(known=known))
-    assert [text.split(":")[0] for text in words[:2]] == ["latency", "curvature of the gain"]
+    assert [str(text).split(":")[0] for text in words[:2]] == ["latency", "curvature of the gain"]
     assert words[2:] == [everything]
     made = of_scans(known=known)
     latency = latency_of(made)
@@ -319,7 +319,7 @@ BAD_AGREEMENT = ScanConsistency(ratio=9.0, disagreement=31e-9, noise=10e-9)
     ("wrong", "said"),
     [
         ({"agreement": BAD_AGREEMENT}, "contradict each other by 31.0 nm rms, 9.0 times"),
-        ({"surprise": 40.0}, "scans and step test contradict each other"),
+        ({"prior_conflict": 40.0}, "scans and step test contradict each other"),
         ({"values": np.array([0.0, 0.0, 0.0, -1e-4])}, "100 µs early"),
     ],
 )

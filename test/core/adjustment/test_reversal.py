@@ -100,7 +100,7 @@ def test_a_poorly_known_delay_of_the_calibration_limits_the_estimate(
 
 
 def test_scans_in_one_direction_are_refused(late_scans: list[ScanColumns]) -> None:
-    with pytest.raises(DataError, match="turn the same way"):
+    with pytest.raises(DataError, match="turn in the same direction"):
         reversal([late_scans[0], late_scans[0]], LATE)
 
 

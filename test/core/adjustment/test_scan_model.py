@@ -27,7 +27,7 @@ def test_a_scan_whose_pace_is_not_known_is_refused() -> None:
     turns = ScanModel([good, good], 3).turns
     assert turns == pytest.approx([2 * 6.0 / (2 * np.pi)] * 2, rel=1e-3)
     lost = np.where(np.arange(2000) == 7, np.nan, good.angular_rate)
-    with pytest.raises(DataError, match="pace of C"):
+    with pytest.raises(DataError, match="speed of C"):
         ScanModel([good, replace(good, angular_rate=lost)], 3)
 
 

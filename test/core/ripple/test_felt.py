@@ -35,7 +35,7 @@ def test_the_longest_run_without_a_gap_is_taken():
 
 
 def test_a_quarter_of_a_second_tells_nothing():
-    with pytest.raises(DataError, match="acceleration of 200 samples on end"):
+    with pytest.raises(DataError, match="acceleration of 200 successive samples"):
         accelerations_of([*blocks(200), *blocks(100, first=500)])
 
 

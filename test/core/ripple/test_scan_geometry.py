@@ -159,7 +159,7 @@ class TestScan:
         assert (found.sample[0], found.height[0], found.height[-1]) == (0, 500.0, 3000.0)
 
     def test_positions_that_are_all_lost_are_refused_by_their_number(self):
-        with pytest.raises(DataError, match=r"'A' has 4000 readings and 0 positions on end"):
+        with pytest.raises(DataError, match=r"'A' has 4000 readings and 0 positions"):
             self.scan(EVERY, EVERY, np.full(COUNT, np.nan))
 
 
