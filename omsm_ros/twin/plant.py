@@ -137,7 +137,7 @@ def _through_system(
 
 
 def _command(motion: Motion, begin: float, count: int, step: float) -> FloatArray:
-    """Return the commanded Z in the middle of ``count`` steps of ``step`` [s] from ``begin`` [s]."""
+    """Return the commanded Z in the middle of ``count`` steps [s] from ``begin`` [s]."""
     return motion.positions(begin + (np.arange(count, dtype=np.float64) + 0.5) * step).z
 
 
