@@ -13,6 +13,7 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 | ``{share:%}`` | percent |
 | ``{p:chance}`` | ``p = 0.02`` |
 | ``{n:count}`` | number of things, ``290 011`` |
+| ``{lost:counts}`` | mapping of counts, ``3 not ok, 1 duplicate`` |
 | ``{factor:plain/2}`` | number without unit, to 2 digits |
 | ``{names:list}`` | items separated by commas |
 | ``{names:and}`` | items joined by "and" |
@@ -88,6 +89,7 @@ _WITH_DIGITS: dict[str, Callable[..., str]] = {"%": readable.percent, "plain": r
 _WRITERS: dict[str, Callable[[Any], str]] = {
     "chance": readable.p_value_text,
     "count": readable.count,
+    "counts": readable.counts_text,
     "list": lambda items: ", ".join(map(str, items)) or "none",
     "and": lambda items: " and ".join(map(str, items)),
     "words": lambda name: str(name).replace("_", " "),

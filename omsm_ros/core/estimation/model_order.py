@@ -83,7 +83,7 @@ def explore(
     Raises IdentificationError for an order that is no number of poles to try.
     """
     if not 0 <= order <= MAX_POLES:
-        raise IdentificationError(f"order {order!r}, expected 0 (choose) to {MAX_POLES}")
+        raise IdentificationError("estimation.order", order=order, most=MAX_POLES)
     found: list[Candidate] = []
     fruitless = 0
     for poles in range(max(_FREE_POLES, order) + 1):

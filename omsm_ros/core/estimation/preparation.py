@@ -29,7 +29,6 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import least_squares
-from omsm_ros.readable import plain, quantity
 
 # What happened before the record is forgotten after this time.
 _SETTLING_S = 50e-3
@@ -91,13 +90,10 @@ def _motion(record: MotionRecord, source: str) -> FloatArray:
     if source == "encoder":
         return record.z
     if source != "reference":
-        raise ConfigurationError(f"input {source!r}, expected 'encoder' or 'reference'")
+        raise ConfigurationError("estimation.unknown_input", input=source)
     known = np.isfinite(record.reference) if record.reference is not None else np.zeros(0, bool)
     if record.reference is None or not np.any(known):
-        raise IdentificationError(
-            "input 'reference', but the recording has no reading of a reference sensor; "
-            "record /omsm/reference or use input 'encoder'"
-        )
+        raise IdentificationError("estimation.no_reference")
     index = np.arange(len(known))
     return np.asarray(np.interp(index, index[known], record.reference[known]))
 
@@ -133,9 +129,10 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
     used &= carried == motion
     if np.sum(used) < LEAST_SAMPLES:
         raise StepTestError(
-            f"{int(np.sum(used))} of {samples} samples can be compared: others are lost, or taken "
-            "while something settles or the motion starts or ends; record at least "
-            f"{LEAST_SAMPLES} more"
+            "estimation.few_compared",
+            compared=int(np.sum(used)),
+            samples=samples,
+            least=LEAST_SAMPLES,
         )
     output = np.where(record.ok, record.distance, 0.0)
     ramp = np.linspace(-1.0, 1.0, samples)
@@ -210,21 +207,14 @@ def check_gain(gain: float, *, slack: float = 1.0) -> None:
     """
     low, high = _PLAUSIBLE_GAIN
     if not low / slack <= abs(gain) <= high * slack:
-        raise IdentificationError(
-            f"the probe moves by {plain(gain)} per travel of the axis, expected about 1: check "
-            "that it looks at a fixed target within its range, that both are in metres, and that Z "
-            "moves to and fro, for what goes evenly one way is taken for drift"
-        )
+        raise IdentificationError("estimation.implausible_gain", gain=gain)
 
 
 def _check_not_clipped(problem: Problem) -> None:
     motion, output = problem.input[problem.used], problem.output[problem.used]
     levels = np.unique(output)
     if len(levels) < 2:
-        raise IdentificationError(
-            "the distance does not change while the axis moves; check that the probe is "
-            "connected, sees its target and is not held at the end of its range"
-        )
+        raise IdentificationError("estimation.constant_distance")
     quantum = float(np.min(np.diff(levels)))
     allowed = max(20 * sample_noise(output), 3 * quantum, 2e-3 * float(np.ptp(motion)))
     for name, extreme in (("greatest", levels[-1]), ("least", levels[0])):
@@ -232,10 +222,9 @@ def _check_not_clipped(problem: Problem) -> None:
         near = int(np.sum(np.abs(output - extreme) < 1.5 * quantum)) - len(there)
         piled = len(there) >= 5 and len(there) > _PILED * near
         if piled and np.ptp(there) > allowed:
+            travel = float(np.ptp(there))
             raise IdentificationError(
-                f"the probe gives its {name} distance {len(there)} times while the axis moves by "
-                f"{quantity(float(np.ptp(there)), 'm')}: it is clipped; "
-                "centre it in its range"
+                "estimation.clipped", end=name, times=len(there), travel=travel
             )
 
 
@@ -293,11 +282,9 @@ def check_axis_steps(prepared: Prepared) -> None:
         part * _rounding_error_variance(plain, step, problem.period) for part in _AS_ROUNDING
     )
     if left > _SEEN * noise**2 and low < left < high:
+        residual = float(np.sqrt(left))
         raise IdentificationError(
-            f"the positions of the axis come in steps of {quantity(step, 'm')}; where it moves "
-            f"that leaves {quantity(float(np.sqrt(left)), 'm')} (rms) that no response explains, "
-            f"beside {quantity(noise, 'm')} of noise: record the encoder in finer steps, and write "
-            "its positions with all their digits"
+            "estimation.coarse_positions", step=step, residual=residual, noise=noise
         )
 
 

@@ -131,9 +131,9 @@ def check_record(input: FloatArray, output: FloatArray, used: BoolArray, order: 
     """Return the highest order that a record can tell; raises as :func:`choose_sampled` does."""
     most = _highest_order(int(np.sum(used)), order)
     if np.ptp(input) == 0:
-        raise IdentificationError("the input never changes; excite it while recording")
+        raise IdentificationError("estimation.constant_input")
     if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
-        raise IdentificationError("a value of input or output is not finite where it is used")
+        raise IdentificationError("estimation.not_finite")
     return _most_excited(input, most, order)
 
 
@@ -156,17 +156,15 @@ def proposed_starts(
 
 def _highest_order(samples: int, order: int) -> int:
     if not 0 <= order <= MAX_ORDER:
-        raise IdentificationError(f"order {order!r}, expected 0 (choose) to {MAX_ORDER}")
+        raise IdentificationError("estimation.order", order=order, most=MAX_ORDER)
     if samples > _MOST_SAMPLES:
         raise IdentificationError(
-            f"{samples!r} samples are used, at most {_MOST_SAMPLES} fit into memory beside their "
-            "derivatives; give a shorter --duration"
+            "estimation.too_many_samples", samples=samples, most=_MOST_SAMPLES
         )
     needed = _LEAST_SAMPLES_EACH * parameters(max(order, 1))
     if samples < needed:
         raise IdentificationError(
-            f"{samples!r} samples are used, at least {needed} are needed for order "
-            f"{max(order, 1)}; record more, or ask for a lower order"
+            "estimation.too_few_samples", samples=samples, least=needed, order=max(order, 1)
         )
     return min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
 
@@ -186,11 +184,10 @@ def excited_parameters(input: FloatArray, most: int) -> int:
 def _most_excited(input: FloatArray, most: int, order: int) -> int:
     """Return the highest order, at most ``most``, whose numerator and denominator show."""
     excited = excited_parameters(input, min(2 * most + 1, len(input)))
-    if excited < 2 * max(order, 1) + 1:
+    needed = 2 * max(order, 1) + 1
+    if excited < needed:
         raise IdentificationError(
-            f"the input excites {excited!r} parameters only, {2 * max(order, 1) + 1!r} are needed "
-            f"for order {max(order, 1)}: each of its frequencies tells a gain and a phase; record "
-            "with steps, noise, or more frequencies at once"
+            "estimation.few_frequencies", excited=excited, needed=needed, order=max(order, 1)
         )
     return min(most, (excited - 1) // 2)
 

@@ -117,10 +117,7 @@ class SampledModel:
         discrete = None if content["discrete"] is None else _discrete_of(content["discrete"])
         lacks = covariance if content["hold"] == BAND_LIMITED else discrete
         if lacks is None:
-            raise CalibrationError(
-                f"model with hold {content['hold']!r}: a held input needs a discrete model, "
-                "a band-limited one a continuous one with its covariance; identify it again"
-            )
+            raise CalibrationError("estimation.missing_part", hold=content["hold"])
         if content["hold"] == BAND_LIMITED and continuous is not None:
             _check_runs(continuous)
         valid = [FREQUENCY.checked(content[f"valid_{end}"], CalibrationError) for end in _ENDS]
@@ -154,8 +151,10 @@ def _continuous_of(
         return None, None
     if content["delay"] > LONGEST_DELAY_SAMPLES * period:
         raise CalibrationError(
-            f"delay is {content['delay']!r} s, expected at most {LONGEST_DELAY_SAMPLES} samples "
-            f"of {period!r} s; identify it again"
+            "estimation.long_delay",
+            delay=content["delay"],
+            most=LONGEST_DELAY_SAMPLES,
+            period=period,
         )
     try:
         dynamics = TransferFunction(
@@ -164,7 +163,7 @@ def _continuous_of(
             content["delay"],
         )
     except OmsmError as err:
-        raise CalibrationError(str(err)) from err
+        raise CalibrationError(err.code, **err.values) from err
     for kind in ("poles", "zeros"):
         checked_roots(dynamics, kind)
     if content["covariance"] is None:
@@ -177,9 +176,9 @@ def _check_runs(dynamics: TransferFunction) -> None:
     """Raise CalibrationError for what cannot run freely; of a held input ``discrete`` does."""
     if not dynamics.is_stable or not np.any(dynamics.numerator):
         raise CalibrationError(
-            f"numerator {dynamics.numerator.tolist()!r}, denominator "
-            f"{dynamics.denominator.tolist()!r} in s is no stable response, or none at all; "
-            "identify it again"
+            "estimation.unstable",
+            numerator=dynamics.numerator.tolist(),
+            denominator=dynamics.denominator.tolist(),
         )
 
 
@@ -189,10 +188,7 @@ def _discrete_of(content: Mapping[str, Any]) -> Discrete:
         for name in ("numerator", "denominator")
     )
     if denominator[0] != 1 or np.any(abs(np.roots(denominator)) >= 1):
-        raise CalibrationError(
-            f"denominator {denominator.tolist()!r} in z⁻¹ is no stable one that begins with 1; "
-            "identify it again"
-        )
+        raise CalibrationError("estimation.unstable_discrete", denominator=denominator.tolist())
     return Discrete(
         numerator=numerator,
         denominator=denominator,
@@ -204,15 +200,11 @@ def _discrete_of(content: Mapping[str, Any]) -> Discrete:
 def _square(values: Sequence[float], size: int) -> FloatArray:
     """Return a covariance from its rows one behind the other."""
     if len(values) != size**2:
-        raise CalibrationError(
-            f"covariance has {len(values)!r} numbers, expected {size**2}; identify it again"
-        )
+        raise CalibrationError("estimation.covariance_size", count=len(values), expected=size**2)
     covariance = SIGNAL.checked_all(np.asarray(values, np.float64), CalibrationError)
     square = np.reshape(covariance, (size, size))
     if np.any(np.diag(square) < 0) or not np.allclose(square, square.T, rtol=1e-6):
-        raise CalibrationError(
-            "covariance is not symmetric, or has a negative variance; identify it again"
-        )
+        raise CalibrationError("estimation.no_covariance")
     return square
 
 
@@ -261,8 +253,10 @@ def free_run(
     counted = np.isfinite(output) if used is None else used & np.isfinite(output)
     if np.sum(counted) < _LEAST_SAMPLES or len(input) != len(output):
         raise IdentificationError(
-            f"input of {len(input)!r} samples, output of {int(np.sum(counted))!r} that count; "
-            f"at least {_LEAST_SAMPLES} of both are needed; record longer"
+            "estimation.short_columns",
+            input=len(input),
+            output=int(np.sum(counted)),
+            least=_LEAST_SAMPLES,
         )
     check_input(input)
     check_varies(output[counted], "output")
@@ -283,10 +277,7 @@ def check_input(input: FloatArray) -> None:
     """
     missing = int(np.count_nonzero(~np.isfinite(input)))
     if missing:
-        raise IdentificationError(
-            f"the input has {missing!r} values that are not finite; cut the record there, or fill "
-            "them in"
-        )
+        raise IdentificationError("estimation.input_gaps", missing=missing)
     check_varies(input, "input")
 
 
@@ -295,10 +286,7 @@ def check_varies(values: FloatArray, name: str) -> None:
     values = values[np.isfinite(values)]
     change = float(np.ptp(values)) if len(values) else 0.0
     if change <= _LEAST_CHANGE:
-        raise IdentificationError(
-            f"the {name} changes by {change:g} in all, which tells nothing; excite it while "
-            "recording, or give it in a larger unit"
-        )
+        raise IdentificationError("estimation.constant_column", name=name, change=change)
 
 
 def stationary_output(

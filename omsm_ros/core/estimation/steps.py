@@ -15,7 +15,6 @@ from scipy import special
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
-from omsm_ros.readable import counts_text, quantity
 
 # A fit of even one parameter with its offset, drift and gain needs a multiple of them.
 LEAST_SAMPLES = 50
@@ -79,15 +78,9 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
     _check_length(len(z))
     noise, travel = sample_noise(z), float(np.ptp(z))
     if travel > _GREATEST_TRAVEL_M:
-        raise StepTestError(
-            f"Z travels {quantity(travel, 'm')}, a probe follows a fixed target over "
-            f"{quantity(_GREATEST_TRAVEL_M, 'm')} at most; positions must be in metres"
-        )
+        raise StepTestError("estimation.long_travel", travel=travel, most=_GREATEST_TRAVEL_M)
     if travel <= max(NOISE_FACTOR * noise, 1e-12):
-        raise StepTestError(
-            f"Z moves by {quantity(travel, 'm')} at a noise of {quantity(noise, 'm')}: no steps; "
-            "run the step test while recording"
-        )
+        raise StepTestError("estimation.no_motion", travel=travel, noise=noise)
     moving = _moving(z, sample_period, max(NOISE_FACTOR * noise, TRAVEL_PART * travel))
     return Steps(_edges(z, moving), moving, noise, travel)
 
@@ -165,21 +158,14 @@ def check_usable(record: MotionRecord) -> None:
     """Raise StepTestError for too few samples that can be used, or too many, saying why."""
     _check_length(len(record))
     if len(record) > _MOST_SAMPLES:
-        raise StepTestError(
-            f"{len(record)} samples are more than can be fitted in a gigabyte of memory, "
-            f"{_MOST_SAMPLES}; record a shorter test, or trigger encoder and probe less often"
-        )
+        raise StepTestError("estimation.many_samples", samples=len(record), most=_MOST_SAMPLES)
     usable = int(np.sum(record.ok))
     if usable < LEAST_SAMPLES:
         raise StepTestError(
-            f"{usable!r} of {len(record)} samples are usable ({counts_text(record.counts)}); "
-            "check the probe's target and range, and the encoder"
+            "estimation.few_usable", usable=usable, samples=len(record), counts=dict(record.counts)
         )
 
 
 def _check_length(samples: int) -> None:
     if samples < LEAST_SAMPLES:
-        raise StepTestError(
-            f"{samples} samples are too few to identify anything; "
-            f"record at least {LEAST_SAMPLES}, a step test takes about ten seconds"
-        )
+        raise StepTestError("estimation.few_samples", samples=samples, least=LEAST_SAMPLES)

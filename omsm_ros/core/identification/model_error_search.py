@@ -35,6 +35,7 @@ from omsm_ros.core.model_errors.families import (
 )
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics, ScoreTest
 from omsm_ros.core.model_errors.undetected import at_fitted_pole, fit_with_added_poles, poles_of
+from omsm_ros.errors import Notice
 
 # Each models one departure; a machine with more is not one to measure with.
 _MOST_ROUNDS = 6
@@ -57,12 +58,6 @@ _FASTER = (1.0, 2.0, 5.0)
 _MODE_FREQUENCY_RATIOS = (1.0, 0.97, 1.03)
 # As a logarithm; a mode that rings seven times is as wide.
 _SAME_LINE = 0.1
-
-
-_INCOMPLETE = (
-    "the search for a model was cut short: its budget of evaluations was exhausted before the "
-    "residual was free of significant model errors; another model may describe the record better"
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +90,8 @@ class SearchResult:
 
 def completeness(searched: SearchResult) -> Finding:
     """Return a reservation where the search was cut short."""
-    return Finding(reservations=(_INCOMPLETE,) if searched.incomplete else ())
+    incomplete = str(Notice("estimation.search_incomplete"))
+    return Finding(reservations=(incomplete,) if searched.incomplete else ())
 
 
 Choose = Callable[[Prepared, EvaluationBudget], tuple[Prepared, ChosenModel]]

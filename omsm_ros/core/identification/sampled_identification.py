@@ -60,9 +60,8 @@ from omsm_ros.core.lti.frequency_response import (
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.errors import ConfigurationError, IdentificationError
+from omsm_ros.errors import ConfigurationError, IdentificationError, Notice
 from omsm_ros.linear_algebra import one_blas_thread
-from omsm_ros.readable import p_value_text, percent, plain, quantity
 
 # May a sampled model be used, and between which frequencies?
 
@@ -115,7 +114,7 @@ def sampled_certificate(
     predicted = entries["predicted"]
     assert isinstance(predicted, float)
     reasons = _reasons(predicted, valid, limits)
-    low, high = (quantity(end, "Hz") for end in valid)
+    accepted = Notice("estimation.accepted", low=valid[0], high=valid[1])
     return {
         "order": order,
         "free_order": free_order,
@@ -127,7 +126,7 @@ def sampled_certificate(
         },
         "warnings": _warnings(entries.get("independence_p"), order, free_order, widened),
         "reasons": reasons,
-        "verdict": REJECTED if reasons else f"accepted from {low} to {high}",
+        "verdict": REJECTED if reasons else str(accepted),
     }
 
 
@@ -135,32 +134,22 @@ def _reasons(predicted: float, valid: tuple[float, float], limits: ResponseLimit
     reasons = []
     if not predicted >= _LEAST_PREDICTED:
         reasons.append(
-            "free runs over parts of the record that were hidden account for "
-            f"{percent(predicted, 3)} of the variance there, less than "
-            f"{percent(_LEAST_PREDICTED)}: it describes what was fitted only; record longer, or "
-            "look for a further input or a drift"
+            Notice("estimation.poor_prediction", predicted=predicted, least=_LEAST_PREDICTED)
         )
     if not valid[1] > valid[0]:
-        reasons.append(
-            f"the response is known nowhere to {percent(limits.gain, 1)} of gain and "
-            f"{quantity(limits.phase, 'rad', 2)}; record longer, or excite more"
-        )
-    return reasons
+        reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
+    return [str(reason) for reason in reasons]
 
 
 def _warnings(independent: object, order: int, free_order: int, widened: float) -> list[str]:
     warnings = []
     if isinstance(independent, float) and independent < _LEAST_INDEPENDENCE_P:
-        warnings.append(
-            f"the residual follows the input ({p_value_text(independent)}): more poles, a longer delay, "
-            "or something that is not linear"
-        )
+        warnings.append(Notice("estimation.residual_follows_input", p=independent))
     if order != free_order:
         warnings.append(
-            f"order {order} was asked for, {free_order} would have been chosen: "
-            f"its uncertainties are taken {plain(widened, 2)} times as large"
+            Notice("estimation.order_differs", order=order, free=free_order, factor=widened)
         )
-    return warnings
+    return [str(warning) for warning in warnings]
 
 
 # A band-limited record of any two quantities, identified as a motion is.
@@ -232,8 +221,7 @@ def _entries_of_band_limited(
 def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepared:
     if int(np.sum(used)) < 2 * LEAST_SAMPLES or not np.all(np.isfinite(input)):
         raise IdentificationError(
-            f"{int(np.sum(used))!r} samples are used, at least {2 * LEAST_SAMPLES} are needed, "
-            "and a finite input everywhere; record more"
+            "estimation.short_record", samples=int(np.sum(used)), least=2 * LEAST_SAMPLES
         )
     samples = len(input)
     moving = np.ones(samples, np.bool_)
@@ -322,7 +310,7 @@ def identify_samples(
     Raises IdentificationError for a useless record, ConfigurationError for another hold.
     """
     if hold not in HOLDS:
-        raise ConfigurationError(f"hold {hold!r}, expected one of {HOLDS}")
+        raise ConfigurationError("estimation.unknown_hold", hold=hold, known=HOLDS)
     used = np.isfinite(output) if used is None else used & np.isfinite(output)
     check_input(input)
     check_varies(output[used], "output")
