@@ -33,8 +33,8 @@ TEMPLATES: dict[str, str] = {
     ),
     "estimation.implausible_gain": (
         "the probe moves by {gain:plain} per travel of the axis, expected about 1: check that it "
-        "looks at a fixed target within its range, that both are in metres, and that Z moves to "
-        "and fro, because a steady motion in one direction is taken for drift"
+        "looks at a fixed target within its range, that both are in metres, and that Z moves in "
+        "both directions; a steady motion in one direction is taken for drift"
     ),
     "estimation.constant_distance": (
         "the distance does not change while the axis moves; check that the probe is connected, "

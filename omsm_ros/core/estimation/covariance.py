@@ -1,4 +1,4 @@
-"""How well are the parameters of a fit known, in coloured noise?"""
+"""Covariance of fitted parameters in coloured noise."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
-# Of transforms that are in memory at a time.
+# Values of transforms held in memory at a time: 32 MB.
 _VALUES = 4_000_000
-# Directions of the parameter space this much weaker than the strongest are lost in rounding.
+# Directions of the parameter space weaker than this part of the strongest are lost in rounding.
 _RANK_TOLERANCE = 1e-11
 
 
@@ -47,7 +47,7 @@ def autoregression(
 
 
 def noise_spectrum(residual: FloatArray, length: int) -> FloatArray:
-    """Return the variance spectrum of the residual (n,) at ``length`` // 2 + 1 frequencies."""
+    """Return the autoregressive variance spectrum (``length`` // 2 + 1,) of a residual (n,)."""
     coefficients, variance = autoregression(residual)
     return np.asarray(variance / np.abs(fft.rfft(coefficients, length)) ** 2)
 
@@ -69,7 +69,7 @@ def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArra
             part[:] = (weight * fft.rfft(row, length)).view(np.float64)
         return found
 
-    # Of a long record not all at once: that takes as much memory again.
+    # A long record is transformed in blocks: all rows at once would double the memory.
     step = max(_VALUES // length, 1)
     blocks = [slice(first, first + step) for first in range(0, len(rows), step)]
     gram = np.empty((len(rows), len(rows)))
@@ -92,9 +92,9 @@ def parameter_covariance(
 
     The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
 
-    passed: fit whose response brings the encoder's noise into the residual; None if none is
-        to be added. A sharp resonance amplifies that noise at its own frequency, in a line too
-        narrow for the residual to show.
+    passed: response through which noise of the encoder reaches the residual; None to add none.
+        A sharp resonance amplifies that noise in a line too narrow for the spectrum of the residual
+        to resolve.
     """
     samples, size = columns.shape
     residual = residual * np.sqrt(samples / max(samples - size, 1))
@@ -128,7 +128,7 @@ def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
 
 
 def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:
-    """Return the spectrum of what ``passed`` makes of the motion's noise, where there is motion."""
+    """Return the spectrum of the noise of the motion after ``passed``, where there is motion."""
     frequency = fft.rfftfreq(length, problem.period)
     moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
     power = np.abs(passed.response(frequency)) ** 2 * problem.noise**2
@@ -138,11 +138,11 @@ def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: i
 def inter_sample_motion_covariance(
     dynamics: TransferFunction, delay_bound: float, sample_period: float
 ) -> FloatArray:
-    """Return the covariance (p, p) of the coefficients due to motion hidden between samples.
+    """Return the covariance (p, p) of the coefficients due to motion between samples.
 
-    Folded motion shifts the lag by up to ``delay_bound`` [s], and bends the response by a
-    term in s² as the folded content varies over a tenth of the sampling rate around it.
-    Either is a bound, taken as a uniform distribution: its standard deviation is 1/√3 of it.
+    Aliased motion shifts the lag by up to ``delay_bound`` [s]. It also adds a term in s², because
+    the aliased content varies over a tenth of the sampling rate. Both bounds are taken as uniform
+    distributions, whose standard deviation is 1/√3 of the bound.
     """
     zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
     directions = np.zeros((2, zeros + poles + 2))

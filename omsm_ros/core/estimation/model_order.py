@@ -1,10 +1,14 @@
-"""How many poles and zeros, and is there a delay? What the data ask for, and one parameter more.
+"""Choice of the order: numbers of poles and zeros, with a delay or without, and starting points.
 
-The Bayesian information criterion finds the smallest structure that the data ask for. It is still
-biased by about one standard deviation, which no covariance shows. The chosen structure is
-therefore the best with one parameter more: it trades that bias for variance, which the band
-states. What else was tried, and changed nothing, is in
-``docs/design/identification-ablation.md``.
+The Bayesian information criterion finds the smallest adequate structure. It is still biased by
+about one standard deviation, which no covariance shows. The chosen structure is therefore the best
+with one parameter more: it trades that bias for variance, which the uncertainty band includes.
+Alternatives that changed nothing are in ``docs/design/identification-ablation.md``.
+
+A fit starts at several points, because the output error has local minima: at the best fit of a
+smaller structure, so that a larger one never fits worse; at the result of iterated linear least
+squares, which finds resonances; and at a simple guess. A long record is first fitted to a decimated
+one, at the bandwidth of its motion; the best minimum there is the start.
 """
 
 from __future__ import annotations
@@ -24,22 +28,22 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 from omsm_ros.linear_algebra import least_squares
 
-# Without asking; real machines in the band of a step test have needed four.
+# Most poles of the free choice; real machines have needed four in the band of a step test.
 _FREE_POLES = 8
-# With asking: beyond, the coefficients of a polynomial lose their digits.
+# Most poles on request: beyond, rounding destroys the coefficients of a polynomial.
 MAX_POLES = 20
-# A lag and its roll-off: with fewer, the band is three times too narrow on a pure delay.
+# A lag and its roll-off: with fewer, the band is three times too narrow for a pure delay.
 _LEAST_PARAMETERS = 3
-# Of the critical damping: a resonance beyond half the sampling rate shows in no sample.
+# Least damping ratio of a pole beyond half the sampling rate, where no sample shows it.
 _DAMPED_BEYOND = 0.1
-# Radians a sample, some thirty times half the sampling rate: from there on it is a constant.
+# Radians a sample, thirty times half the sampling rate: a faster pole acts as a constant.
 _UNOBSERVABLE = 100.0
-# Distance of a zero from a pole, relative: nearer than the data could ever tell apart.
+# Relative distance of a zero from a pole below which no data distinguish them.
 _CANCELLING = 0.005
 
 
 def structures(poles: int) -> list[Structure]:
-    """Return those with ``poles``, smallest first: one or two zeros fewer, with a delay or without.
+    """Return the structures with ``poles`` and one or two zeros fewer, smallest first.
 
     A mass cannot follow infinitely fast, so there are always fewer zeros than poles.
     """
@@ -61,8 +65,9 @@ class Candidate:
 def information(fit: Fit, colour: float = 1.0) -> float:
     """Return the Bayesian information criterion, -2 log likelihood + colour · size · log n.
 
-    colour: power of the noise at low frequency over its mean. A parameter of slow dynamics
-        explains that much more of coloured noise by chance, so its price is that much higher.
+    colour: power of the noise at low frequency over its mean. By chance a parameter of slow
+        dynamics
+        explains that much more of coloured noise, so its penalty is that much higher.
     """
     n = fit.samples
     floor = float(np.finfo(np.float64).tiny)
@@ -80,7 +85,7 @@ def explore(
     order: number of poles to go to in any case;  colour: of the noise, see :func:`information`
     budget: of the fits; no further order is tried once it is exhausted
 
-    Raises IdentificationError for an order that is no number of poles to try.
+    Raises IdentificationError for an order out of range.
     """
     if not 0 <= order <= MAX_POLES:
         raise IdentificationError("estimation.order", order=order, most=MAX_POLES)
@@ -105,10 +110,10 @@ def _promising(
     fit_structure: Callable[[Structure, Sequence[Fit]], Fit],
     colour: float,
 ) -> list[Structure]:
-    """Return the structures with ``poles`` that may yet win.
+    """Return the structures with ``poles`` that can still have the lowest criterion.
 
-    The largest contains them all: what it cannot gain none of them can, so it is fitted
-    first and added to ``found``, unless there are so few poles that all are of interest.
+    The largest one contains the others and bounds their gain. It is fitted first and added to
+    ``found``, unless there are so few poles that all are fitted.
     """
     every = structures(poles)
     if poles < 3:
@@ -139,9 +144,9 @@ def choose(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def identifiable(dynamics: TransferFunction, period: float, duration: float) -> bool:
-    """Return whether samples every ``period`` [s] for ``duration`` [s] identify every pole.
+    """Return True if samples every ``period`` [s] for ``duration`` [s] identify every pole.
 
-    One that decays no faster than the record lasts is a line of vibration or a drift; one that
+    A pole that decays more slowly than the record lasts is a line of vibration or a drift. One that
     rings beyond half the sampling rate fits noise, and a filter made of it would ring.
     """
     poles = dynamics.poles()
@@ -154,7 +159,7 @@ def identifiable(dynamics: TransferFunction, period: float, duration: float) -> 
 
 
 def cancels(dynamics: TransferFunction) -> bool:
-    """Return whether a zero nearly cancels a pole: neither then has a meaningful covariance."""
+    """Return True if a zero nearly cancels a pole: their covariance has no meaning then."""
     poles, zeros = dynamics.poles(), dynamics.zeros()
     apart = np.abs(poles[:, np.newaxis] - zeros[np.newaxis])
     return bool(np.any(apart < _CANCELLING * np.abs(poles[:, np.newaxis])))
@@ -170,29 +175,22 @@ def held_out_rms(problem: Problem, fitted: Fit, held: BoolArray) -> float:
     return float(np.sqrt(np.mean(missed**2)))
 
 
-# Where a fit starts: several places, because the output error has local minima.
-#
-# From the best fit of a smaller structure, so that a larger one never fits worse; from iterated
-# linear least squares, which finds a resonance that no guess would; and from a simple guess.
-# Of a period of many samples all of them are tried on fewer, where the motion has content; the best
-# of these minima is the start.
-
-# Guess of the slowest pole, in units of the rate at which the motion has its content.
+# Guess of the slowest pole, in units of the bandwidth of the motion.
 _GUESSED_RATE = 3.0
-# From the positive real axis [rad]: a damping of 0.42.
+# Its angle from the positive real axis [rad]: a damping ratio of 0.42.
 _GUESSED_ANGLE = 2.0
-# Of the whole lag, the part first given to a delay where there are poles too.
+# Part of the lag that starts as a delay where there are poles too.
 _KEPT_DELAY = 0.3
-# Sanathanan and Koerner (1963): it has converged, or will not.
+# Iterations after Sanathanan and Koerner (1963): by then they have converged, or will not.
 _LINEAR_ITERATIONS = 8
-# An added pole begins fast enough not to be seen, and slow enough to have a gradient.
+# Start of an added pole: fast enough to change little, slow enough to have a gradient.
 _ADDED_POLE = -10.0
-# Samples of a period; of two such a fit is started on one. A step test at 1 kHz has 20 000.
+# A record of twice as many samples is decimated first; a step test at 1 kHz has 20 000.
 ENOUGH_SAMPLES = 20_000
-# Half the sampling rate of a coarse problem over the rate at which the motion has its content.
+# Half the sampling rate of a decimated problem over the bandwidth of the motion.
 ABOVE_CONTENT = 1.25
-# Samples of the new rate on either side over which a low pass reaches, the middle of its edge over
-# the new half rate, and Kaiser's shape: at the new half rate it leaves 3e-5 of an amplitude.
+# Anti-alias filter: taps on either side at the new rate, the middle of its edge over half the new
+# rate, and Kaiser's shape; it attenuates to 3e-5 at half the new rate.
 _HALF_TAPS, _PASSES, _STOPPING_SHAPE = 24, 0.88, 9.0
 
 
@@ -226,7 +224,7 @@ class StartingPoints:
 
     @cached_property
     def coarser(self) -> StartingPoints | None:
-        """Those of the problem with fewer samples, if it has many more than its motion needs."""
+        """Those of the decimated problem; None if the record is short or the motion fast."""
         problem = self.problem
         per_content = np.pi / (problem.rate * problem.period) / ABOVE_CONTENT
         every = int(min(problem.closed_length / ENOUGH_SAMPLES, per_content))
@@ -236,7 +234,7 @@ class StartingPoints:
 
     @cached_property
     def _probe(self) -> ComplexArray:
-        """Spectrum of the output without background, lost samples taken from the motion."""
+        """Spectrum of the output without background; lost samples are replaced by the motion."""
         problem, lag = self.problem, self.pure_delay
         output = problem.output - problem.background @ lag.background
         filled = np.where(problem.used, output, lag.gain * problem.input)
@@ -244,7 +242,7 @@ class StartingPoints:
 
     def _linear(self, structure: Structure, delay: float) -> ComplexArray:
         """Return the poles (n,) by iterated linear least squares (Sanathanan and Koerner 1963)."""
-        # At s = 0 only the background is decided; there, and at the end, s may be extreme.
+        # The line at s = 0 determines the background only; at both ends s may be extreme.
         inside = slice(1, max(len(self.problem.s) - 1, 2))
         s, probe = self.problem.s[inside, np.newaxis], self._probe[inside]
         powers = np.vander(s[:, 0], structure.poles + 1, increasing=True)
@@ -270,15 +268,15 @@ class StartingPoints:
 
 
 def coarser(problem: Problem, every: int) -> Problem:
-    """Return the problem at every so many samples, all of it filtered by the same low pass.
+    """Return the problem decimated to one in ``every`` samples, all signals by the same low pass.
 
-    A linear response of one is that of the other. Lost samples are bridged by a straight line, and
-    so is what lies between readings that are rarer than the samples of the axis.
+    The linear response is that of the original. Lost samples, and those between readings that are
+    rarer than the samples of the axis, are interpolated linearly.
     """
     index = np.arange(len(problem.used))
     output = np.interp(index, index[problem.used], problem.output[problem.used])
 
-    # A light mode beyond the new half rate would fold to where the response is another.
+    # A lightly damped mode beyond half the new rate would be aliased.
     low_pass = signal.firwin(
         2 * _HALF_TAPS * every + 1, _PASSES / every, window=("kaiser", _STOPPING_SHAPE)
     )
@@ -300,10 +298,10 @@ def coarser(problem: Problem, every: int) -> Problem:
 
 
 def _bridged(used: BoolArray, every: int) -> BoolArray:
-    """Return, of every so many samples, which are used or lie in a bridge that hides nothing.
+    """Return True for those of one in ``every`` samples that are used or well interpolated.
 
-    Such a bridge is no longer than a new sample, or than the readings are apart anyhow: where every
-    second sample holds a reading, those picked may all lie between them.
+    A gap is well interpolated if it is no longer than a new sample, or than the usual distance of
+    readings: where every second sample holds a reading, all picked samples may lie between them.
     """
     picked, places = np.arange(0, len(used), every), np.flatnonzero(used)
     apart = np.diff(places)

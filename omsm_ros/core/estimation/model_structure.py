@@ -1,8 +1,8 @@
-"""Which transfer functions a fit may choose from, and how their coefficients are parametrised.
+"""Structures of transfer functions and their parametrisation.
 
-A structure is a number of zeros, a number of poles, and a delay or none. Its denominator
-is a product of sections ``1 + e^α s + e^β s²``, so that every parameter vector is a
-stable G(s) with G(0) = 1, and no search can leave that set.
+A structure is a number of zeros, a number of poles, and a delay or none. Its denominator is a
+product of sections ``1 + e^α s + e^β s²``. Every parameter vector is therefore a stable G(s) with
+G(0) = 1.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.polynomial import polynomial
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 
-# Poles may be this many e-folds of time constant away from the content of the motion.
+# Range of time constants in e-folds around the bandwidth of the motion, a factor of 9e6.
 _LOG_RANGE = 16.0
 
 
@@ -45,10 +45,6 @@ class Structure:
             and other.zeros <= self.zeros
             and other.delay <= self.delay
         )
-
-    def label(self) -> str:
-        """Return the structure in words: ``2 zeros, 3 poles, delay``."""
-        return f"{self.zeros} zeros, {self.poles} poles{', delay' if self.delay else ''}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

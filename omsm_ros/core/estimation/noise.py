@@ -1,8 +1,17 @@
-"""Noise that is not the same at all readings: rounding without noise, and scatter in time.
+"""Noise that is not stationary and white: timing jitter, quantisation, noise of the encoder.
 
-A reading that is δ late is off by δ times the rate of the motion. Where δ is random this is
-noise, from sample to sample anew, in proportion to the rate; what a model misses is not, for it
-lasts longer than a sample.
+**Timing jitter.** A reading that is late by δ is wrong by δ times the rate of the motion. Random δ
+make noise that is independent from sample to sample and proportional to the rate; an error of the
+model lasts longer than a sample.
+
+**Quantisation.** With noise of half a step or more, the rounding error is noise too. With less
+noise all readings of a plateau share one rounding error of up to half a step, which no mean
+reduces.
+
+**Errors in variables** (Ljung 1999, sec. 13.5). A fit takes the input as exact. A resonance of the
+model amplifies noise of the encoder that the probe did not follow. So a fit increases the damping
+of a mode, or fits backlash and scale errors to that noise. Where the axis is stationary, the mean
+of many samples has little noise.
 """
 
 from __future__ import annotations
@@ -19,24 +28,24 @@ from omsm_ros.core.estimation.steps import Edge, Steps
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
-# Standard deviations beyond which an excess, or a correlation, is no chance.
+# Standard deviations beyond which an excess or a correlation is significant: 6e-7 by chance.
 _CLEARLY = 5.0
-# Their variance is known to 10 %.
+# Stationary samples needed: their variance is then known to 10 %.
 _LEAST_STILL = 200
-# Of the greatest rate squared: slower is at rest.
+# Part of the greatest squared rate below which the axis counts as stationary.
 _STILL = 1e-4
-# Orders of differences: what is left of a smooth motion falls with the order, noise does not.
+# Orders of differences: the remainder of a smooth motion falls with the order, noise does not.
 _SMOOTH, _SMOOTHER = 4, 8
-# By which two orders may differ; noise makes a tenth.
+# Relative difference allowed between the two orders; noise alone makes a tenth.
 _ALIKE = 0.2
-# Second differences of white noise share their noise: Σ ρ² over all lags.
+# Correlation of the second differences of white noise: Σ ρ² over all lags.
 _SHARED = 1 + 2 * ((4 / 6) ** 2 + (1 / 6) ** 2)
 
 
 def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatArray:
-    """Return what errors beside even noise make of ``columns`` (k, c), an independent error a row.
+    """Return the effects of rounding and jitter on ``columns`` (k, c), one independent error a row.
 
-    Each row is that of one standard deviation, so that with rows E their covariance is EᵀE.
+    Each row is the effect of one standard deviation: rows E have the covariance EᵀE.
     scatter: variance of the time of a reading [s²], see :func:`scatter_in_time`
     """
     return np.concatenate(
@@ -45,9 +54,10 @@ def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatA
 
 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
-    """Return the variance [s²] of the time of a reading that ``residual`` (k,) shows.
+    """Return the variance [s²] of the time of a reading, estimated from ``residual`` (k,).
 
-    0 where rounding is larger than noise: that too scatters where the axis moves only.
+    It is 0 where rounding exceeds noise, because rounding errors too vary only while the axis
+    moves.
     """
     if problem.shared > 0:
         return 0.0
@@ -60,10 +70,7 @@ def rate_of(problem: Problem) -> FloatArray:
 
 
 def _rounding_rows(problem: Problem, columns: FloatArray) -> FloatArray:
-    """Return rows of rounding errors: one a plateau, whose readings share it, one a moving reading.
-
-    The noise at rest does not show the latter.
-    """
+    """Return rows of rounding errors: one for each plateau, one for each reading while moving."""
     if problem.plateau is None or problem.shared == 0:
         return np.zeros((0, columns.shape[1]))
     plateau = problem.plateau[problem.used]
@@ -82,7 +89,7 @@ def _timing_rows(problem: Problem, columns: FloatArray, variance: float) -> Floa
 
 
 def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
-    """Return the variance [s²] of the time of a reading, from a residual; 0 where it does not show.
+    """Return the variance [s²] of the time of a reading, 0 where it is not significant.
 
     on_grid: residual (n,) [m], NaN where nothing is compared;  rate: of the motion (n,) [m/s]
     """
@@ -97,14 +104,14 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
     at_rest = float(np.mean(second[still] ** 2))
     total = float(np.sum(weight**2))
     found = float(np.sum(weight * (second**2 - at_rest))) / total
-    # Of the excess itself, and of the noise at rest that it exceeds.
+    # Relative variance of the excess, and of the stationary noise that is subtracted.
     known_to = 1 / total + (float(np.sum(weight)) / total) ** 2 / float(np.sum(still))
     spread = at_rest * np.sqrt(2 * _SHARED * known_to)
     return found if found > _CLEARLY * spread else 0.0
 
 
 def _persists(on_grid: FloatArray, rate: FloatArray) -> bool:
-    """Return True if neighbours in ``on_grid`` resemble each other where the axis moves."""
+    """Return True if neighbours in ``on_grid`` correlate where the axis moves."""
     moving = rate**2 > _STILL * np.max(rate**2)
     value = np.where(moving & np.isfinite(on_grid), on_grid, 0.0)
     product = value[1:] * value[:-1]
@@ -115,11 +122,10 @@ def _persists(on_grid: FloatArray, rate: FloatArray) -> bool:
 def motion_scatter(motion: FloatArray, rate: FloatArray) -> float:
     """Return the standard deviation [s] of the time of a reading of ``motion`` (n,) itself.
 
-    0 where it does not show, or where the motion is too sharp for its samples to tell.
     rate: of the motion (n,) [m/s]
 
-    The instant of a reading of the axes passes through the response, so that what it leaves in a
-    residual lasts. Between the readings of one smooth motion it does not.
+    It is 0 where it is not significant, or where the motion is too sharp for its sampling. A
+    residual cannot show it, because there the jitter of the axis is filtered by the response.
     """
     rough, smooth = (_scatter_of_differences(motion, rate, n) for n in (_SMOOTH, _SMOOTHER))
     return smooth if abs(rough - smooth) < _ALIKE * smooth else 0.0
@@ -137,23 +143,18 @@ def _scatter_of_differences(motion: FloatArray, rate: FloatArray, order: int) ->
     return float(np.sqrt(max(excess, 0.0) / np.sum(weight**2)))
 
 
-# What the steps of a probe's readings leave open where noise does not carry it across them.
-#
-# With noise of half a step and more the error of rounding is noise too. With less it is the same
-# at each reading of a plateau, up to half a step, and no number of readings averages it.
-
-# Readings of a probe with steps share their values; of one without, hardly any two do.
+# Quantised readings share their values; without quantisation hardly two are equal.
 _LEAST_READINGS_A_LEVEL = 3.0
-# Of a step squared: this much is lost in any noise.
+# Part of a squared step that is negligible against any noise.
 _NOTHING = 1e-4
-# Of the error of rounding, that are added up: without noise all but 0.6 % of q²/12.
+# Harmonics of the rounding error that are summed: all but 0.6 % of q²/12.
 _HARMONICS = 100
-# Gaps between levels are whole steps, but for the rounding of decimals.
+# Tolerance of gaps between levels as whole steps: decimals are rounded.
 _WHOLE = 0.05
 
 
 def reading_step(readings: FloatArray) -> float:
-    """Return the step of ``readings`` (k,) [m], finite; 0 where they show none."""
+    """Return the quantisation step of finite ``readings`` (k,) [m]; 0 where there is none."""
     levels = np.unique(readings)
     if len(levels) < 3 or len(readings) < _LEAST_READINGS_A_LEVEL * len(levels):
         return 0.0
@@ -184,7 +185,7 @@ def plateau_variance(readings: FloatArray, plateau: IntArray, step: float) -> fl
     count = np.bincount(plateau[resting])
     mean = np.bincount(plateau[resting], readings[resting]) / np.maximum(count, 1)
     spread = float(np.mean((readings - mean[plateau])[resting] ** 2))
-    # Of a reading that never changes all noise may be hidden; of others rounding adds its own.
+    # Rounding adds q²/12 to the spread; a reading that never changes may have any smaller noise.
     noise = max(spread - step**2 / 12, 0.0)
     harmonic = np.arange(1, _HARMONICS + 1)
     weakened = np.exp(-4 * np.pi**2 * harmonic**2 * noise / step**2) / harmonic**2
@@ -192,35 +193,27 @@ def plateau_variance(readings: FloatArray, plateau: IntArray, step: float) -> fl
     return shared if shared > _NOTHING * step**2 else 0.0
 
 
-# Noise of the encoder's own: what it shows at rest and the probe did not follow.
-#
-# A fit takes the input for exact. Noise in it goes through the response and comes out larger where
-# that rings, so a fit damps a light mode, or finds backlash and errors of the scale that swallow
-# the noise (errors in variables, Ljung 1999, sec. 13.5). Where an axis rests, a mean of many
-# samples has no noise to speak of.
-
-# Width of the intervals that must have a value in common, in standard deviations. On quintic steps
-# with noise of 1 and 3 nm two leaves least: 0.15 of it, and of quintic edges nothing that repeats.
+# Half width of the intervals that must intersect, in standard deviations. On quintic steps with
+# noise of 1 and 3 nm, 2 leaves the least noise (0.15 of it) and nothing of the edges.
 _INTERVAL = 2.0
-# Standard deviations beyond which a part that is followed, or is not, is no chance. Noise that
-# shows less imitates no departure that would be significant.
-
-# Those beyond which a mean over all edges is no chance in a hundred samples after each.
+# Standard deviations beyond which a mean over all edges is significant, a hundred samples each.
 _SEEN = 3.0
+# Protects divisions of signals without power.
 _TINY = float(np.finfo(np.float64).tiny)
-# Of a record's spectrum: dozens of bands, the lowest of so many lines that they tell their noise.
+# Bands of the spectrum: dozens of them, the lowest with enough lines to estimate its noise.
 _BANDS_AN_OCTAVE, _NARROWEST = 3, 64
 
 
 def correct_errors_in_variables(
     problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()
 ) -> Problem | None:
-    """Return the problem without that part of the input's noise that the probe did not follow.
+    """Return the problem without the noise of the input that the probe did not follow.
 
     edges: of the input, if it has any
-    fitted: to ``problem``; its residual shows how much of that noise did not come through it.
-        Where some of it did, its expected motion stays (Carroll et al. 2006, ch. 4).
-    None where the probe followed all, as far as the residual shows, or it was taken out before.
+    fitted: to ``problem``; its residual shows the share of the noise that the probe did not follow.
+        The expected motion of the rest stays in the input (Carroll et al. 2006, ch. 4).
+
+    Return None where the probe followed all of it, or where it was taken out before.
     """
     if problem.noise <= 0 or problem.errors_in_variables is not None:
         return None
@@ -243,11 +236,11 @@ def correct_errors_in_variables(
 
 
 def _unfollowed_share(residual: FloatArray, made: FloatArray) -> tuple[FloatArray | None, IntArray]:
-    """Return the share of what was ``made`` (n,) that ``residual`` (n,) lacks, of each band.
+    """Return the share of ``made`` (n,) that ``residual`` (n,) lacks in each band, and the bands.
 
-    The second is the band of each line of their spectra. Bands that do not differ have one share;
-    others their own: what a servo does at rest is followed, beside noise that is not. None where
-    nothing is lacking.
+    Bands that do not differ have one share. Others have their own: vibration of the servo is
+    followed by the probe, while noise in other bands is not. The share is None where it is 0
+    everywhere.
     """
     expected, seen = fft.rfft(made), fft.rfft(residual)
     line = np.arange(len(expected))
@@ -257,7 +250,7 @@ def _unfollowed_share(residual: FloatArray, made: FloatArray) -> tuple[FloatArra
     weight = np.where(own, 0.0, known_to**-2.0)
     share = np.where(own, found, np.sum(weight * found) / np.sum(weight))
     known_to = np.where(own, known_to, np.sum(weight) ** -0.5)
-    # What may all be there stays; of the rest, what may all be lacking is taken out.
+    # A share that may be 0 is taken as 0, one that may be 1 as 1.
     lacking = share > _CLEARLY * known_to
     share = np.where(lacking, np.where(share > 1 - _CLEARLY * known_to, 1.0, share), 0.0)
     return (share if np.any(lacking) else None), band
@@ -268,7 +261,7 @@ def _shares(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the share of ``expected`` (k,) that ``seen`` (k,) lacks in each band (b,).
 
-    The second is the standard deviation of each, from what else there is to see.
+    The second is the standard deviation of each, from the rest of the spectrum.
     """
     power = np.maximum(np.bincount(band, np.abs(expected) ** 2), _TINY)
     share = np.bincount(band, -(seen * expected.conj()).real) / power
@@ -286,14 +279,14 @@ def _weighted_median(values: FloatArray, weights: FloatArray) -> float:
 def smoothed(
     positions: FloatArray, noise: float, edges: Sequence[Edge] = ()
 ) -> tuple[FloatArray, float]:
-    """Return ``positions`` (n,) [m] as their means where they rest, and the noise that is left [m].
+    """Return ``positions`` (n,) [m] averaged where stationary, and the remaining noise [m].
 
-    noise: standard deviation of a sample, white [m];  edges: where they move, if they do in steps
+    noise: standard deviation of a sample, white [m];  edges: of a motion in steps
 
-    Of the samples before and after, each as many are taken as agree with a constant: the intervals
-    of their means intersect (Goldenshluger and Nemirovski 1997). So an edge keeps its shape, and a
-    motion that stands out of the noise stays. How an axis comes to rest does not; what of it is
-    alike at all edges, and stands out of the noise of their mean, is given back.
+    Each sample becomes the mean of as many neighbours on each side as agree with a constant: the
+    intervals of their means intersect (Goldenshluger and Nemirovski 1997). Edges and any motion
+    above the noise keep their shape. The settling of the axis would be averaged too; the part of it
+    that is common to all edges and significant in their mean is added back.
     """
     middle = float(np.mean(positions))
     rest = positions - middle
@@ -307,15 +300,15 @@ def smoothed(
 
 
 def _alike(taken: FloatArray, noise: float, edges: Sequence[Edge]) -> tuple[FloatArray, FloatArray]:
-    """Return what of ``taken`` (n,) is alike at all ``edges``, by their heights, (n,).
+    """Return the part of ``taken`` (n,) common to all ``edges``, per height, (n,).
 
-    The second is the share of the variance of ``noise`` in it, (n,). Noise that all edges had alike
-    would show in no residual: nothing is returned that may be noise.
+    The second is the share of the variance of ``noise`` in it, (n,). Only what is significant is
+    returned, because noise common to all edges would show in no residual.
     """
     alike, left = np.zeros((2, len(taken)))
     if not edges:
         return alike, left
-    # As long again as an edge takes it may come to rest.
+    # Settling is looked for over once more the duration of an edge.
     length = 2 * max(edge.stop - edge.start for edge in edges)
     ends = [edge.start for edge in edges[1:]] + [len(taken)]
     parts = [slice(e.start, min(e.start + length, end)) for e, end in zip(edges, ends, strict=True)]
@@ -326,7 +319,7 @@ def _alike(taken: FloatArray, noise: float, edges: Sequence[Edge]) -> tuple[Floa
     seen = np.abs(moved) > _SEEN * noise * np.sqrt(power)
     for edge, part in zip(edges, parts, strict=True):
         within = slice(part.stop - part.start)
-        # Where all come back to where they were, nothing is seen, and there is no power either.
+        # Edges that return to their start have neither a common part nor power.
         scale = np.where(seen[within], edge.height / np.maximum(power[within], _TINY), 0.0)
         alike[part] = scale * moved[within]
         left[part] = scale * edge.height

@@ -1,4 +1,4 @@
-"""Down to a least sum of squares from where it is started, inside a box; and how often at most."""
+"""Bounded Levenberg-Marquardt minimisation, and the budget of evaluations of a model search."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
-# Madsen, Nielsen and Tingleff (2004) advise it where the start is no more than fair.
+# Recommended for a fair start by Madsen, Nielsen and Tingleff (2004).
 _FIRST_DAMPING = 1e-3
-# A parameter that changes the output this much less than another is not identifiable.
+# A parameter of a smaller relative sensitivity is not identifiable.
 _INSENSITIVE = 1e-10
-# Relative to 1 + |ψ|: smaller ones change no digit of a coefficient that is printed.
+# Relative to 1 + |ψ|: smaller steps change no printed digit of a coefficient.
 _SMALLEST_STEP = 1e-9
-# In ψ, the logarithm of a coefficient: a factor of twenty, beyond which no quadratic model holds.
+# In ψ, the logarithm of a coefficient: a factor of 20, beyond which no quadratic model holds.
 _LONGEST_STEP = 3.0
-# Of what one parameter gains by chance.
+# Part of the decrease of χ² that one parameter makes by chance.
 _CONVERGED = 1e-4
-# Of 270 disturbed step tests all that were accepted needed at most 1200 evaluations before their
-# last round, half of them fewer than 250; 1500 of 20 s at 1 kHz take five to eight seconds.
+# All accepted of 270 disturbed step tests needed at most 1200 evaluations before their last round,
+# half of them fewer than 250; 1500 of 20 s at 1 kHz take five to eight seconds.
 _MOST_EVALUATIONS = 1500
 # As much work as 1500 evaluations of 20 s at 1 kHz, and 300 with all samples of a long record,
 # most of whose evaluations use fewer samples.
@@ -73,7 +73,7 @@ class EvaluationBudget:
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """At one ψ, ``nonlinear``: residual (k,), linear parameters (m + 1 + q,)."""
+    """The residual (k,) at one ψ, ``nonlinear``, and the linear parameters (m + 1 + q,) there."""
 
     nonlinear: FloatArray
     residual: FloatArray
@@ -82,7 +82,7 @@ class Projection:
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """Derivative of the residual by ψ, (k, len ψ); where no step starts, none is needed."""
+        """Derivative of the residual by ψ, (k, len ψ), computed when a step starts here."""
         return self.derivative()
 
     @cached_property
@@ -96,12 +96,12 @@ Box = tuple[FloatArray, FloatArray]
 
 
 def descend(project: Project, start: Projection, box: Box, evaluations: int) -> Projection:
-    """Minimise inside the box by Levenberg and Marquardt's method, damped after Nielsen (1999).
+    """Minimise the sum of squares inside ``box`` (Levenberg-Marquardt, damping of Nielsen 1999).
 
-    project: residual at any ψ;  box: lower and upper bounds of ψ
+    project: residual at any ψ;  box: lower and upper bounds of ψ;  evaluations: at most
 
-    On normal equations: a handful of parameters against many samples, whose scale is taken
-    out. A general solver factorises the whole jacobian at each step, and takes ten times as long.
+    It solves scaled normal equations of a few parameters. A general solver factorises the whole
+    jacobian at each step, which takes ten times as long.
     """
     at = start
     if not len(at.nonlinear):
@@ -112,7 +112,7 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
     for _ in range(evaluations):
         nonlinear = at.nonlinear
         slope, curvature = at.normal_equations
-        # A parameter at its bound that would leave the box stays.
+        # A parameter at its bound whose step would leave the box is fixed.
         free = ~(((nonlinear <= lower) & (slope > 0)) | ((nonlinear >= upper) & (slope < 0)))
         scale = np.sqrt(np.diag(curvature))
         free &= scale > _INSENSITIVE * np.max(scale)
@@ -131,7 +131,6 @@ def descend(project: Project, start: Projection, box: Box, evaluations: int) -> 
         at, cost = tried, new_cost
         ratio = gained / promised if promised > 0 else 1.0
         damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
-        # χ² that changes by less than this is converged.
         if gained <= _CONVERGED * cost / len(at.residual) and damping < 1:
             break
     return at
@@ -144,5 +143,4 @@ def _damped_step(
     damped = curvature[np.ix_(free, free)] / np.outer(unit, unit) + damping * np.eye(len(unit))
     step = np.zeros_like(slope)
     step[free] = -np.linalg.solve(damped, slope[free] / unit) / unit
-    # Logarithms of time constants: further than this in one step is a leap in the dark.
     return np.asarray(np.clip(step, -_LONGEST_STEP, _LONGEST_STEP))

@@ -1,12 +1,12 @@
 """Fit G(s) to an input and an output by the error of the output.
 
 The motion is closed to a period by a smooth bridge, and filtered by its spectrum,
-``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is
-exact for any G and any delay as long as the encoder has nothing beyond half the sampling
-rate; :mod:`~omsm_ros.core.identification.covariance_terms` bounds what an edge may hide there.
-Model and data are compared in time, so a missing sample is simply not compared.
-Gain, offset and drift enter linearly and are eliminated (variable projection, Golub and
-Pereyra 1973, with Kaufman's simplification of the derivative).
+``Y(jω) = G(jω) U(jω)``. This takes the motion between samples as band-limited, which is exact for
+any G and any delay as long as the motion has no content beyond half the sampling rate;
+:mod:`~omsm_ros.core.identification.covariance_terms` bounds the error where it has. Model and data
+are compared in time, so a missing sample is simply not compared. Gain, offset and drift enter
+linearly and are eliminated (variable projection, Golub and Pereyra 1973, with Kaufman's
+simplification of the derivative).
 """
 
 from __future__ import annotations
@@ -26,24 +26,22 @@ from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.linear_algebra import least_squares
 
-# A recorded motion as one period, and its spectrum without the noise of the encoder.
-
-# Long enough that a bridge across the whole travel adds nothing near the fastest motion.
+# Duration of the bridge: across the whole travel it adds nothing near the fastest motion.
 _BRIDGE_S = 0.3
-# Where samples are slow a bridge must still be smooth to them.
+# Least length of the bridge, so that it is smooth at a low sampling rate too.
 _MIN_BRIDGE_SAMPLES = 64
-# In it a light mode rings down.
+# Rest after the bridge, in which a lightly damped mode decays.
 _STATIONARY_S = 1.0
-# A record of milliseconds tells of no mode that rings for a second: so many times as long it rests.
+# Most rest per duration: a record of milliseconds shows no mode that rings for a second.
 _PLATEAU_SHARE = 4.0
-# Power is then known to 10 %.
+# Lines over which power is averaged: it is then known to 10 %.
 _SMOOTHING_BINS = 101
 
 
 def close_period(motion: FloatArray, period: float) -> FloatArray:
-    """Return ``motion`` (n,) and a smooth way back to its start, of a length quick to transform.
+    """Return ``motion`` (n,) closed to a period by a smooth bridge to its start and a rest.
 
-    On the way back it rests, until nothing rings when the record starts anew.
+    The rest lets modes decay before the period repeats; the length suits the FFT.
     """
     duration = len(motion) * period
     bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
@@ -55,10 +53,10 @@ def close_period(motion: FloatArray, period: float) -> FloatArray:
 
 
 def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
-    """Return what is motion in its ``spectrum`` (k,), up to the last frequency that has any.
+    """Return ``spectrum`` (k,) after a Wiener filter, up to its last frequency above the noise.
 
-    Wiener's filter. Where an encoder shows only its noise, the probe saw nothing of it;
-    a fit that took it for motion would be paid for a response that vanishes there.
+    Where the encoder reads only its own noise, a fit that took it for motion would be biased
+    towards a response that vanishes there.
     """
     if noise_power <= 0:
         return spectrum
@@ -66,46 +64,46 @@ def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
     power = np.abs(spectrum) ** 2
     smooth = ndimage.uniform_filter1d(power, width, mode="nearest")
     weight = np.clip(1 - noise_power / np.maximum(smooth, np.finfo(np.float64).tiny), 0.0, 1.0)
-    # A mean of m exponential variables scatters by 1/√m; twice that is not motion.
+    # The mean of m exponential variables has the relative deviation 1/√m; 3 of them are noise.
     weight[weight < 3 / np.sqrt(width)] = 0.0
     last = int(np.flatnonzero(weight)[-1]) if np.any(weight) else 0
     return np.asarray((weight * spectrum)[: last + 1], np.complex128)
 
 
 def motion_spectrum(motion: FloatArray, period: float, noise: float) -> ComplexArray:
-    """Transform of ``motion`` (n,), closed to a period, up to its last content, (k,).
+    """Return the transform (k,) of ``motion`` (n,), closed to a period, up to its last content.
 
-    noise: standard deviation of a sample of the motion [m], taken out
+    noise: standard deviation of a sample of the motion [m], which is filtered out
     """
     closed = np.asarray(fft.rfft(close_period(motion, period)), np.complex128)
     return denoised(closed, len(motion) * noise**2)
 
 
-# A linear column weaker than this part of the strongest is rounding.
+# Linear columns weaker than this part of the strongest are rounding.
 _RANK_TOLERANCE = 1e-12
-# Columns that LAPACK takes at a time.
+# Block size of LAPACK.
 _BLOCK = 32
-# Of columns that are in memory at a time beside the result.
+# Values of columns held in memory at a time beside the result.
 _VALUES = 4_000_000
-# Of each start; held inputs need five (docs/design/identification-ablation.md).
+# Iterations from each start; held inputs need five (docs/design/identification-ablation.md).
 _RACE_EVALUATIONS = 5
-# A bound for fits that creep along a valley; others end by convergence before.
+# Most iterations from the best start: it bounds fits along a flat valley, others converge.
 _FINISH_EVALUATIONS = 60
-# The pulse before a record has this content left, as a power of e, where its band ends.
+# Exponent of e to which the pulse before a record has decayed where its band ends.
 _PULSE_END = 14.0
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """What is fitted: ``output`` (n,) where ``used`` (n,), by ``input`` (n,) and ``background``.
+    """A fit of ``output`` (n,), where ``used`` (n,), by ``input`` (n,) and ``background``.
 
-    background: (n, q) columns of what adds to the output whatever the axis does (offset, drift …)
+    background: (n, q) columns added to the output, independent of G (offset, drift …)
     rate: [rad/s] unit of s inside the fit
     noise: standard deviation of a sample of the motion [m]
     fits_initial_condition: fit the response to the unknown motion before the first sample too
-    plateau: number of the plateau a sample rests on, (n,), -1 elsewhere; or None
-    shared: variance of an error that all readings of a plateau share [m²], see ``reading_steps``
-    errors_in_variables: what was taken out of the input, (n,) [m], see ``encoder_noise``; or None
+    plateau: number of the plateau of a sample, (n,), -1 elsewhere; or None
+    shared: variance of the rounding error that the readings of a plateau share [m²]
+    errors_in_variables: noise that was taken out of the input, (n,) [m]; or None
     """
 
     input: FloatArray
@@ -130,13 +128,13 @@ class Problem:
         return np.asarray(fft.rfft(close_period(values, self.period)))[: len(self.s)]
 
     def padded_spectrum(self, values: FloatArray) -> ComplexArray:
-        """Transform of ``values`` (n,) and nothing after them, at ``s``, shape (k,)."""
+        """Transform of ``values`` (n,) followed by zeros, at ``s``, shape (k,)."""
         return np.asarray(fft.rfft(values, self.closed_length))[: len(self.s)]
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
         moved = motion_spectrum(self.input, self.period, self.noise)
-        # A decay may be faster than anything in the motion: then the whole band is needed.
+        # The initial-condition response may be faster than the motion: it needs the whole band.
         missing = self.closed_length // 2 + 1 - len(moved)
         return np.pad(moved, (0, missing)) if self.fits_initial_condition else moved
 
@@ -151,15 +149,15 @@ class Problem:
         return ScaledStructure(structure, self.rate)
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
-        """Return what drives the system: spectra (k,), each with its number of numerator terms."""
+        """Return the inputs: spectra (k,), each with its number of numerator terms."""
         motion = (self._spectrum, structure.zeros + 1)
         return [motion, (self._pulse, structure.poles)] if self.fits_initial_condition else [motion]
 
     @cached_property
     def _pulse(self) -> ComplexArray:
-        """Spectrum (k,) of a Gaussian that is over before the first sample.
+        """Spectrum (k,) of a Gaussian pulse that has decayed before the first sample.
 
-        After it, its n derivatives through n poles are as many free decays, and any of them.
+        Through n poles, the pulse and its derivatives make any initial-condition response.
         """
         angle = self.s.imag * self.rate
         width = np.sqrt(2 * _PULSE_END) / max(float(angle[-1]), np.finfo(np.float64).tiny)
@@ -192,7 +190,7 @@ class Problem:
 
     def _in_time(self, spectra: ComplexArray) -> FloatArray:
         found = np.empty((len(spectra), len(self._places)))
-        # All at once take a long record's memory again.
+        # In blocks: all at once would double the memory of a long record.
         step = max(_VALUES // self.closed_length, 1)
         for first in range(0, len(spectra), step):
             part = slice(first, first + step)
@@ -204,10 +202,10 @@ class Problem:
         """Return the residual at one ψ after the linear parameters are eliminated."""
         structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
         moved = self._moved(structure, lag)
-        # Column after column in memory, as LAPACK has it: numpy's takes five times as long.
+        # In the memory order of LAPACK: in that of numpy it takes five times as long.
         columns = np.concatenate([moved, self._fixed.T, self._target[np.newaxis]]).T
         size = columns.shape[1] - 1
-        # The target among the columns: what it is on their basis needs no basis then.
+        # With the target as the last column, its part in their basis is in the triangle.
         (packed, factors), triangle = linalg.qr(columns, mode="raw", check_finite=False)
         linear = least_squares(triangle[:size, :size], triangle[:size, size], _RANK_TOLERANCE)
         residual = self._target - columns[:, :size] @ linear
@@ -230,7 +228,7 @@ class Problem:
         """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
         total, place = np.zeros_like(lag), 0
         for spectrum, count in self.drives(structure):
-            # A pulse before the record has no term where there is no pole.
+            # Without a pole, the pulse before the record has no term.
             part = np.append(coefficients[place : place + count], 0.0)
             total += polynomial.polyval(self.s, part) * spectrum
             place += count
@@ -241,7 +239,7 @@ class Problem:
         terms = []
         for spectrum, count in self.drives(structure):
             term = lag * spectrum
-            # One more factor each: powers of complex numbers take a logarithm.
+            # Repeated products are faster than powers of complex numbers.
             for _ in range(count):
                 terms.append(term)
                 term = term * self.s
@@ -295,7 +293,7 @@ class Problem:
     def low_order_sensitivity(self, fitted: Fit) -> FloatArray:
         """Return d output / d(gain, lag, curvature, further drives, background), (k, …).
 
-        That is by coefficients of 1, s and s² in front of it: any response bends like that.
+        Those are the coefficients of 1, s and s² as factors of the response.
         """
         lag = fitted.scaled.lag(fitted.nonlinear, self.s)
         driven = self._driven(fitted.structure, lag)
@@ -308,7 +306,7 @@ class Problem:
 class Fit:
     """A fitted structure.
 
-    nonlinear: ψ;  driven: coefficients of the driven terms, scaled, the numerator's first
+    nonlinear: ψ;  driven: coefficients of the driven terms, scaled, those of the numerator first
     background: coefficients (q,);  residual: (k,) [m]
     """
 
@@ -325,12 +323,12 @@ class Fit:
 
     @property
     def gain(self) -> float:
-        """Of the probe per motion at rest."""
+        """Static gain, motion of the probe per motion of the axis."""
         return float(self.driven[0])
 
     @property
     def numerator(self) -> FloatArray:
-        """Scaled, (m+1,), numerator[0] = 1."""
+        """Scaled numerator (m+1,), numerator[0] = 1."""
         return np.asarray(self.driven[: self.structure.zeros + 1] / self.driven[0])
 
     @property
@@ -345,12 +343,12 @@ class Fit:
 
     @property
     def sum_of_squares(self) -> float:
-        """[m²]"""
+        """Sum of the squared residual [m²]."""
         return float(self.residual @ self.residual)
 
     @property
     def rms(self) -> float:
-        """Of the residual [m]."""
+        """Root mean square of the residual [m]."""
         return float(np.sqrt(self.sum_of_squares / self.samples))
 
     @property
@@ -392,7 +390,7 @@ def fit(
 
 
 def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:
-    """Return ``structure`` at ψ as it is; only what enters linearly is fitted."""
+    """Return ``structure`` at the given ψ; only the linear parameters are fitted."""
     scaled = problem.parametrised(structure)
     return _fit_at(problem, scaled, problem.project(scaled, nonlinear))
 

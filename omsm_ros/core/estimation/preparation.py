@@ -1,7 +1,12 @@
-"""From a record to a problem that can be fitted, or one clear reason why it cannot.
+"""Prepare a record for a fit, or raise the reason why it cannot be fitted.
 
-What happens here is decided before any model exists: which samples count, what the probe
-may have measured besides the motion, and whether it followed the motion at all.
+Before any model exists, it is decided which samples are compared, which readings are spikes, and
+whether the probe followed the motion.
+
+A position rounded to steps q has an error of q / √12 rms, evenly spread (Widrow and Kollár 2008,
+ch. 4). The probe measures the true motion, so through G the error remains in the residual where the
+axis moves, with the mean of |G|² over all frequencies. A search for other errors in that residual
+would be in vain.
 """
 
 from __future__ import annotations
@@ -30,19 +35,19 @@ from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import least_squares
 
-# What happened before the record is forgotten after this time.
+# Time after which the motion before the record has no effect.
 _SETTLING_S = 50e-3
-# Interpolation between samples needs neighbours on both sides.
+# Samples at the end that interpolation needs as neighbours.
 _EDGE_GUARD = 8
-# In this time a moving end is faded; the shape keeps its content within 4 / time, to 1e-6.
+# Fade of a moving end and its Kaiser shape, which keeps the content within 4 / time, to 1e-6.
 _FADE_S = 0.5
 _FADE_SHAPE = 12.0
-# Of Gaussian noise, one sample of five hundred million.
+# Limit of a spike: Gaussian noise exceeds it in one of five hundred million samples.
 _SPIKE_SIGMAS = 6.0
-# A smooth peak dwells 1/(√2 - 1) times as long in its last step as in the one before; one that
-# is clipped holds there all that would lie beyond.
+# Readings at the extreme value per reading one step below: a smooth peak has 1/(√2 - 1) = 2.4, a
+# clipped one has all readings that would lie beyond.
 _PILED = 4.0
-# A probe is linear to a few per cent; beyond this a unit or a target is wrong.
+# A probe is linear to a few per cent; outside of this range a unit or a target is wrong.
 _PLAUSIBLE_GAIN = (0.5, 2.0)
 
 
@@ -50,8 +55,8 @@ _PLAUSIBLE_GAIN = (0.5, 2.0)
 class Prepared:
     """A problem, and the steps in its motion.
 
-    spikes: number of single readings of the probe that were taken out
-    axis_spikes: of those of the axis that were replaced by what lies around them
+    spikes: number of single readings of the probe that were removed
+    axis_spikes: number of positions of the axis that were interpolated
     """
 
     problem: Problem
@@ -61,7 +66,7 @@ class Prepared:
 
 
 def prepare(record: MotionRecord, source: str) -> Prepared:
-    """Find the motion in ``source`` ("encoder" or "reference") and what the probe saw of it.
+    """Return the problem of the motion in ``source`` ("encoder" or "reference") and the distance.
 
     Raises StepTestError without a usable motion, IdentificationError when the probe did not
     follow it, ConfigurationError for another source.
@@ -71,7 +76,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     steps = _complete_edges(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps)
     if steps.edges:
-        # Of a motion that never rests a lag of half a period is another gain; the fit tells.
+        # Without plateaus a lag of half a period inverts the gain; the fit shows it.
         check_gain(_static_gain(problem))
     _check_not_clipped(problem)
     problem, spikes = _without_spikes(problem)
@@ -79,7 +84,7 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
-    """Return the problem with what the steps of the probe's readings leave open on plateaus."""
+    """Return the problem with the variance of the rounding errors that plateaus share."""
     plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
     shared = plateau_variance(output, plateau[problem.used], reading_step(output))
     return replace(problem, plateau=plateau, shared=shared)
@@ -99,20 +104,20 @@ def _motion(record: MotionRecord, source: str) -> FloatArray:
 
 
 def _bridged(motion: FloatArray) -> tuple[FloatArray, int]:
-    """Return ``motion`` (n,) without single positions that stand apart from both sides; how many.
+    """Return ``motion`` (n,) with single outliers interpolated, and their number.
 
-    They are replaced by the cubic through two neighbours on each side. An axis does not go where
-    no neighbour is: a bit or a line of the encoder was read wrongly, and the probe saw none of it.
+    They are replaced by the cubic through two neighbours on each side. An axis cannot jump for one
+    sample: a bit or a line of the encoder was read wrongly.
     """
     calm = ndimage.median_filter(motion, 3, mode="nearest")
     least = max(NOISE_FACTOR * sample_noise(calm), TRAVEL_PART * float(np.ptp(calm)))
     if float(np.ptp(calm)) <= max(least, 1e-12):
-        return motion, 0  # all that moves are spikes
+        return motion, 0  # without spikes there is no motion
     step = np.diff(motion)
     outer, inner = motion[:-4] + motion[4:], motion[1:-3] + motion[3:-1]
     across = 0.5 * (motion[3:-1] - motion[1:-3])
     expected = (9 * inner - outer) / 16
-    # What the speed does nearby is no spike, however sharp an edge.
+    # A change of speed nearby raises the limit: a sharp edge is no spike.
     around = np.maximum(np.abs(across - step[:-3]), np.abs(across - step[3:]))
     spikes = np.flatnonzero(np.abs(motion[2:-2] - expected) > least + 2 * around)
     bridged = motion.copy()
@@ -148,9 +153,9 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
 
 
 def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
-    """Return ``motion`` (n,), where it starts or ends moving faded to its mean there.
+    """Return ``motion`` (n,) faded to its mean where it starts or ends while moving.
 
-    A motion that breaks off would have content at all frequencies, where there was none.
+    A motion that breaks off would have content at all frequencies.
     """
     length = min(round(_FADE_S / period), len(motion) // 5)
     if length == 0:  # the fade is shorter than a sample
@@ -169,7 +174,7 @@ def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) ->
 
 
 def _affected_by_loss(record: MotionRecord) -> BoolArray:
-    """Return True where the response still remembers a motion that was lost, shape (n,)."""
+    """Return True where the response depends on lost positions, shape (n,)."""
     samples = len(record)
     if record.z_lost is None:
         return np.zeros(samples, np.bool_)
@@ -179,7 +184,7 @@ def _affected_by_loss(record: MotionRecord) -> BoolArray:
 
 
 def _complete_edges(steps: Steps, record: MotionRecord) -> Steps:
-    """Return the steps without those edges of which a part was lost."""
+    """Return the steps without the edges that are partly lost."""
     if record.z_lost is None:
         return steps
     lost = record.z_lost
@@ -188,9 +193,9 @@ def _complete_edges(steps: Steps, record: MotionRecord) -> Steps:
 
 
 def input_bandwidth(motion: FloatArray, sample_period: float) -> float:
-    """Return the frequency [Hz] below which 99 % of the velocity's energy lies, noise and all."""
+    """Return the frequency [Hz] below which 99 % of the energy of the velocity lies, with noise."""
     power = np.abs(np.fft.rfft(np.diff(motion))) ** 2
-    # Compared without a division: of no motion, or of one too small to square, all is at rest.
+    # Without a division: the power may be 0, also by underflow.
     place = int(np.searchsorted(np.cumsum(power), 0.99 * np.sum(power))) + 1
     return float(place / (len(motion) * sample_period))
 
@@ -201,9 +206,9 @@ def _static_gain(problem: Problem) -> float:
 
 
 def check_gain(gain: float, *, slack: float = 1.0) -> None:
-    """Raise IdentificationError unless the probe follows the motion about one to one.
+    """Raise IdentificationError unless the probe follows the motion with a gain of about one.
 
-    slack: by how much further from one it may be
+    slack: factor by which the limits are relaxed
     """
     low, high = _PLAUSIBLE_GAIN
     if not low / slack <= abs(gain) <= high * slack:
@@ -229,11 +234,11 @@ def _check_not_clipped(problem: Problem) -> None:
 
 
 def _without_spikes(problem: Problem) -> tuple[Problem, int]:
-    """Take out single readings that stand apart from both neighbours, and count them."""
+    """Remove single readings that differ from both neighbours, and count them."""
     apart = np.where(problem.used, problem.output - _static_gain(problem) * problem.input, np.nan)
     before, after = np.roll(apart, 1), np.roll(apart, -1)
     jump = np.abs(apart - 0.5 * (before + after))
-    # What the edges do nearby is no spike, however large.
+    # A change nearby raises the limit: an edge is no spike.
     around = np.fmax(np.abs(before - np.roll(apart, 2)), np.abs(after - np.roll(apart, -2)))
     around = np.fmax(around, np.abs(after - before))
     limit = _SPIKE_SIGMAS * sample_noise(apart[np.isfinite(apart)]) + 2 * around
@@ -241,33 +246,26 @@ def _without_spikes(problem: Problem) -> tuple[Problem, int]:
     return replace(problem, used=problem.used & ~spikes), int(np.sum(spikes))
 
 
-# Positions of the axis in steps too coarse for the probe: what no response explains of them.
-#
-# A position rounded to steps q is wrong by up to half a step, evenly: q / √12 rms (Widrow and
-# Kollár 2008, ch. 4). The probe saw the true motion, so through the response G that error, with
-# the mean of \|G\|² over all frequencies, is left where the axis moves. Other errors of the probe
-# would be looked for in it in vain, and for long.
-
-# A lag and its roll-off: enough to see a residual of the size of a step.
+# A lag and its roll-off are enough to show a residual of the size of a step.
 _PLAIN = Structure(2, 1, True)
-# Of what evenly spread errors leave. They are not spread evenly where plateaus are whole steps
-# (a fifth was seen) or near them all on one side (2.8 was).
+# Limits of the residual over that of evenly spread errors. Plateaus at whole steps gave a fifth,
+# plateaus on one side of whole steps 2.8.
 _AS_ROUNDING = (0.1, 5.0)
-# Of the variance of the noise: where a step has more rms error than the noise, it left 0.4 and more
-# in two seeds of eight steps. Those tests were rejected for other reasons, but for the finest step,
-# of 1.1 times the noise, which was accepted with reservations.
+# Least excess over the variance of the noise. Steps with more rms error than the noise gave 0.4 or
+# more in two seeds of eight step tests.
 _SEEN = 0.25
-# A planned motion may lie on steps too, but a ramp of it advances evenly, except where it begins
-# and ends: at less than a fifth of ten samples. Of a rounded one 0.4 to 1 was seen.
+# Share of moving samples at which the speed changes. A ramp of a planned motion advances evenly but
+# for its ends, less than 0.2; rounded motions gave 0.4 to 1.
 _UNEVEN = 0.3
+# Frequencies over which |G|² is averaged.
 _FREQUENCIES = 2000
 
 
 def check_axis_steps(prepared: Prepared) -> None:
     """Raise IdentificationError where steps of the axis' positions hide the response.
 
-    That is where their error is larger than the noise of the probe, and what a plain response
-    leaves is as large as it. What is larger or smaller is none of theirs.
+    That is where their rounding error exceeds the noise of the probe, and where the residual of a
+    simple response is about as large as that error; a residual of another size has another cause.
     """
     problem = prepared.problem
     positions = problem.input[problem.used]

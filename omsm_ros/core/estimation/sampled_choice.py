@@ -1,9 +1,14 @@
-"""Which sampled model predicts best the parts of a record that were hidden from its fit?
+"""Choose the order of a sampled model by cross-validation.
 
-Orders are fitted to the first part of the record and run freely over the rest. The few that
-predict it best are then judged on several hidden parts, as they are and with their residual
-whitened, which is efficient only for a model that has all the dynamics. Of those that
-predict equally well the simplest is taken: superfluous poles would follow a drift.
+Models of each order are fitted to the first part of the record and simulated over the rest. The
+best few are then compared on several held-out parts, once as they are and once with a whitened
+residual, which is efficient only for a model of all the dynamics. The
+simplest of equally good models is taken, because superfluous poles would follow a drift.
+
+To fit every order to every held-out part of a long record takes minutes. A few thousand samples
+determine the order as well, except for dynamics slower than they last or too weak for them. So the
+order is chosen on the most exciting part; the lowest orders, and two poles more, are fitted to the
+whole record too.
 """
 
 from __future__ import annotations
@@ -28,31 +33,31 @@ from omsm_ros.core.estimation.sampled_fit import (
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 
-# As many as the table of quantities lets a user ask for.
+# As in the table of quantities.
 MAX_ORDER = 20
-# Parts of the used samples; all but the first are hidden once, and the last three together.
+# Parts of the used samples: all but the first are held out in turn, and the last ones together.
 _PARTS = 6
-# Part of the used samples to which every order is fitted first.
+# Share of the used samples to which every order is fitted first.
 _FIRST_PART = 0.75
-# Orders that are judged on every hidden part: so many of the best over the last part, and of
-# the lowest within this factor of the least error. One part alone misjudges by about as much.
+# Orders compared on every held-out part: the best over the last part, and the lowest orders within
+# this factor of the least error. One part alone is uncertain by about this factor.
 _FINALISTS = 3
 _EQUIVALENT = 2.0
-# So many orders in a row that predict no better than the best so far end the search.
+# Orders in a row without a better prediction that end the search.
 _FRUITLESS = 5
-# By so many standard errors a model has to predict better to beat another. A pole too few costs a
-# record with disturbances more than one too many (docs/design/identification-ablation.md).
+# Standard errors by which a model must predict better than another. With disturbances, a pole too
+# few costs more than one too many (docs/design/identification-ablation.md).
 _IMPROVES_BY = 0.5
 # Order of the model by which the delay is chosen.
 _DELAY_ORDER = 3
-# Samples for each parameter: with fewer, an order is not tried.
+# Samples per parameter: with fewer, an order is not tried.
 _LEAST_SAMPLES_EACH = 3
-# Sixty columns of them, and their spectra, take a third of a gigabyte.
+# Sixty columns and their spectra then take a third of a gigabyte.
 _MOST_SAMPLES = 200_000
-# Of the refit without a hidden part, which starts at the minimum over all of them: what more would
-# gain is less than what one part misjudges by, and on orders beyond ten takes most of the time.
+# Iterations without a held-out part, from the minimum over all parts: more would gain less than the
+# uncertainty of one part, and beyond order ten would take most of the time.
 _HELD_OUT_EVALUATIONS = 5
-# Of the power of the strongest direction: what is weaker is rounding of a text with six digits.
+# Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
 
 
@@ -61,7 +66,7 @@ class SampledCandidate:
     """A fit to all used samples, and how it predicts.
 
     order: poles;  whitened: fitted with its residual made white
-    held_out: mean square error of free runs over each hidden part (folds,), empty if not judged
+    held_out: mean square error of free runs over each held-out part (folds,), empty if not compared
     """
 
     problem: ZeroOrderHoldProblem
@@ -73,7 +78,9 @@ class SampledCandidate:
 
 @dataclass(frozen=True, eq=False)
 class SampledChoice:
-    """chosen: of the order asked for, or freely;  free: the free choice
+    """The chosen model, and the free choice.
+
+    chosen: of the order asked for, or the free choice;  free: the free choice
     delay: whole samples;  by_order: mean square error [unit²] over the last part, of each order
     """
 
@@ -128,7 +135,7 @@ def choose_sampled(
 
 
 def check_record(input: FloatArray, output: FloatArray, used: BoolArray, order: int) -> int:
-    """Return the highest order that a record can tell; raises as :func:`choose_sampled` does."""
+    """Return the highest order that a record determines; raise as :func:`choose_sampled` does."""
     most = _highest_order(int(np.sum(used)), order)
     if np.ptp(input) == 0:
         raise IdentificationError("estimation.constant_input")
@@ -138,7 +145,7 @@ def check_record(input: FloatArray, output: FloatArray, used: BoolArray, order: 
 
 
 def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCandidate:
-    """Return the candidate at the best minimum that starts from all used samples lead to."""
+    """Return the candidate at the best minimum from starts of all used samples."""
     if candidate.order == 0 or candidate.whitened:
         return candidate
     every = [candidate.fit.nonlinear, *proposed_starts(candidate.problem, candidate.order, starts)]
@@ -170,10 +177,10 @@ def _highest_order(samples: int, order: int) -> int:
 
 
 def excited_parameters(input: FloatArray, most: int) -> int:
-    """Return how many parameters ``input`` (n,) can tell, at most ``most``.
+    """Return the number of parameters that ``input`` (n,) determines, at most ``most``.
 
-    The order to which it is persistently exciting beside a constant (Ljung 1999, ch. 13): of all
-    windows of ``most`` samples, how many are independent. Each sine gives two; noise, all.
+    That is its order of persistent excitation beside a constant (Ljung 1999, ch. 13): the rank of
+    all its windows of ``most`` samples. Each sine gives two, noise gives all.
     """
     windows = np.lib.stride_tricks.sliding_window_view(input, most)
     varied = windows - np.mean(windows, axis=0)
@@ -182,7 +189,7 @@ def excited_parameters(input: FloatArray, most: int) -> int:
 
 
 def _most_excited(input: FloatArray, most: int, order: int) -> int:
-    """Return the highest order, at most ``most``, whose numerator and denominator show."""
+    """Return the highest order, at most ``most``, whose parameters the input determines."""
     excited = excited_parameters(input, min(2 * most + 1, len(input)))
     needed = 2 * max(order, 1) + 1
     if excited < needed:
@@ -193,7 +200,7 @@ def _most_excited(input: FloatArray, most: int, order: int) -> int:
 
 
 def parts(used: BoolArray) -> FloatArray:
-    """Return in which part, 0 to _PARTS, each used sample lies, with fractions; -1 elsewhere."""
+    """Return the place of each used sample in parts, 0 to _PARTS, fractional; -1 elsewhere."""
     place = np.cumsum(used) - 1.0
     return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
 
@@ -201,7 +208,7 @@ def parts(used: BoolArray) -> FloatArray:
 def delayed(
     input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
 ) -> ZeroOrderHoldProblem:
-    """Return the problem whose ``input`` (n,) comes ``delay`` samples later."""
+    """Return the problem with ``input`` (n,) delayed by ``delay`` samples."""
     late = np.roll(input, delay)
     return ZeroOrderHoldProblem(
         input=late - np.mean(late),
@@ -216,7 +223,7 @@ def delayed(
 def _best_delay(
     input: FloatArray, output: FloatArray, used: BoolArray, period: float, most: int
 ) -> int:
-    """Return the whole samples by which a small model is best late."""
+    """Return the delay [samples] at which a small model fits best."""
     if most == 0:
         return 0
     same = used & (np.arange(len(used)) >= most)
@@ -234,7 +241,7 @@ def _best_delay(
 def _explored(
     early: ZeroOrderHoldProblem, late: BoolArray, most: int, at_least: int
 ) -> tuple[list[Fit], FloatArray]:
-    """Return fits of rising order and their errors over ``late``; stop when some predict no better.
+    """Return fits of rising order and their errors over ``late``, until they stop to improve.
 
     at_least: order to go to in any case
     """
@@ -252,7 +259,7 @@ def _explored(
 def next_order(
     problem: ZeroOrderHoldProblem, smaller: Sequence[Fit], starts: DiscreteStarts
 ) -> Fit:
-    """Fit as many poles as there are ``smaller`` fits, and return the best."""
+    """Return the best fit with as many poles as there are ``smaller`` fits."""
     order = len(smaller)
     structure = Structure(order, order, False)
     if order == 0:
@@ -291,7 +298,7 @@ def _missed(problem: ZeroOrderHoldProblem, fitted: Fit, held_out: BoolArray) -> 
 
 
 def _finalists(by_order: FloatArray, order: int) -> list[int]:
-    """Return the orders worth judging: the best, the lowest about as good, 0, 1 and ``order``."""
+    """Return the orders to compare: the best, the lowest of similar error, 0, 1 and ``order``."""
     best = np.argsort(by_order, kind="stable")[:_FINALISTS]
     about_as_good = np.flatnonzero(by_order <= _EQUIVALENT * np.min(by_order))[:_FINALISTS]
     return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
@@ -300,12 +307,12 @@ def _finalists(by_order: FloatArray, order: int) -> list[int]:
 def held_out_errors(
     candidate: SampledCandidate, part: FloatArray, evaluations: int = _HELD_OUT_EVALUATIONS
 ) -> FloatArray:
-    """Return the mean square error over each hidden part, the candidate fitted without it.
+    """Return the mean square error over each held-out part, the candidate fitted without it.
 
-    part: in which each sample lies, see :func:`parts`;  evaluations: of that fit
+    part: of each sample, see :func:`parts`;  evaluations: of that fit
 
-    Some parts lie inside the record and one at its end. Inside alone would misjudge a plant that
-    drifts, because the data hold the model at both ends. No model has to run backwards.
+    Some parts lie inside the record, others reach to its end. Parts inside alone would favour
+    models of a drift, because the data constrain the model on both sides.
     """
     problem, number = candidate.problem, np.floor(part)
     held_out = [number == i for i in range(1, _PARTS)]
@@ -319,10 +326,10 @@ def held_out_errors(
 
 
 def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate:
-    """Return the simplest of those that no other beats: not whitened, then with fewest poles.
+    """Return the simplest candidate that no other dominates: not whitened, then fewest poles.
 
-    One beats another that is better in the mean by more than half a standard error of their
-    difference (after Breiman et al. 1984, paired).
+    A candidate dominates if its mean error is lower by more than half a standard error of their
+    paired difference (after Breiman et al. 1984).
     """
     errors = np.array([c.held_out for c in judged])
     with np.errstate(invalid="ignore"):
@@ -334,24 +341,16 @@ def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate
     return judged[min(every, key=lambda i: (judged[i].whitened, judged[i].order))]
 
 
-# The model of a long record: chosen on the part that tells most, fitted and judged on the whole.
-#
-# To fit every order to every hidden part of a long record takes minutes, and tells of the order
-# what
-# a few thousand samples tell. What they do not is what is slower than they last, and what is too
-# weak
-# to show in them: so the lowest orders, and two poles more, are fitted to the whole as well.
-
-# Samples that are used, on which is chosen: eighty for each parameter of the highest order.
+# Used samples on which the order is chosen: eighty per parameter of the highest order.
 CHOSEN_ON = 5000
-# Parts that are compared in how much they tell.
+# Parts whose excitation is compared.
 _MOST_PARTS = 16
-# Fitted to the whole in any case: what is slower than a part.
+# Highest of the lowest orders, which are fitted to the whole record: for slow dynamics.
 _LOWEST = 2
-# and what is too weak for it.
+# Poles more than chosen on the part, fitted to the whole record: for weak dynamics.
 _POLES_MORE = 2
-# Without a part of a long record a model hardly moves.
-_HIDDEN_EVALUATIONS_LONG_RECORD = 2
+# Iterations without a held-out part: in a long record it hardly changes the model.
+_HELD_OUT_EVALUATIONS_LONG_RECORD = 2
 
 
 def choose_sampled_long(
@@ -363,7 +362,7 @@ def choose_sampled_long(
     order: int = 0,
     max_delay: int = 0,
 ) -> SampledChoice:
-    """Fit sampled models and choose, as :func:`choose_sampled` does, whatever the length."""
+    """Choose a model as :func:`choose_sampled` does, quickly for a long record too."""
     check_record(input, output, used, order)
     if int(np.sum(used)) <= CHOSEN_ON:
         return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
@@ -373,7 +372,7 @@ def choose_sampled_long(
             input[part], output[part], used[part], period, order=order, max_delay=max_delay
         )
     except IdentificationError:
-        # No part excites as much as the whole does.
+        # No part excites as much as the whole record.
         return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
     centred = np.where(used, output - np.mean(output[used]), 0.0)
     return _on_full_record(delayed(input, centred, used, period, choice.delay), choice)
@@ -406,21 +405,21 @@ def _on_full_record(problem: ZeroOrderHoldProblem, choice: SampledChoice) -> Sam
     free = _refit_on_full_record(problem, choice.free)
     tried += [free, *_with_further_poles(problem, free, starts)]
     judged = [
-        replace(c, held_out=held_out_errors(c, part, _HIDDEN_EVALUATIONS_LONG_RECORD))
+        replace(c, held_out=held_out_errors(c, part, _HELD_OUT_EVALUATIONS_LONG_RECORD))
         for c in tried
     ]
     best = simplest_undominated(judged)
     if choice.chosen is choice.free:
         return replace(choice, chosen=best, free=best)
     asked = _refit_on_full_record(problem, choice.chosen)
-    asked = replace(asked, held_out=held_out_errors(asked, part, _HIDDEN_EVALUATIONS_LONG_RECORD))
+    asked = replace(asked, held_out=held_out_errors(asked, part, _HELD_OUT_EVALUATIONS_LONG_RECORD))
     return replace(choice, chosen=asked, free=best)
 
 
 def _refit_on_full_record(
     problem: ZeroOrderHoldProblem, found: SampledCandidate
 ) -> SampledCandidate:
-    """Return the candidate that was ``found`` on a part, fitted to the whole ``problem``."""
+    """Return the candidate ``found`` on a part, fitted to the whole ``problem``."""
     return replace(found, problem=problem, fit=refit(problem, found.fit, found.whitened))
 
 

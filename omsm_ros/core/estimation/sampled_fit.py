@@ -1,10 +1,18 @@
 """Fit a rational H(z) to an input that is held between samples, such as a drive's command.
 
-A linear system behind a zero-order or a first-order hold is exactly rational in z⁻¹, with as
-many poles as the system has, and from its initial state on it is known exactly too: that
-adds a polynomial over the same denominator. So the fit of :mod:`output_error` serves with
-q = z⁻¹ for s. The denominator is a product of sections of
-``w = (2/T) (1 - q)/(1 + q)``, so every parameter vector is stable.
+A linear system behind a zero-order or a first-order hold is exactly rational in z⁻¹, with the poles
+of the system. Its initial state adds a polynomial over the same denominator, exactly. So the fit of
+:mod:`output_error` is used with q = z⁻¹ for s. The denominator is a product of sections of
+``w = (2/T) (1 - q)/(1 + q)``, so that every parameter vector is stable.
+
+The G(s) of a sampled H(z): each pole p of H is exp(sT) of a pole of G, and its residue follows in
+closed form. With a zero-order hold ``x' = s x + u`` gives ``x[k+1] = p x[k] + h u[k]``,
+h = (p - 1)/s; with a first-order hold ``x[k+1] = p x[k] + h0 u[k] + h1 u[k+1]``,
+h1 = (h/T - 1)/s, h0 = h - h1.
+
+Starting points are poles by ARX, instrumental variables and a subspace method. ARX finds
+well-damped responses in little noise, instrumental variables find them in coloured noise, and a
+subspace method finds all modes of a high order at once.
 """
 
 from __future__ import annotations
@@ -24,11 +32,11 @@ from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.linear_algebra import least_squares
 
-# w over the rate of a section, per (1 - q)/(1 + q), where the rate is half the sampling rate:
-# half way between the slowest and the fastest that a sampled pole can be.
+# w over the rate, per (1 - q)/(1 + q), and the rate in 1/T: the middle of the range of sampled
+# poles.
 _PER_BILINEAR = 4.0
 RATE_SAMPLES = 0.5
-# A pole is kept this far inside the unit circle and off z = -1, where w is infinite.
+# Least relative distance of a pole from the unit circle; at z = -1, w is infinite.
 _OFF_BORDER = 1e-6
 
 
@@ -56,7 +64,7 @@ class ScaledDiscreteStructure(ScaledStructure):
     ) -> Iterator[tuple[ComplexArray, list[ComplexArray]]]:
         """Yield each factor of the denominator at q = ``s``, and its terms beyond the first.
 
-        Not from its coefficients in q: near q = 1 those of a slow pole cancel.
+        They are not computed from coefficients in q, which cancel near q = 1 for a slow pole.
         """
         up, down = 1 + s, _PER_BILINEAR * (1 - s)
         for section in self.sections(nonlinear):
@@ -95,7 +103,7 @@ def inside_unit_circle(poles: ComplexArray) -> ComplexArray:
 
 
 class ZeroOrderHoldProblem(Problem):
-    """A problem whose input is held between samples; ``s`` is q = z⁻¹, the rate 0.5 / period."""
+    """A problem whose input is held between samples: ``s`` is q = z⁻¹, the rate is 0.5 / period."""
 
     @cached_property
     def closed_length(self) -> int:
@@ -121,15 +129,15 @@ class ZeroOrderHoldProblem(Problem):
         return ScaledDiscreteStructure(structure, self.rate)
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
-        """Return the input, and a pulse at the first sample whose terms make any initial state.
+        """Return the input and a pulse at the first sample, whose terms make any initial state.
 
-        n terms do so from the second sample on; one more frees the first sample.
+        n terms do so from the second sample on; one more does so for the first sample.
         """
         pulse = np.ones(len(self.s), np.complex128)
         return [(self._spectrum, structure.zeros + 1), (pulse, structure.poles + 1)]
 
     def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
-        """Return columns without their mean: the offset stands for it; an integrator's is vast."""
+        """Return columns without their mean, which is huge for an integrator; the offset has it."""
         spectra = super()._driven(structure, lag)
         spectra[:, 0] = 0.0
         return spectra
@@ -137,7 +145,7 @@ class ZeroOrderHoldProblem(Problem):
     def _moved(self, structure: Structure, lag: ComplexArray) -> FloatArray:
         """Return the linear columns where they are compared, (terms, k).
 
-        Each is the one before, a sample later: the period has no bridge, so it turns round.
+        Each is the one before, delayed by a sample; the period has no bridge, so the columns wrap.
         """
         rows = []
         for spectrum, count in self.drives(structure):
@@ -153,7 +161,7 @@ class ZeroOrderHoldProblem(Problem):
         """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
         total, place = np.zeros_like(lag), 0
         for spectrum, count in self.drives(structure):
-            # A polynomial in q at every line is the transform of its coefficients.
+            # The values of a polynomial in q are the transform of its coefficients.
             part = coefficients[place : place + count]
             total += fft.rfft(part, self.closed_length) * spectrum
             place += count
@@ -230,16 +238,10 @@ def _changes(
     return first + second
 
 
-# Which G(s) makes a sampled H(z), when its input is held between the samples?
-#
-# Each pole p of H is exp(sT) of one of G, and its residue follows in closed form. With a
-# zero-order hold ``x' = s x + u`` gives ``x[k+1] = p x[k] + h u[k]``, h = (p - 1)/s; with a
-# first-order hold ``x[k+1] = p x[k] + h0 u[k] + h1 u[k+1]``, h1 = (h/T - 1)/s, h0 = h - h1.
-
 ZERO_ORDER, FIRST_ORDER = "zero-order", "first-order"
-# Poles nearer to each other than this, relative, have no residues that rounding would leave.
+# Residues of poles nearer to each other than this are lost in rounding.
 _APART = 1e-6
-# A pole this near to z = 0 is a delay, and one this near to 1 an integrator.
+# A pole nearer to z = 0 than this is a delay, one nearer to 1 an integrator.
 _LEAST = 1e-9
 
 
@@ -250,8 +252,8 @@ def zero_order_hold_equivalent(
 
     period: [s];  hold: "zero-order" or "first-order"
 
-    None where there is no such G: a pole on the negative real axis, at 0 or at 1, or several
-    in one place.
+    Return None where there is no such G: for a pole on the negative real axis, at 0 or at 1, or for
+    multiple poles.
     """
     n = len(denominator) - 1
     b = np.pad(numerator, (0, max(n + 1 - len(numerator), 0)))
@@ -297,27 +299,21 @@ def _fractions(b: FloatArray, a: FloatArray, poles: ComplexArray) -> tuple[float
     return direct, np.asarray(values / slopes, np.complex128)
 
 
-# Where the fit of a sampled model starts: poles by ARX, instrumental variables, and subspace.
-#
-# Each finds what the others miss. Least squares of an ARX model finds a well-damped response in
-# little noise; instrumental variables find it in coloured noise too; a subspace method finds all
-# modes of a high order at once.
-
-# Steiglitz and McBride (1965): it has converged, or will not.
+# Iterations after Steiglitz and McBride (1965): by then they have converged, or will not.
 _ITERATIONS = 8
 # Rows of past and of future beyond the highest order.
 _SPARE_ROWS = 5
-# Thirty times its rows at the highest order; more only cost time.
+# Most columns: thirty times the rows at the highest order; more only cost time.
 _MAX_COLUMNS = 5000
-# Logarithm of the time constant of a pole too fast to be seen, but not to have a gradient.
+# Logarithm of the time constant of an added pole: too fast to matter, but with a gradient.
 _FAST = float(np.log(0.1))
 
 
 @dataclass(frozen=True, eq=False)
 class DiscreteStarts:
-    """Proposes poles in z for a record ``input``, ``output`` (n,), compared where ``used`` (n,).
+    """Propose poles in z for a record ``input``, ``output`` (n,), compared where ``used`` (n,).
 
-    order: the highest that will be asked for
+    order: the highest one needed
     """
 
     input: FloatArray
@@ -417,8 +413,8 @@ def _poles(coefficients: FloatArray) -> ComplexArray:
 def grown_starts(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
     """Return the starts for one pole more than the last of ``smaller``.
 
-    A pole too fast to matter, so that a larger model never fits worse; and two as slow as the
-    record is long: descent alone does not reach a pair of integrators from other starts.
+    One adds a pole too fast to matter, so that a larger model never fits worse. The other adds two
+    as slow as the record is long: from other starts a fit does not reach a pair of integrators.
     """
     slow = np.log(samples / 2)
     fast = [with_fast_pole(smaller[-1])]

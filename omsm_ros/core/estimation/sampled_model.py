@@ -1,4 +1,4 @@
-"""A model between samples of any two quantities: its coefficients, and how well they are known."""
+"""Sampled model of any two quantities: coefficients with uncertainty, its file, and free runs."""
 
 from __future__ import annotations
 
@@ -69,16 +69,16 @@ class Discrete:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SampledModel:
-    """How samples of ``output`` follow from samples of ``input``, in the units of the record.
+    """A model of samples of ``output`` from samples of ``input``, in the units of the record.
 
-    hold: what the input does between samples: "band-limited", "zero-order" or "first-order"
-    working_point: input, and the output that rests there; the model is of deviations from both
+    hold: of the input between samples: "band-limited", "zero-order" or "first-order"
+    working_point: input and its steady output; the model is of deviations from both
     discrete: the model of a held input, None of a band-limited one
-    continuous: G(s) with its gain; of a held input the one that makes ``discrete``, None if none
+    continuous: G(s) with its gain; of a held input the one equivalent to ``discrete``, or None
     covariance: (p, p) of ``continuous``, order numerator, denominator[1:], delay; None of a held
         input, whose covariance is in ``discrete``
-    valid_from, valid_up_to: [Hz] between which the 95 % band keeps within the limits; equal
-        where it does so nowhere
+    valid_from, valid_up_to: [Hz] between which the 95 % band is within the limits; equal if it is
+        nowhere
     certificate: JSON values
     """
 
@@ -110,7 +110,7 @@ class SampledModel:
     def from_content(cls, content: Mapping[str, Any]) -> SampledModel:
         """Return the inverse of :meth:`content`, for values of the right types.
 
-        Raises CalibrationError for a model that cannot be, or that cannot be computed with.
+        Raises CalibrationError for an inconsistent model, or one that cannot be computed.
         """
         period = SAMPLE_PERIOD.checked(content["sample_period"], CalibrationError)
         continuous, covariance = _continuous_of(content["continuous"], period)
@@ -173,7 +173,7 @@ def _continuous_of(
 
 
 def _check_runs(dynamics: TransferFunction) -> None:
-    """Raise CalibrationError for what cannot run freely; of a held input ``discrete`` does."""
+    """Raise CalibrationError for a response that is unstable or zero."""
     if not dynamics.is_stable or not np.any(dynamics.numerator):
         raise CalibrationError(
             "estimation.unstable",
@@ -198,7 +198,7 @@ def _discrete_of(content: Mapping[str, Any]) -> Discrete:
 
 
 def _square(values: Sequence[float], size: int) -> FloatArray:
-    """Return a covariance from its rows one behind the other."""
+    """Return a covariance (size, size) from its rows in sequence."""
     if len(values) != size**2:
         raise CalibrationError("estimation.covariance_size", count=len(values), expected=size**2)
     covariance = SIGNAL.checked_all(np.asarray(values, np.float64), CalibrationError)
@@ -217,18 +217,18 @@ def _discrete_content(discrete: Discrete) -> dict[str, object]:
     }
 
 
-# What does a sampled model make of an input alone?
-
-# The least that shows more than an initial state of 20 poles and an offset.
+# Enough samples for an initial state of 20 poles and an offset.
 _LEAST_SAMPLES = 50
-# The square of a smaller change, over a noise that is smaller still, is no float.
+# The square of a smaller change underflows.
 _LEAST_CHANGE = 1e-50
 
 
 @dataclass(frozen=True, eq=False)
 class FreeRun:
-    """output, residual: (n,), in the units of the record; the residual NaN where nothing counts
-    explained: part of the variance of what was measured [1];  rms: of the residual
+    """The simulated output and its residual.
+
+    output, residual: (n,), in the units of the record; the residual is NaN where none is counted
+    explained: part of the variance of the measured output [1];  rms: of the residual
     """
 
     output: FloatArray
@@ -240,15 +240,14 @@ class FreeRun:
 def free_run(
     model: SampledModel, input: FloatArray, output: FloatArray, used: BoolArray | None = None
 ) -> FreeRun:
-    """Return the output that ``model`` makes of ``input`` (n,) beside the measured ``output`` (n,).
+    """Simulate ``model`` for ``input`` (n,) and compare it with the measured ``output`` (n,).
 
     used: True where the output counts, None where it is finite
 
-    Nothing of the model is fitted again; only the state that it starts in, and a constant, are
-    taken from the output. Samples are a ``sample_period`` of the model apart.
+    Only the initial state and a constant are fitted to the output. Samples are a ``sample_period``
+    of the model apart.
 
-    Raises IdentificationError for a record that is too short, that does not change, or of whose
-    input something is missing.
+    Raises IdentificationError for a record that is too short or constant, or for gaps of the input.
     """
     counted = np.isfinite(output) if used is None else used & np.isfinite(output)
     if np.sum(counted) < _LEAST_SAMPLES or len(input) != len(output):
@@ -271,9 +270,9 @@ def free_run(
 
 
 def check_input(input: FloatArray) -> None:
-    """Raise IdentificationError for an input that does not change, or of which a value is missing.
+    """Raise IdentificationError for a constant input, or one with a missing value.
 
-    What follows a missing value would be as unknown as it is.
+    After a missing value the output would be unknown.
     """
     missing = int(np.count_nonzero(~np.isfinite(input)))
     if missing:
@@ -282,7 +281,7 @@ def check_input(input: FloatArray) -> None:
 
 
 def check_varies(values: FloatArray, name: str) -> None:
-    """Raise IdentificationError for a column that does not change; what is finite of it counts."""
+    """Raise IdentificationError for a column whose finite values are constant."""
     values = values[np.isfinite(values)]
     change = float(np.ptp(values)) if len(values) else 0.0
     if change <= _LEAST_CHANGE:
@@ -292,17 +291,17 @@ def check_varies(values: FloatArray, name: str) -> None:
 def stationary_output(
     discrete: Discrete, input: FloatArray, output: FloatArray, used: BoolArray
 ) -> float:
-    """Return the output at which ``discrete`` rests where ``input`` (n,) has its mean."""
+    """Return the steady output of ``discrete`` at the mean of ``input`` (n,)."""
     driven, free = _zero_order_hold_responses(discrete, input - np.mean(input))
     columns = np.column_stack([*free, np.ones(len(input))])
     return float(least_squares(columns[used], (output - driven)[used])[-1])
 
 
 def _responses(model: SampledModel, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return response (n,) to ``motion``, and (k, n) to each state that the model may start in."""
+    """Return the response (n,) to ``motion``, and those (k, n) to each initial state."""
     if model.discrete is not None:
         return _zero_order_hold_responses(model.discrete, motion)
-    assert model.continuous is not None  # a band-limited model has nothing else
+    assert model.continuous is not None  # a band-limited model has no other response
     recursion = Recursion(discretise(model.continuous, model.sample_period))
     recursion.start(motion[:1])
     poles = np.exp(model.continuous.poles() * model.sample_period)

@@ -1,7 +1,7 @@
-"""The steps in a motion: where they are, what lies between them, and which to hold out.
+"""Detect the steps in a motion, split it between them, and select parts to hold out.
 
-No number, size, direction or rate of steps is assumed. A motion without plateaus (a
-chirp, a scan) has no edges; it identifies as well, by its own content.
+No number, size, direction or rate of steps is assumed. A motion without plateaus (a chirp, a scan)
+has no edges; it can be used for identification too.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
 
-# A fit of even one parameter with its offset, drift and gain needs a multiple of them.
+# A fit of one parameter with offset, drift and gain needs a multiple of its four unknowns.
 LEAST_SAMPLES = 50
 # A step test of ten seconds at 70 kHz; each takes 1.3 kB in a fit and its covariance.
 _MOST_SAMPLES = 800_000
-# Far beyond the range of any probe that could have seen the motion.
+# Far beyond the range of any probe.
 _GREATEST_TRAVEL_M = 20e-3
-# Motion must stand out of the encoder's noise by this factor, and by this part of the travel.
+# Motion exceeds the noise of the encoder by this factor, and this part of the travel.
 NOISE_FACTOR = 20.0
 TRAVEL_PART = 2e-3
+# Orders of differences from which noise is estimated: the motion vanishes in the higher ones.
 _DIFFERENCES = (2, 4, 6, 8)
-# Rest is the axis staying put for this long, and an edge ends when it begins.
+# The axis is stationary if it stays in place for this time; then an edge ends.
 _STATIONARY_S = 20e-3
 
 
@@ -41,7 +42,7 @@ class Edge:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The edges of a motion (n,), its rests, and its noise.
+    """The edges of a motion (n,) and its noise.
 
     moving: True from an edge's start to its stop, shape (n,)
     noise: standard deviation of one encoder sample [m]
@@ -57,8 +58,8 @@ class Steps:
 def sample_noise(values: FloatArray) -> float:
     """Return the standard deviation of white noise on a smooth signal, from its differences.
 
-    Motion adds to the differences of each order, to the lowest most, so the smallest estimate is
-    taken. Each is a median, to which the few samples at edges do not matter.
+    Motion adds to the differences of each order, so the smallest estimate is taken. Each is a
+    median, which the few samples at edges do not change.
     """
     orders = [order for order in _DIFFERENCES if order < len(values)]
     return min((_difference_noise(values, order) for order in orders), default=0.0)
@@ -86,10 +87,10 @@ def find_steps(z: FloatArray, sample_period: float) -> Steps:
 
 
 def _moving(z: FloatArray, sample_period: float, threshold: float) -> BoolArray:
-    """Return True where z leaves its value by more than ``threshold`` within a rest's duration."""
+    """Return True where z changes by more than ``threshold`` within _STATIONARY_S."""
     width = min(max(round(_STATIONARY_S / sample_period), 2), len(z) - 1)
     changes = np.abs(z[width:] - z[:-width]) > threshold
-    # A change between k and k + width lies anywhere between: close the window over it.
+    # A change between k and k + width may lie anywhere between, so the whole window counts.
     return extended(np.concatenate([changes, np.zeros(width, np.bool_)]), width)
 
 
@@ -139,7 +140,7 @@ def held_out(steps: Steps, samples: int) -> BoolArray:
 
 
 def backlash_columns(steps: Steps, samples: int) -> FloatArray:
-    """Return the direction of the last move, and a mark of the time before the first, (n, 1 or 2).
+    """Return the direction of the last move and 1 before the first move, as columns (n, 0 or 2).
 
     A backlash of b shifts the output by ±b/2 with the direction of approach.
     """
@@ -155,7 +156,7 @@ def backlash_columns(steps: Steps, samples: int) -> FloatArray:
 
 
 def check_usable(record: MotionRecord) -> None:
-    """Raise StepTestError for too few samples that can be used, or too many, saying why."""
+    """Raise StepTestError for too few usable samples, or too many samples."""
     _check_length(len(record))
     if len(record) > _MOST_SAMPLES:
         raise StepTestError("estimation.many_samples", samples=len(record), most=_MOST_SAMPLES)

@@ -1,4 +1,9 @@
-"""Which model does a prepared problem support?"""
+"""Choose a model for a prepared problem.
+
+The motion before the first sample is unknown. Its response after it is a sum of decays at the poles
+of G. Fast ones are over before the first compared sample; a lightly damped mode may ring for a
+second, and would bias a fit that takes it for a response to the motion.
+"""
 
 from __future__ import annotations
 
@@ -22,26 +27,20 @@ from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
 from omsm_ros.linear_algebra import triangle
 
-# Does the record start while the machine still rings from an earlier motion?
-#
-# The motion before the first sample is unknown, but its response since then is a sum of decays at
-# the poles of G. Fast ones are over before the first sample that counts. A lightly damped mode may
-# ring for a second, and a fit that takes its ringing for a response to the motion is biased.
-
-# χ² a column must explain to be taken: four sigma.
+# χ² that each column must explain to be significant: four sigma.
 _CLEARLY_SHOWN = 16.0
-# A decay by e to this power is over.
+# Decay times after which a response is over.
 _OVER = 10.0
-# Directions this much weaker than the strongest are rounding.
+# Directions weaker than this part of the strongest are rounding.
 _SPANNED = 1e-6
 
 
 def has_initial_response(
     problem: Problem, fitted: Fit, colour: float = 1.0, *, at_rest: bool = True
 ) -> bool:
-    """Return whether decays at the poles of ``fitted`` reach into the samples that count.
+    """Return True if decays at the poles of ``fitted`` reach into the compared samples.
 
-    at_rest: the axis rests at the start; then the decays have to show clearly in the residual
+    at_rest: the axis is stationary at the start; then the decays must be significant
     colour: power of the noise at low frequency over its mean, see ``information``
     """
     counted = np.flatnonzero(problem.used)
@@ -53,7 +52,7 @@ def has_initial_response(
     if not at_rest:
         return True
     columns = problem.initial_condition_response(fitted)[problem.used]
-    # The fit has already taken of a decay what the parameters of the model can imitate.
+    # The fit already contains the part of a decay that is collinear with its parameters.
     known = problem.sensitivity(fitted)
     lengths = [np.sqrt(np.einsum("kq,kq->q", part, part)) for part in (columns, known)]
     scale = np.concatenate([*lengths, np.ones(1)])
@@ -67,22 +66,22 @@ def has_initial_response(
     return bool(explained * fitted.samples > colour * _CLEARLY_SHOWN * max(size, 1) * rest)
 
 
-# Of what is worse by so much on fewer samples none is chosen on all of them; a structure is chosen
-# within one parameter of the best, at 14 at most.
+# Difference of the criterion on fewer samples beyond which a structure is not chosen on all. The
+# chosen structure is within one parameter of the best, at most 14.
 _MAY_BE_CHOSEN_BIC = 30.0
 # "Not worth more than a bare mention" (Kass and Raftery 1995).
 _ALIKE_BIC = 2.0
-# Beyond the first ones, of a fit that starts at the minimum over fewer samples.
+# Further iterations of a fit that starts at the minimum over fewer samples.
 _NEARLY_EVALUATIONS = 2
-# Probability by chance below which what moves faster than fewer samples show tells more.
+# p-value below which content beyond the decimated bandwidth determines the model further.
 _NO_FURTHER_GAIN = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenModel:
-    """The chosen candidate among those of its kind that were tried.
+    """The chosen candidate and those that were tried.
 
-    free: the choice without asking, where an order was asked for; else None
+    free: the free choice, where an order was asked for; else None
     """
 
     chosen: Candidate
@@ -137,10 +136,10 @@ def keep_better(
 
 
 def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) -> ChosenModel | None:
-    """Return ``before``, which was chosen while the problem was another, fitted to it as it is.
+    """Return ``before``, chosen for an earlier problem, fitted to ``problem``.
 
-    None where the change lets some candidates describe more than others: then a structure that
-    was not tried may describe more too. None also where an order was asked for.
+    Return None where the change improves some candidates more than others, because an untried
+    structure may then be better, and where an order was asked for.
     """
     if before.free is not None:
         return None
@@ -176,7 +175,7 @@ def _chosen_on_subset(
     """Explore structures at the samples of ``points``; fit to all those that may be chosen.
 
     lag: the fit of a delay alone to all samples
-    A structure that is far from the best there is compared with all samples where it was best.
+    A structure far from the best there is evaluated with all samples at its minimum over fewer.
     """
     problem, coarse = prepared.problem, points.problem
     every = round(coarse.period / problem.period)
@@ -219,7 +218,7 @@ def _chosen_on_subset(
 
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Return those whose poles are identifiable; a delay alone has none."""
+    """Return the candidates whose poles are identifiable."""
     duration = len(problem.input) * problem.period
     return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
 
@@ -227,7 +226,7 @@ def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence
 def model_from_start(
     prepared: Prepared, budget: EvaluationBudget | None = None, order: int = 0
 ) -> tuple[Prepared, ChosenModel]:
-    """Choose a model, with the initial-condition response fitted where the record begins in it.
+    """Choose a model, with the initial-condition response where the record starts during one.
 
     Returns the problem as it was fitted, and the model.
     """

@@ -1,9 +1,9 @@
-"""Model departures one after the other, as long as the residual shows a significant one.
+"""Model errors are added to a fit one after the other while the residual shows a significant one.
 
-A slow relaxation or a soft mode becomes a pole; what adds to the reading whatever G is
-(backlash, friction, drift, a line of vibration …) becomes columns beside it. Two slow families
-that explain the residual about equally well are fitted together: alone, one would take the
-other's part.
+A slow relaxation or a soft mode becomes poles of G. Errors that are added to the reading
+independently of G (backlash, friction, drift, lines of vibration …) become nuisance terms, columns
+of the background. Two slow families that explain the residual about equally well are fitted
+together, because one alone would also explain a part of the other.
 """
 
 from __future__ import annotations
@@ -37,32 +37,33 @@ from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics,
 from omsm_ros.core.model_errors.undetected import at_fitted_pole, fit_with_added_poles, poles_of
 from omsm_ros.errors import Notice
 
-# Each models one departure; a machine with more is not one to measure with.
+# Rounds, each for one model error; a machine with more errors cannot be used to measure.
 _MOST_ROUNDS = 6
 _NUISANCE_FAMILIES = {BACKLASH, DRIFT, FRICTION, LINEARITY, PERIODIC, VIBRATION}
-# Their columns follow the fitted response, which they improve.
+# Families whose columns depend on the fitted response, and improve it.
 _TURNING = {BACKLASH, FRICTION}
 _SLOW = {BACKLASH, CREEP, DRIFT, FRICTION, LINEARITY}
-# Odds below which the data do not choose, as a logarithm (Kass and Raftery 1995: very strong).
+# Log odds below which two families count as equal (Kass and Raftery 1995: very strong).
 _UNDECIDED = 5.0
-# A decay slower than the record is a drift.
+# Fewest decay times in a record: a slower decay is a drift.
 _LEAST_DECAYS = 1.0
-# A ring that has decayed by fewer e-folds at the end of the record is still felt at its beginning,
-# where the period begins anew: a thousandth of it is left after seven.
+# Decay times in a record below which the start of the period contains the response to its end:
+# after seven a thousandth remains.
 _SETTLED_DECAYS = 7.0
-# A structure and its roll-off; what is not linear looks like many more.
+# Most poles of a simple model, a structure and its roll-off; nonlinearity looks like many more.
 _PLAIN_POLES = 2
-# Two time constants a decade apart look much the same: the fit starts at several. Of modes those
-# looked for lie six per cent apart.
+# Factors on poles at which a fit starts: time constants a decade apart look similar, and tested
+# modes are six per cent apart.
 _FASTER = (1.0, 2.0, 5.0)
 _MODE_FREQUENCY_RATIOS = (1.0, 0.97, 1.03)
-# As a logarithm; a mode that rings seven times is as wide.
+# Logarithm of the frequency ratio within which a line belongs to a mode: a mode of that width rings
+# seven times.
 _SAME_LINE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class ModelledTerm:
-    """A departure with columns of its own in the background, at ``columns``."""
+    """A nuisance term and its ``columns`` in the background."""
 
     term: ModelErrorTerm
     columns: slice
@@ -70,10 +71,10 @@ class ModelledTerm:
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What was fitted in the end.
+    """The result of the search.
 
     nuisance_terms: departures in the background;  added_poles: those that became poles
-    unmodelled: significant, but no model describes them;  diagnostics: of the last fit
+    unmodelled: significant, but without a model;  diagnostics: of the last fit
     without: survey of the fit before each of ``added_poles`` was added
     incomplete: the search was cut short, because its budget was exhausted
     """
@@ -162,7 +163,7 @@ def search_model_errors(
 def _initial_model(
     prepared: Prepared, choose: Choose, budget: EvaluationBudget
 ) -> tuple[Prepared, list[ModelledTerm], ChosenModel, EvaluationBudget]:
-    """Return the problem, its first nuisance terms and its model, and the budget to go on with."""
+    """Return the problem, its first nuisance terms and its model, and the remaining budget."""
     prepared, nuisance_terms = _with_columns(prepared, _drift(prepared, budget))
     prepared, model = choose(prepared, budget)
     prepared, model, budget = _with_errors_in_variables(prepared, model, choose, budget)
@@ -177,7 +178,7 @@ def _initial_model(
 def _rechoose(
     prepared: Prepared, model: ChosenModel, choose: Choose, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel]:
-    """Return a problem that has changed since ``model`` was chosen, and the model chosen anew."""
+    """Return the problem and a model chosen anew, after it has changed since ``model``."""
     prepared, found = choose(prepared, budget)
     return prepared, keep_better(prepared.problem, found, model.chosen.fit, budget)
 
@@ -201,11 +202,11 @@ def _with_errors_in_variables(
 
 
 def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
-    """Return drift, if it shows before any model does: a model would take it for a slow pole."""
+    """Return drift that is significant with a delay alone, before a slow pole can fit it."""
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
     diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT))
-    # What does not show in fewer samples of a long record need not be looked for in all.
+    # If the decimated record shows none, all samples need not be tested.
     if diagnostics.thinned is not None and not _detected_drift(diagnostics.thinned):
         return []
     return _detected_drift(diagnostics)
@@ -219,16 +220,13 @@ def _detected_drift(diagnostics: ResidualDiagnostics) -> list[ScoreTest]:
 def _modelled_as_poles(
     prepared: Prepared, model: ChosenModel, budget: EvaluationBudget
 ) -> list[ScoreTest]:
-    """Return departures that poles of ``model`` imitate: beside them a plain model describes more.
-
-    What is not linear is not bent into poles where fewer of them and its own columns do better.
-    """
+    """Return nuisance terms that ``model`` fits by poles: with them a simple model is better."""
     chosen, best = model.chosen, _best_plain(model)
     if chosen.fit.structure.poles <= _PLAIN_POLES or best is None:
         return []
     diagnostics = ResidualDiagnostics(prepared.problem, best, prepared.steps, _NUISANCE_FAMILIES)
     fewer = diagnostics.thinned
-    # As above: of a long record not all are looked at where fewer do not ask for it.
+    # If the decimated record shows none, all samples need not be tested.
     if fewer is not None:
         there = evaluated(fewer.problem, chosen.fit.structure, chosen.fit.nonlinear)
         if not _improving_terms(prepared, fewer, there, budget):
@@ -239,7 +237,7 @@ def _modelled_as_poles(
 def _improving_terms(
     prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit, budget: EvaluationBudget
 ) -> list[ScoreTest]:
-    """Return what shows, if the fit of ``diagnostics`` describes more beside it than ``chosen`` does."""
+    """Return nuisance terms with which the fit of ``diagnostics`` is better than ``chosen``."""
     columns = _select_nuisance_terms(diagnostics, diagnostics.significant())
     if not columns:
         return []
@@ -256,8 +254,8 @@ def _improving_terms(
 def _without_modelled_lines(shown: Sequence[ScoreTest], modes: Sequence[float]) -> list[ScoreTest]:
     """Return ``shown`` without lines of vibration at ``modes`` [Hz] that described more.
 
-    A light mode that the steps keep ringing looks like a line, and one that a fit has not met, or
-    met badly, leaves one. Beside the response it would be gone from it.
+    A lightly damped mode that the steps keep exciting looks like a line, and a badly fitted one
+    leaves a line. As a nuisance term it would be missing in the response.
     """
     return [
         judged
@@ -270,7 +268,7 @@ def _without_modelled_lines(shown: Sequence[ScoreTest], modes: Sequence[float]) 
 def _select_nuisance_terms(
     diagnostics: ResidualDiagnostics, shown: Sequence[ScoreTest]
 ) -> list[ScoreTest]:
-    """Return those to fit in the background now: the clearest, and its equals among the slow."""
+    """Return the terms to fit as nuisance now: the first, and its equals among slow families."""
     if not shown:
         return []
     first = shown[0]
@@ -282,7 +280,7 @@ def _select_nuisance_terms(
     ]
     chosen = [judged for judged in (first, *equals) if judged.term.family in _NUISANCE_FAMILIES]
     turning = [judged for judged in chosen if judged.term.family in _TURNING]
-    # Backlash and friction look so much alike that both at once cancel at any size.
+    # Backlash and friction are nearly collinear: fitted together, they would cancel at any size.
     return [judged for judged in chosen if judged not in turning[1:]]
 
 
@@ -294,7 +292,7 @@ def _with_columns(
     drifts = [b.columns.stop - b.columns.start for b in before if b.term.family == DRIFT]
     for judged in shown:
         start = background.shape[1]
-        # Of a drift that needs more terms the first are there already.
+        # A drift of higher degree keeps the columns of the lower ones.
         known = sum(drifts) if judged.term.family == DRIFT else 0
         background = np.column_stack([background, judged.term.columns[:, known:]])
         added.append(ModelledTerm(judged.term, slice(start, background.shape[1])))
@@ -308,7 +306,7 @@ def _recomputed_columns(
     nuisance_terms: Sequence[ModelledTerm],
     families: set[str],
 ) -> tuple[Prepared, list[ModelledTerm]]:
-    """Return the problem with the columns of ``families`` as the fit of ``diagnostics`` has them."""
+    """Return the problem with the columns of ``families`` for the fit of ``diagnostics``."""
     background, renewed = prepared.problem.background.copy(), []
     for modelled in nuisance_terms:
         term = modelled.term
@@ -322,17 +320,17 @@ def _recomputed_columns(
 def _grown(
     prepared: Prepared, model: ChosenModel, term: ModelErrorTerm, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel] | None:
-    """Return the model with the poles of ``term``, or None where that describes nothing better."""
+    """Return the model with the poles of ``term``, or None where that is no improvement."""
     if term.family not in (CREEP, MODE):
         return None
     problem, new = prepared.problem, poles_of(term)
     decays = float(np.min(-new.real)) * len(problem.input) * problem.period
     if term.family == CREEP or decays < _SETTLED_DECAYS:
-        # What has not died away at the end has not when a period begins anew.
+        # The response to the end of the record reaches the start of the period.
         problem = replace(problem, fits_initial_condition=True)
     starts = _FASTER if term.family == CREEP else _MODE_FREQUENCY_RATIOS
     tried = [fit_with_added_poles(problem, base, new, starts, budget) for base in _bases(model)]
-    # The chosen one may owe poles to what ``term`` describes: with it, fewer may do.
+    # The chosen model may have poles for what ``term`` describes: fewer may suffice with it.
     found = [
         Candidate(fitted, information(fitted))
         for fitted in tried
@@ -341,7 +339,7 @@ def _grown(
     best = min(found, key=lambda candidate: candidate.bic, default=None)
     chosen = model.chosen.fit
     if problem is not prepared.problem:
-        # What rang before the record is priced on both sides.
+        # Both models include the initial-condition response in the criterion.
         chosen = fit(problem, chosen.structure, [chosen.nonlinear], budget=budget)
     if best is None or best.bic >= information(chosen):
         return None
@@ -350,10 +348,10 @@ def _grown(
 
 
 def _bases(model: ChosenModel) -> list[Fit]:
-    """Return the fits that a pole may be added to: the chosen one, and a plain one.
+    """Return the fits to which poles are added: the chosen one, and a simple one.
 
-    That one is chosen by the same rule: a single lag beside a relaxation has no roll-off, so its
-    band would be far too narrow at the upper end.
+    The simple one is chosen by the same rule: a single lag with a relaxation has no roll-off, so
+    that its band would be far too narrow at high frequencies.
     """
     chosen, candidates = model.chosen.fit, _plain_candidates(model)
     plain = choose_candidate(candidates).fit if candidates else chosen
@@ -361,7 +359,7 @@ def _bases(model: ChosenModel) -> list[Fit]:
 
 
 def _best_plain(model: ChosenModel) -> Fit | None:
-    """Return the best fit of a structure and its roll-off alone, if one was tried."""
+    """Return the best simple fit, if one was tried."""
     plain = _plain_candidates(model)
     return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
 
@@ -371,6 +369,6 @@ def _plain_candidates(model: ChosenModel) -> list[Candidate]:
 
 
 def _decays(found: Fit, problem: Problem) -> bool:
-    """Return True if every pole of ``found`` forgets within the record."""
+    """Return True if the response of every pole of ``found`` decays within the record."""
     slowest = float(np.min(-found.dynamics.poles().real))
     return slowest * len(problem.input) * problem.period > _LEAST_DECAYS

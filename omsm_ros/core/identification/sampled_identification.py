@@ -1,14 +1,17 @@
-"""Identify how one sampled quantity follows another, whatever they are and in what units.
+"""Identify a model between any two sampled quantities, in any units.
 
-The engine is that of :mod:`omsm_ros.core.identification.identify`; what a probe on a machine must
-be like (its gain, its noise at rest, its steps) is not asked here. ``hold`` says what the
-input does between samples:
+The method is that of :mod:`omsm_ros.core.identification.identify`, without the checks of a probe on
+a machine (gain, stationary noise, steps). ``hold`` is the behaviour of the input between samples:
 
 | hold | the input | the model |
 |---|---|---|
-| band-limited | moves smoothly, as what is measured does | G(s) with a delay |
-| zero-order | stands still from sample to sample, as a command does | H(z), and the G(s) of it |
-| first-order | runs straight from sample to sample | the same H(z), another G(s) |
+| band-limited | smooth, as a measured quantity | G(s) with a delay |
+| zero-order | constant from sample to sample, as a command | H(z), and its equivalent G(s) |
+| first-order | linear from sample to sample | the same H(z), another G(s) |
+
+A band-limited record is identified as a motion is. The durations of that method (fading, bridging,
+settling) are those of a machine sampled every millisecond, so time is scaled to that period, and
+the result is scaled back.
 """
 
 from __future__ import annotations
@@ -63,13 +66,11 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import ConfigurationError, IdentificationError, Notice
 from omsm_ros.linear_algebra import one_blas_thread
 
-# May a sampled model be used, and between which frequencies?
-
-# A tenth of the gain, and as much of a radian: a model of a process, not of a measuring machine.
+# Limits of the band, a tenth of gain and of a radian: for a process, not a measuring machine.
 SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
-# Half of the variance of what the model has not seen: with less it is no model to run freely.
+# Least share of the variance of held-out parts that free runs predict.
 _LEAST_PREDICTED = 0.5
-# A residual that follows the input by chance once in ten thousand records.
+# Least p-value of a residual that is independent of the input.
 _LEAST_INDEPENDENCE_P = 1e-4
 
 
@@ -78,9 +79,9 @@ def widest_valid_range(
 ) -> tuple[float, float]:
     """Return the widest range [Hz], in octaves, in which the 95 % band keeps within ``limits``.
 
-    shown: where the data would show a response beyond them, (k,) at the frequencies of the band;
-        None for everywhere
-    Both ends are the lowest frequency of the band where there is none.
+    shown: True where the data would show a response beyond the limits, (k,) at the frequencies of
+        the band; None for everywhere
+    Both ends are the lowest frequency of the band if there is no such range.
     """
     inside = (COVERAGE_FACTOR * band.gain <= limits.gain) & (
         COVERAGE_FACTOR * band.phase <= limits.phase
@@ -109,7 +110,7 @@ def sampled_certificate(
     order, free_order: number of poles of the model, and of the free choice
     widened: factor on its uncertainties, for an order that was asked for
     valid: range [Hz] within ``limits``
-    entries: with "predicted", the share of the variance of the hidden parts that free runs explain
+    entries: with "predicted", the share of the variance of held-out parts that free runs explain
     """
     predicted = entries["predicted"]
     assert isinstance(predicted, float)
@@ -152,12 +153,8 @@ def _warnings(independent: object, order: int, free_order: int, widened: float) 
     return [str(warning) for warning in warnings]
 
 
-# A band-limited record of any two quantities, identified as a motion is.
-
-# The engine's durations (fading, bridging, settling) are those of a machine read every
-# millisecond. Time is scaled so that this record is one, and scaled back in the result.
+# Sampling period of a machine, to which time is scaled.
 _NOMINAL_PERIOD_S = 1e-3
-# Over three decades: 1.7 % apart.
 
 
 def band_limited(
@@ -168,7 +165,7 @@ def band_limited(
     order: int,
     limits: ResponseLimits,
 ) -> SampledModel:
-    """Return the model of a record whose input moves smoothly between samples.
+    """Return the model of a record whose input is smooth between samples.
 
     Arguments as of :func:`~omsm_ros.core.identification.sampled_identification.identify_samples`.
     """
@@ -225,7 +222,6 @@ def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepare
         )
     samples = len(input)
     moving = np.ones(samples, np.bool_)
-    # In units of its own spread, as a machine's motion is of its travel.
     faded = faded_to_stationary(input, moving, _NOMINAL_PERIOD_S)
     used = used & (faded == input)
     problem = Problem(
@@ -257,7 +253,7 @@ def _slower(
 
 
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
-# On a logarithmic grid over three decades: neighbours 2 % apart.
+# Frequencies over three decades: neighbours are 2 % apart.
 _FREQUENCIES = 400
 
 
@@ -302,12 +298,13 @@ def identify_samples(
     """Return the model by which ``output`` (n,) follows ``input`` (n,), sampled evenly.
 
     period: from sample to sample [s]
-    hold: what the input does between samples, one of HOLDS
+    hold: behaviour of the input between samples, one of HOLDS
     order: number of poles, 0 to choose it
     max_delay: of a held input, whole samples to try; of a band-limited one the delay is free
     used: True where the output counts, None where it is finite
 
-    Raises IdentificationError for a useless record, ConfigurationError for another hold.
+    Raises IdentificationError for a record that determines no model, ConfigurationError for another
+    hold.
     """
     if hold not in HOLDS:
         raise ConfigurationError("estimation.unknown_hold", hold=hold, known=HOLDS)
@@ -344,7 +341,7 @@ def identify_samples(
 
 
 def _shown(known: _Known, candidate: SampledCandidate) -> BoolArray:
-    """Return what lies between frequencies at which an error of the response would show, (k,)."""
+    """Return True between the frequencies at which an error of the response would show, (k,)."""
     problem, samples = candidate.problem, len(candidate.problem.used)
     discrete, taper = known.discrete, signal.windows.hann(samples)
     driven = signal.lfilter(discrete.numerator, discrete.denominator, problem.input)
@@ -359,7 +356,7 @@ def _shown(known: _Known, candidate: SampledCandidate) -> BoolArray:
 def _inflate_to_free_choice(
     known: _Known, choice: SampledChoice, period: float
 ) -> tuple[_Known, float]:
-    """Return ``known`` with uncertainties that hold those of the free choice, and their factor."""
+    """Return ``known`` with uncertainties that include the free choice, and their factor."""
     if choice.chosen.order == choice.free.order:
         return known, 1.0
     free = _Known.of(choice.free, choice.delay, period)

@@ -1,7 +1,11 @@
-"""In which ways may a machine depart from a linear, steady G(s), and how would it look?
+"""Families of model errors: deviations of a machine from a linear, time-invariant G(s).
 
-Each family gives columns (n, c) of what it adds to the probe's reading, per unit of its size:
+Each family makes columns (n, c) that it adds to the reading of the probe, per unit of its size:
 metres for errors of position, a share of the response for relaxations and modes.
+
+Backlash, and friction before sliding, depend on the reversals of the motion only, not on time. A
+reversal counts once the motion has gone back by a multiple of its noise, so that stationary noise
+has no effect.
 """
 
 from __future__ import annotations
@@ -19,12 +23,8 @@ from omsm_ros.core.estimation.steps import Steps, backlash_columns
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 
-# What depends on where a motion turned last: backlash (a gap), and friction before it slides.
-#
-# Both depend on reversals only, not on time. A reversal counts once the motion has gone back by a
-# few times its noise; so noise at rest changes nothing.
-
-# What noise does beyond is far less than any gap looked for; a wider one would lose reversals.
+# Half width of the backlash that removes reversals of noise, in standard deviations. The remaining
+# noise is far smaller than any backlash looked for; a larger width would lose reversals.
 _NOISE_HALF_GAP = 2.0
 
 
@@ -39,10 +39,10 @@ def through_backlash(motion: FloatArray, half: float) -> FloatArray:
     moved = np.flatnonzero(change)
     if len(moved) == 0:
         return motion.copy()
-    # Along a run of one direction only its end counts.
+    # Only the end of a run in one direction matters.
     back = change[moved] < 0
     turns = moved[np.flatnonzero(back[1:] != back[:-1])]
-    del change, moved  # of a long record, memory for what follows
+    del change, moved  # memory for the rest, in a long record
     ends = np.append(turns, len(motion) - 1)
     state, states = float(motion[0]), []
     for end in motion[ends].tolist():
@@ -56,9 +56,9 @@ def through_backlash(motion: FloatArray, half: float) -> FloatArray:
 
 
 def backlash_lead(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatArray]:
-    """Yield the lead of ``motion`` (n,) over half of each gap [m], -1 to 1, and its start column.
+    """Yield the lead of ``motion`` (n,) over half of each backlash [m], and its start column.
 
-    Until the whole gap is crossed, what is ahead depends on where in it the motion began.
+    The start column is for the unknown first position in the backlash, until it is crossed.
     """
     crossed = np.maximum.accumulate(motion) - np.minimum.accumulate(motion)
     for gap in gaps:
@@ -67,7 +67,7 @@ def backlash_lead(motion: FloatArray, gaps: Sequence[float]) -> Iterator[FloatAr
 
 
 def dahl_friction(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatArray]:
-    """Return the friction force along ``motion`` (n,), -1 to 1, and the decay of its start value.
+    """Return the friction force along ``motion`` (n,), -1 to 1, and the decay of its first value.
 
     dF/dx = (1 - F sgn v) / travel (Dahl 1968).
     """
@@ -84,15 +84,12 @@ def dahl_friction(motion: FloatArray, travel: float) -> tuple[FloatArray, FloatA
     return force[last], np.cumprod(kept)
 
 
-# One way in which a machine may depart from a linear, steady response, and a family of such.
-
-
 @dataclass(frozen=True, eq=False)
 class ModelErrorTerm:
-    """One departure from a linear, steady response.
+    """One model error.
 
     parameter: time constant [s], frequency [Hz], travel or period [m]; 0 where it has none
-    trials: how many independent ones its family tries, for the probability of the best
+    trials: number of independent terms of its family, for the probability of the best
     damping: of a mode, else 0
     columns: (n, c), added to the reading per unit
     """
@@ -108,8 +105,9 @@ class ModelErrorTerm:
 class ModelErrorFamily:
     """Terms of one kind.
 
-    part: columns (n, terms · c) of the terms from one index to another, side by side, made when
-        they are asked for: all of a long record's would be gigabytes
+    part: columns (n, terms · c) of the terms from one index to another, side by side, made on
+        demand:
+        those of all terms of a long record would take gigabytes
     width: columns of one term, c
     """
 
@@ -128,14 +126,14 @@ class ModelErrorFamily:
         width = int(columns.shape[1] // len(parameters))
 
         def part(first: int, last: int) -> FloatArray:
-            # A copy: a term outlives its family, and a view would keep all of that.
+            # A copy, because a view would keep the whole family in memory.
             return columns.T[first * width : last * width].copy().T
 
         return cls(name, parameters, trials, part, width)
 
     @property
     def columns(self) -> FloatArray:
-        """Those of all terms, (n, terms · c)."""
+        """Columns of all terms, (n, terms · c)."""
         return self.part(0, len(self.parameters))
 
     def term(self, index: int) -> ModelErrorTerm:
@@ -151,40 +149,40 @@ BACKLASH, FRICTION = "backlash", "friction"
 STIFFENING, LINEARITY, PERIODIC = "stiffening", "probe linearity", "periodic probe error"
 VIBRATION, DRIFT = "vibration", "drift"
 
-# Below this a relaxation is no slower than the structure itself.
+# A faster relaxation is no slower than the structure itself.
 FASTEST_CREEP_S = 20e-3
-# Neighbours a factor of 1.6 apart look the same within a few per cent; so few are tried.
+# Time constants tried: a factor of 1.6 apart, neighbours differ by a few per cent.
 _CREEPS_A_DECADE = 5
-# A line of damping ζ is 2ζ wide, and so far apart are neighbours.
+# Damping ratios ζ tried; a mode is 2ζ wide, which is the distance of neighbours.
 _DAMPINGS = (0.03, 0.15)
 # Faster modes are poles of the structure, which the choice of order finds.
 FASTEST_MODE_HZ = 100.0
-# Travel over which friction builds up before it slides (Armstrong-Hélouvry 1994: some µm).
+# Pre-sliding travels tried (Armstrong-Hélouvry 1994: some micrometres).
 _SLIDING_TRAVELS_M = (0.3e-6, 0.6e-6, 1e-6, 2e-6, 4e-6, 10e-6)
-# Values a sample at which a reversal is looked for: at 0.2 m/s² half a nanometre is missed.
+# Values per sample among which a reversal is located: at 0.2 m/s² to half a nanometre.
 _FINER = 8
-# A motion crosses any of them in about a sample, so few do.
+# Backlashes tried: a motion crosses any of them in about a sample, so a few suffice.
 _GAPS_M = (10e-9, 30e-9, 100e-9, 300e-9)
-# Of a period in the travel: 98 µm in steps make 1 µm, a fringe of a scale or of an interferometer.
+# Most periods in the travel: 98 µm make 1 µm, the period of a scale or an interferometer.
 _MOST_CYCLES = 100
-# A period half a cycle off leaves as much as it takes, and would call for a second one.
+# Periods tried between neighbours; half a cycle off, half of the error would remain.
 _BETWEEN_CYCLES = 37
-# The best of periods between independent ones is the best of so many times as many (Davies 1987).
+# Factor on the number of independent periods, for those between them (Davies 1987).
 _OVERLAP = 3.0
-# Of Legendre polynomials: from a bend to two periods over the record, where lines begin. More of
-# them would follow a staircase, and hide a relaxation in it.
+# Degrees of Legendre polynomials: from a bend to two periods over the record, where lines begin.
+# Higher ones would follow a staircase, and mask a relaxation.
 _DRIFT_DEGREES = (2, 3, 4, 6, 8)
-# Of a line over the record: a drift has fewer.
+# Fewest periods of a line over the record; drift has fewer.
 _FEWEST_PERIODS = 2
-# Of vibration at a time: the next round looks for more.
+# Lines of vibration tried at a time; the next round tries more.
 _LINES_TRIED = 3
 
 
 @dataclass(frozen=True, eq=False)
 class ModelErrorFamilies:
-    """All families for the fit ``fitted`` of ``problem``.
+    """All families of model errors for the fit ``fitted`` of ``problem``.
 
-    slower: than the record, by so much may a relaxation be
+    slower: longest time constant of a relaxation over the duration of the record
     """
 
     problem: Problem
@@ -193,8 +191,8 @@ class ModelErrorFamilies:
     slower: float = 1.0
 
     def families(self, only: Collection[str] = ()) -> Iterator[ModelErrorFamily]:
-        """Return the families that this motion could show at all, or those named of them."""
-        turning = cache(self._turning)  # as long as families are asked for: it is large
+        """Yield the families that this motion excites, or those of them named in ``only``."""
+        turning = cache(self._turning)  # shared by two families, and large
         makers: dict[str, Callable[[], Iterator[ModelErrorFamily]]] = {
             CREEP: lambda: iter([self.creep()]),
             MODE: lambda: iter([self.modes()]),
@@ -211,14 +209,14 @@ class ModelErrorFamilies:
                 yield from make()
 
     def again(self, term: ModelErrorTerm) -> ModelErrorTerm:
-        """Return the ``term`` of another fit with the columns that it has in this one."""
+        """Return the ``term`` of another fit with its columns in this fit."""
         for family in self.families((term.family,)):
             for index in np.flatnonzero(family.parameters == term.parameter):
                 return family.term(int(index))
         return term
 
     def alike(self, family: ModelErrorFamily) -> ModelErrorFamily:
-        """Return the terms of ``family``, of the same record, as this fit has them."""
+        """Return the terms of ``family``, made for another fit of the record, for this fit."""
         if family.name == CREEP:
             return self.creep(family.parameters)
         if family.name == MODE and family.dampings is not None:
@@ -230,7 +228,7 @@ class ModelErrorFamilies:
 
     @property
     def duration(self) -> float:
-        """Of the record [s]."""
+        """Duration of the record [s]."""
         return len(self.problem.input) * self.problem.period
 
     def _in_time(self, spectra: ComplexArray) -> FloatArray:
@@ -239,14 +237,14 @@ class ModelErrorFamilies:
 
     @cached_property
     def _answer(self) -> ComplexArray:
-        """Spectrum of what the motion gave, at ``problem.s``; not what rang before the record.
+        """Spectrum of the output at ``problem.s``, without the initial-condition response.
 
-        That is known only as far as it lasts into the samples compared, and is huge before.
+        That is known only where it reaches compared samples, and is huge before them.
         """
         return self.problem.output_spectrum(self.fitted)
 
     def time_constants(self) -> FloatArray:
-        """Return the time constants [s] that are looked for, up to ``slower`` records."""
+        """Return the time constants [s] tried, up to ``slower`` durations of the record."""
         slowest = max(self.slower * self.duration, 2 * FASTEST_CREEP_S)
         decades = np.log10(slowest / FASTEST_CREEP_S)
         return np.geomspace(FASTEST_CREEP_S, slowest, max(round(_CREEPS_A_DECADE * decades), 2))
@@ -254,7 +252,8 @@ class ModelErrorFamilies:
     def creep(self, time_constants: FloatArray | None = None) -> ModelErrorFamily:
         """Return ``1 - ε + ε / (1 + sτ)`` on the response, per ε, and its derivative by ln τ.
 
-        In time and from rest: a relaxation longer than the record remembers how it began.
+        It is computed in time and from rest, because a relaxation longer than the record depends on
+        its start.
         """
         found = self.time_constants() if time_constants is None else time_constants
         answer = self._in_time(self._answer)
@@ -269,9 +268,9 @@ class ModelErrorFamilies:
         return ModelErrorFamily(CREEP, found, 3.0, part, 2)
 
     def modes(self, ladder: Sequence[tuple[float, float]] = ()) -> ModelErrorFamily:
-        """Return ``1 + a (M - 1)``, M a mode, and as much of its velocity, per participation a.
+        """Return ``1 + a (M - 1)``, M a mode, and its velocity, per participation a.
 
-        ladder: frequencies [Hz] and dampings, if not all
+        ladder: frequencies [Hz] and damping ratios; empty for all
         """
         found = ladder or self._mode_frequencies()
 
@@ -317,7 +316,7 @@ class ModelErrorFamilies:
         return ModelErrorFamily.of(VIBRATION, np.asarray(found), samples / 2, columns)
 
     def drift(self) -> Iterator[ModelErrorFamily]:
-        """Return polynomials of time beyond the first: slow drift, whatever the axis does."""
+        """Yield polynomials of time of degree 2 and more: drift, independent of the axis."""
         time = np.linspace(-1.0, 1.0, len(self.problem.input))
         columns = np.asarray(legendre.legvander(time, max(_DRIFT_DEGREES)), np.float64)
         for degree in _DRIFT_DEGREES:
@@ -325,10 +324,10 @@ class ModelErrorFamilies:
             yield ModelErrorFamily.of(DRIFT, scale, 1.0, np.asarray(columns[:, 2 : degree + 1]))
 
     def linearity(self) -> ModelErrorFamily:
-        """Return square and cube of the place in the travel: a probe that is not linear.
+        """Return square and cube of the position in the travel: the nonlinearity of the probe.
 
-        Of the place that the probe sees, late as it is: of the axis's own, a scale that changes by
-        a per cent would pass for one per cent of the lag.
+        They are of the position at the probe, with its lag: of that of the axis, a scale that
+        changes by one per cent would look like one per cent of the lag.
         """
         motion, seen = self.problem.input, self._in_time(self._answer) / self.fitted.gain
         middle = 0.5 * (motion.max() + motion.min())
@@ -366,7 +365,7 @@ class ModelErrorFamilies:
         apart = 1 / periods[1] - 1 / periods[0]
 
         def part(first: int, last: int) -> FloatArray:
-            # Each is the one before, turned by the same angle.
+            # Each is the one before, rotated by the same angle.
             turned, step = np.exp(1j * angle / periods[first]), np.exp(1j * apart * angle)
             rows = np.empty((2 * (last - first), len(angle)))
             for row in range(0, len(rows), 2):
@@ -377,7 +376,7 @@ class ModelErrorFamilies:
         return ModelErrorFamily(PERIODIC, np.asarray(periods), trials, part, 2)
 
     def friction(self, turning: Callable[[], FloatArray]) -> Iterator[ModelErrorFamily]:
-        """Yield Dahl's pre-sliding friction (1968) over several travels, and its unknown start."""
+        """Yield Dahl's pre-sliding friction (1968) for several travels, with its unknown start."""
         if not self.steps.edges:
             return
 
@@ -399,7 +398,7 @@ class ModelErrorFamilies:
         return without_noise(answer[: _FINER * len(self.problem.input)], self.problem.noise)
 
     def backlash(self, turning: Callable[[], FloatArray]) -> Iterator[ModelErrorFamily]:
-        """Return half of the backlash: by the last reversal, and by the last step."""
+        """Yield half of the backlash: by the last reversal, and by the last step."""
 
         def part(first: int, last: int) -> FloatArray:
             lost = [c[::_FINER] for c in backlash_lead(turning(), _GAPS_M[first:last])]
@@ -413,9 +412,9 @@ class ModelErrorFamilies:
 
 
 def _vertex(power: FloatArray, peak: int) -> float:
-    """Place of the maximum of ``power`` (n,) at ``peak``, by the parabola of its logarithm.
+    """Return the place of the maximum of ``power`` (n,) near ``peak``, by a log parabola.
 
-    Half a line off, a sine leaves a fifth of itself at the ends of the record.
+    Half a line off, a fifth of a sine would remain at the ends of the record.
     """
     near = power[max(peak - 1, 0) : peak + 2]
     if len(near) < 3 or np.min(near) <= 0:
@@ -430,9 +429,11 @@ def _geometric(low: float, high: float, step: float) -> FloatArray:
 
 
 def low_pass_response(values: FloatArray, step: float) -> FloatArray:
-    """Return ``values`` (n,) through 1 / (1 + sτ), at rest before; ``step``: sample period over τ.
+    """Return ``values`` (n,) through 1 / (1 + sτ), stationary before.
 
-    The values run straight from sample to sample.
+    step: sample period over τ
+
+    Between samples the values are linear.
     """
     kept = np.exp(-step)
     mean = (1 - kept) / step

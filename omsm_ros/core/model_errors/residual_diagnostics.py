@@ -1,8 +1,11 @@
-"""How much of a residual would one more term explain, and how large a term would stay hidden?
+"""Score tests of a residual: model errors, and differences between parts of a step test.
 
-A score test (Rao 1948): the part of the term's column that the fitted parameters can imitate is
-taken out, and the residual is projected on the rest. Its variance is that of the spectrum of the
-residual *without* the term, because a large term would otherwise count as noise.
+The score test (Rao 1948) of a term projects its columns orthogonally to those of the fitted
+parameters, and the residual on the rest. The variance is that of the spectrum of the residual
+*without* the term, because a large term would otherwise count as noise.
+
+A linear, time-invariant response has one lag and one gain. A contrast lets them differ between two
+parts of the test (steps up and down, small and large, early and late) by ``±d`` and tests d.
 """
 
 from __future__ import annotations
@@ -32,25 +35,25 @@ from omsm_ros.core.model_errors.families import (
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.linear_algebra import unit_columns
 
-# Of a column whose remainder is weaker than this, the fit imitates everything but rounding.
+# A column with a weaker remainder is collinear with the fitted parameters but for rounding.
 _COLLINEAR_SHARE = 1e-4
 # Directions this much weaker than the strongest are rounding.
 _SPANNED = 1e-9
-# That are in memory at a time beside the result.
+# Samples held in memory at a time beside the result.
 _SAMPLES = 65_536
-# Noise is averaged over at least this many lines: its level is then known to a quarter.
+# Fewest lines over which noise is averaged: its level is then known to a quarter,
 _LEAST_LINES = 8
-# and over half an octave on either side where the lines are dense.
+# and the factor of frequency on either side where lines are dense, half an octave.
 _HALF_WIDTH = 2**0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What the residual says of one term.
+    """Score test of one term without the correction for the number of terms.
 
     size: its coefficients (c,), and covariance (c, c) of them
-    chi_square: of the hypothesis that they are zero;  degrees: coefficients that the fit does
-        not imitate
+    chi_square: of the hypothesis that they are zero
+    degrees: number of coefficients that are not collinear with the fit
     """
 
     size: FloatArray
@@ -71,7 +74,7 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class ResidualSpace:
-    """The residual of ``fitted`` and what its parameters can imitate."""
+    """The residual of ``fitted``, orthogonal to the columns of its parameters."""
 
     problem: Problem
     fitted: Fit
@@ -82,14 +85,14 @@ class ResidualSpace:
 
     @cached_property
     def _decomposed(self) -> tuple[FloatArray, FloatArray]:
-        """What the parameters can imitate: a basis (k, r), and its parameters (p, r)."""
+        """A basis (k, r) of the columns of the parameters, and its parameters (p, r)."""
         unit, scale = unit_columns(self.problem.sensitivity(self.fitted))
         left, values, right = np.linalg.svd(unit, full_matrices=False)
         kept = values > _SPANNED * values[0]
         return left[:, kept], right[kept].T / values[kept] / scale[:, np.newaxis]
 
     def collinear_parameters(self, column: FloatArray) -> FloatArray:
-        """Return the parameters (p,) that come nearest to ``column`` (n,) where it is compared."""
+        """Return the parameters (p,) nearest to ``column`` (n,) over the compared samples."""
         basis, parameters = self._decomposed
         return np.asarray(parameters @ (basis.T @ column[self.problem.used]))
 
@@ -97,7 +100,7 @@ class ResidualSpace:
         """Return those of ``columns`` (n, c) that are compared, (k, c), each in one piece."""
         first, last = self._places[0], self._places[-1]
         if last - first < len(self._places):
-            # Without a gap there is nothing to pick.
+            # Without a gap a slice suffices.
             rows = columns.T[:, first : last + 1]
             return (rows if rows.strides[1] == rows.itemsize else np.ascontiguousarray(rows)).T
         return np.take(columns.T, self._places, axis=1).T
@@ -107,13 +110,13 @@ class ResidualSpace:
         return np.flatnonzero(self.problem.used)
 
     def projected(self, columns: FloatArray) -> FloatArray:
-        """Return ``columns`` (n, c) less what the fit can imitate, where compared (k, c)."""
+        """Return ``columns`` (n, c) projected orthogonally to the fit, where compared, (k, c)."""
         rows = columns.T.copy()
         self._free(rows)
         return np.asarray(rows[:, self.problem.used].T)
 
     def _free(self, rows: FloatArray) -> None:
-        """Take from ``rows`` (c, n) what is not compared, and what the fit can imitate."""
+        """Project ``rows`` (c, n) orthogonally to the fit, with 0 where nothing is compared."""
         rows[:, ~self.problem.used] = 0.0
         parts = [slice(i, i + _SAMPLES) for i in range(0, len(self._places), _SAMPLES)]
         imitated = np.zeros((len(rows), self._basis.shape[1]))
@@ -123,9 +126,9 @@ class ResidualSpace:
             rows[:, self._places[part]] -= imitated @ self._basis[part].T
 
     def screen(self, columns: FloatArray, terms: int) -> FloatArray:
-        """Return χ² of each group of ``terms`` neighbouring columns of (n, c), as for white noise.
+        """Return χ² in white noise of each group of ``terms`` neighbouring columns of (n, c).
 
-        To find the best of many; :meth:`score` then judges it.
+        It finds the best of many terms; :meth:`score` then tests it.
         """
         compared = self._compared(columns)
         imitated = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
@@ -141,11 +144,11 @@ class ResidualSpace:
         return np.asarray(explained / (self.fitted.sum_of_squares / self.fitted.samples))
 
     def score(self, columns: FloatArray) -> Score:
-        """Judge the term of ``columns`` (n, c), all its coefficients together."""
+        """Test the term of ``columns`` (n, c), all its coefficients together."""
         return self.judged(columns.T.copy())
 
     def judged(self, rows: FloatArray) -> Score:
-        """Judge the term of ``rows`` (c, n), its columns, which are overwritten."""
+        """Test the term whose columns are ``rows`` (c, n), which are overwritten."""
         rows[:, ~self.problem.used] = 0.0
         before = _lengths(rows)
         self._free(rows)
@@ -172,7 +175,7 @@ class ResidualSpace:
     def _noise_of(self, rows: FloatArray, found: FloatArray) -> FloatArray:
         """Return the covariance (c, c) of noise times ``rows`` (c, n).
 
-        The noise is like what ``rows``, ``found`` (c,) times, leave of the residual.
+        The noise is the residual without ``rows`` times ``found`` (c,).
         """
         used = self.problem.used
         samples = len(used)
@@ -192,12 +195,12 @@ class ResidualSpace:
 
 
 def _lengths(rows: FloatArray) -> FloatArray:
-    """Return the lengths (c,) of ``rows`` (c, n); numpy's norm takes their memory again."""
+    """Return the lengths (c,) of ``rows`` (c, n), in less memory than numpy's norm."""
     return np.asarray(np.sqrt(np.einsum("cn,cn->c", rows, rows)))
 
 
 def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int]:
-    """Return the inverse (c, c) of ``gram`` where it is not zero, and in how many directions."""
+    """Return the pseudo-inverse (c, c) of ``gram``, and its rank."""
     values, directions = np.linalg.eigh(gram)
     kept = values > tolerance * values[-1]
     strong = directions[:, kept]
@@ -210,7 +213,8 @@ def smoothed_noise_spectrum(
     """Return the variance spectrum of ``residual`` (k,) at ``length`` // 2 + 1 frequencies.
 
     place: index of each among ``samples``
-    The larger of an autoregressive one, which misses slow drift, and of the periodogram
+
+    It is the larger of an autoregressive spectrum, which misses slow drift, and of the periodogram
     smoothed over an octave, which does not.
     """
     on_grid = np.zeros(samples)
@@ -226,25 +230,23 @@ def smoothed_noise_spectrum(
     return np.asarray(np.maximum(smooth, noise_spectrum(residual, length)))
 
 
-# Which departures from a linear, steady G(s) does the residual of one fit show?
-
-# Probability of a false alarm of one family; ten of them together stay far below two per cent.
+# Probability of a false alarm of one family; that of ten families is 1e-3.
 FALSE_ALARM = 1e-4
-# Of the rate of the motion, as the residual may follow it.
+# Lags [samples] of the rate of the motion that are tested for correlation.
 _LAGS = 25
 # A lagged rate weaker than this part of the strongest is rounding.
 _ABOVE_ROUNDING = 1e-6
-# Rows, and values of columns, that are in memory at a time.
+# Rows, and values of columns, held in memory at a time.
 _ROWS, _VALUES = 65_536, 8_000_000
-# A step test rests for most of its time.
+# Largest share of moving samples of a step test that is decimated.
 _MOSTLY = 0.5
-# Where a motion turns and what a line is, fewer samples do not tell as well; their terms are few.
+# Families tested with all samples: reversals and lines need them, and their terms are few.
 _BY_ALL = (VIBRATION, BACKLASH, FRICTION)
 
 
 @dataclass(frozen=True, eq=False)
 class ScoreTest:
-    """A term and what the residual says of it."""
+    """A term of a family and its score test."""
 
     term: ModelErrorTerm
     score: Score
@@ -255,7 +257,7 @@ class ScoreTest:
         return self.score.log_p + float(np.log(self.term.trials))
 
     def evidence(self, samples: int) -> float:
-        """Return ln of the odds for this term (Schwarz 1978), its coefficients priced."""
+        """Return ln of the odds for this term, with the penalty of Schwarz (1978)."""
         return 0.5 * (self.score.chi_square - self.score.degrees * float(np.log(samples)))
 
     @property
@@ -266,7 +268,7 @@ class ScoreTest:
 
 @dataclass(frozen=True, eq=False)
 class ResidualDiagnostics:
-    """The scores for ``fitted`` of all families, or of those named; each is computed once.
+    """The score tests of ``fitted`` for all families, or those in ``only``, each computed once.
 
     slower: see :class:`ModelErrorFamilies`
     """
@@ -279,7 +281,7 @@ class ResidualDiagnostics:
 
     @cached_property
     def space(self) -> ResidualSpace:
-        """The residual, and what the fit imitates."""
+        """The residual and the columns of the fit."""
         return ResidualSpace(self.problem, self.fitted)
 
     @cached_property
@@ -309,7 +311,7 @@ class ResidualDiagnostics:
         return family.term(int(np.argmax(self.thinned.screening_scores(alike))))
 
     def screening_scores(self, family: ModelErrorFamily) -> FloatArray:
-        """Return χ² of each term of ``family``, as for white noise, see :class:`ResidualSpace`."""
+        """Return χ² in white noise of each term of ``family``."""
         every = len(family.parameters)
         step = max(_VALUES // (len(self.problem.input) * family.width), 1)
         return np.concatenate(
@@ -321,10 +323,10 @@ class ResidualDiagnostics:
 
     @cached_property
     def thinned(self) -> ResidualDiagnostics | None:
-        """The same of fewer samples, of a long step test: what is slow shows there as well.
+        """The diagnostics of a long step test decimated, for slow model errors.
 
-        None where there are few samples, where the motion hardly rests, so that much of it may be
-        fast, or where rounding is shared by the readings of a plateau.
+        None where there are few samples, where the motion is rarely stationary, so that much of it
+        may be fast, or where rounding is shared by the readings of a plateau.
         """
         problem, steps = self.problem, self.steps
         fastest = max(problem.rate / (2 * np.pi), FASTEST_MODE_HZ)
@@ -343,16 +345,16 @@ class ResidualDiagnostics:
 
     @cached_property
     def creep(self) -> tuple[ScoreTest, ...]:
-        """Return relaxations of every time constant that is looked for, each judged alone."""
+        """Return the tests of a relaxation of each time constant."""
         family = self.model_errors.creep()
         terms = (family.term(index) for index in range(len(family.parameters)))
         return tuple(ScoreTest(t, self.space.score(t.columns[:, :1])) for t in terms)
 
     @cached_property
     def independence(self) -> float:
-        """Return the probability that the residual follows the motion's rate by chance."""
+        """Return the p-value of the correlation of the residual with the rate of the motion."""
         rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.input)])
-        # The last values of the rate, the newest last; at the very first samples there are none.
+        # The last values of the rate, the newest last, 0 before the record.
         past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
         gram = np.zeros((_LAGS, _LAGS))
         for first in range(0, len(past), _ROWS):
@@ -369,7 +371,7 @@ class ResidualDiagnostics:
         return float(np.exp(self.space.judged(columns).log_p))
 
     def significant(self, but: Collection[str] = ()) -> list[ScoreTest]:
-        """Return the significant families, the clearest first, without those named ``but``."""
+        """Return the significant tests, that of most evidence first, without families ``but``."""
         shown = [j for j in self.best.values() if j.term.family not in but and j.significant]
         return sorted(shown, key=self.evidence, reverse=True)
 
@@ -379,35 +381,30 @@ class ResidualDiagnostics:
 
     @property
     def longest_time_constant(self) -> float:
-        """Return the longest time constant [s] that was looked for."""
+        """Return the longest time constant [s] that was tried."""
         return float(self.model_errors.time_constants()[-1])
 
     @property
     def plateau(self) -> float:
-        """Time from one edge to the next [s]; of a motion without edges its whole length."""
+        """Time from one edge to the next [s]; without edges the duration of the record."""
         starts = [edge.start for edge in self.steps.edges]
         if len(starts) < 2:
             return self.model_errors.duration
         return float(np.median(np.diff(starts))) * self.problem.period
 
 
-# Do the parts of one step test agree? Steps up and down, small and large, early and late.
-#
-# A linear, steady response has one lag and one gain. Each contrast lets them differ between two
-# parts of the test by ``±d`` and asks what the residual says of d.
-
 UP_DOWN = "steps up against steps down"
 HALVES = "first half against second"
 SIZES = "small steps against large"
-# Two of a kind show how far they scatter.
+# Fewest edges: two of each kind show their scatter.
 _LEAST_EDGES = 4
-# Of heights that are meant to be different.
+# Least ratio of heights that are intended to differ.
 _TWO_SIZES = 1.5
 
 
 @dataclass(frozen=True, eq=False)
 class Contrast:
-    """What differs between two parts of a test, the first one less the second.
+    """The difference between two parts of a test, the first one less the second.
 
     parts: their names;  gain: relative [1], lag: [s], each with standard uncertainty
     p: probability of such differences by chance

@@ -1,8 +1,14 @@
-"""How large could a departure be that a residual does not show, and what would it do to G?
+"""Bounds of model errors that the tests of a residual cannot detect, and their effect on G.
 
-A slow relaxation of size ε leaves G(0) = 1 and scales everything faster by 1 - ε, a little late.
-That changes the whole numerator and the delay; below ``valid_from`` the gain is one again. A mode
-or a stiffness that is left out is imitated by the fitted coefficients, which shifts them.
+A slow relaxation of size ε leaves G(0) = 1 and scales everything faster by 1 - ε, with a small lag.
+That changes the whole numerator and the delay; below ``valid_from`` the gain is one again. An
+omitted mode or stiffness shifts the fitted coefficients, whose columns are nearly collinear with
+its own.
+
+Steps at regular intervals excite a comb of frequencies. A lightly damped mode between its lines
+shows at the neighbouring lines only, so that several frequencies and dampings explain the residual
+about equally well. The covariance of one of them does not include the others: their spread,
+weighted by likelihood, is added.
 """
 
 from __future__ import annotations
@@ -36,45 +42,44 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.linear_algebra import least_squares
 
 # Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
-# area-weighted rms [m]; the mean of each turn moves over minutes and counts as rest.
+# area-weighted rms [m]; the mean of each turn moves over minutes and counts as static.
 PAPER_SCAN_LINES = ((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6))
-# Of its rate [m/s], rms.
+# Its rate [m/s], rms.
 _SCAN_RATE = float(np.sqrt(sum((2 * np.pi * f * rms) ** 2 for f, rms in PAPER_SCAN_LINES)))
-# A test that alarms with probability α misses with 5 % what lies 1.645 σ above its limit.
+# A term 1.645 σ above the limit of a test is missed with a probability of 5 %.
 _POWER = 1.645
 # The families whose omission bends the response itself.
 _BENDING = (MODE, STIFFENING)
 UNDETECTED = (CREEP, *_BENDING)
-"""Every family that may hide in a test, by which priors are named."""
+"""Families that may stay undetected in a test; priors are named by them."""
 
 # Decades of time between a structure's slowest motion and the length of a record.
 _DECADES = 3.0
-# What creeps within the record creeps on beyond it, about as much in each of three decades from
-# none to all: a uniform distribution, whose standard deviation is 1/√3 of its end.
+# Creep goes on beyond the record, by none to as much in each of three decades: a uniform
+# distribution, whose standard deviation is 1/√3 of its limit.
 _UNSEEN = _DECADES / 3**0.5
-# A joint or a piezo goes on creeping for a minute, whatever a record lasts; what is slower moves
-# by less in a scan. Of what is slower than ten records not even its beginning shows. A drift of
-# 100 nm a minute may be a relaxation of 50 s and 0.17 %; of 100 s, it would be twice that, and a
-# warm machine could not be calibrated.
+# Slowest relaxation [s], and in durations of the record. A joint or a piezo creeps for about a
+# minute; slower creep moves less during a scan, and beyond ten records not even its start is
+# measurable. A drift of 100 nm a minute may be a relaxation of 50 s and 0.17 %; with 100 s it would
+# be twice that, and a warm machine could not be calibrated.
 _SLOWEST_CREEP_S, _MOST_RECORDS = 50.0, 10.0
-# Probability by chance below which a mode is carried that is not significant.
+# p-value below which the uncertainty includes a mode that is not significant.
 _HINT = 0.05
-# Of the background: the drift that every fit has.
+# Column of the background for the linear drift, which every fit has.
 _STEADY_DRIFT = slice(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class UndetectedTerm:
-    """One family that could hide.
+    """A model error that the tests may not have detected.
 
     size, uncertainty: of the most significant term of the family, in its unit
-    missed: largest size that the test would have missed with 5 % probability; inf where it
-        shows none
-    shift: (p,) of the coefficients per unit, if the term is left out
-    gain, late: (p,) change of the coefficients that scales the whole response by one, and that
-        delays it by a second
+    missed: size that the test would miss with 5 % probability; infinite where it detects none
+    shift: (p,) of the coefficients per unit, if the term is omitted
+    gain, late: (p,) change of the coefficients that scales the response by one, and that delays it
+        by a second
     above: relative error of the gain at all frequencies above ``valid_from``, per unit
-    lag: that costs a scan as much as what the response is late by [s], per unit
+    lag: delay of the same effect on a scan [s], per unit
     effect: rms error on the paper's scan per unit [m]
     """
 
@@ -92,7 +97,7 @@ class UndetectedTerm:
 
     @property
     def carried(self) -> float:
-        """Standard uncertainty of the size that is left out."""
+        """Standard uncertainty of the omitted size."""
         return float(np.hypot(self.size, self.uncertainty))
 
     def covariance(self, carried: float) -> FloatArray:
@@ -104,11 +109,11 @@ class UndetectedTerm:
 def undetected_terms(
     diagnostics: ResidualDiagnostics, drift: Sequence[slice] = ()
 ) -> list[UndetectedTerm]:
-    """Return what could hide: the worst relaxation first, then the families that bend G.
+    """Return the undetected model errors: the worst relaxation, then the families that shift G.
 
     drift: columns of the background that model a drift
     """
-    # Of relaxations alone: what the survey found of all else stands.
+    # Only the relaxations are tested again, up to slower ones.
     slow = with_slow_creep(diagnostics.thinned or diagnostics)
     relaxations = [_undetected_terms(slow, judged) for judged in slow.creep]
     for gone in _drift_models(drift):
@@ -128,13 +133,13 @@ def undetected_terms(
 
 
 def _drift_models(drift: Sequence[slice]) -> list[Sequence[slice]]:
-    """Return which drifts to take for noise: the steady one, the bent one, and both."""
+    """Return which drifts to treat as noise: the linear one, the nonlinear ones, and both."""
     steady = [_STEADY_DRIFT]
     return [steady, drift, [*steady, *drift]] if drift else [steady]
 
 
 def with_slow_creep(diagnostics: ResidualDiagnostics) -> ResidualDiagnostics:
-    """Return ``diagnostics`` with relaxations of a minute, or as slow as this record is long."""
+    """Return ``diagnostics`` with relaxations up to _SLOWEST_CREEP_S, or the record if longer."""
     slower = min(_MOST_RECORDS, _SLOWEST_CREEP_S / diagnostics.model_errors.duration)
     return replace(diagnostics, slower=max(slower, 1.0))
 
@@ -142,11 +147,11 @@ def with_slow_creep(diagnostics: ResidualDiagnostics) -> ResidualDiagnostics:
 def with_drift_as_noise(
     diagnostics: ResidualDiagnostics, drift: Sequence[slice]
 ) -> ResidualDiagnostics:
-    """Return ``diagnostics`` with the drift that was modelled taken for noise of the readings.
+    """Return ``diagnostics`` with the modelled drift treated as noise of the readings.
 
-    Columns of any size let a drift of a micrometre undo a relaxation of as much. One that
-    wanders by nanometres cannot, and as noise it is no larger than it was found to be. A slow
-    relaxation itself looks like a steady drift: where there is none, there is no relaxation.
+    As free columns, a drift of a micrometre could cancel a relaxation of as much. A drift of
+    nanometres cannot, and as noise it has the size that was fitted. A slow relaxation looks like a
+    linear drift: where there is none, there is no relaxation.
     """
     fitted, problem = diagnostics.fitted, diagnostics.problem
     gone = np.zeros(problem.background.shape[1], np.bool_)
@@ -163,22 +168,20 @@ def with_drift_as_noise(
 
 
 def _better_relaxation(term: UndetectedTerm, other: ScoreTest) -> UndetectedTerm:
-    """Return the relaxation ``term`` as ``other`` has it, where that leaves less of it open."""
+    """Return the relaxation ``term`` as ``other`` has it, where its bound is smaller."""
     size, uncertainty = float(other.score.size[0]), other.score.uncertainty
     if not np.hypot(size, uncertainty) < term.carried:
         return term
-    # The alarm is that of the fit, which lets the drift be as large as it likes.
+    # The size that the test would miss stays that of the fit, whose drift is free.
     return replace(term, size=size, uncertainty=uncertainty)
 
 
 def _worst_relaxation(relaxations: list[UndetectedTerm], found: float) -> list[UndetectedTerm]:
-    """Return the relaxation that would cost most, and of another one the lag if that is larger.
+    """Return the relaxation of the largest effect, and the lag of another one if that is larger.
 
-    Neither is larger than is likely where one was found.
-
-    found: size of what is in the model already. Creep of joints and of piezos goes about
-    evenly with the logarithm of time; what lies in the other decades of the record is not
-    more than a few times what was found, and a larger one only the model's own imitates.
+    found: size of the relaxation in the model. Creep of joints and piezos is about even in the
+        logarithm of time: that in the other decades of the record is at most a few times the fitted
+        one, and bounds are limited to that.
     """
     if found > 0:
         limit = _DECADES * found
@@ -198,10 +201,10 @@ def _worst_relaxation(relaxations: list[UndetectedTerm], found: float) -> list[U
 
 
 def _lag_beyond_noise(term: UndetectedTerm) -> UndetectedTerm:
-    """Return the lag alone of ``term``, in the size by which it exceeds what noise makes of none.
+    """Return the lag alone of ``term``, for its size in excess of noise.
 
-    Many relaxations lag, of each of which the noise would hide some; those that the data hint at
-    are carried.
+    Many relaxations lag, and noise would mask a part of each; those that the data suggest are
+    included.
     """
     excess = float(np.sqrt(max(term.size**2 - term.uncertainty**2, 0.0)))
     effect = term.lag * _SCAN_RATE
@@ -209,7 +212,7 @@ def _lag_beyond_noise(term: UndetectedTerm) -> UndetectedTerm:
 
 
 def fitted_relaxation(dynamics: TransferFunction) -> float:
-    """Return the share of G(0) that comes with real poles slower than a structure's [1]."""
+    """Return the share of G(0) [1] of real poles that are slower than a structure."""
     poles = dynamics.poles()
     found = 0.0
     for index, pole in enumerate(poles):
@@ -221,12 +224,12 @@ def fitted_relaxation(dynamics: TransferFunction) -> float:
 
 
 def _excited(diagnostics: ResidualDiagnostics, judged: ScoreTest) -> bool:
-    """Return False for a mode slower than the steps follow each other: they hardly excite it."""
+    """Return False for a mode slower than the interval of the steps, which hardly excite it."""
     return judged.term.family != MODE or judged.term.parameter * diagnostics.plateau >= 1
 
 
 def _hinted_by_data(judged: ScoreTest) -> bool:
-    """Return whether chance alone makes such a mode in one test of twenty, or in fewer."""
+    """Return True for a mode whose p-value is below _HINT."""
     return judged.term.family == MODE and judged.log_p < np.log(_HINT)
 
 
@@ -236,7 +239,7 @@ def _undetected_terms(diagnostics: ResidualDiagnostics, judged: ScoreTest) -> Un
     frequency, rms = np.array(PAPER_SCAN_LINES).T
     imitated = _relative(fitted, frequency, shift)
     remaining = imitated - _response_error(term.family, term.parameter, term.damping, frequency)
-    # A light mode is tenfold at its own frequency, which no fitted coefficient imitates.
+    # Fitted coefficients cannot follow the resonance of a lightly damped mode.
     whole = term.family == CREEP or _hinted_by_data(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
     lag = float(np.linalg.norm(remaining.imag * rms)) / _SCAN_RATE
@@ -265,7 +268,7 @@ def _undetected_size(judged: ScoreTest) -> float:
 def _response_error(
     family: str, parameter: float, damping: float, frequency: FloatArray
 ) -> FloatArray:
-    """Return the complex departure of G, relative, at ``frequency`` (k,) [Hz], per unit, (k,)."""
+    """Return the complex relative error of G at ``frequency`` (k,) [Hz], per unit, (k,)."""
     s = 2j * np.pi * frequency
     if family == CREEP:
         return np.asarray(-s * parameter / (1 + s * parameter))
@@ -287,35 +290,28 @@ def omission_shift(diagnostics: ResidualDiagnostics, column: FloatArray) -> Floa
     return np.asarray(jacobian @ solved[: fitted.structure.size])
 
 
-# How else could a light mode that became a pole look, and describe the record about as well?
-#
-# Steps that follow each other evenly excite a comb of frequencies. A light mode between its teeth
-# shows at the teeth beside it only, so that several frequencies and dampings explain the residual
-# about equally well. The covariance at one of them knows nothing of the others: their spread,
-# weighted by likelihood, comes on top.
-
-# Of the frequency found, as a logarithm; and the dampings, a factor of two apart.
+# Frequencies of other modes, as logarithm over that of the fitted one, and their damping ratios.
 _FREQUENCIES = np.linspace(-0.4, 0.4, 33)
 _DAMPINGS = (0.01, 0.02, 0.04, 0.08, 0.16)
-# Less likely than this against the best, they add nothing that matters.
+# Modes less likely than this, relative to the best, are negligible.
 _LEAST_LIKELY = 1e-3
-# Where responses are compared, a few per cent apart.
+# Frequencies at which responses are compared, a few per cent apart.
 _LINES = 150
 _LOWEST_HZ = 0.1
-# Times the mode's frequency; far above it nothing depends on which mode it is.
+# Highest of them over that of the mode; far above it the responses agree.
 _HIGHEST = 10.0
-# Of the largest variation: less is all alike.
+# Part of the largest variation below which variations count alike.
 _LITTLE = 0.02
-# Directions of the coefficients weaker than this change no response by what matters.
+# Directions of the coefficients weaker than this part of the strongest are left out.
 _DIRECTIONS = 1e-6
 
 
 def alternative_mode_covariance(
     before: ResidualDiagnostics, term: ModelErrorTerm, fitted: Fit
 ) -> FloatArray:
-    """Return the covariance (p, p) of what other light modes than ``term`` would make of G.
+    """Return the covariance (p, p) of G over other lightly damped modes than ``term``.
 
-    before: survey of the fit without the mode;  term: the mode as ``fitted`` has it
+    before: diagnostics of the fit without the mode;  term: the mode as ``fitted`` has it
     """
     highest = 0.25 / before.problem.period
     tried: list[tuple[float, float]] = [(term.parameter, term.damping)]
@@ -343,11 +339,11 @@ def alternative_mode_covariance(
 def _collinear_covariance(fitted: Fit, lines: FloatArray, rows: ComplexArray) -> FloatArray:
     """Return the covariance (p, p) with which G varies at ``lines`` (k,) as by ``rows`` (m, k).
 
-    Coefficients turn one mode into its neighbours, not into all of them: where ``rows`` are large
-    the covariance is as large at least.
+    Coefficients cannot follow every variation: where ``rows`` are large, the covariance is scaled
+    to include them.
     """
     wanted = np.linalg.norm(rows, axis=0)
-    # Where little varies, as little may come of it.
+    # Where variation is small, its weight is limited.
     weight = 1 / np.maximum(wanted, _LITTLE * np.max(wanted)) if np.any(wanted) else wanted
     jacobian = np.concatenate(
         weight[:, np.newaxis] * relative_response_jacobian(fitted.dynamics, lines)
@@ -377,9 +373,6 @@ def _change(before: ResidualDiagnostics, term: ModelErrorTerm, lines: FloatArray
     return np.asarray(size[0] * (mode - 1) + size[1] * ratio * mode - real - 1j * imaginary)
 
 
-# A relaxation, or a light mode, as poles of a response.
-
-
 def poles_of(term: ModelErrorTerm) -> ComplexArray:
     """Return the poles [rad/s] of a relaxation, (1,), or of a mode, (2,)."""
     if term.family == CREEP:
@@ -390,7 +383,7 @@ def poles_of(term: ModelErrorTerm) -> ComplexArray:
 
 
 def at_fitted_pole(term: ModelErrorTerm, fitted: Fit) -> ModelErrorTerm:
-    """Return ``term`` with the time constant [s] or frequency [Hz] of the pole that it became."""
+    """Return ``term`` with the time constant [s] or frequency [Hz] of its fitted pole."""
     poles = fitted.dynamics.poles()
     near = np.abs(np.log(poles / poles_of(term)[0]))
     pole = poles[int(np.argmin(near))]
@@ -407,7 +400,8 @@ def fit_with_added_poles(
 ) -> Fit | None:
     """Return the fit of ``base`` and ``new`` poles [rad/s], started at multiples of them.
 
-    None where they would be more than can be fitted.
+    starts: factors on ``new``
+    Return None where the poles would be more than can be fitted.
     """
     zeros, delay = base.structure.zeros + len(new), base.structure.delay
     larger = Structure(base.structure.poles + len(new), zeros, delay)

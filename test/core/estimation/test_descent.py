@@ -1,4 +1,4 @@
-"""Descent to a least sum of squares: against linear algebra, scipy, and the edges of its box."""
+"""Test the minimisation against linear algebra and scipy, its bounds, and the budget."""
 
 from __future__ import annotations
 
@@ -181,7 +181,7 @@ def test_a_step_that_makes_it_worse_is_not_taken() -> None:
 
 
 def test_no_step_leaps() -> None:
-    """Of a logarithm e³ at once, however far a quadratic model would go."""
+    """A step of a logarithm is at most 3, however far the quadratic model would go."""
     flat = Watched(lambda p: np.array([1e-3 * p[0] - 1.0]), lambda _: np.array([[1e-3]]))
     flat.down([0.0], *open_box(1), evaluations=1)
     assert flat.asked[-1][0] == pytest.approx(3.0)

@@ -1,4 +1,4 @@
-"""Noise of the encoder on machines made here, without the twin: followed by the probe, or not."""
+"""Test noise of the encoder that the probe follows or does not, on simulated machines."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER, RAMP, STEP, READING = 1e-3, 5, 20, 9.8e-6, 10e-9
-# A light mode of 5 % damping, which makes white noise of the axis larger.
+# A lightly damped mode of 5 %, which amplifies white noise of the axis.
 FREQUENCY, DAMPING = 60.0, 0.05
 OMEGA = 2 * np.pi * FREQUENCY
 MODE = signal.TransferFunction([1.0], [OMEGA**-2, 2 * DAMPING / OMEGA, 1.0])
@@ -39,7 +39,7 @@ def seen_by_probe(moved):
 
 
 def record_of(moved, noise, seed=2):
-    """What axis and probe read of ``moved``; noise: of the encoder, not of the axis [m]."""
+    """Return readings of axis and probe for ``moved``; noise: of the encoder alone [m]."""
     rng = np.random.default_rng(seed)
     z = moved + rng.normal(0, 1, len(moved)) * noise
     return MotionRecord.from_arrays(
@@ -72,14 +72,14 @@ def test_where_an_axis_rests_its_noise_is_averaged():
 
 
 def test_what_is_left_of_noise_is_stated():
-    """Beside edges, where fewer samples agree, more of it is left than in a long rest."""
+    """Near edges fewer samples are averaged, so more noise remains than in a long plateau."""
     z = staircase(300)
     smooth, left = smoothed(z + np.random.default_rng(1).normal(0, 3e-9, len(z)), 3e-9)
     assert 0.5 < left / np.std(smooth - z) < 1.2
 
 
 def test_an_edge_keeps_its_shape():
-    """Of many records the mean shows what repeats, where noise alone would leave a sixth of it."""
+    """The mean of 40 records shows a repeated error; noise alone is reduced to a sixth."""
     z, rng = staircase(100, 2), np.random.default_rng(3)
     off = [smoothed(z + rng.normal(0, 1e-9, len(z)), 1e-9)[0] - z for _ in range(40)]
     assert np.sqrt(np.mean(np.mean(off, axis=0) ** 2)) < 0.2e-9
@@ -125,7 +125,7 @@ def test_what_the_probe_follows_stays():
 
 
 def test_half_followed_is_half_taken_out():
-    """Of noise and jitter of one size the expected motion is half of what the encoder shows."""
+    """With noise and jitter of equal size the expected motion is half of the reading."""
     z = staircase(500)
     shaken = z + jitter(len(z), 3e-9, 400.0)
     problem, quiet = cleaned(record_of(shaken, 3e-9))
@@ -157,7 +157,7 @@ def test_it_is_taken_out_once():
 @pytest.mark.parametrize("rest", [500, 2000])
 @pytest.mark.parametrize("noise", [1e-9, 4e-9])
 def test_a_lightly_damped_mode_is_known_in_addition(rest, noise):
-    """Without a word of backlash, other modes or errors of the scale, which swallow noise too."""
+    """No backlash, further mode or scale error is reported, although each could fit the noise."""
     found = identify(record_of(staircase(rest), noise)).calibration
     certificate = found.certificate
     assert str(certificate["verdict"]).startswith("accepted,")

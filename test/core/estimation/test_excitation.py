@@ -1,4 +1,4 @@
-"""Persistence of excitation of inputs where it is known."""
+"""Test the order of persistent excitation of known inputs."""
 
 import numpy as np
 import pytest

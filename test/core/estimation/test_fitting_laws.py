@@ -1,4 +1,4 @@
-"""Steps, noise, rounding and covariances: what scales with what, and what must not matter."""
+"""Test scaling laws and invariances of steps, noise, rounding and covariances."""
 
 from __future__ import annotations
 

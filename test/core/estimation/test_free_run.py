@@ -1,4 +1,4 @@
-"""A model runs over another record: against the system that made it, in every hold."""
+"""Test free runs of a model over another record against the true system, for every hold."""
 
 from dataclasses import replace
 
@@ -46,8 +46,8 @@ def model(**parts):
 
 
 def moving(lead=5.0):
-    """A smooth input whose record begins ``lead`` seconds after it was at rest."""
-    # Ten times as fine: between its samples the simulation runs straight.
+    """Return a smooth input; the record starts ``lead`` seconds after it was stationary."""
+    # At ten times the rate, because the simulation is linear between samples.
     time = PERIOD / 10 * np.arange(10 * (2000 + round(lead / PERIOD)))
     u = 4.0 + np.sin(2 * np.pi * 0.7 * time) * (1 - np.exp(-time))
     _, y, _ = signal.lsim((TRUTH.numerator[::-1], TRUTH.denominator[::-1]), u - 4.0, time)

@@ -1,4 +1,4 @@
-"""The order behind a hold, on simulated systems and measured records."""
+"""Test the choice of order of sampled models, on simulated systems and measured records."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A held input: exact in z, stable by construction, with derivatives that hold."""
+"""Test fits to a held input: exact in z, stable, with derivatives against differences."""
 
 from dataclasses import replace
 

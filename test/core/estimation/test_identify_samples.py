@@ -1,4 +1,4 @@
-"""Any two sampled quantities: model, covariance, validity and verdict against the truth."""
+"""Test models of any two sampled quantities: covariance, validity, verdict against truth."""
 
 from dataclasses import replace
 

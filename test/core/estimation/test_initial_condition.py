@@ -1,4 +1,4 @@
-"""Free decays at the start of a record: their form, and when they are seen."""
+"""Test initial-condition responses: their form, and when they are significant."""
 
 from dataclasses import replace
 
@@ -19,13 +19,13 @@ NOISE = 10e-9
 
 
 def bumps():
-    """Band-limited, and at rest at both ends."""
+    """Return a band-limited motion that is stationary at both ends."""
     centres = np.arange(0.6, 3.3, 0.3)
     return sum(1e-5 * np.exp(-(((TIME - centre) / 6e-3) ** 2)) for centre in centres)
 
 
 def ringing(amplitude):
-    """What is left of an unknown past: by the differential equation, in closed form."""
+    """Return the initial-condition response of the mode, in closed form."""
     turning = OMEGA * np.sqrt(1 - DAMPING**2)
     return amplitude * np.exp(-DAMPING * OMEGA * TIME) * np.cos(turning * TIME + 0.7)
 
@@ -61,7 +61,7 @@ def test_ringing_is_seen_where_it_is(amplitude):
 
 
 def test_a_record_that_starts_moving_is_not_asked():
-    """What moved before is unknown; a little of it would bias long before it showed."""
+    """The motion before is unknown; it would bias a fit before it becomes significant."""
     of = problem(0.0)
     assert has_initial_response(of, fitted(of), at_rest=False)
 

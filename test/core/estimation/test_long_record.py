@@ -1,4 +1,4 @@
-"""Long records behind a hold: what a part tells, what the whole adds, and what the choice costs."""
+"""Test sampled models of long records: choice on a part, fit to the whole, cost."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_the_response_of_a_long_record_is_the_true_one_within_its_uncertainty():
     off = np.log(model.discrete.response(LINES, 1.0) / response(b, a))
     assert np.max(np.abs(off.real) / band.gain) < 4
     assert np.max(np.abs(off.imag) / band.phase) < 4
-    # Of all: white noise tells the gain at rest to σ/√n over it, and some shape more.
+    # White noise determines the static gain to σ/√n; the other parameters widen it.
     assert band.gain[0] < 4 * 0.05 / np.sqrt(MANY)
     assert model.certificate["samples"]["compared"] > MANY - 10
 

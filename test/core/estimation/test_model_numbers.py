@@ -1,4 +1,4 @@
-"""A sampled model in numbers: response, band and range against second methods and closed forms."""
+"""Test response, band and range of a sampled model against second methods."""
 
 from __future__ import annotations
 

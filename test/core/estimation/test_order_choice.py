@@ -1,4 +1,4 @@
-"""Which structures are tried, and which is chosen, on steps through systems of known order."""
+"""Test which structures are tried and chosen, on steps through systems of known order."""
 
 import math
 from dataclasses import replace
@@ -99,7 +99,7 @@ def test_an_order_that_no_polynomial_has_digits_for_is_refused(order):
 
 
 def test_information_is_minus_twice_the_log_likelihood_and_log_n_a_parameter():
-    """Of normal residuals with their own variance, but for a constant of n."""
+    """Check against the normal likelihood of the residuals, up to a constant of n."""
     small, *_, large = (c.fit for c in explored(PAIR))
     n = small.samples
     assert small.size < large.size
@@ -170,7 +170,7 @@ def test_held_out_edges_are_predicted_to_the_noise_by_the_right_structure_only()
 
 
 def test_what_was_held_out_did_not_teach_the_model():
-    """Of other values where it is held out, the same structure misses just those."""
+    """Changed values in the held-out part change only the errors there."""
     problem = problem_of(PAIR)
     held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
     shifted = replace(problem, output=problem.output + np.where(held, 1e-6, 0.0))
@@ -199,7 +199,7 @@ def test_a_zero_on_a_pole_is_no_richer():
 
 @pytest.mark.parametrize(("apart", "cancelling"), [(1e-4, True), (0.05, False)])
 def test_a_zero_cancels_a_pole_that_no_data_could_tell_from_it(apart, cancelling):
-    """Of either pole, wherever the other one lies."""
+    """Test either pole, with the other one slower or faster."""
     for pole, other in ((100.0, 1e4), (1e4, 100.0)):
         poles = np.polynomial.polynomial.polymul([1.0, 1 / pole], [1.0, 1 / other])
         zero = [1.0, 1 / (pole * (1 + apart))]
@@ -222,7 +222,7 @@ def test_the_search_goes_as_far_as_the_order_asked_for_and_tries_all_below():
 
 
 def test_hopeless_structures_are_not_fitted():
-    """Of four poles and more the largest structure gains nothing; so none of them can."""
+    """The largest structure of four poles gains nothing, so no smaller one of four can."""
     tried = explored(FIRST_ORDER, 4)
     assert sum(c.fit.structure.poles == 4 for c in tried) == 1
 

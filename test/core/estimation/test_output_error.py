@@ -1,4 +1,4 @@
-"""The fit itself, against motions whose response is known in closed form."""
+"""Test the fit against motions whose response is known in closed form."""
 
 from dataclasses import replace
 

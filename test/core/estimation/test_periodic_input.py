@@ -1,4 +1,4 @@
-"""A motion as one period: what is added, and what is taken for noise."""
+"""Test the closing of a motion to a period, and its Wiener filter."""
 
 import numpy as np
 

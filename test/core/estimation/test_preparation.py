@@ -1,4 +1,4 @@
-"""What is decided before any model exists."""
+"""Test the preparation of a record: compared samples, spikes, gain and clipping."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_edges_are_no_spikes():
 
 @pytest.mark.parametrize("off", [1e-6, -40e-6, 5e-3])
 def test_single_positions_that_stand_apart_are_bridged(off):
-    """At rest, within an edge and next to one; where the axis was is known to nanometres."""
+    """Spikes on a plateau, in an edge and next to one; the true position is known."""
     record = record_of()
     edge = prepare(record, "encoder").steps.edges[3]
     places = [700, (edge.start + edge.stop) // 2, edge.start - 3, 9000]

@@ -1,4 +1,4 @@
-"""Rounding without noise is an error that a plateau shares: no number of readings averages it."""
+"""Test the variance of the rounding error that all readings of a plateau share."""
 
 import numpy as np
 import pytest
@@ -36,9 +36,9 @@ def test_what_a_plateau_shares_against_many_plateaus(noise):
     readings = np.round(position + RNG.normal(0, noise, len(plateau)))
     mean = np.bincount(plateau, readings - position) / 400
     found = plateau_variance(readings, plateau, 1.0)
-    # Of the mean of 400 readings their own scatter is left too.
+    # The scatter of the mean of 400 readings remains too.
     own = (noise**2 + 1 / 12) / 400
-    # Wider where the little noise is not told from rounding.
+    # The tolerance is wider where small noise cannot be separated from rounding.
     assert 0.9 * (np.var(mean) - own) < found < 3 * np.var(mean)
 
 

@@ -1,4 +1,4 @@
-"""Places to start from, judged by how near they come to the answer."""
+"""Test starting points by their distance from the known answer."""
 
 from dataclasses import replace
 
@@ -84,7 +84,7 @@ def test_many_samples_start_where_fewer_of_them_lead(frequency, damping, lost):
 
 @pytest.mark.parametrize("every", [2, 3, 5])
 def test_a_coarser_problem_has_the_same_response(every):
-    """Of a plant and a motion whose spectra are known, to what noise leaves."""
+    """Compare with the known response of plant and motion, within the noise."""
     truth = TransferFunction.from_ascending([1.0, 2e-3], [1.0, 6e-3, 2e-5], 1e-3)
     problem = points_for(truth, finer=4).problem
     coarse = coarser(problem, every)

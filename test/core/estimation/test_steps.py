@@ -1,4 +1,4 @@
-"""Finding the steps in a motion."""
+"""Test the detection of steps in a motion."""
 
 import numpy as np
 import pytest

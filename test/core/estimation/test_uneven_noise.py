@@ -1,4 +1,4 @@
-"""Readings that scatter in time are noisier where the axis moves, and nothing else is wrong."""
+"""Test timing jitter: noise in proportion to the rate of the axis."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A short step test whose probe is late, fitted by a delay, and what departs from that."""
+"""A short step test whose probe has a delay, fitted by a delay, with model errors added."""
 
 from types import SimpleNamespace
 
@@ -19,7 +19,7 @@ Z, LATE = STEPS.positions(TIME).z, STEPS.positions(TIME - LAG).z
 
 
 def diagnostics(added=0.0, seed=1, lost=(), **options):
-    """added: to what the probe sees, along the motion (n,) [m];  lost: readings (k,) without"""
+    """Return a step test; added: error along the motion (n,) [m];  lost: readings (k,)."""
     random = np.random.default_rng(seed)
     seen = -(LATE + added) + random.normal(0, NOISE, len(TIME))
     seen[list(lost)] = np.nan

@@ -1,4 +1,4 @@
-"""Columns of the families against the differential equations and formulas they stand for."""
+"""Test the columns of the families against differential equations and closed forms."""
 
 from dataclasses import replace
 
@@ -30,12 +30,12 @@ def model_errors(clean):
 
 @pytest.fixture(scope="module")
 def answer(clean):
-    """What the fitted G and gain make of the motion, by the fit itself."""
+    """Return the motion through the fitted G and gain."""
     return clean.fitted.gain * clean.problem.response(clean.fitted)
 
 
 def through(numerator, denominator, values, period):
-    """At rest before: straight from sample to sample, by the state space."""
+    """Return the response from rest to linear segments, by the state space."""
     time = np.arange(len(values)) * period
     return signal.lsim((numerator, denominator), values - values[0], time)[1]
 
@@ -110,7 +110,9 @@ class TestModes:
 
     def test_modes_cover_their_band_and_stand_as_they_are_alone(self, model_errors):
         family = model_errors.modes()
-        for damping in np.unique(family.dampings):
+        dampings = np.unique(family.dampings)
+        assert len(dampings) == 2
+        for damping in dampings:
             lines = family.parameters[family.dampings == damping]
             assert lines[0] == pytest.approx(2 / model_errors.duration)
             assert np.all(np.diff(np.log(lines)) < 2.5 * damping)
@@ -187,6 +189,7 @@ class TestOfThePosition:
     def test_a_periodic_error_is_sine_and_cosine_of_the_place(self, model_errors, answer, near):
         family = model_errors.periodic(near)
         place = answer / model_errors.fitted.gain
+        assert len(family.parameters) > 9
         for index in range(0, len(family.parameters), 9):
             term = family.term(index)
             angle = 2 * np.pi * place / term.parameter
@@ -229,11 +232,13 @@ class TestWhichFamilies:
         assert len(list(clean.model_errors.families((BACKLASH,)))) == 2
 
     def test_friction_and_gap_have_the_size_of_a_force_and_of_a_lead(self, model_errors):
-        for family in model_errors.families((FRICTION, BACKLASH)):
-            assert np.max(abs(family.columns)) == pytest.approx(1.0, rel=0.01)
+        largest = [
+            np.max(abs(family.columns)) for family in model_errors.families((FRICTION, BACKLASH))
+        ]
+        assert largest == pytest.approx([1.0, 1.0, 1.0], rel=0.01)
 
     def test_what_a_gap_loses_is_what_the_probe_does_not_follow(self, model_errors, step_test_of):
-        """Half a gap of 300 nm, against the play operator on the true motion."""
+        """Compare half a backlash of 300 nm with the play operator on the true motion."""
         (of_travel, _) = model_errors.families((BACKLASH,))
         half, state, lost = 150e-9, step_test_of.late[0], []
         for value in step_test_of.late:
@@ -249,7 +254,9 @@ class TestWhichFamilies:
 
     def test_a_term_has_its_columns_in_another_fit(self, clean, step_test_of):
         other = step_test_of.diagnostics(seed=9).model_errors
-        for family in clean.model_errors.families((CREEP, PERIODIC, LINEARITY)):
+        every = list(clean.model_errors.families((CREEP, PERIODIC, LINEARITY)))
+        assert len(every) == 3
+        for family in every:
             term = family.term(0)
             again = other.again(term)
             assert (again.family, again.damping) == (term.family, term.damping)

@@ -1,4 +1,4 @@
-"""What an omitted term does to G, against fitting anew without it; sizes against closed forms."""
+"""Test the effect of omitted terms on G against new fits, and their sizes in closed form."""
 
 from dataclasses import replace
 
@@ -26,7 +26,6 @@ SCAN_RMS = np.sqrt(sum(rms**2 for _, rms in PAPER_SCAN_LINES))
 
 def coefficients(fitted):
     g = fitted.dynamics
-    # As they are listed in a shift: the denominator without its first, which is one.
     return np.concatenate([g.numerator, g.denominator[1:], [g.delay]])
 
 
@@ -107,7 +106,7 @@ class TestSizes:
 class TestRelaxationFound:
     @staticmethod
     def shares(found):
-        """By partial fractions: what each pole slower than 20 ms has of G(0)."""
+        """Return the share of G(0) of poles slower than 20 ms, by partial fractions."""
         parts, poles, _ = signal.residue(found.numerator[::-1], found.denominator[::-1])
         slow = (abs(poles.imag) < 1e-9) & (-poles.real < 50)
         return sum(abs(-part / pole) for part, pole in zip(parts[slow], poles[slow], strict=True))

@@ -1,4 +1,4 @@
-"""Gap and friction against the same written value by value, and what holds for any motion."""
+"""Test backlash and friction against loops over single values, and their invariances."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def played(motion, half):
 
 
 def stepwise(motion, travel, force=0.0, pieces=400):
-    """Friction by many small steps of its differential equation (Heun), from ``force``."""
+    """Integrate the differential equation of friction in small steps (Heun), from ``force``."""
     found = [force]
     for there, here in zip(motion[1:], motion[:-1], strict=True):
         direction, length = np.sign(there - here), abs(there - here) / pieces / travel
@@ -75,7 +75,7 @@ class TestGap:
         assert motion[0] == 2.0
 
     def test_the_lead_of_a_triangle(self):
-        """Up it leads by half the gap once that is taken up; back it gives way over all of it."""
+        """The lead is half the backlash once crossed; after a reversal it takes all of it."""
         up = np.arange(0, 33) / 16.0
         motion = np.r_[up, up[-2::-1]]
         ahead, start = backlash_lead(motion, [1.0])

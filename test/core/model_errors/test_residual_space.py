@@ -1,4 +1,4 @@
-"""The score test against least squares of everything at once: the same, by Frisch and Waugh."""
+"""Test the score test against least squares of all columns (theorem of Frisch and Waugh)."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
 
 
 def columns_like(diagnostics, count, seed=3):
-    """Smooth ones: half of them follow the motion, so the fit imitates a part of each."""
+    """Return smooth columns; half of them correlate with those of the fit."""
     time = np.linspace(0, 1, len(diagnostics.problem.input))
     rng = np.random.default_rng(seed)
     waves = [np.sin(2 * np.pi * f * time + p) for f, p in rng.uniform(2, 40, (count, 2))]
@@ -24,7 +24,7 @@ def columns_like(diagnostics, count, seed=3):
 
 
 def at_once(diagnostics, columns):
-    """Return coefficients of ``columns`` beside all that the fit may change, and squares left."""
+    """Return coefficients of ``columns`` fitted with all parameters, and the sum of squares."""
     used = diagnostics.problem.used
     every = np.column_stack([diagnostics.problem.sensitivity(diagnostics.fitted), columns[used]])
     scale = np.linalg.norm(every, axis=0)
@@ -196,7 +196,7 @@ class TestNoise:
         )
 
     def test_the_scatter_of_any_sum_is_as_stated_in_noise_that_wanders(self, clean):
-        """Noise with memory: what is stated of a slow and a fast wave, against many draws."""
+        """Compare the stated covariance in coloured noise with that of many draws."""
         rng = np.random.default_rng(5)
         samples, time = clean.fitted.samples, np.linspace(0, 1, len(clean.problem.input))
         waves = np.column_stack([np.sin(2 * np.pi * f * time) for f in (4.0, 200.0)])

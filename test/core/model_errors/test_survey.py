@@ -1,4 +1,4 @@
-"""What a survey says of its families: chances, evidence, order, and what it does not look for."""
+"""Test the diagnostics: p-values, evidence, order of families, families left out."""
 
 from dataclasses import replace
 
@@ -144,7 +144,7 @@ class TestReferenceLag:
         assert reference_lag(self.record(np.zeros(4000))) is None
 
     def test_offset_drift_scale_and_holes_in_either_leave_the_lag(self):
-        """The lag is small against the period, so that its first order is all."""
+        """The lag is small against the period, so that the first order suffices."""
         late = 150e-6
         reference = -0.5 * 20e-6 * np.sin(2 * np.pi * 1.3 * (self.TIME - late))
         reference += 3e-3 + 2e-6 * self.TIME

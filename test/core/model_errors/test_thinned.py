@@ -1,4 +1,4 @@
-"""Departures of a long step test, looked for in fewer samples, against all of them."""
+"""Test the decimated diagnostics of a long step test against those of all samples."""
 
 from dataclasses import replace
 
@@ -35,7 +35,8 @@ def long():
 
 
 def test_relaxations_are_as_large_and_as_well_known_in_fewer_samples(long):
-    every = zip(long.creep, long.thinned.creep, strict=True)
+    every = list(zip(long.creep, long.thinned.creep, strict=True))
+    assert len(every) > 5
     for all_, fewer in every:
         assert fewer.term.parameter == all_.term.parameter
         assert fewer.score.uncertainty == pytest.approx(all_.score.uncertainty, rel=0.15)
@@ -62,7 +63,9 @@ def test_the_relaxation_that_is_there_is_the_one_found(time_constant):
 
 
 def test_each_family_has_the_same_terms_there(long):
-    for family in long.model_errors.families((CREEP, MODE, PERIODIC, BACKLASH)):
+    families = list(long.model_errors.families((CREEP, MODE, PERIODIC, BACKLASH)))
+    assert {f.name for f in families} == {CREEP, MODE, PERIODIC, BACKLASH}
+    for family in families:
         if len(family.parameters) == 1:
             continue
         alike = long.thinned.model_errors.alike(family)
@@ -70,7 +73,7 @@ def test_each_family_has_the_same_terms_there(long):
         np.testing.assert_array_equal(alike.parameters, family.parameters)
         every = round(long.thinned.problem.period / PERIOD)
         rested = ~np.convolve(long.steps.moving, np.ones(200), "same").astype(bool)[::every]
-        # Where in a gap of 10 nm a motion rests is a matter of its noise.
+        # The position in a backlash of 10 nm depends on noise.
         first = len(family.parameters) - 1 if family.name == BACKLASH else 0
         for index in (first, len(family.parameters) - 1):
             there, here = alike.term(index).columns, family.term(index).columns[::every]
