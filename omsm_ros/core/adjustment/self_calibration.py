@@ -28,6 +28,7 @@ from omsm_ros.core.adjustment.scan_model import (
 from omsm_ros.core.adjustment.scan_reader import ScanColumns
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError
+from omsm_ros.linear_algebra import one_blas_thread
 from omsm_ros.units import RPM_RAD_S
 
 # Rings and harmonics of the residuals, coarser than the terms of the surface.
@@ -239,6 +240,7 @@ class SelfCalibration:
         return float(direction @ self.values), float(np.sqrt(variance))
 
 
+@one_blas_thread()
 def self_calibrate(
     scans: Sequence[ScanColumns], prior: Prior, harmonics: int = DEFAULT_HARMONICS
 ) -> SelfCalibration:

@@ -169,23 +169,6 @@ class TestVerdict:
         assert self.certified()["verdict"] == "accepted from 0.100 Hz to 3.00 Hz"
         assert self.certified()["warnings"] == []
 
-    @pytest.mark.parametrize(
-        ("changed", "says"),
-        [
-            ({"entries": {"predicted": 0.4}}, "account for 40.0 %"),
-            ({"valid": (0.1, 0.1)}, "known nowhere to 10 %"),
-        ],
-    )
-    def test_bad_evidence_is_rejected_by_name(self, changed, says):
-        found = self.certified(**changed)
-        assert found["verdict"] == "rejected"
-        (reason,) = found["reasons"]
-        assert says in reason
-
-    def test_a_residual_that_follows_the_input_is_warned_of(self):
-        (text,) = self.certified(entries={"predicted": 0.9, "independence_p": 1e-6})["warnings"]
-        assert "follows the input" in text
-
     def test_the_widest_range_in_octaves_is_taken(self):
         frequency = np.array([1.0, 2.0, 3.0, 4.0, 8.0, 16.0, 32.0])
         gain = np.array([0.01, 0.01, 1.0, 0.01, 0.01, 0.01, 1.0])

@@ -219,8 +219,8 @@ def test_a_model_that_predicts_is_accepted_with_its_range() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"entries": {"predicted": 0.2}}, "describes what was fitted only"),
-        ({"entries": {"predicted": -3.0}}, "describes what was fitted only"),
+        ({"entries": {"predicted": 0.2}}, "describes only what it was fitted to"),
+        ({"entries": {"predicted": -3.0}}, "describes only what it was fitted to"),
         ({"valid": (0.1, 0.1)}, "known nowhere to 10 % of gain"),
     ],
 )
