@@ -58,8 +58,8 @@ def triangle(*parts: FloatArray) -> FloatArray:
     found = np.zeros((0, sum(part.shape[1] for part in parts)))
     for first in range(0, len(parts[0]), _ROWS):
         block = np.column_stack([part[first : first + _ROWS] for part in parts])
-        found = np.linalg.qr(np.concatenate([found, block]), mode="r")
-    return np.asarray(found)
+        found = np.asarray(np.linalg.qr(np.concatenate([found, block]), mode="r"))
+    return found
 
 
 class _OneThread:

@@ -9,7 +9,7 @@ together, because one alone would also explain a part of the other.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -73,9 +73,9 @@ class ModelledTerm:
 class SearchResult:
     """The result of the search.
 
-    nuisance_terms: departures in the background;  added_poles: those that became poles
+    nuisance_terms: model errors in the background;  added_poles: those that became poles
     unmodelled: significant, but without a model;  diagnostics: of the last fit
-    without: survey of the fit before each of ``added_poles`` was added
+    without: diagnostics of the fit before each of ``added_poles`` was added
     incomplete: the search was cut short, because its budget was exhausted
     """
 
@@ -110,54 +110,85 @@ def search_model_errors(
     choose: fits a prepared problem anew;  budget: of all evaluations, None for the default
     may_grow: poles may be added to the model
     """
-    prepared, nuisance_terms, model, budget = _initial_model(
-        prepared, choose, budget or EvaluationBudget()
-    )
-    grown: list[ModelErrorTerm] = []
-    without: list[ResidualDiagnostics] = []
-    settled: set[str] = set()
-    modes: list[float] = []
-    refused: set[str] = set() if may_grow else {CREEP, MODE}
-    diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
+    search = _Search(choose, *_initial_model(prepared, choose, budget or EvaluationBudget()))
+    search.refused |= set() if may_grow else {CREEP, MODE}
+    diagnostics = search.diagnostics()
     for _ in range(_MOST_ROUNDS):
-        shown = _without_modelled_lines(diagnostics.significant(refused | settled), modes)
-        if not shown or budget.stops():
+        shown = diagnostics.significant(search.refused | search.settled)
+        shown = _without_modelled_lines(shown, search.modes)
+        if not shown or search.budget.stops():
             break
-        columns = _select_nuisance_terms(diagnostics, shown)
-        again = (
-            {c.term.family for c in columns} & _TURNING & {b.term.family for b in nuisance_terms}
-        )
-        if again:
-            prepared, nuisance_terms = _recomputed_columns(
-                prepared, diagnostics, nuisance_terms, again
-            )
-            settled |= again
-            prepared, model = _rechoose(prepared, model, choose, budget)
-        elif columns:
-            prepared, added = _with_columns(prepared, columns, nuisance_terms)
-            nuisance_terms += added
-            prepared, model = _rechoose(prepared, model, choose, budget)
-            grown, without = [], []
-        else:
-            larger = _grown(prepared, model, shown[0].term, budget)
-            modes += [shown[0].term.parameter] if shown[0].term.family == MODE else []
-            if larger is None:
-                refused.add(shown[0].term.family)
-                continue
-            prepared, model = larger
-            grown.append(at_fitted_pole(shown[0].term, model.chosen.fit))
-            without.append(diagnostics)
-        diagnostics = ResidualDiagnostics(prepared.problem, model.chosen.fit, prepared.steps)
+        if search.add(diagnostics, shown):
+            diagnostics = search.diagnostics()
     return SearchResult(
-        prepared,
-        model,
+        search.prepared,
+        search.model,
         diagnostics,
-        nuisance_terms,
-        grown,
-        diagnostics.significant(settled),
-        without,
-        incomplete=budget.incomplete,
+        search.nuisance_terms,
+        search.grown,
+        diagnostics.significant(search.settled),
+        search.without,
+        incomplete=search.budget.incomplete,
     )
+
+
+@dataclass(eq=False)
+class _Search:
+    """The state of a search.
+
+    refused: families whose poles were no improvement
+    settled: families whose columns were recomputed for the response
+    modes: frequencies that were tried as poles [Hz]
+    grown, without: terms that became poles since the last nuisance term, and the diagnostics before
+    """
+
+    choose: Choose
+    prepared: Prepared
+    nuisance_terms: list[ModelledTerm]
+    model: ChosenModel
+    budget: EvaluationBudget
+    refused: set[str] = field(default_factory=set)
+    settled: set[str] = field(default_factory=set)
+    modes: list[float] = field(default_factory=list)
+    grown: list[ModelErrorTerm] = field(default_factory=list)
+    without: list[ResidualDiagnostics] = field(default_factory=list)
+
+    def diagnostics(self) -> ResidualDiagnostics:
+        """Return the diagnostics of the model."""
+        return ResidualDiagnostics(
+            self.prepared.problem, self.model.chosen.fit, self.prepared.steps
+        )
+
+    def add(self, diagnostics: ResidualDiagnostics, shown: Sequence[ScoreTest]) -> bool:
+        """Add the first of the model errors ``shown``; return False if it is refused."""
+        columns = _select_nuisance_terms(diagnostics, shown)
+        present = {modelled.term.family for modelled in self.nuisance_terms}
+        again = {judged.term.family for judged in columns} & _TURNING & present
+        if again:
+            self.prepared, self.nuisance_terms = _recomputed_columns(
+                self.prepared, diagnostics, self.nuisance_terms, again
+            )
+            self.settled |= again
+        elif columns:
+            self.prepared, added = _with_columns(self.prepared, columns, self.nuisance_terms)
+            self.nuisance_terms = [*self.nuisance_terms, *added]
+            self.grown, self.without = [], []
+        else:
+            return self._add_poles(diagnostics, shown[0].term)
+        self.prepared, self.model = _rechoose(self.prepared, self.model, self.choose, self.budget)
+        return True
+
+    def _add_poles(self, diagnostics: ResidualDiagnostics, term: ModelErrorTerm) -> bool:
+        larger = _grown(self.prepared, self.model, term, self.budget)
+        if term.family == MODE:
+            self.modes.append(term.parameter)
+        if larger is None:
+            self.refused.add(term.family)
+            return False
+        self.prepared, self.model = larger
+        self.grown.append(at_fitted_pole(term, self.model.chosen.fit))
+        self.without.append(diagnostics)
+        return True
 
 
 def _initial_model(

@@ -313,6 +313,19 @@ def identify_samples(
     check_varies(output[used], "output")
     if hold == BAND_LIMITED:
         return band_limited(input, output, used, period, order, SAMPLED_LIMITS)
+    return _held_input(input, output, used, period, hold, order, max_delay)
+
+
+def _held_input(
+    input: FloatArray,
+    output: FloatArray,
+    used: BoolArray,
+    period: float,
+    hold: str,
+    order: int,
+    max_delay: int,
+) -> SampledModel:
+    """Return the model of a record whose input is held between samples."""
     choice = choose_sampled_long(input, output, used, period, order=order, max_delay=max_delay)
     known = _Known.of(choice.chosen, choice.delay, period)
     known, factor = _inflate_to_free_choice(known, choice, period)
