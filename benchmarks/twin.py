@@ -16,7 +16,7 @@ from omsm_ros.twin.catalogue import CATALOGUE, together
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
-from omsm_ros.twin.sensors import Accelerometer
+from omsm_ros.twin.sensors import AccelerationSensor
 from omsm_ros.units import NANOMETRE_M
 
 _RUNS = 3
@@ -48,7 +48,7 @@ def rows(full: bool) -> Iterator[Row]:
 
 def everything_at_once() -> tuple[Disturbances, int]:
     """All disturbances of the catalogue in medium size that do not exclude each other."""
-    joined, count = Disturbances(accelerometer=Accelerometer()), 0
+    joined, count = Disturbances(accelerometer=AccelerationSensor()), 0
     for sizes in CATALOGUE.values():
         try:
             joined = together(joined, sizes[1])

@@ -39,7 +39,7 @@ TEMPLATES: dict[str, str] = {
     "adjustment.one_direction": (
         "both scans turn in the same direction; reverse the spindle for one of them"
     ),
-    # What the certificate states.
+    # Statements of the certificate.
     "adjustment.latency_scope": (
         "identified on a surface that Z follows, where latency has no effect: the response is that "
         "of the structure, for surfaces that Z follows as closely; a step test would determine the "

@@ -9,11 +9,11 @@ TEMPLATES: dict[str, str] = {
         "at most, which is as fine as points are resampled; widen {opt.spacing}"
     ),
     "comparison.unknown_freedom": (
-        "degree of freedom {name!r} is unknown, expected one of {known}"
+        "pose parameter {name!r} is unknown, expected one of {known}"
     ),
     "comparison.not_converged": (
         "shift and clocking of the second measurement do not converge; place it nearer, or fit "
-        "fewer degrees of freedom with {opt.fit}"
+        "fewer pose parameters with {opt.fit}"
     ),
     "comparison.few_places": (
         "the two measurements share {count} places of {side:m}, expected {least} or more; do they "

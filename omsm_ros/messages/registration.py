@@ -2,10 +2,10 @@
 
 TEMPLATES: dict[str, str] = {
     "registration.unknown_freedom": (
-        "degree of freedom {name!r} is unknown, expected a list of {known}"
+        "pose parameter {name!r} is unknown, expected a list of {known}"
     ),
-    "registration.repeated_freedom": "degree of freedom {name!r} stands twice; name it once",
-    "registration.no_freedom": "no degree of freedom is named, expected a list of {known}",
+    "registration.repeated_freedom": "pose parameter {name!r} stands twice; name it once",
+    "registration.no_freedom": "no pose parameter is named, expected a list of {known}",
     "registration.not_determined": "{name} cannot be fitted: {reason}; leave it out of {opt.fit}",
     "registration.surface_unchanged": "this move does not change the surface",
     "registration.same_effect": "on this surface it has the effect of {others:and}",
@@ -22,15 +22,15 @@ TEMPLATES: dict[str, str] = {
     "registration.form_like_pose": (
         "the pose does not converge: on these points pose and form of the part look alike; check "
         "the parameters of the surface, the sign of its radii and the units of the cloud, or fit "
-        "fewer degrees of freedom with {opt.fit} piston,tip,tilt"
+        "fewer pose parameters with {opt.fit} piston,tip,tilt"
     ),
     "registration.not_converged": (
         "the points do not converge on the nominal surface; check its parameters, the sign of its "
-        "radii and the units of the cloud, or fit fewer degrees of freedom with {opt.fit}"
+        "radii and the units of the cloud, or fit fewer pose parameters with {opt.fit}"
     ),
     "registration.no_pose": (
         "no pose brings the points onto the nominal surface; check its parameters, the sign of its "
-        "radii and the units of the cloud, or fit fewer degrees of freedom with {opt.fit}"
+        "radii and the units of the cloud, or fit fewer pose parameters with {opt.fit}"
     ),
     "registration.no_form": (
         "the points lie at too few places to show any form; measure across the part"

@@ -351,6 +351,10 @@ class _RegisteredFields:
     def names(self) -> tuple[str, ...]:
         return self.fields.names
 
+    @property
+    def aligned(self) -> tuple[str, ...]:
+        return self.fields.aligned
+
     def at(self, first: int, count: int) -> FloatArray:
         """Return the fields (s, count) [m] of the kept points from ``first`` on."""
         chosen = self.kept[first : first + count]
@@ -370,6 +374,11 @@ class _PoseFields:
     @property
     def names(self) -> tuple[str, ...]:
         return (POSE,) * (len(self.found.pose_effects) + 2 * len(self.found.held_effects))
+
+    @property
+    def aligned(self) -> tuple[str, ...]:
+        """Return no names: errors of two poses are independent."""
+        return ()
 
     def at(self, first: int, count: int) -> FloatArray:
         """Return the fields (p, count) [m] of the kept points from ``first`` on."""

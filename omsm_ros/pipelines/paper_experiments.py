@@ -36,7 +36,7 @@ from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.plant import PAPER_DYNAMICS
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, on_a_flat, planned_test_of, scan_of
-from omsm_ros.twin.sensors import Accelerometer
+from omsm_ros.twin.sensors import AccelerationSensor
 from omsm_ros.twin.vibration import VibrationLine
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
@@ -122,7 +122,7 @@ def circle_scan(name: str, seed: int) -> Recording:
     shaking = VibrationLine(amplitude_m=SHAKING_M, frequency_hz=SHAKING_HZ)
     errors = Disturbances(
         vibration=(shaking,) if rpm > 10 else (),
-        accelerometer=Accelerometer(sample_period_s=_ACCELEROMETER_S),
+        accelerometer=AccelerationSensor(sample_period_s=_ACCELEROMETER_S),
         probe=ProbeErrors(exposure_s=_EXPOSURE_S),
     )
     cell = Cell(seed=seed, probe=_TEXTURE_PROBE, disturbances=errors)

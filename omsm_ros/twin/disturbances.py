@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.sensors import Accelerometer, ClockErrors, EncoderErrors, ReferenceSensor
+from omsm_ros.twin.sensors import AccelerationSensor, ClockErrors, EncoderErrors, ReferenceSensor
 from omsm_ros.twin.structure import StructureErrors
 from omsm_ros.twin.vibration import VibrationLine
 
@@ -32,7 +32,7 @@ class Disturbances:
     clocks: ClockErrors = field(default_factory=ClockErrors)
     vibration: tuple[VibrationLine, ...] = ()
     reference: ReferenceSensor | None = None
-    accelerometer: Accelerometer | None = None
+    accelerometer: AccelerationSensor | None = None
 
     def __post_init__(self) -> None:
         width = self.servo_bandwidth_hz

@@ -1,8 +1,8 @@
 """Simulate reference sensor, accelerometer, sampling instants, and the encoder of Z.
 
-Not imitated: anti-alias filters, saturation of the accelerometer, ground loops, a counter that
-slips (see the faults of the emulators), stamps of the computer, errors of the encoders of X, Y, B
-and C, count loss, bending of a scale.
+Not imitated: anti-alias filters, saturation of the accelerometer, ground loops, stamps of the
+computer. Not imitated for encoders: errors of X, Y, B and C, count loss, bending of a scale. Slips
+of a counter are faults of the emulators.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class ReferenceSensor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Accelerometer:
+class AccelerationSensor:
     """Piezoelectric accelerometer on the probe, as a PCB 356A17.
 
     sample_period_s: of the sensor, None for that of the trigger
@@ -88,7 +88,7 @@ class Accelerometer:
         )
         if self.sample_period_s is not None and self.sample_period_s < _SHORTEST_PERIOD_S:
             raise ConfigurationError(
-                f"Accelerometer: sample_period_s is {self.sample_period_s!r}, expected "
+                f"AccelerationSensor: sample_period_s is {self.sample_period_s!r}, expected "
                 f"{_SHORTEST_PERIOD_S:g} or more"
             )
 

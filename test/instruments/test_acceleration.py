@@ -7,7 +7,7 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.instruments.emulator_factory import AccelerationFeed
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
-from omsm_ros.twin.sensors import Accelerometer
+from omsm_ros.twin.sensors import AccelerationSensor
 from omsm_ros.twin.vibration import VibrationLine
 
 
@@ -18,7 +18,9 @@ def recording(disturbances):
 
 def test_every_sample_comes_once_and_in_time():
     shaking = VibrationLine(amplitude_m=5e-9, frequency_hz=680.0)
-    errors = Disturbances(vibration=(shaking,), accelerometer=Accelerometer(sample_period_s=2.5e-4))
+    errors = Disturbances(
+        vibration=(shaking,), accelerometer=AccelerationSensor(sample_period_s=2.5e-4)
+    )
     made = recording(errors)
     feed = AccelerationFeed(made, start_ns=7_000_000_000)
     given = [feed.due(played) for played in (0, 100, 100, 250, 1000, 1000)]

@@ -145,6 +145,19 @@ def test_each_may_be_registered_to_the_nominal_surface_first(results, tmp_path, 
         assert any("registered by" in note for note in facts[side]["notes"])
 
 
+def test_two_scans_of_one_calibration_may_be_registered_first(results, tmp_path, capsys):
+    """Errors of the calibration stay common to both after the registration."""
+    nominal = tmp_path / "mirror.yaml"
+    nominal.write_text(
+        "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
+    )
+    pair = (results["slow"], results["fast"], "--nominal", nominal)
+    _, plain = difference(capsys, tmp_path / "d", *pair)
+    _, facts = difference(capsys, tmp_path / "e", *pair, "--register", "piston,tip,tilt")
+    assert facts["verdict"] == "agree"
+    assert facts["common_errors"] == plain["common_errors"] != []
+
+
 def test_it_speaks_to_people(results, tmp_path, capsys):
     pair = (str(results["slow"]), str(results["fast"]))
     assert main(["difference", *pair, "--out", str(tmp_path / "d")]) == DONE
@@ -156,7 +169,7 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (["--fit", "piston,roll"], "freedom 'roll' is unknown"),
+        (["--fit", "piston,roll"], "pose parameter 'roll' is unknown"),
         (["--uncertainty", "-1"], "standard uncertainty"),
         (["--nominal", "missing.yaml"], "no surface at 'missing.yaml'"),
         (["--spacing", "1e-9"], "widen "),

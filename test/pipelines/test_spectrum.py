@@ -17,7 +17,7 @@ from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.sensors import Accelerometer
+from omsm_ros.twin.sensors import AccelerationSensor
 from omsm_ros.twin.vibration import VibrationLine
 
 RADIUS, SECONDS = 21.6e-3, 10.0
@@ -29,7 +29,7 @@ def scan(name, rpm):
     shaking = (VibrationLine(amplitude_m=5e-9, frequency_hz=680.0),) if rpm > 10 else ()
     errors = Disturbances(
         vibration=shaking,
-        accelerometer=Accelerometer(sample_period_s=2.5e-4),
+        accelerometer=AccelerationSensor(sample_period_s=2.5e-4),
         probe=ProbeErrors(exposure_s=0.5e-3),
     )
     cell = Cell(seed=3, probe=Probe(noise=3e-9, resolution=1e-9), disturbances=errors)

@@ -11,7 +11,13 @@ from omsm_ros.twin.part import AzimuthalRipple, PartPose
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, move, respond
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.record_checks import check_numbers, is_default
-from omsm_ros.twin.sensors import Accelerometer, ClockErrors, EncoderErrors, Pitch, acceleration_of
+from omsm_ros.twin.sensors import (
+    AccelerationSensor,
+    ClockErrors,
+    EncoderErrors,
+    Pitch,
+    acceleration_of,
+)
 from omsm_ros.twin.structure import (
     Creep,
     SoftMode,
@@ -66,14 +72,14 @@ def test_servo_and_probe_obey_their_equations(bandwidth):
 
     times = np.arange(1, 150) * STEP
     x, _, q0, q1, q2 = integrated(rate, 5, times)
-    # Of second order in the step: a quarter of it leaves a sixteenth, and is a picometre.
+    # The error is of second order in the step: a quarter of the step leaves a picometre.
     found = respond(plant, motion, 150, STEP, substeps=64)
     np.testing.assert_allclose(found.slide[1:], x, atol=1.5e-12)
     np.testing.assert_allclose(found.probe[1:], b[0] * q0 + b[1] * q1 + b[2] * q2, atol=1.5e-12)
 
 
 def swing(step=2e-4, lead=0.0):
-    """A motion of half a millimetre on a grid, at rest to begin with."""
+    """Return a motion of half a millimetre on a grid that starts at standstill."""
     time = np.arange(-lead, 1.0, step)
     return Trajectory(-lead, step, Swing().z(time))
 
@@ -171,7 +177,7 @@ def test_an_accelerometer_feels_the_second_derivative_through_its_high_pass():
         a = -(omega**2) * amplitude * np.sin(omega * (t + STEP))
         return [a - s[0] / tau]
 
-    quiet = Accelerometer(noise_m_per_s2=0.0, cross_talk=0.02, scale_ppm=500.0)
+    quiet = AccelerationSensor(noise_m_per_s2=0.0, cross_talk=0.02, scale_ppm=500.0)
     block = quiet.read(acceleration_lines.values, STEP, np.random.default_rng(1))
     times = np.arange(1, len(acceleration_lines.values)) * STEP
     (held,) = integrated(rate, 1, times)

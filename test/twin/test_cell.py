@@ -1,4 +1,4 @@
-"""What the devices report of a motion: scale, noise, resolution, range, drift, seed."""
+"""Samples of the devices: scale, noise, resolution, range, drift, seed."""
 
 import numpy as np
 import pytest

@@ -14,7 +14,7 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.sensors import Accelerometer, ReferenceSensor
+from omsm_ros.twin.sensors import AccelerationSensor, ReferenceSensor
 from omsm_ros.twin.vibration import VibrationLine
 
 SILENT = {"noise_m_per_s2": 0.0}
@@ -75,7 +75,7 @@ def test_the_reference_has_noise_and_a_range():
 
 @pytest.mark.parametrize("frequency", [3.0, 15.0, 50.0])
 def test_the_accelerometer_feels_the_probe(frequency):
-    made = _seen(Swing(frequency), accelerometer=Accelerometer(**SILENT, high_pass_hz=0.5))
+    made = _seen(Swing(frequency), accelerometer=AccelerationSensor(**SILENT, high_pass_hz=0.5))
     plant = Cell().plant
     gain = abs(plant.servo.response(frequency) * plant.dynamics.response(frequency))
     high_pass = 1 / np.hypot(1, 0.5 / frequency)
@@ -87,7 +87,7 @@ def test_it_feels_a_vibration_that_the_probe_sees_at_its_own_rate():
     line = VibrationLine(amplitude_m=20e-9, frequency_hz=680.0)
     expected = (2 * np.pi * 680) ** 2 * 20e-9
     for period, seen_at in ((None, aliased_frequency(680.0, 1000.0)), (1e-4, 680.0)):
-        sensor = Accelerometer(**SILENT, sample_period_s=period)
+        sensor = AccelerationSensor(**SILENT, sample_period_s=period)
         made = _seen(Swing(0.0), vibration=(line,), accelerometer=sensor)
         block = made.acceleration
         assert block.sample_period == (period or 1e-3)
@@ -99,7 +99,7 @@ def test_it_feels_a_vibration_that_the_probe_sees_at_its_own_rate():
 def test_a_line_in_step_with_the_spindle_shakes_at_its_order():
     line = VibrationLine(amplitude_m=20e-9, per_turn=20.0)
     circle = Circle(Flat(), 5e-3, 120.0, turns=8.0)
-    made = _seen(circle, vibration=(line,), accelerometer=Accelerometer(**SILENT))
+    made = _seen(circle, vibration=(line,), accelerometer=AccelerationSensor(**SILENT))
     assert _amplitude(made.acceleration.z, 40.0) == pytest.approx(
         (2 * np.pi * 40) ** 2 * 20e-9, rel=1e-3
     )
@@ -108,7 +108,7 @@ def test_a_line_in_step_with_the_spindle_shakes_at_its_order():
 def test_it_moves_down_when_the_workpiece_comes_nearer():
     """Seen by the probe as nearer, felt as the probe's own fall."""
     line = VibrationLine(amplitude_m=20e-9, frequency_hz=40.0, phase_rad=0.0)
-    made = _seen(Swing(0.0), vibration=(line,), accelerometer=Accelerometer(**SILENT))
+    made = _seen(Swing(0.0), vibration=(line,), accelerometer=AccelerationSensor(**SILENT))
     time = np.arange(4000) * 1e-3
     nearer = 20e-9 * np.sin(2 * np.pi * 40 * time)
     late = slice(2000, None)
@@ -117,18 +117,18 @@ def test_it_moves_down_when_the_workpiece_comes_nearer():
 
 
 def test_it_has_noise_and_cross_talk():
-    sensor = Accelerometer(noise_m_per_s2=1e-3)
+    sensor = AccelerationSensor(noise_m_per_s2=1e-3)
     made = _seen(Swing(0.0), accelerometer=sensor)
     for axis in "xyz":
         assert np.std(getattr(made.acceleration, axis)) == pytest.approx(1e-3, rel=0.05)
-    crossed = _seen(Swing(15.0), accelerometer=Accelerometer(**SILENT, cross_talk=0.02))
+    crossed = _seen(Swing(15.0), accelerometer=AccelerationSensor(**SILENT, cross_talk=0.02))
     np.testing.assert_allclose(crossed.acceleration.x, 0.02 * crossed.acceleration.z)
 
 
 def test_sizes_that_cannot_be_are_named():
     with pytest.raises(ConfigurationError, match="sample_period_s"):
-        Accelerometer(sample_period_s=0.0)
+        AccelerationSensor(sample_period_s=0.0)
     with pytest.raises(ConfigurationError, match="5e-06 or more"):
-        Accelerometer(sample_period_s=1e-9)
+        AccelerationSensor(sample_period_s=1e-9)
     with pytest.raises(ConfigurationError, match="half_range_m"):
         ReferenceSensor(half_range_m=-1.0)

@@ -1,4 +1,4 @@
-"""What disturbances do to the paper's scan, against what a pencil says they must."""
+"""Effects of disturbances on the paper's scan, against estimates by hand."""
 
 from __future__ import annotations
 

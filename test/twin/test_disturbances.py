@@ -64,7 +64,7 @@ def test_the_catalogue_rises_in_size_and_halving_the_step_changes_nothing(name):
         assert np.max(abs(coarse.probe_motion - fine.probe_motion)) < 0.1 * NANOMETRE_M
 
 
-# What brings the part nearer than its height tells, and what falsifies a reading.
+# Disturbances that raise the part, and disturbances of the reading.
 RAISING = (
     *("drift", "vibration", "straightness of X", "beam", "B swinging"),
     *("spindle, axial", "spindle, tilt", "spindle, asynchronous"),
@@ -128,7 +128,7 @@ def test_a_swing_is_read_as_the_true_response_says(errors, frequency):
 
 @pytest.mark.parametrize("latency", [0.34e-3, 2e-3, 2.5e-3])
 def test_latency_shifts_time_and_place_by_itself_exactly(latency):
-    """What a late probe says now is what a prompt one would have said so long ago."""
+    """The reading of a late probe is the earlier reading of one without latency."""
 
     @dataclass(frozen=True)
     class Earlier:

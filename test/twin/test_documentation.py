@@ -1,4 +1,4 @@
-"""What stands in ``docs/twin.md`` is what there is."""
+"""The fields in ``docs/twin.md`` are those of the twin."""
 
 from __future__ import annotations
 

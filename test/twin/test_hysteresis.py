@@ -10,7 +10,7 @@ from omsm_ros.twin.trajectory import Trajectory
 
 
 def behind(position, width):
-    """What follows ``position``, one value a second."""
+    """Return the motion behind backlash that follows ``position``, one value a second."""
     return backlash(Trajectory(0.0, 1.0, position), width)
 
 

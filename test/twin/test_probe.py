@@ -1,4 +1,4 @@
-"""What the probe makes of a distance, of slope and of light, against closed forms."""
+"""Readings of the probe for distance, slope and light, against closed forms."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_slope_of_a_sphere_is_position_over_height_of_the_centre():
     x, y = np.array([3e-3, -5e-3, 0.0]), np.array([1e-3, 4e-3, 0.0])
     slope = slope_of(Sphere(r), x, y, np.full(3, c))
     depth = np.sqrt(r**2 - x**2 - y**2)
-    # Of the machine's axes, seen from the chuck: x is (cos c, -sin c), y is (sin c, cos c).
+    # In the frame of the chuck the axes of the machine are (cos c, -sin c) and (sin c, cos c).
     np.testing.assert_allclose(slope.x, (x * np.cos(c) - y * np.sin(c)) / depth, atol=1e-8)
     np.testing.assert_allclose(slope.y, (x * np.sin(c) + y * np.cos(c)) / depth, atol=1e-8)
     np.testing.assert_allclose(slope.steepness, np.hypot(x, y) / depth, atol=1e-8)

@@ -88,8 +88,8 @@ def after_step_test(calibration: Calibration) -> Prior:
 def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
     """Return ``calibration`` updated with the result of scans that were corrected with it.
 
-    The covariance Σ of all parameters becomes ``Σ - K (J Σ Jᵀ - P) Kᵀ``, with J the Jacobian of
-    lag and curvature, K = Σ Jᵀ (J Σ Jᵀ)⁻¹, and P the covariance of both after the scans.
+    The covariance Σ of all parameters becomes ``Σ - K (J Σ Jᵀ - P) Kᵀ``, ``K = Σ Jᵀ (J Σ Jᵀ)⁻¹``.
+    J is the Jacobian of lag and curvature, and P the covariance of both after the scans.
     """
     g, sigma = _moved(calibration, float(found.values[LAG]), float(found.values[CURVATURE]))
     jacobian = slow_motion_jacobian(g)

@@ -1,9 +1,9 @@
 """Model of several scans of one part: a common surface, and parameters in which scans differ.
 
 ``h = S(P(t - τ)) + δ Dz - κ D²z + ε d + terms of the scan``, D = d/dt, with h the height after a
-correction: its lag is wrong by δ, its curvature (of the gain, in s²) by κ, its static gain by the
-share ε, and the probe is late relative to the slides by τ. Each scan except the first has its own
-drift, clocking, shift and tilt of the part.
+correction. The correction has a wrong lag (by δ), curvature of the gain (by κ [s²]) and static gain
+(by the share ε). The probe is late relative to the slides by τ. Each scan except the first has its
+own drift, clocking, shift and tilt of the part.
 
 To first order two speeds or directions separate ``δ - τ`` from S, because its effect is
 proportional to the speed; a following error, or a step test, separates δ from τ. At constant speed
@@ -269,7 +269,9 @@ class ScanModel:
             np.clip(min(self.turns) // _TURNS_AN_INTERVAL, _LEAST_INTERVALS, _MOST_INTERVALS)
         )
         self.basis = PolarBasis(inner, outer, intervals, harmonics)
-        self._drifts = [_Drift.of(s, turns) for s, turns in zip(scans, self.turns, strict=True)]
+        self._drifts = [
+            _DriftSpline.of(s, turns) for s, turns in zip(scans, self.turns, strict=True)
+        ]
         self._interval = self.basis.interval(self._column["radius"])
         self._order = np.lexsort((np.arange(len(self.scan)), self._interval))
 
@@ -348,14 +350,14 @@ class ScanModel:
 
 
 @dataclass(frozen=True)
-class _Drift:
+class _DriftSpline:
     """Cubic spline over ``duration`` [s], including its constant."""
 
     duration: float
     intervals: int
 
     @classmethod
-    def of(cls, scan: ScanColumns, turns: float) -> _Drift:
+    def of(cls, scan: ScanColumns, turns: float) -> _DriftSpline:
         intervals = int(np.clip(turns // _TURNS_A_DRIFT, 1, _MOST_DRIFT_INTERVALS))
         return cls(float(scan.time[-1]), intervals)
 

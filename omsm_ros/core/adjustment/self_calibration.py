@@ -250,7 +250,7 @@ def self_calibrate(
     along the path, a part that was mounted again, or data without noise.
     """
     model = ScanModel(scans, harmonics)
-    fit = _Fit(model, prior)
+    fit = _DynamicsFit(model, prior)
     if not fit.determined:
         raise _undetermined(model, prior)
     for index in _MAY_REMAIN_UNDETERMINED:
@@ -268,7 +268,7 @@ def _undetermined(model: ScanModel, prior: Prior) -> DataError:
     return DataError("adjustment.symmetric_surface", speeds=speeds)
 
 
-class _Fit:
+class _DynamicsFit:
     """Gauss-Newton fit with a prior; nonlinear in latency and clocking only."""
 
     def __init__(self, model: ScanModel, prior: Prior, omitted: BoolArray = _NONE) -> None:
@@ -281,11 +281,11 @@ class _Fit:
         self._variance = _NOISE_M**2
         self._iterate()
 
-    def without(self, index: int) -> _Fit:
+    def without(self, index: int) -> _DynamicsFit:
         """Return the fit with one of the four dynamic parameters held at its prior."""
         covariance = _with_fixed(self._prior.covariance, index)
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
-        return _Fit(self._model, replace(self._prior, covariance=covariance), omitted)
+        return _DynamicsFit(self._model, replace(self._prior, covariance=covariance), omitted)
 
     @property
     def determined(self) -> bool:
@@ -426,7 +426,7 @@ def _prior_conflict(
     values: (2,);  prior: (2, 2);  inverse: of the normal matrix including the prior (2, 2)
     covariance: by rings (2, 2)
 
-    With P the inverse of the normal matrix and Λ the precision of the prior, the values change by
+    P is the inverse of the normal matrix, Λ the precision of the prior. The values change by
     ``P (H x + noise)`` with x distributed as the prior: variance ``Λ⁻¹ - 2 P + covariance``.
     """
     known = prior + np.diag(_FLOOR[:GAIN] ** 2)

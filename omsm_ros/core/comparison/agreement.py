@@ -128,7 +128,7 @@ FIGURES: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 
 def figures_of(matched: Matched) -> dict[str, ComparedFigure]:
-    """Return the figures of both measurements without the fitted degrees of freedom or E_n."""
+    """Return the figures of both measurements without the fitted pose or E_n."""
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
     return {
         name: ComparedFigure(float(figure(a)), float(figure(b)), None, None)

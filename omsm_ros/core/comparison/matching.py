@@ -17,7 +17,7 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import ConfigurationError, DataError, Notice
 
 DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
-"""Degrees of freedom in this order, with the signs of a pose: tip raises the side of +y, tilt
+"""Pose parameters in this order, with the signs of a pose: tip raises the side of +y, tilt
 lowers the side of +x, clocking turns from x towards y."""
 
 SEATED = ("piston", "tip", "tilt")
@@ -27,7 +27,7 @@ _TURNS = 8
 _SETTLED = 1e-3
 # Four places for each of the 25 tested terms.
 _FEWEST_PLACES = 100
-# A degree of freedom with a smaller independent share of its column is not separable.
+# A pose parameter with a smaller independent share of its column is not separable.
 _LEAST_OWN_SHARE = 1e-3
 # Least share of the surface in the mean square of a column; with more noise in the slopes
 # Gauss-Newton takes too short steps and does not converge.
@@ -45,9 +45,9 @@ class Matched:
     grid: of all places, with the difference a − b [m], NaN where one of both has no height
     filled: which places of the grid have a difference, flat
     x, y: [m];  a, b: heights [m], b without the fitted piston, tip, tilt and power
-    columns: change of a − b by each fitted degree of freedom (p, m)
+    columns: change of a − b by each fitted pose parameter (p, m)
     dofs: fitted;  moved: the step of each [m], [rad], power [1/m]
-    refused: degrees of freedom that the surface does not determine, and why
+    refused: pose parameters that the surface does not determine, and why
     from_a, from_b: local fits;  b_x, b_y: places in the frame of the second measurement [m]
     """
 
@@ -72,14 +72,14 @@ class Matched:
         return self.a - self.b
 
     def without_fit(self, values: FloatArray) -> FloatArray:
-        """Return values (…, m) without their fit by the fitted degrees of freedom."""
+        """Return values (…, m) without their fit by the fitted pose parameters."""
         design = self.columns.T / np.linalg.norm(self.columns, axis=1)
         solved = np.linalg.lstsq(design, values.T, rcond=1e-10)[0]
         return np.asarray(values - (design @ solved).T, np.float64)
 
 
 def ordered_dofs(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the degrees of freedom in their order; raise ConfigurationError for other names."""
+    """Return the pose parameters in their order; raise ConfigurationError for other names."""
     for name in names:
         if name not in DEGREES_OF_FREEDOM:
             raise ConfigurationError(
@@ -112,7 +112,7 @@ def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """Both measurements where they have heights, and the column of each degree of freedom (n,)."""
+    """Both measurements where they have heights, and the column of each pose parameter (n,)."""
 
     filled: BoolArray
     a: FloatArray
@@ -123,7 +123,7 @@ class _Seen:
     v: FloatArray
 
     def step(self) -> dict[str, float]:
-        """Return the least-squares step of each degree of freedom."""
+        """Return the least-squares step of each pose parameter."""
         design = np.stack(list(self.columns.values()), axis=1)
         scale = np.linalg.norm(design, axis=0)
         solved = np.linalg.lstsq(design / scale, self.a - self.b, rcond=1e-10)[0] / scale
@@ -214,7 +214,7 @@ def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> Flo
 def _not_determined(
     columns: dict[str, FloatArray], of_first: dict[str, FloatArray], place: float
 ) -> dict[str, Notice]:
-    """Return the lateral degrees of freedom that the surface does not determine, and why.
+    """Return the lateral pose parameters that the surface does not determine, and why.
 
     columns, of_first: of the second and of the first measurement. Their common part belongs to the
     surface; the rest is noise of the slopes.

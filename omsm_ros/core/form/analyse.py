@@ -64,7 +64,7 @@ def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registrati
     """Return the fit with the effect of lateral pose errors on its terms.
 
     A lateral shift of the part moves the form: its effect is the slope of the smooth form times
-    the shift, for each undetermined degree of freedom and each pose error.
+    the shift, for each undetermined pose parameter and each pose error.
     """
     few = map_.every(_MOST_POINTS)
     slopes = (
@@ -185,7 +185,7 @@ def analyse_form(
 ) -> FormResult:
     """Register the points and evaluate their deviations.
 
-    portions: reads the points;  asked: degrees of freedom of the fit, or "auto"
+    portions: reads the points;  asked: pose parameters of the fit, or "auto"
     sources: names of the systematic errors;  bounds: those of which only an upper bound is known
     aperture: of the part; None: the disc about the part's origin that holds all points
     even: the points form an evenly spaced grid
@@ -199,7 +199,7 @@ def analyse_form(
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
     bounded = [n for n, name in enumerate(sources) if name in bounds]
-    # Of a held degree of freedom only an upper bound of its offset is known.
+    # A held pose parameter has an upper bound of its offset only.
     bounded += range(len(sources), found.moved.shape[1])
     map_ = gathered.map(found, even, bounded)
     points = (map_.x, map_.y, map_.deviation)

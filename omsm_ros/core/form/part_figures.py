@@ -313,7 +313,7 @@ def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
 
 
 def best_fit(map_: DeviationMap) -> DeviationMap:
-    """Return the map after best-fit alignment in all fitted and held degrees of freedom.
+    """Return the map after best-fit alignment in all fitted and held pose parameters.
 
     It contains neither the uncertainty of the pose nor form that looks like a move.
     """

@@ -3,8 +3,8 @@
 The areal density is ``S(f_x, f_y) = dx dy |FFT(w z)|² / Σ w²``, two-sided, in m⁴, with the window
 ``w`` of the present cells: its sum over all frequencies times df_x df_y is the mean square of the
 map under that window (Parseval). The radial density is the content of each ring of width Δf over
-the area of the ring, so that ``Σ 2π f S(f) Δf`` is the mean square in the band of the rings; the
-azimuthal density is the mean square per radian of half a turn.
+the area of the ring: ``Σ 2π f S(f) Δf`` is the mean square in the band of the rings. The azimuthal
+density is the mean square per radian of half a turn.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Select the degrees of freedom of a pose that the points determine; bound the pose error.
+"""Select the pose parameters of a pose that the points determine; bound the pose error.
 
-A degree of freedom is fitted if it changes the deviation in a way that the preceding ones do not.
+A pose parameter is fitted if it changes the deviation in a way that the preceding ones do not.
 A sphere that turns about its axis stays the same; a lateral shift of it acts like a tilt.
 """
 
@@ -29,10 +29,10 @@ from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 AUTO = "auto"
 HELD = "freedoms held"
-"""Name of the error source for degrees of freedom that are held at their nominal value."""
+"""Name of the error source for pose parameters that are held at their nominal value."""
 RIGID = DEGREES_OF_FREEDOM[:6]
 MOVES = ("x", "y", "clocking")
-"""Degrees of freedom that a chuck may hold at zero; piston, tip and tilt always vary."""
+"""Pose parameters that a chuck may hold at zero; piston, tip and tilt always vary."""
 # Odds from which a move of the part counts as strong evidence (Kass and Raftery, 1995).
 _STRONG_ODDS = 20.0
 # Form below a nanometre is not resolved.
@@ -42,7 +42,7 @@ _LEAST_FORM_M = NANOMETRE_M
 def typical_range(dof: str) -> float:
     """Return the largest plausible offset of a manually mounted part [m], [rad] or [1/m].
 
-    A degree of freedom that a nanometre of form would move by more is not determined.
+    A pose parameter that a nanometre of form would move by more is not determined.
     """
     if dof == "power":
         return 1.0
@@ -50,7 +50,7 @@ def typical_range(dof: str) -> float:
 
 
 class DegreesOfFreedom(NamedTuple):
-    """Degrees of freedom that are fitted, in the order of their columns, and why others are not.
+    """Pose parameters that are fitted, in the order of their columns, and why others are not.
 
     refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest_dof`
     """
@@ -83,10 +83,10 @@ def parse_dofs(text: str) -> tuple[str, ...]:
 
 
 def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> DegreesOfFreedom:
-    """Return which of the degrees of freedom ``asked`` for the surface determines.
+    """Return which of the pose parameters ``asked`` for the surface determines.
 
     asked: names, or "auto" for all rigid ones that are determined, alone or with "power"
-    gram: sums of products (7, 7) of the columns of all degrees of freedom over ``points``
+    gram: sums of products (7, 7) of the columns of all pose parameters over ``points``
 
     Raises DataError if one that was named is not determined.
     """
@@ -165,11 +165,11 @@ class Registration:
     from_source: standard uncertainty of each fitted value (p,) by error source
     pose_effects: steps (p, p), one row for each independent part of the pose error
     taken: mean products (p, p) of the share of each row that form probably caused, at most one
-    held_effects: steps (h, h) of the held degrees of freedom within the bounds of the points
+    held_effects: steps (h, h) of the held pose parameters within the bounds of the points
     moved: steps (p, s + 2h) for one standard uncertainty of each systematic source, and then for
-        the held degrees of freedom in first and second order
-    spread: standard uncertainty of each degree of freedom asked for [m], [rad] or [1/m]
-    correlated_moves: for each undetermined degree of freedom at its largest plausible offset: the
+        the held pose parameters in first and second order
+    spread: standard uncertainty of each pose parameter asked for [m], [rad] or [1/m]
+    correlated_moves: for each undetermined pose parameter at its largest plausible offset: the
         effect on each fitted one, in first and second order (2,)
     limit: deviation from the smooth form beyond which a point is an outlier [m]
     disc: the aperture, or a disc that holds all points
@@ -195,14 +195,14 @@ class Registration:
     before: float
 
     def uncertainty(self, dof: str) -> float | None:
-        """Return the standard uncertainty of a degree of freedom, None if it was not asked for."""
+        """Return the standard uncertainty of a pose parameter, None if it was not asked for."""
         return self.spread.get(dof)
 
     def effects(self, points: Placed, systematic: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the effects of pose errors (p, n) and sources (s + 2h, n) on the deviations [m].
 
         systematic: effects of the sources on the heights (s, n); the fitted pose follows them. The
-        last 2h sources are the held degrees of freedom.
+        last 2h sources are the held pose parameters.
         """
         columns = dof_columns(self.placement, points, self.dofs.fitted)
         names = tuple(self.dofs.held)
@@ -213,7 +213,7 @@ class Registration:
     def undetermined_displacements(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the possible lateral shift (r, 2, n) [m] of places x, y (n,) [m] on the part.
 
-        One for each of the r undetermined degrees of freedom at its largest plausible offset; the
+        One for each of the r undetermined pose parameters at its largest plausible offset; the
         fitted ones follow, so that the points stay on the surface.
         """
         fitted = self.dofs.fitted
@@ -232,7 +232,7 @@ class Registration:
         fitted, held = self.dofs.fitted, tuple(self.dofs.held)
         own = np.zeros((len(self.pose_effects) + self.moved.shape[1], len(fitted) + len(held)))
         own[:, : len(fitted)] = np.concatenate([self.pose_effects, self.moved.T])
-        # The second order of a held degree of freedom shifts no place.
+        # The second order of a held pose parameter shifts no place.
         first = len(own) - 2 * len(held)
         own[first::2, len(fitted) :] = self.held_effects
         return np.array([self._moved((*fitted, *held), step, x, y) for step in own])
@@ -265,7 +265,7 @@ class Registration:
 def held_dof_effects(
     surface: Surface, at: Placement, points: Placed, names: Sequence[str], steps: FloatArray
 ) -> FloatArray:
-    """Return the effects (2h, n) [m] of ``steps`` (h, h) of held degrees of freedom.
+    """Return the effects (2h, n) [m] of ``steps`` (h, h) of held pose parameters.
 
     In first and second order, because a held value may be off by tenths of a millimetre.
     """
@@ -284,7 +284,7 @@ def held_dof_effects(
 class OpenUncertainty(NamedTuple):
     """Pose errors that the covariance of the fit does not contain.
 
-    unknown: for each undetermined degree of freedom: its effect on each of the others, in first
+    unknown: for each undetermined pose parameter: its effect on each of the others, in first
         and second order
     held: mean products of the held values, estimate and covariance together (h, h)
     """
@@ -317,7 +317,7 @@ class OpenUncertainty(NamedTuple):
         return found
 
     def spread(self, dofs: DegreesOfFreedom, by_source: dict[str, FloatArray]) -> dict[str, float]:
-        """Return the standard uncertainty of each degree of freedom that was asked for."""
+        """Return the standard uncertainty of each pose parameter that was asked for."""
         held = np.sqrt(np.diag(self.held))
         fitted = np.sqrt(np.sum([s**2 for s in by_source.values()], axis=0))
         found = dict(zip(dofs.fitted, map(float, fitted), strict=True))

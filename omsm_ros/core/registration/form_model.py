@@ -6,7 +6,7 @@ and understate the uncertainty by a factor of a hundred. The model is
 
     d = J δ + Z c + noise,   c_k ~ N(0, σ_g²)
 
-with J the columns of the pose, whose prior is the offset of a manually mounted part, and Z
+J holds the columns of the pose, whose prior is the offset of a manually mounted part; Z holds
 polynomials of orders 2 to 8. Restricted maximum likelihood gives the standard deviation σ_g of
 each order (D. MacKay, Neural Comput. 4, 415; fixed point of its eq. 4.9). No order may have a
 smaller σ_g than a higher order. A σ_g from few terms may be small by chance, so its upper

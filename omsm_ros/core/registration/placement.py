@@ -24,7 +24,7 @@ LEAST_POINTS = 200
 # A cloud of a nanometre has a wrong unit.
 _LEAST_EXTENT_M = 1e-9
 DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
-"""Degrees of freedom of a fit: the six of a pose, and an additional curvature [1/m]."""
+"""Pose parameters of a fit: the six of a pose, and an additional curvature [1/m]."""
 
 _SHIFTS = {"x": 0, "y": 1, "piston": 2}
 _TURNS = {"tip": 0, "tilt": 1, "clocking": 2}
@@ -74,7 +74,7 @@ class Placement:
     power: float = 0.0
 
     def moved(self, dofs: Sequence[str], step: FloatArray) -> Placement:
-        """Return the placement after a ``step`` (p,) of the degrees of freedom ``dofs``.
+        """Return the placement after a ``step`` (p,) of the pose parameters ``dofs``.
 
         Raises DataError for a pose outside the machine: the fit diverged.
         """
@@ -87,7 +87,7 @@ class Placement:
         return Placement(pose, power)
 
     def value(self, dof: str) -> float:
-        """Return the value of one degree of freedom [m], [rad] or [1/m]."""
+        """Return the value of one pose parameter [m], [rad] or [1/m]."""
         return self.power if dof == "power" else float(getattr(self.pose, dof))
 
 
@@ -138,7 +138,7 @@ def _slopes(
 
 
 def dof_columns(placement: Placement, points: Placed, dofs: Sequence[str]) -> FloatArray:
-    """Return the derivatives (p, n) of the deviation by each degree of freedom."""
+    """Return the derivatives (p, n) of the deviation by each pose parameter."""
     rates, rotation = placement.pose.rotation_rates(), placement.pose.rotation
     columns = np.empty((len(dofs), len(points.x)))
     for row, name in enumerate(dofs):

@@ -106,7 +106,7 @@ def _bounded_step(
 ) -> FloatArray:
     """Return the regularised least-squares step (p,) along ``columns`` (p, n).
 
-    The residual, mostly form, is correlated over the part. A degree of freedom with a smaller
+    The residual, mostly form, is correlated over the part. A pose parameter with a smaller
     effect than the residual is therefore held near zero, within its plausible offset.
 
     at: present values;  widest_: plausible offsets;  both (p,), in the unit of the step
@@ -138,13 +138,13 @@ def register(
     aperture: Aperture | None = None,
     even: bool = False,
 ) -> Registration:
-    """Fit the degrees of freedom ``asked`` for, or "auto", of a part to its nominal ``surface``.
+    """Fit the pose parameters ``asked`` for, or "auto", of a part to its nominal ``surface``.
 
     portions: reads the points;  sources: names of their ``systematic`` rows
     aperture: of the part, beyond which points are ignored; None for all points
     even: the points form an evenly spaced grid
 
-    Raises DataError for too few points, a degree of freedom that the surface does not determine,
+    Raises DataError for too few points, a pose parameter that the surface does not determine,
     or a fit that does not converge.
     """
     chosen = selection(portions, _MOST_SELECTED)
@@ -160,7 +160,7 @@ def register(
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture or centred_aperture(points)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
-    fit = _Fit(surface, dofs, aperture, basis, at)
+    fit = _PoseFit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
     open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
     if AUTO in asked:
@@ -175,7 +175,7 @@ def _determined(
     aperture: Aperture | None,
     at: Placement,
 ) -> DegreesOfFreedom:
-    """Return which degrees of freedom the surface determines where the part is ``at``."""
+    """Return which pose parameters the surface determines where the part is ``at``."""
     points = inside_aperture(placed(surface, at, chosen), aperture)
     columns = dof_columns(at, points, DEGREES_OF_FREEDOM)
     return determined_dofs(asked, columns @ columns.T, len(points.x))
@@ -196,12 +196,12 @@ class _PlacementState(NamedTuple):
 
 
 def _useful(
-    fit: _Fit,
+    fit: _PoseFit,
     stand: _PlacementState,
     chosen: PointBatch,
     asked: Sequence[str],
     open_: OpenUncertainty,
-) -> tuple[_Fit, _PlacementState, OpenUncertainty]:
+) -> tuple[_PoseFit, _PlacementState, OpenUncertainty]:
     """Hold the moves that were not asked for by name and that the points hardly determine."""
     names, at = fit.names, stand.at
     values = np.array([at.value(name) for name in names])
@@ -227,7 +227,7 @@ def _useful(
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _PoseFit:
     """Fixed inputs of the passes;  plain: the least-squares placement."""
 
     surface: Surface
@@ -244,7 +244,7 @@ class _Fit:
         return FormNormalEquations(len(self.names) + len(self.basis), sources)
 
     def unknown(self, at: Placement, chosen: PointBatch) -> dict[str, dict[str, FloatArray]]:
-        """Return the effect (2,) of each undetermined degree of freedom on each fitted one.
+        """Return the effect (2,) of each undetermined pose parameter on each fitted one.
 
         A surface without errors is fitted again with the undetermined one at its largest plausible
         offset to either side. Half the difference and the mean of both are the first and second
@@ -347,7 +347,7 @@ class _Fit:
 
 
 def _over_all(
-    fit: _Fit,
+    fit: _PoseFit,
     stand: _PlacementState,
     portions: PointBatches,
     sources: Sequence[str],

@@ -77,7 +77,7 @@ def accelerations_of(blocks: Sequence[AccelerationBlock]) -> tuple[float, dict[s
 def acceleration_lines(period: float, axes: dict[str, FloatArray]) -> AccelerationLines:
     """Return the lines of accelerations (n,) by axis, sampled every ``period`` [s], NaN where lost.
 
-    Of lines with one frequency on several axes the strongest is kept.
+    For lines with one frequency on several axes the strongest is kept.
     """
     found: list[AccelerationLine] = []
     for axis, values in axes.items():

@@ -1,7 +1,7 @@
 """Test hypotheses on the sources of lines against all scans, and select the sources.
 
-A texture on the part has the same wavelength in every scan (along the path or from ring to ring), a
-vibration the same frequency, a spindle error the same number of waves a turn. Each hypothesis
+A texture on the part has the same wavelength in every scan, along the path or from ring to ring; a
+vibration has the same frequency, a spindle error the same number of waves a turn. Each hypothesis
 predicts the frequency of the line in every other scan. Lines found there are its partners. Sources
 are selected one after the other, those with most partners first; a line that is explained by one
 source is no evidence for another.

@@ -105,7 +105,7 @@ def test_a_ring_that_nobody_saw_has_no_shape_and_harms_nothing() -> None:
 
 
 def test_a_column_that_is_a_surface_has_no_say() -> None:
-    """What the surface can do is eliminated: nothing of it is left to be asked for."""
+    """Eliminate a column that the surface can represent: the parameters do not change."""
     wave = B @ SURFACE
 
     def with_wave(part: IntervalRows) -> tuple[FloatArray, FloatArray]:

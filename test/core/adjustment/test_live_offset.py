@@ -1,4 +1,4 @@
-"""What the motion says of two counters, live: against the truth, or nothing."""
+"""Offset of two counters from the motion, live: equal to the truth, or unknown."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_nothing_is_reported_of_counts_that_only_one_stream_has() -> None:
 
 @pytest.mark.parametrize("period", [1e-7, 5.0, 10.0])
 def test_samples_of_any_period_that_may_come_are_taken(period: float) -> None:
-    """Of ten seconds none lay within the span that is kept, and there was nothing to take."""
+    """Blocks of ten seconds exceed the span that is kept, so that nothing is established."""
     came = [
         (replace(axes, sample_period=period), replace(distance, sample_period=period))
         for axes, distance in blocks(motion("chirp"), 0)[:5]

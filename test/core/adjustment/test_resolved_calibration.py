@@ -1,4 +1,4 @@
-"""What scans add to a calibration: by series, differences and the rules of covariances."""
+"""Update of a calibration by scans: against series, differences and the rules of covariances."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ VALUES = np.array([3.1e-4, 2.0e-7, 0.0, 1.2e-4])
 
 
 def found_by(values: FloatArray = VALUES, **other: object) -> SelfCalibration:
-    """What a fit would return: all known, nothing contradicted, unless stated otherwise."""
+    """Return the result of a fit, by default with all parameters known and no contradiction."""
     stated: dict[str, object] = {
         "values": np.asarray(values, np.float64),
         "covariance": COVARIANCE,
@@ -268,7 +268,7 @@ def test_latency_is_stated_with_its_speeds_and_its_share() -> None:
     assert latency.uncertainty_s == pytest.approx(np.sqrt(COVARIANCE[LATENCY, LATENCY]))
     assert latency.share == pytest.approx(1.5e-4 / before.dynamics.low_frequency_delay)
     assert "2 scans of one part at 30, 60 rpm" in latency.reason
-    # What the lag of Z shares with it moves no height a second time.
+    # The part in common with the lag of Z must not count twice.
     two = [LAG, LATENCY]
     apart = [1, -1] @ COVARIANCE[np.ix_(two, two)] @ [1, -1] - COVARIANCE[LAG, LAG]
     assert latency.beside_z_s == pytest.approx(np.sqrt(max(apart, 0.0)))

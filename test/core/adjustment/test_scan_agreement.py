@@ -1,4 +1,4 @@
-"""What is left of scans that should agree, against waves and noise of known size."""
+"""Residuals of scans that should agree, against waves and noise of known size."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def judged(wave, seed=1):
 def test_noise_alone_is_what_neighbours_tell():
     found = judged(np.zeros(len(ANGLE)))
     assert found.noise == pytest.approx(NOISE, rel=0.01)
-    # A mean of so many exponential variables of mean one.
+    # The ratio is the mean of exponential variables of mean one.
     assert found.ratio == pytest.approx(1.0, abs=4 / np.sqrt(2 * RINGS * HARMONICS))
     assert found.holds
 

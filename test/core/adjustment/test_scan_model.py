@@ -1,4 +1,4 @@
-"""What cannot be fitted to is told before."""
+"""Scans that cannot be fitted are refused with the reason."""
 
 from __future__ import annotations
 

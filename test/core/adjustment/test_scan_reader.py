@@ -1,4 +1,4 @@
-"""What is read of a scan does not depend on how it came, and a dropout costs its points only."""
+"""Read scans independently of the size of their portions; a dropout costs its own points only."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ def scanned(recording: Recording, known: Calibration) -> ScanColumns:
 
 
 def step_test(latency: float, off: float = 0.0) -> Calibration:
-    """What a step test of the paper's structure and a late probe says, its lag wrong by ``off``."""
+    """Return a step test of the paper's structure and a late probe, with a lag wrong by ``off``."""
     g = PAPER_DYNAMICS
     dynamics = TransferFunction(g.numerator, g.denominator, latency + 50e-6 + off)
     # Part of the structure's lag stands as delay, so that an error of either sign has room.
@@ -195,8 +195,8 @@ def test_scans_of_different_parts_contradict_each_other() -> None:
 
 
 def test_a_step_test_that_the_scans_contradict_is_reported() -> None:
-    # The probe is prompt; the step test was made with a slower structure. What it has too much
-    # passes for latency, but for the following error, which shows that it is none.
+    # The probe has no latency; the step test was made with a slower structure. Its excess lag looks
+    # like a negative latency, except for the following error, which shows the conflict.
     slow = step_test(0.0, off=300e-6)
     pair = [scanned(made(rpm, s, disturbed()), slow) for s, rpm in ((1, 30.0), (2, 60.0))]
     found = self_calibrate(pair, after_step_test(slow))

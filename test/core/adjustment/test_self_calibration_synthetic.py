@@ -147,7 +147,7 @@ def test_which_scan_is_called_the_first_does_not_matter(late: SelfCalibration) -
     found = fitted(LATE[::-1])
     for index in (LAG, CURVATURE, LATENCY):
         assert abs(found.values[index] - late.values[index]) < spread(late, index)
-    # What the second is turned by against the first, the first is against the second.
+    # Exchanging the scans changes the sign of the clocking.
     both = np.hypot(found.own_uncertainty[0][0], late.own_uncertainty[0][0])
     assert abs(found.own[0][0] + late.own[0][0]) < both
 
@@ -225,7 +225,7 @@ def test_scatter_over_repetitions_is_what_is_stated() -> None:
 
 
 def test_a_direction_lost_in_rounding_is_hardly_known() -> None:
-    """Of two columns that are one, their sum is known and their difference is not."""
+    """For two equal columns the sum of their parameters is known and the difference is not."""
     units = np.array([1e-6, 1e3])
     found = _inverse(np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer(units, units))
     in_units = found * np.outer(units, units)

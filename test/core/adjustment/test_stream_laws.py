@@ -1,4 +1,4 @@
-"""What must not matter to offsets of counters, agreement of scans, and scans as they are read."""
+"""Invariances of counter offsets, of the agreement of scans, and of the reader of scans."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def test_agreement_knows_no_unit_order_sign_or_beginning_of_the_angle() -> None:
 
 def test_portions_cost_the_agreement_one_difference_each() -> None:
     alike(agreement(LEFT, every=1000), agreement(LEFT), rel=1e-3)
-    # Whole turns of the wave of three: nothing else is different.
+    # Both cover whole turns of the wave of three, so the result is the same.
     assert agreement(LEFT, every=1000).disagreement == pytest.approx(
         agreement(LEFT).disagreement, rel=1e-4
     )

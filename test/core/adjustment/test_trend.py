@@ -61,7 +61,7 @@ def test_of_very_many_points_some_tell_the_slope_of_all():
     values = 2e-15 * times + random.normal(0, 1e-10, 60_000)
     order = random.permutation(60_000)
     found = trend(times[order], values[order])
-    # Of n points evenly in T with noise σ, a line's slope has σ √12 / (T √n), here of the 1000.
+    # The slope of n points evenly over T with noise σ has the uncertainty σ √12 / (T √n).
     assert found.slope == pytest.approx(2e-15, abs=4 * 1e-10 * np.sqrt(12 / 1000) / 1e6)
     assert found.low < 2e-15 < found.high
     assert found.high - found.low == pytest.approx(

@@ -34,7 +34,7 @@ SIDE = 3e-4
 
 
 def polynomial(x, y):
-    """Of the sixth degree in the share of the radius."""
+    """Return a polynomial of sixth degree over the radius."""
     u, v = x / RADIUS, y / RADIUS
     return sum(c * u**i * v**j for c, (i, j) in zip(SIZES, POWERS, strict=True))
 
@@ -143,7 +143,7 @@ def test_points_in_another_order_are_the_same_surface():
 
 
 def test_errors_are_carried_as_heights_are():
-    """What each point is off by, at the places: by the fit of heights that are off by it."""
+    """Interpolate errors of points: equal to the change of the fit by these errors."""
     error = 1e-8 * np.stack([np.ones(COUNT), np.sin(X / 1e-3), RNG.normal(size=COUNT)])
     surface = LocalQuadratic(points(wavy(X, Y)), SIDE)
     carried = surface.carried(lambda first, count: error[:, first : first + count], AT_X, AT_Y)
@@ -195,7 +195,7 @@ def two(second, **first):
 
 
 def seat(x, y):
-    """What a piston, a tip, a tilt and a power make, with the signs of a pose."""
+    """Return the heights of piston, tip, tilt and power, with the signs of a pose."""
     return 2e-6 + 3e-6 * y - (-4e-6) * x + 5e-3 * (x**2 + y**2) / 2
 
 

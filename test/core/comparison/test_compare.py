@@ -187,7 +187,7 @@ def test_each_direction_of_a_calibration_is_one_error_in_both():
     cancelled = explained(known(first, 2e-3, 3e-3), known(second, 2e-3, 3e-3))
     turned = explained(known(first, 2e-3, 3e-3), known(second, -2e-3, -3e-3))
     assert cancelled < 0.1 * broad
-    # What is of opposite signs in both adds up; of independent errors only the squares would.
+    # Common errors of opposite sign add; independent errors would add in squares.
     assert turned == pytest.approx(
         broad * 2 * np.hypot(2, 3) / np.sqrt(2**2 + 3**2 + 2**2), rel=0.05
     )
@@ -276,8 +276,7 @@ def test_slopes_that_are_noise_alone_tell_no_turn():
 
 
 def test_steep_heights_that_were_compared_whole_are_reported():
-    """Of a cylinder: moved beside its axis by a micrometre, it is higher by the micrometre's slope,
-    which a tilt takes up; a saddle of fourth order keeps it."""
+    """A lateral shift changes a fourth-order surface by slope times shift, a plane by a tilt."""
     at = np.linspace(-RADIUS, RADIUS, 61)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     steep = MeasuredPoints(x=x, y=y, height=1e-3 * (x / RADIUS) ** 4)
@@ -320,7 +319,7 @@ def test_a_small_overlap_cannot_tell():
 
 
 def test_an_unknown_freedom_is_refused():
-    with pytest.raises(ConfigurationError, match="freedom 'z' is unknown"):
+    with pytest.raises(ConfigurationError, match="pose parameter 'z' is unknown"):
         compare_measurements_of_part(mapped(), mapped(), ("piston", "z"))
 
 

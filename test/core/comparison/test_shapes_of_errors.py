@@ -49,7 +49,7 @@ GRID_X, GRID_Y = (v.ravel() for v in np.meshgrid(*[np.linspace(-5e-3, 5e-3, 60)]
 
 @pytest.mark.parametrize("length", [5e-3, 2.5e-3, 1e-3, 0.6e-3])
 def test_over_a_map_row_by_row_no_place_is_better_known_than_another(length):
-    """And the mean over the map is as uncertain as the mean of the covariance says."""
+    """The mean over the map has the variance of the mean of the covariance."""
     shapes = unknown_form(GRID_X, GRID_Y, np.full(3600, 2e-9), length)
     np.testing.assert_allclose(np.linalg.norm(shapes, axis=0), np.full(3600, 2e-9), rtol=1e-9)
     x, y = GRID_X[::7], GRID_Y[::7]
@@ -61,7 +61,7 @@ def test_over_a_map_row_by_row_no_place_is_better_known_than_another(length):
 @pytest.mark.parametrize("length", [1e-4, 1e-6])
 @pytest.mark.parametrize(("x", "y"), [(GRID_X, GRID_Y), (X, Y)])
 def test_an_error_of_short_length_is_never_lost(x, y, length):
-    """What no 400 nodes resolve is taken for as long as they lie apart, which averages out less."""
+    """A correlation length below the distance of the 400 nodes is raised to it."""
     shapes = unknown_form(x, y, np.full(len(x), 2e-9), length)
     np.testing.assert_allclose(np.linalg.norm(shapes, axis=0), np.full(len(x), 2e-9), rtol=1e-9)
     assert np.linalg.norm(shapes.mean(axis=1)) > 2e-9 / np.sqrt(len(x))
@@ -163,7 +163,7 @@ def test_the_largest_of_a_drift_is_where_its_shapes_add_up_to_most():
     )
 
 
-# Who knows it.
+# Origin of the errors.
 
 
 class Known:

@@ -19,7 +19,7 @@ COMPARED_M = 100e-9
 
 
 class Compared:
-    """Of a comparison what a verdict looks at: heights of 100 nm rms, less the fit."""
+    """Matched heights of 100 nm rms, as input of a verdict."""
 
     a = COMPARED_M * np.array([1.0, -1.0, 1.0, -1.0])
     b = 0.5 * a
@@ -127,7 +127,7 @@ def test_a_figure_alone_makes_no_difference_but_a_doubt():
     found = judged(figures=figures)
     assert found.verdict == CANNOT_TELL
     assert "E_n = 2.00, too close to 1 for a decision" in str(found.reasons[0])
-    # Beside a term that differs it is told, too.
+    # With a term that differs the figure is reported, too.
     found = judged(figures=figures, terms=terms({(2, 2): 2.0}))
     assert found.verdict == DIFFER
     assert str(found.reasons[-1]).endswith(": E_n = 2.00")

@@ -81,7 +81,7 @@ def test_a_profile_has_the_figures_of_its_line(turned):
     rms, extent = (found[f"{name}_best_fit"] for name in ("rms", "peak_to_valley"))
     assert rms.value == pytest.approx(np.std(truth), rel=2e-3)
     assert abs(extent.value - np.ptp(truth)) < 2 * extent.uncertainty + 0.01e-9
-    # What noise adds to an extent is about its own size, in two places.
+    # Noise changes an extent by about its own size at two places.
     assert 0.02e-9 < extent.uncertainty < 0.3e-9
     rest = found["rms_without_second_order"]
     assert rest.value == pytest.approx(ripple / np.sqrt(2), rel=0.01)

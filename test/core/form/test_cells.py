@@ -129,7 +129,7 @@ def test_the_density_of_noise_is_flat_and_of_the_known_height():
     height = np.mean(cells.noise**2) * cells.pitch**2
     middle = found.value[5:-5]
     assert np.mean(middle) == pytest.approx(height, rel=0.05, abs=0)
-    # Of the corners, where not all directions are, the radial one has nothing: π/4 is left.
+    # The radial density ends before the corners of the square, so π/4 of the power remains.
     both = power_density(cells)
     assert both.mean_square_in_band == pytest.approx(np.pi / 4 * both.mean_square, rel=0.04, abs=0)
     # All of it is noise, and the uncertainty says so.

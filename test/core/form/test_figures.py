@@ -24,7 +24,7 @@ FORM = (
     + 15e-9 * (3 * (_RADIUS / 1e-2) ** 2 - 2) * X / 1e-2
     + 1.5e-9 * np.cos(_RADIUS / 80e-6)
 )
-# What an instrument may do: bend, tilt, and a wave twice a turn.
+# Errors of an instrument: bending, tilt, and a wave twice a turn.
 EFFECTS = np.array(
     [20e-9 * ((_RADIUS / 1e-2) ** 2 - 0.5), 15e-9 * X / 1e-2, 8e-9 * np.cos(2 * _ANGLE)]
 )
@@ -40,7 +40,7 @@ def map_of(deviation, noise=0.0, effects=None, area=None, bounds=()):
 
 
 def measured(true, noise, effects, seed):
-    """What an instrument with such errors and noise makes of a part."""
+    """Return the map of a part measured with such errors and noise."""
     rng = np.random.default_rng(seed)
     errors = rng.normal(size=len(effects)) @ effects
     return map_of(true + errors + rng.normal(0.0, noise, len(true)), noise, effects)
@@ -64,7 +64,7 @@ def test_without_errors_the_figures_are_those_of_the_deviations():
 
 @pytest.mark.parametrize("noise", [1e-9, 1e-8, 3e-8])
 def test_noise_is_not_taken_for_form(noise):
-    """Of the raw extent some eight times the noise is noise."""
+    """The raw extent contains about eight times the noise."""
     for seed in range(2):
         map_ = measured(FORM, noise, EFFECTS[:0], seed)
         assert noise < 5e-9 or np.ptp(map_.deviation) > TRUE["pv"] + 4 * noise
@@ -140,7 +140,7 @@ def test_the_rms_under_a_bound_is_that_of_draws():
     bounds = EFFECTS[:2]
     reported = rms_of_part(map_of(FORM, effects=bounds, bounds=[0, 1]))
     drawn = rng.normal(size=(4000, 2))
-    # Of FORM - drawn @ bounds, the mean square less that of FORM, written out.
+    # Mean square of FORM - drawn @ bounds less that of FORM, in closed form.
     products = bounds @ bounds.T / POINTS
     more = np.sum(drawn @ products * drawn, axis=1) - 2 * drawn @ (bounds @ FORM / POINTS)
     spread = np.sqrt(np.mean(more**2))

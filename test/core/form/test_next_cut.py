@@ -72,7 +72,7 @@ def test_at_a_cell_its_own_offset_is_the_answer():
     np.testing.assert_allclose(between.reshape(x.shape), found.offset, atol=1e-12)
 
 
-# What is left off.
+# Offsets of the next cut.
 
 
 def wave(length):
@@ -113,7 +113,7 @@ def test_on_a_steep_part_the_tool_goes_deeper_along_z():
     found = compensation(map_of(np.full(len(X), 30e-9)), part, 2e-3)
     known = np.isfinite(found.offset)
     np.testing.assert_allclose(found.offset[known], -30e-9 / np.cos(0.5), rtol=1e-9)
-    # And the points then lie where they should.
+    # After the cut the points lie on the nominal surface.
     assert found.after < 1e-15
 
 
@@ -132,7 +132,7 @@ def test_an_effect_of_the_whole_part_is_its_uncertainty_and_noise_averages_out()
     np.testing.assert_allclose(found.uncertainty[known], np.sqrt(5) * 5e-9, rtol=1e-9)
     noisy = [compensation(map_of(0 * X, noise=1e-8), Flat(), w) for w in (2e-3, 4e-3)]
     centre = tuple(size // 2 for size in noisy[0].offset.shape)
-    # Of twice the width four times as many points: half the noise.
+    # Twice the width averages four times as many points: half the noise.
     one, half = (float(f.uncertainty[centre]) for f in noisy)
     assert one / half == pytest.approx(2.0, rel=0.06)
     # A Gaussian of cutoff c over points of spacing s leaves σ s √(π / 2 ln 2) / c of white noise.
@@ -183,7 +183,7 @@ def test_a_tool_path_is_a_spiral_from_the_rim_inwards(per_turn):
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     assert path.radius[-1] == pytest.approx(0.0, abs=2e-4)
     assert np.all(np.diff(path.angle) > 0)
-    # Beside the corners of the square nobody measured.
+    # The spiral leaves the measured square beyond its sides.
     assert path.left_out > 0
     assert path.left_out + len(path.radius) == int(rim / 2e-4 * per_turn) + 1
 

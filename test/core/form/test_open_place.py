@@ -1,4 +1,4 @@
-"""Terms of a part whose place along itself nobody knows, against the same form fitted elsewhere."""
+"""Terms of a part with an undetermined pose, against the same form fitted at another place."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Of paths whose turns and lines are known."""
+"""Passes of paths with a known number of turns and lines."""
 
 import numpy as np
 import pytest

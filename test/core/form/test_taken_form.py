@@ -102,5 +102,5 @@ def test_form_that_was_taken_away_is_added_again_on_the_average():
         reported.append(rms_of_part(seen).value ** 2)
     assert np.mean(reported) == pytest.approx(np.mean(squares), rel=0.25, abs=0)
     whole, _ = extents_of_part(seen, Aperture(RADIUS))
-    # Of that last one: the extent of c times the shape is twice c.
+    # The extent of c times the last shape is twice c.
     assert whole.value == pytest.approx(2 * np.hypot(kept, 30e-9), rel=0.15)

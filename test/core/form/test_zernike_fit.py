@@ -43,8 +43,8 @@ def test_the_uncertainty_is_the_scatter():
 
 
 def test_on_a_spiral_the_stated_variance_is_not_too_small():
-    """Of white noise its value is known. The fit follows the few groups of successive points at
-    the rim, and their residuals alone would state 7 % too little, 17 % of symmetric terms."""
+    """For white noise the covariance is known. The fit follows the few groups at the rim; without
+    the jackknife the result would be 7 % too small, 17 % for symmetric terms."""
     radius, angle = np.linspace(12.7e-3, 0, 20_000), np.linspace(0, 200 * np.pi, 20_000)
     x, y = radius * np.cos(angle) + DISC.x, radius * np.sin(angle) + DISC.y
     columns = zernike_values(*DISC.scaled(x, y), TERMS)
@@ -73,7 +73,7 @@ def test_errors_that_hang_together_count_as_such():
 
 
 def spiral(turns, points):
-    """Of even turns from the rim to the centre, with the area that each point stands for."""
+    """Return a spiral of even turns from the rim to the centre, with the area of each point."""
     radius, angle = np.linspace(12.7e-3, 0, points), np.linspace(0, 2 * np.pi * turns, points)
     return radius * np.cos(angle) + DISC.x, radius * np.sin(angle) + DISC.y, radius
 

@@ -31,10 +31,10 @@ def sphere_scan(
     seed: int = 1,
     wobble: float = 40e-6,
 ) -> SphereScan:
-    """What the machine reports over a concave (radius > 0) or convex sphere, off centre.
+    """Return the samples of a concave (radius > 0) or convex sphere, off centre.
 
-    Z follows the sphere but for a wobble, which the distance makes up for; the distance is
-    found by intersecting the leaning beam with the sphere.
+    Z follows the sphere with a wobble, which the distance compensates; the distance is the
+    intersection of the inclined beam with the sphere.
     """
     random = np.random.default_rng(seed)
     n = 6000

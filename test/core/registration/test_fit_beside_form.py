@@ -141,7 +141,7 @@ BROAD = (np.zeros(2), np.full(2, 1e3))
 
 
 def problem(form, step, noise=1e-9, points=2000, seed=1):
-    """Two freedoms beside seven terms of form, one of which looks like the first freedom."""
+    """Two pose parameters with seven terms of form, one of which looks like the first parameter."""
     rng = np.random.default_rng(seed)
     z = rng.normal(size=(7, points))
     j = np.stack([z[0] + 0.05 * rng.normal(size=points), rng.normal(size=points)])
@@ -155,7 +155,7 @@ def solved(gram, moments, largest, noise=1e-9, expected=BROAD):
 
 
 def test_the_estimate_is_that_of_dense_algebra_with_the_sizes_that_it_found():
-    """``(AᵀA/σ² + diag(1/s²))⁻¹ Aᵀd/σ²``, form and freedoms with the sizes as priors."""
+    """Solve ``(AᵀA/σ² + diag(1/s²))⁻¹ Aᵀd/σ²`` directly, with the sizes as priors."""
     form = 1e-8 * RNG.normal(size=7)
     gram, moments, largest = problem(form, np.array([3e-8, -2e-8]))
     found = solved(gram, moments, largest)
@@ -167,7 +167,7 @@ def test_the_estimate_is_that_of_dense_algebra_with_the_sizes_that_it_found():
 
 
 def test_within_its_covariance_the_truth_is_found():
-    """Of fifty parts with form of 10 nm a term: the standard score of every number."""
+    """Standard scores of all estimates for fifty parts with 10 nm of form in each term."""
     scores = []
     for seed in range(50):
         rng = np.random.default_rng(seed)
@@ -258,7 +258,7 @@ def test_what_more_than_one_point_of_twenty_does_is_no_dust():
 
 @pytest.mark.parametrize("rate", [0.5, -0.5, -1.5])
 def test_a_relaxed_step_finds_the_end_of_a_series_at_once(rate):
-    """Of steps that shrink, or swing, by a factor: Aitken's share is 1/(1 − rate) of the next."""
+    """For steps that change by a constant factor Aitken's share is 1/(1 − rate)."""
     step = np.array([1.0, -2.0])
     share = relaxation_factor(1.0, step, rate * step)
     assert share == pytest.approx(min(1 / (1 - rate), 1.0))
@@ -296,7 +296,7 @@ def test_shares_of_rows_make_up_another_covariance():
     np.testing.assert_allclose(
         made / np.outer(scale, scale), other / np.outer(scale, scale), atol=1e-6
     )
-    # Of its own, all.
+    # The shares of its own covariance are one.
     own = rows.T @ rows
     np.testing.assert_allclose(shares_of(rows, own), np.eye(4), atol=1e-6)
 

@@ -1,4 +1,4 @@
-"""Beside form that nobody knows: how long a step is, and poses that go to and fro within it."""
+"""Fit of a pose with unknown form: length of a step, and convergence of an oscillating pose."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ RADIUS = 12.7e-3
 
 
 def test_a_step_is_measured_in_its_own_uncertainty():
-    """By the inverse of the covariance, whatever the units of the freedoms."""
+    """Compare with the inverse of the covariance for parameters of different units."""
     rng = np.random.default_rng(1)
     mixed = rng.normal(size=(3, 3)) * np.array([[1e-9], [1e3], [1.0]])
     covariance = np.zeros((5, 5))

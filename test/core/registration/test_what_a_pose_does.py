@@ -52,7 +52,7 @@ def points(found):
 
 
 def test_a_scan_in_portions_is_the_scan(found):
-    """Whole groups of 128 in each, so that errors that hang together are cut alike."""
+    """Use portions of whole groups of 128 points, so that correlated errors are grouped alike."""
     cuts = [slice(k, k + 1280) for k in range(0, POINTS, 1280)]
     again = register(PAPER_MIRROR, lambda: [portion(cut) for cut in cuts], NAMES)
     for name in NAMES:
@@ -132,7 +132,7 @@ def axes(first, count, seed=1):
 
 
 def corrected(block, pick=slice(None)):
-    """What the corrector makes of a block without geometry: height = z − error + d cos b."""
+    """Return the points of a block corrected without geometry: height = z − error + d cos b."""
     rng = np.random.default_rng(block.first_sample + 5)
     error, distance = rng.normal(0, 1e-7, (2, len(block)))
     empty = join_points([])
@@ -193,7 +193,7 @@ def test_points_that_are_not_finite_are_counted_with_those_there_are():
 
 
 def test_a_scan_of_a_flat_is_no_sphere():
-    """Its centre strays: that is told of the scan, not of a number that nobody gave."""
+    """Refuse a flat scan by its radius, although the centre leaves the machine during the fit."""
     n = 3000
     c, x = np.linspace(0, 60 * np.pi, n), np.linspace(8e-3, 0, n)
     scan = SphereScan(x=x, y=0 * x, z=0 * x, b=0 * x, c=c, distance=RNG.normal(0, 1e-8, n))

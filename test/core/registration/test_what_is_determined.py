@@ -1,4 +1,4 @@
-"""Which freedoms a surface shows, and which are held: from products of columns made by hand."""
+"""Determined and held pose parameters, from products of columns written by hand."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ X, Y = RNG.uniform(-1e-2, 1e-2, (2, POINTS))
 
 
 def gram_of(**columns):
-    """Products of the columns of all freedoms, none where it is not named."""
+    """Return the products of the columns of all pose parameters, zero for those without one."""
     rows = np.array([columns.get(name, np.zeros(POINTS)) for name in DEGREES_OF_FREEDOM])
     return rows @ rows.T
 
@@ -104,7 +104,7 @@ def test_names_are_read_with_or_without_spaces(text, names):
     [
         ("roll", "'roll' is unknown, expected a list of .*clocking"),
         ("x,y,x", "'x' stands twice"),
-        (" , ", "no degree of freedom is named"),
+        (" , ", "no pose parameter is named"),
         ("X", "'X' is unknown"),
     ],
 )
@@ -132,7 +132,7 @@ def test_a_freedom_that_is_held_is_no_longer_fitted():
 
 
 def weak(values, spreads, effects, names=("piston", "x", "y")):
-    """Of freedoms independent of each other, each of so much form a unit."""
+    """Return the weakest of independent pose parameters with these effects."""
     return weakest_dof(
         names, np.array(values), np.diag(np.square(spreads)), np.diag(np.square(effects))
     )

@@ -1,4 +1,4 @@
-"""What an accelerometer felt, from the blocks of a recording."""
+"""Lines measured by an accelerometer, from the blocks of a recording."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What form takes out and leaves, against Zernike's polynomials and harmonics written out."""
+"""Removal of form, against Zernike polynomials and harmonics in closed form."""
 
 from dataclasses import replace
 
@@ -139,7 +139,7 @@ class TestOrders:
         assert min(one.order for one in found.orders) == 3
         (order,) = [one for one in found.orders if one.order == 3]
         assert order.cosine == pytest.approx(9 * NM, abs=4 * order.uncertainty)
-        # Of white noise on a circle: the bound of a sum of cosines.
+        # For white noise on a circle the bound is that of a sum of cosines.
         assert order.uncertainty == pytest.approx(1 * NM * np.sqrt(2 / COUNT), rel=0.1, abs=0)
 
     def test_orders_go_to_twelve(self):

@@ -1,4 +1,4 @@
-"""What is found in noise of known size: bounds in closed form, and what is no line."""
+"""Lines in noise of known size: bounds in closed form, and signals that are no line."""
 
 from dataclasses import replace
 
@@ -99,7 +99,7 @@ class TestWhatIsNone:
 
     def test_waves_a_turn_that_belong_to_the_form_are_no_lines(self):
         values = noise() + sine(6.0, 9 * NM) + sine(61.0, 4 * NM)
-        # What leaks of a strong one farther than that would be lines of their own.
+        # Leakage of a strong order beyond that width would be found as lines.
         taken = find_lines(circle(), values, owned=[(3.0, 1.6)]).lines
         assert [round(line.frequency) for line in taken] == [61]
         free = find_lines(circle(), values).lines

@@ -34,7 +34,7 @@ class TestWhatALineMayBe:
         for h in found:
             assert aliased(h.frequency, 1000.0) == pytest.approx(320.0)
             assert h.alias_count == round(h.frequency / 1000.0)
-            # What was sampled anew from a whole number of rates away is as uncertain.
+            # Aliases are as uncertain as the line itself.
             assert h.uncertainty == found[0].uncertainty
 
     def test_in_each_coordinate_of_the_part_and_as_a_whole_order_it_is_one_more(self):

@@ -133,7 +133,7 @@ class TestFit:
         assert CLOSEST < 1
 
     def test_a_long_scan_is_fitted_in_pieces_as_in_one(self):
-        """Of more samples than are taken at a time."""
+        """Fit more samples than one portion holds."""
         count = 70_000
         time = np.arange(count) * PERIOD
         long = {TIME: Coordinate(TIME, time, 1.0, TIME, 500.0)}

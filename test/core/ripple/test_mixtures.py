@@ -1,4 +1,4 @@
-"""Random mixtures, as the benchmark has a hundred of: marks, vibrations, folded, spindle, drift."""
+"""Random mixtures of marks, vibrations, aliases, spindle errors and drift, as in the benchmark."""
 
 from collections import Counter
 

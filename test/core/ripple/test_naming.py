@@ -1,4 +1,4 @@
-"""What each line is called, where truth says which scans show it where: no height is looked at."""
+"""Sources of lines, for scans with lines placed by the truth instead of by a fit of heights."""
 
 import re
 
@@ -204,7 +204,7 @@ class TestCoincidences:
         assert (both.kind, both.also) == expected
         assert f"a line that is {expected[1]}" in str(both.evidence[-1])
         sizes = re.findall(r"has ([\d.]+) nm, the other ([\d.]+) nm", str(both.evidence[-1]))
-        # Of the marks an average over a sample takes 1.6 %.
+        # Averaging over a sample attenuates the marks by 1.6 %.
         assert [float(size) for size in sizes[0]] == pytest.approx(
             [max(mark, shake), min(mark, shake)], rel=0.02
         )
@@ -259,7 +259,7 @@ class TestAccelerometerLines:
             assert kinds(*machine(one, waves=[("t", 123.4, 4 * NM)])) == [[kind]]
 
     def test_many_acceleration_lines_must_agree_four_times_as_well(self):
-        """Of 600 lines over 500 Hz one lies within a resolution of any place by chance."""
+        """With 600 lines over 500 Hz one lies within a resolution of any frequency by chance."""
         many = [(2.0 + 0.8 * k, 4 * NM) for k in range(600)]
         for off, kind in ((0.012, VIBRATION), (0.03, UNDECIDED)):
             near = [f for f in many if abs(aliased(f[0], 1000.0) - 123.4) > 1.0]

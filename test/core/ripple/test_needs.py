@@ -1,4 +1,4 @@
-"""What would decide what a line is: advice that was followed already helps nobody."""
+"""Measurements that would decide the source of a line are new ones."""
 
 from types import SimpleNamespace
 

@@ -48,7 +48,7 @@ class TestSignificance:
         assert float(found) == pytest.approx(sigma, abs=1e-6)
 
     def test_one_frequency_is_an_exponential(self):
-        """Of noise alone: 2.3 % of single powers are beyond two σ."""
+        """In noise alone 2.3 % of single powers exceed two σ."""
         assert ratio_at(2.0, 1.0) == pytest.approx(-np.log(stats.norm.sf(2.0)))
 
 

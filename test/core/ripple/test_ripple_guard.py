@@ -1,4 +1,4 @@
-"""What is each line? On scans written down in plain numpy, whose truth is known."""
+"""Sources of the lines of scans that are written in plain numpy, so that the truth is known."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def accelerometer(lines, seconds=20.0, rate=4000.0, noise=6e-4):
 
 
 def named(*scans):
-    """Of each scan, {frequency in time to 0.1 Hz or wavelength in µm: row}."""
+    """Return for each scan {frequency in time to 0.1 Hz or wavelength in µm: row}."""
     studied = analyse_scans([scan if isinstance(scan, tuple) else (scan, None) for scan in scans])
     return [
         {
@@ -105,7 +105,7 @@ def circles(made, lines, rpms=(0.14, 1.875, 15.0, 30.0)):
 
 
 def test_the_papers_four_scans(made):
-    """15 µm marks at four speeds: resolved twice, folded twice; and with them their harmonic."""
+    """15 µm marks at four speeds: resolved twice, aliased twice; and with them their harmonic."""
     rows = named(*circles(made, [("s", 1 / 15e-6, 15 * NM), ("s", 2 / 15e-6, 4 * NM)]))
     assert kinds(rows[0]) == {21.1: PART, 42.2: PART}
     assert kinds(rows[1]) == {282.7: PART, 434.5: ARTEFACT}
