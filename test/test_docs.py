@@ -1,4 +1,4 @@
-"""What the documents point at exists."""
+"""Check that files and headings that the documents name exist."""
 
 import re
 from pathlib import Path
@@ -12,13 +12,13 @@ PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglo
 
 
 def named(page):
-    """Files that a page links to, or names in code as a path of this tree."""
+    """Yield files that a page links to, or names in code as a path of this tree."""
     text = page.read_text(encoding="utf-8")
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text):
         if "://" not in target:
             yield page.parent / target
     for name in re.findall(r"`([\w./]+\.(?:py|yaml|md))`", text):
-        # A file that a page adds as it goes along stands there as a block of code.
+        # A page shows a file that it adds itself as a block of code.
         if "/" in name and f": `{name}`" not in text:
             yield next(
                 (b / name for b in (ROOT, ROOT / "omsm_ros") if (b / name).exists()), Path(name)
@@ -41,9 +41,14 @@ def test_a_heading_that_is_pointed_at_exists(page):
         assert anchor in anchors
 
 
-def test_every_command_of_the_readme_exists():
+def test_the_page_of_commands_has_every_command():
     from omsm_ros.cli.words import WORDS
 
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"^\| `omsm (\w+)", readme, re.MULTILINE))
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"^\| `omsm (\w+)", page, re.MULTILINE))
     assert named == set(WORDS)
+
+
+def test_the_readme_is_short():
+    """At most 900 words: the figures, commands and nodes have pages of their own."""
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900

@@ -1,7 +1,6 @@
-"""What pages show: blocks of commands, commands within the text, and what stands for what in them.
+"""Commands on the pages of the manual, in blocks and in the text, with file names filled in.
 
-Sybil takes the blocks out of a page too, but neither commands within the text, nor lines of a block
-one by one, nor a shell that they share; with it this file would be longer.
+Sybil extracts blocks, too, but no commands in the text, and its blocks do not share a shell.
 """
 
 import re
@@ -32,7 +31,7 @@ _COMMAND = re.compile(rf"(?:{'|'.join(re.escape(p) for p in PROGRAMS)}) ")
 
 @dataclass(frozen=True)
 class Shown:
-    """One command, or block of them, on a page; ``text`` is as it stands there."""
+    """One command, or a block of commands, on a page; ``text`` is as printed."""
 
     page: str
     line: int
@@ -44,7 +43,7 @@ class Shown:
 
 
 def shown_on(path):
-    """Blocks that hold commands, and commands in the text, from top to bottom."""
+    """Return blocks with commands, and commands in the text, from top to bottom."""
     text, page = path.read_text(encoding="utf-8"), path.relative_to(ROOT).as_posix()
     found = []
     for match in BLOCKS.finditer(text):
@@ -60,7 +59,7 @@ def shown_on(path):
 
 
 def lines_of(shown):
-    """The commands of a block, one a line, without remarks; what a here-document holds is none."""
+    """Yield the commands of a block without remarks and without the content of here-documents."""
     held = None
     for line in shown.text.splitlines():
         if held is None and line.strip():
@@ -71,7 +70,7 @@ def lines_of(shown):
             held = None
 
 
-# What a command's form in capitals stands for; by command where that differs.
+# File or value for each placeholder in capitals; by command where that differs.
 STANDS_FOR = {
     "BAG": "scan.mcap", "SCAN": "scan.mcap", "MOTION": "scan.mcap", "FOLDER": "recordings",
     "CW": "CW.mcap", "CCW": "CCW.mcap", "CLOUD": "result/cloud.ply",
@@ -98,7 +97,7 @@ _ENDINGS = {"DIR": "made", "BAG": "made.mcap", "FILE": "made.xyz", "GEO.yaml": "
 
 
 def filled_in(command):
-    """A command with names of files where it shows what stands for them; optional parts given."""
+    """Return a command with its placeholders filled in and its optional parts included."""
     word = command.split()[1]
     scans = iter(("scan.mcap", "fast.mcap", "fast.mcap"))
     names = STANDS_FOR | IN_COMMAND.get(word, {})
@@ -117,7 +116,7 @@ def filled_in(command):
 
 
 def is_name(command):
-    """Whether code in the text names a command or an option of it, and is nothing to be typed."""
+    """Return whether code in the text only names a command or an option, and is not to be run."""
     program, word, *rest = command.split()
     if program == "ros2":
         return len(rest) <= 1 and command != "ros2 lifecycle nodes"

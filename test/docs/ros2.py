@@ -1,9 +1,11 @@
-"""What pages ask of `ros2`, where only the wheels of ROS are: `python ros2.py run omsm_ros NODE …`.
+"""Substitute for `ros2` where only the wheels of ROS are installed.
 
-`run` and `launch` return once their nodes are active and leave them running; each is a line in the
-file that the variable PAGE_NODES names, so that the test ends them all. Another `launch` ends what
-the one before had started, as who follows the page would by Ctrl-C. A real `ros2`, named by the
-variable REAL_ROS2, is used for everything that it can do.
+It is called as `python ros2.py run omsm_ros NODE …`.
+
+`run` and `launch` return when their nodes are active, and leave them running. Each node is a line
+in the file that the variable PAGE_NODES names, so that the test can stop all of them. A further
+`launch` stops the nodes of the one before, as a reader would by Ctrl-C. If the variable REAL_ROS2
+names a real `ros2`, that is used for everything it can do.
 """
 
 import importlib
@@ -70,7 +72,7 @@ def launch(package, file, *arguments):
 
 
 def end_all_but(kept):
-    """End as Ctrl-C does what was started before; the file keeps the rest."""
+    """Stop earlier nodes as Ctrl-C does; the file keeps those that go on."""
     lines = NODES.read_text().splitlines() if NODES.exists() else []
     ended = [line for line in lines if line.split()[1] != kept]
     for line in ended:
@@ -88,7 +90,7 @@ def alive(pid):
 
 
 def wait_for(namespace, names, started):
-    """Until nodes are active; or until the process has ended well, as a player at its bag's end."""
+    """Wait until nodes are active, or until the process has ended without error."""
     from lifecycle_msgs.srv import GetState
 
     for name in names:
@@ -162,7 +164,7 @@ def lifecycle(verb, node="", transition=""):
 
 
 def play(motion):
-    """Ours: let the emulated machine make a motion, as its operator would, and wait for its end."""
+    """Let the emulated machine make a motion, and wait for its end."""
     from diagnostic_msgs.msg import DiagnosticArray
 
     said = []

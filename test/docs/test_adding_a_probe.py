@@ -1,4 +1,4 @@
-"""The worked example of the page does what the page says."""
+"""Run the worked example of the page."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Every command that a document names is one that is understood; test_run_pages runs them."""
+"""Check that every command in the documents parses; test_run_pages runs them."""
 
 import argparse
 import re
@@ -19,7 +19,7 @@ INLINE = re.compile(r"`([^`\n]+)`")
 
 
 def commands(text, word):
-    """Command lines of ``word`` in blocks and in code within the text, without what follows #."""
+    """Yield command lines of ``word`` in blocks and in the text, without remarks after #."""
     blocks = [b.replace("\\\n", " ") for b in BLOCKS.findall(text)]
     lines = [line.strip() for block in blocks for line in block.splitlines()]
     lines += [line.strip() for line in INLINE.findall(BLOCKS.sub("", text))]
@@ -31,7 +31,7 @@ def commands(text, word):
 
 @cache
 def options(word):
-    """Options of a command, of itself and of those below it."""
+    """Return the options of a command and of its subcommands."""
     found, waiting = set(), [_parser(word)]
     while waiting:
         for action in waiting.pop()._actions:

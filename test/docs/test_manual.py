@@ -1,4 +1,4 @@
-"""Sphinx makes the manual without a warning; what its commands do is in test_run_pages."""
+"""Check that Sphinx builds the manual without a warning; test_run_pages runs its commands."""
 
 import re
 import subprocess
@@ -19,7 +19,7 @@ def test_what_the_tutorial_promises_is_there(tmp_path):
 
 
 def test_a_page_without_a_way_to_it_is_found_out():
-    """Sphinx warns of a page outside of the contents, so this build shows that it looks."""
+    """Fail for a page that the index does not list."""
     pytest.importorskip("sphinx", reason="sphinx makes the manual")
     index = (DOCS / "index.md").read_text(encoding="utf-8")
     for page in DOCS.rglob("*.md"):

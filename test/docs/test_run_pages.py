@@ -1,4 +1,4 @@
-"""Every command on a page does what it says: each is run as it stands, unless it is listed here."""
+"""Run every command on a page as it is printed, except those in ``NOT_RUN``."""
 
 import os
 import re
@@ -18,7 +18,7 @@ from .workshop import Workshop
 HERE = Path(__file__).resolve().parent
 REAL_ROS2 = shutil.which("ros2") or ""
 
-# Commands that no test can run as they stand, and why; a new command on a page is run.
+# Commands that no test can run, and why; a new command on a page is run.
 NOT_RUN = {
     r"git clone|cd ~/ws && git clone": "needs the network, and a repository that is public",
     r"rosdep |colcon |\. install/setup\.bash": "need a ROS distribution from apt; 'make setup' "
@@ -38,7 +38,7 @@ NEEDS_LAUNCH = {
 }
 NOT_RUN |= {} if REAL_ROS2 else NEEDS_LAUNCH
 
-# What a page takes for granted at that place.
+# Commands that a page assumes to have been run before.
 CELL = "ros2 launch omsm_ros cell.launch.py params:=my_cell/"
 CHROCODILE = "ros2 launch omsm_ros cell.launch.py emulated:=true device:=chrocodile"
 BEFORE = {
@@ -53,7 +53,7 @@ EMULATOR = "ros2 run omsm_ros cell_emulator --ros-args -p link:={port} -p time_l
 
 # A few seconds of them are in every run, all in `make soak`.
 QUICK = re.compile(
-    r"README.md.* omsm (plan|surface|completion)"
+    r"docs/commands.md.* omsm (plan|surface|completion)"
     r"|README.md.* make |CONTRIBUTING.md|docs/import.md.*import steps|docs/form.md.*surface"
 )
 
@@ -63,7 +63,7 @@ def not_run(line):
 
 
 def cases():
-    """Blocks of a page one after the other, and each command in a text by itself, once."""
+    """Yield all blocks of a page together, and each command of the text by itself, once."""
     seen = set()
     for path in PAGES:
         shown = shown_on(path)
@@ -77,7 +77,7 @@ def cases():
 
 
 def script_of(case):
-    """What is typed, as shell, and the commands in it."""
+    """Return the shell script of a case, and the commands in it."""
     script, commands, has = [], [], set()
     for shown in case:
         text = shown.text
@@ -120,13 +120,13 @@ def workshop(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def programs(tmp_path_factory):
-    """A folder of what the pages call by name: ours, and stand-ins of ros2 and make."""
+    """Return a folder with the programs that the pages call: omsm, and substitutes for ros2 and make."""
     folder = tmp_path_factory.mktemp("bin")
     python = f'exec "{sys.executable}"'
     for name, line in (
         ("omsm", f'{python} -W error -m omsm_ros.cli "$@"'),
         ("ros2", f'{python} "{HERE / "ros2.py"}" "$@"'),
-        # What it would do; it would set up, or test, the checkout that is being tested.
+        # Dry run, because make would set up or test the checkout that is being tested.
         ("make", f'exec "{shutil.which("make")}" -n -C "{ROOT}" "$@"'),
     ):
         (folder / name).write_text(f"#!/bin/sh\n{line}\n")
@@ -167,12 +167,12 @@ def test_every_command_runs_as_it_stands(case, script, tmp_path, workshop, progr
 
 
 def ended(nodes):
-    """End what `ros2 run` and `ros2 launch` have left running; fail where one had ended badly."""
+    """Stop all nodes that `ros2 run` and `ros2 launch` started; fail if one does not stop."""
     lines = nodes.read_text().splitlines() if nodes.exists() else []
     running = [line.split() for line in lines]
     left = {int(pid): name for pid, name in running if alive(pid)}
     for pid in left:
-        os.killpg(pid, signal.SIGINT)  # as Ctrl-C, to all of it
+        os.killpg(pid, signal.SIGINT)  # as Ctrl-C does, to the whole group
     until = time.monotonic() + 30
     while any(map(alive, left)) and time.monotonic() < until:
         time.sleep(0.05)
@@ -184,7 +184,7 @@ def ended(nodes):
 
 
 def alive(pid):
-    """Whether a process runs; one that nobody has waited for does not."""
+    """Return whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(") ", 1)[1][0] != "Z"
     except FileNotFoundError:
@@ -199,7 +199,7 @@ def wrote_what_they_say(text, folder):
 
 
 def test_every_exception_is_of_use():
-    """One that no page needs any more goes from the list."""
+    """Fail for an exception that no page needs any more."""
     lines = [line for path in PAGES for shown in shown_on(path) for line in lines_of(shown)]
     for pattern in NOT_RUN:
         assert any(re.match(pattern, line) for line in lines), pattern
@@ -207,5 +207,5 @@ def test_every_exception_is_of_use():
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
 def test_no_command_stands_where_it_is_not_looked_for(path):
-    """In a block by indentation alone."""
+    """Fail for a command in a block that only its indentation marks."""
     assert not re.findall(r"^    (?:omsm|ros2) .*--.*", path.read_text("utf-8"), re.MULTILINE)

@@ -1,4 +1,4 @@
-"""The files that pages name, each made when one first needs it: by the twin, or a plain script."""
+"""Files that the pages name, made by the twin or a script when first needed."""
 
 import functools
 import re
@@ -25,7 +25,7 @@ def omsm(*words):
 
 
 def yaml_on(page, holds):
-    """The block of a page's YAML that holds a key."""
+    """Return the YAML block of a page that holds a key."""
     text = (ROOT / page).read_text(encoding="utf-8")
     (found,) = [b for kind, b in BLOCKS.findall(text) if kind == "yaml" and holds in b]
     return found
@@ -35,13 +35,13 @@ _MADE = ("path:=", "record:=", ">")
 
 
 class Workshop:
-    """Makes files by name in a folder of its own, and lays copies of them where they are needed."""
+    """Makes files by name in its own folder, and copies them where they are needed."""
 
     def __init__(self, folder, port):
         self.folder, self.port = folder, port
 
     def lay_out(self, text, where):
-        """Copy to ``where`` what a text names before it makes it, if it does."""
+        """Copy to ``where`` the files that a text uses before it makes them."""
         for name in NAMES:
             named = re.search(rf"(\S*)(?<![\w./-]){re.escape(name)}(?![\w.-])", text)
             before = text[: named.start()].split() if named else []
@@ -105,7 +105,7 @@ def recordings(shop, path):
 
 
 def datx(shop, path):
-    """An interferometer's map of the mirror's middle, by what is public of the format."""
+    """Write an interferometer's map of the middle of the mirror, from public documents of the format."""
     import h5py
 
     side = np.arange(-40, 41) * 25e-6
@@ -122,7 +122,7 @@ def datx(shop, path):
 
 
 def shop_log(shop, path):
-    """A step test as a control may log it: as the map on the page of `omsm import` reads it."""
+    """Write a step test as a control logs it, for the map on the page of `omsm import`."""
     made = planned_test_of(Scenario(seed=5))
     lines = ["Maschine 7", "Schrittversuch", "n;X-axis;Z-axis;C-axis;probe;peak", ";mm;mm;deg;;%"]
     for i, (z, d) in enumerate(zip(made.axes.z, made.distance.distance, strict=True)):
@@ -144,7 +144,7 @@ def sources(shop, path):
 
 
 def motion_columns(shop, path):
-    """Two columns of a system with one pole, 20 rad/s, under a pseudo-random input."""
+    """Write input and output of a system with one pole, 20 rad/s, and a pseudo-random input."""
     rng = np.random.default_rng(1)
     u = np.repeat(rng.choice((-1.0, 1.0), 200), 20)
     y, pole = np.zeros(len(u)), np.exp(-20e-3)
@@ -167,7 +167,7 @@ def node_file(name):
 
 
 def cell_config(name, port):
-    """The shipped file, with this cell's port, and played in a twentieth of the time."""
+    """Write the shipped file with the port of this cell and a time lapse of 20."""
     content = yaml.safe_load((CONFIG / f"{name}.yaml").read_text(encoding="utf-8"))
     parameters = content["/**"]["ros__parameters"]
     if name == "confocal_driver":
@@ -208,4 +208,4 @@ NAMES = {
     **{f"{name}.yaml": node_file(name)
        for name in ("confocal_driver", "calibrator", "corrector", "viewer")},
 }  # fmt: skip
-"""Each name on the pages, and what makes it; called with the workshop and the path."""
+"""Function that makes each name on the pages; called with the workshop and the path."""
