@@ -1,4 +1,4 @@
-"""A cell: driver, calibrator and corrector, real or emulated, recorded, seen in RViz.
+"""Start a cell: driver, calibrator and corrector, real or emulated, recorded, shown in RViz.
 
 ros2 launch omsm_ros cell.launch.py params:=/path/to/my_cell
 ros2 launch omsm_ros cell.launch.py emulated:=true namespace:=cell2 record:=scan.mcap
@@ -22,20 +22,20 @@ from omsm_ros.nodes.start import LAUNCHED_BY
 
 SHARE = Path(get_package_share_directory("omsm_ros"))
 ARGUMENTS = {
-    "namespace": ("omsm", "of every node and topic; another one for each cell", None),
-    "device": ("", "what is connected; empty = as the YAML says", None),
+    "namespace": ("omsm", "namespace of all nodes and topics; a different one for each cell", None),
+    "device": ("", "connected device; empty = as in the YAML", None),
     "emulated": ("false", "start the digital twin and read it", ["true", "false"]),
-    "record": ("", "an .mcap file to record into; empty = none", None),
+    "record": ("", ".mcap file to record into; empty = none", None),
     "view": ("false", "show the scan in a browser", ["true", "false"]),
     "rviz": ("false", "show the points in RViz", ["true", "false"]),
     "params": (str(SHARE / "config"), "folder of the nodes' YAML files", None),
-    "log_level": ("info", "of every node", ["debug", "info", "warn", "error", "fatal"]),
-    "respawn": ("false", "start a node again that ended by itself", ["true", "false"]),
+    "log_level": ("info", "log level of every node", ["debug", "info", "warn", "error", "fatal"]),
+    "respawn": ("false", "restart a node that has ended by itself", ["true", "false"]),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    """What is started, once the arguments are known."""
+    """Return the nodes to start, once the arguments are known."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
         for name, (default, text, choices) in ARGUMENTS.items()
@@ -44,7 +44,7 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def cell(context: LaunchContext) -> list[Node]:
-    """The nodes that the arguments ask for."""
+    """Return the nodes that the arguments ask for."""
     warn_of_others(context.argv)
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     driver: dict[str, object] = {"device": given["device"]} if given["device"] else {}
@@ -59,7 +59,7 @@ def cell(context: LaunchContext) -> list[Node]:
         node(given, "corrector", {}),
     ]
     if given["record"]:
-        # One that is started again goes on beside what it had recorded.
+        # A restarted recorder continues in a further file.
         goes_on = given["respawn"] == "true"
         nodes.append(node(given, "recorder", {"path": given["record"], "numbered": goes_on}))
     if given["view"] == "true":
@@ -70,19 +70,19 @@ def cell(context: LaunchContext) -> list[Node]:
 
 
 def warn_of_others(arguments: list[str]) -> None:
-    """Name those of the command line that nobody takes; launch passes over them in silence."""
+    """Warn of unknown arguments, which launch ignores silently."""
     for name in (text.split(":=")[0] for text in arguments):
         if name not in ARGUMENTS:
             near = get_close_matches(name, ARGUMENTS, 1)
-            hint = f"did you mean {near[0]}:=?" if near else "--show-args tells them all"
+            hint = f"did you mean {near[0]}:=?" if near else "--show-args lists them"
             get_logger("omsm_ros").warning(f"cell.launch.py has no argument {name!r}; {hint}")
 
 
 def node(given: dict[str, str], name: str, parameters: dict[str, object]) -> Node:
-    """A node with its YAML, and ``parameters`` over it."""
+    """Return a node with its YAML file, overridden by ``parameters``."""
     file = Path(given["params"]) / f"{name}.yaml"
     if not file.is_file():
-        # launch would go on with the defaults.
+        # launch would continue with the defaults.
         raise FileNotFoundError(f"no parameters for {name} at {str(file)!r}; check params:=")
     return Node(
         package="omsm_ros",
@@ -101,12 +101,12 @@ Parameters = dict[str, object]
 
 
 def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str, Parameters]]:
-    """Parameters of the emulator, of the driver that reads it, and of the node beside that."""
+    """Return the parameters of the emulator, of its driver, and of a second driver if there is one."""
     if device not in EMULATED:
         raise ValueError(f"device {device!r} has no emulator, expected one of {sorted(EMULATED)}")
     known = emulated(device)
     serial = str(runtime_folder(namespace) / "cell")
-    # Another one for each cell, else a second driver would read the first cell's device.
+    # A different port for each cell, else a second driver would read the device of the first cell.
     tcp = f"tcp://127.0.0.1:{7000 + crc32(namespace.strip('/').encode()) % 1000}"
     port = tcp if known.tcp else serial
     played = {"device": device, "link": port}
@@ -119,7 +119,7 @@ def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str,
 
 
 def rviz(namespace: str) -> Node:
-    """RViz, with the layout that is shipped."""
+    """Return RViz with the shipped layout."""
     return Node(
         package="rviz2",
         executable="rviz2",

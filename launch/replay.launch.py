@@ -1,4 +1,4 @@
-"""A recording played to a corrector; ends when all of it is corrected (needs the full ROS 2).
+"""Play a recording to a corrector; end when all of it is corrected (needs the full ROS 2).
 
 ros2 launch omsm_ros replay.launch.py bag:=scan.mcap calibration:=cal.json [rate:=0]
 """
@@ -22,10 +22,10 @@ ARGUMENTS = {
     "calibration": ("", "calibration file; empty takes the one that the bag holds"),
     "rate": ("1.0", "seconds of the bag a second; 0 = no faster than the corrector takes it"),
     "cell": ("", "namespace of the cell in the bag; empty = the only one"),
-    # Who was there before them may be known to new nodes only when Fast DDS announces him again,
-    # three seconds later; then the two tell each other what they listen to.
-    "delay": ("3.5", "seconds to wait until all who listen are known; 0 = begin at once"),
-    "namespace": ("/replay", "where to play it: apart from a live cell"),
+    # Fast DDS may announce an existing node to a new one only after three seconds; then they
+    # exchange what they subscribe to.
+    "delay": ("3.5", "seconds to wait until all subscribers are known; 0 = begin at once"),
+    "namespace": ("/replay", "namespace of the player, separate from a live cell"),
 }
 
 
@@ -34,7 +34,7 @@ def _text(name: str) -> ParameterValue:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Player and corrector in a namespace of their own; the end of one ends both."""
+    """Return player and corrector in a separate namespace; the end of one ends both."""
     declared = [
         DeclareLaunchArgument(name, default_value=default, description=described)
         for name, (default, described) in ARGUMENTS.items()
@@ -59,7 +59,7 @@ def generate_launch_description() -> LaunchDescription:
                 "bag": _text("bag"),
                 "cell": _text("cell"),
                 "wait_for": "corrector",
-                # Of whatever type they are: the player says what is wrong with them.
+                # Any type is passed on: the player reports a wrong one.
                 "rate": ParameterValue(LaunchConfiguration("rate")),
                 "delay": ParameterValue(LaunchConfiguration("delay")),
             }
@@ -74,10 +74,10 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def ended(event: ProcessExited, context: LaunchContext) -> list[Shutdown]:
-    """End the launch with either of both; exit code 1 if one could not do it."""
+    """End the launch when one node ends; raise RuntimeError if it failed."""
     if event.returncode and not context.is_shutdown:
         raise RuntimeError(
-            f"not all was played: {event.process_name} ended with exit code {event.returncode}, "
-            "see its line"
+            f"not all was played: {event.process_name} ended with exit code {event.returncode}; "
+            "its last line gives the reason"
         )
     return [Shutdown(reason=f"{event.process_name} ended")]

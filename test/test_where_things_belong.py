@@ -205,9 +205,9 @@ def test_an_offline_command_is_added_in_cli(tmp_path):
         ('"begin": {\n', '"begin": {\n        "weigh": Word("weighing", "what it weighs"),\n'),
     )
     (tmp_path / "omsm_ros" / "cli" / "weighing.py").write_text(
-        "from omsm_ros.cli.command import Command\n"
+        "from omsm_ros.cli.command import CliCommand\n"
         "def declare(parser):\n    parser.add_argument('grams', type=float)\n"
-        "COMMANDS = [Command('weigh', declare,\n"
+        "COMMANDS = [CliCommand('weigh', declare,\n"
         "    lambda args: {'kg': args.grams / 1000}, print)]\n"
     )
     main = "from omsm_ros.cli import main; sys.exit(main(sys.argv[1:]))"
