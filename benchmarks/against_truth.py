@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.row import Row, at_least, between, not_compared, shown
-from omsm_ros.core.calibration.calibration import REJECTED, Calibration
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass, known_modes
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -52,7 +53,7 @@ def mass_errors(found: Sequence[Calibration], truth: TwoMass, *, collocated: boo
     stated, noise = [], []
     for calibration in found:
         certificate: Any = calibration.certificate
-        entry = certificate["two_mass"]
+        entry = certificate.response.two_mass
         if entry is None or entry["collocated"] is not collocated:
             continue
         model, relative = entry["model"], entry["relative_uncertainty"]
@@ -61,7 +62,7 @@ def mass_errors(found: Sequence[Calibration], truth: TwoMass, *, collocated: boo
         size = len(calibration.covariance)
         fitted = fit_two_mass(
             calibration.dynamics,
-            np.reshape(certificate["noise_covariance"], (size, size)),
+            np.reshape(certificate.noise_covariance, (size, size)),
             table_mass=1.0,
             collocated=collocated,
             frequencies=np.linspace(0.025, 1.0, 40) * calibration.valid_up_to,
@@ -84,7 +85,7 @@ def over_stated(errors: tuple[FloatArray, FloatArray]) -> float:
 
 def rejected(found: Sequence[Calibration]) -> BoolArray:
     """By the certificate, (runs,)."""
-    return np.array([c.certificate["verdict"] == REJECTED for c in found])
+    return np.array([c.certificate.verdict == REJECTED for c in found])
 
 
 def coverage(name: str, held: BoolArray, accepted: BoolArray) -> Row:

@@ -23,7 +23,8 @@ from benchmarks.drawn_machine import (
     stated,
 )
 from benchmarks.row import Row, between, shown
-from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, with_latency
+from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.correction.budget import scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points

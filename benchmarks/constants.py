@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.identification import record_once
+from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.model_errors.undetected import PAPER_SCAN_LINES
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
@@ -99,8 +99,8 @@ def _outcome(case: Case) -> Outcome:
         found = identify(case.motion).calibration
     except OmsmError:
         return Outcome("refused", float("nan"))
-    frequency, rms = np.array(PAPER_SCAN_LINES).T
-    verdict = str(found.certificate["verdict"]).partition(",")[0]
+    frequency, rms = PAPER_USE.frequencies_hz, PAPER_USE.rms_m
+    verdict = str(found.certificate.verdict).partition(",")[0]
     off = found.dynamics.response(frequency) - case.truth.response(frequency)
     return Outcome(verdict, float(np.sqrt(np.sum((np.abs(off) * rms) ** 2))))
 

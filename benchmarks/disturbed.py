@@ -19,11 +19,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.row import Row, at_most, shown
-from omsm_ros.core.calibration.calibration import REJECTED, Calibration
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED
+from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
-from omsm_ros.core.model_errors.undetected import PAPER_SCAN_LINES
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
 from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together
@@ -125,9 +126,9 @@ def outcome(name: str, disturbances: Disturbances, seed: int) -> Outcome:
     except OmsmError as err:
         return Outcome(name, "refused", str(err))
     certificate = found.certificate
-    reasons = [*certificate["reasons"], *certificate["reservations"]]  # type: ignore[misc]
-    verdict = str(certificate["verdict"])
-    lowest = float(str(certificate["valid_from"]))
+    reasons = [*certificate.reasons, *certificate.reservations]  # type: ignore[misc]
+    verdict = str(certificate.verdict)
+    lowest = float(str(certificate.validity.from_hz))
     lines = np.geomspace(max(lowest, 0.1), max(found.valid_up_to, 0.2), 100)
     band = response_band(found.dynamics, found.covariance, lines)
     off = np.log(found.dynamics.response(lines) / made.truth.response.response(lines))
@@ -136,14 +137,14 @@ def outcome(name: str, disturbances: Disturbances, seed: int) -> Outcome:
     return Outcome(name, verdict, "; ".join(map(str, reasons)), error, sigmas, stated)
 
 
-_SCAN_HZ, _SCAN_M = np.array(PAPER_SCAN_LINES).T
+_SCAN_HZ, _SCAN_M = PAPER_USE.frequencies_hz, PAPER_USE.rms_m
 
 
 def _on_scan(found: Calibration, truth: np.ndarray) -> tuple[float, float]:  # type: ignore[type-arg]
     off = np.abs(found.dynamics.response(_SCAN_HZ) - truth)
     band = response_band(found.dynamics, found.covariance, _SCAN_HZ)
     stated = np.hypot(band.gain, band.phase)
-    motion_error = float(str(found.certificate["motion_error_m"]))
+    motion_error = float(str(found.certificate.model_errors.motion_error_m))
     return (
         float(np.linalg.norm(off * _SCAN_M)),
         float(np.hypot(np.linalg.norm(stated * _SCAN_M), motion_error)),

@@ -110,8 +110,8 @@ def scatter(calibration: Calibration) -> FloatArray:
     That of the calibration also holds what no test has shown, and repeated tests do not either.
     """
     shape = calibration.covariance.shape
-    noise = np.reshape(np.asarray(calibration.certificate["noise_covariance"]), shape)
-    delay_bound = float(str(calibration.certificate["inter_sample_delay_bound_s"]))
+    noise = np.reshape(np.asarray(calibration.certificate.noise_covariance), shape)
+    delay_bound = float(str(calibration.certificate.response.inter_sample_delay_bound_s))
     allowed = inter_sample_motion_covariance(
         calibration.dynamics, delay_bound, calibration.sample_period
     )

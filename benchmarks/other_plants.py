@@ -48,7 +48,7 @@ def modes_and_delay(runs: int, fast_runs: int) -> list[Row]:
     frequency, damping = mode_errors(lone, LONE_MODE, 0)
     pair, pair_damping = mode_errors(fast, Plant().dynamics, 0)
     off = [c.dynamics.low_frequency_delay - late.delay for c in delayed]
-    stated = [c.certificate["low_frequency_delay_uncertainty_s"] for c in delayed]
+    stated = [c.certificate.response.low_frequency_delay_uncertainty_s for c in delayed]
     pair_off = 100 * worst(pair)
     over = over_stated(pair)
     return [

@@ -17,7 +17,7 @@ from omsm_ros.core.adjustment.resolved_calibration import (
 )
 from omsm_ros.core.adjustment.scan_reader import ScanColumns, read_scan
 from omsm_ros.core.adjustment.self_calibration import self_calibrate
-from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.identification.identify import identify
@@ -84,7 +84,7 @@ def _with_a_step_test(runs: int, also: Disturbances = NOTHING) -> tuple[list[flo
             known = identify(test.motion_record()).calibration
             found = self_calibrate(_pair(seed, _late(share, also), known), after_step_test(known))
             made = resolved(known, found)
-            latency = latency_of(made)
+            latency = made.latency
             errors.append(_error_left(made, share))
             spread = latency.uncertainty_s or 0.0
             inside.append(abs(float(found.values[3]) - share * LAG_S) < 2 * spread)

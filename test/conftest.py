@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
@@ -87,5 +88,5 @@ def true_calibration():
         valid_up_to=100.0,
         covariance=np.zeros((p, p)),
         settings={"machine": "twin"},
-        certificate={"verdict": "accepted"},
+        certificate=Certificate(verdict="accepted"),
     )

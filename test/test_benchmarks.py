@@ -9,13 +9,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from benchmarks.against_truth import band_held, coverage
 from benchmarks.cramer_rao import response_bounds
 from benchmarks.parts import PARTS, measure
 from benchmarks.parts import __file__ as parts_file
 from benchmarks.row import at_least, at_most, between, shown
-from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
 PERIOD, NOISE, GAIN = 1e-3, 1e-8, 0.99
@@ -106,7 +107,10 @@ def test_a_band_too_narrow_fails_however_many_runs_are_rejected(true_calibration
         covariance[-1, -1] = variance
         certificate = {"verdict": verdict}
         one = replace(
-            true_calibration, dynamics=off, covariance=covariance, certificate=certificate
+            true_calibration,
+            dynamics=off,
+            covariance=covariance,
+            certificate=certified_by(certificate),
         )
         return [one] * count
 

@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 
 import omsm_ros
-from omsm_ros.core.calibration.finding import Finding
+from omsm_ros.core.calibration.finding import REJECTS, WARNING, Finding
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.identification import checks, covariance_terms, identify, response_uncertainty
-from omsm_ros.core.identification.covariance_terms import CovarianceTerm
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface import nominal
@@ -66,25 +65,27 @@ def test_a_residual_test_is_added_in_core_identification(monkeypatch, motion):
     def skewed(evidence):
         residual = evidence.fit.residual
         skew = float(np.mean(residual**3) / np.mean(residual**2) ** 1.5)
-        return Finding({"skewness": skew}, {"skewness": 0.0}, ("skewed",), ("look at it",))
+        yield Finding("skewed", REJECTS, {"skewness": skew}, {"skewness_greatest": 0.0})
+        yield Finding("look at it", WARNING)
 
     monkeypatch.setattr(identify, "CHECKS", (*checks.CHECKS, skewed))
     certificate = identify.identify(motion, order=2).calibration.certificate
-    assert abs(certificate["skewness"]) < 0.1
-    assert certificate["limits"]["skewness"] == 0.0
-    assert certificate["verdict"] == "rejected"
-    assert certificate["reasons"] == ["skewed"]
-    assert "look at it" in certificate["warnings"]
+    (reason,) = certificate.reasons
+    assert abs(reason.values["skewness"]) < 0.1
+    assert reason.limits["skewness_greatest"] == 0.0
+    assert certificate.verdict == "rejected"
+    assert str(reason) == "skewed"
+    assert "look at it" in map(str, certificate.warnings)
 
 
 def test_what_the_data_cannot_show_is_added_in_core_identification(monkeypatch, motion):
     """One entry of COVARIANCE_TERMS: the covariance and every band widen by it."""
     before = identify.identify(motion, order=2).calibration
 
-    def doubt(prepared, fit, from_noise):
-        further = np.zeros_like(from_noise)
+    def doubt(prepared, fit):
+        further = np.zeros_like(before.covariance)
         further[-1, -1] = (100e-6) ** 2
-        return CovarianceTerm(further, Finding({"doubt_s": 100e-6}))
+        return further
 
     every = (*covariance_terms.COVARIANCE_TERMS, doubt)
     monkeypatch.setattr(response_uncertainty, "COVARIANCE_TERMS", every)
@@ -92,7 +93,6 @@ def test_what_the_data_cannot_show_is_added_in_core_identification(monkeypatch, 
     added = after.covariance - before.covariance
     assert added[-1, -1] == pytest.approx(1e-8)
     assert np.count_nonzero(added) == 1
-    assert after.certificate["doubt_s"] == 100e-6
 
 
 # An uncertainty source.

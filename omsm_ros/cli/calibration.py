@@ -23,7 +23,6 @@ from omsm_ros.cli.command import (
     table,
     written,
 )
-from omsm_ros.core.calibration.calibration import verdict_of
 from omsm_ros.core.calibration.calibration_set import calibration_set
 from omsm_ros.core.calibration.repeatability import (
     Repeatability,
@@ -43,6 +42,7 @@ from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.io.files import save_text
 from omsm_ros.pipelines.verify_calibration import established_offset, path_check_of
 from omsm_ros.readable import quantity
+from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import DEGREE_RAD
 
 
@@ -220,16 +220,15 @@ def _calset(args: argparse.Namespace) -> Facts:
         raise CalibrationError(f"a set along {' and '.join(axes)}, expected one axis; make two")
     placed = [(position, load_calibration(path)) for path, _, position in args.placed]
     made = calibration_set(axes[0], placed)
-    verdict, reasons = verdict_of(made)
-    path = output_path_for(args.out, verdict)
+    path = output_path_for(args.out, made.certificate.verdict or "")
     save_calibration(path, made)
     return {
         "along": made.along,
         "positions": list(made.positions),
         "lags": [member.dynamics.low_frequency_delay for member in made.members],
         "valid_up_to": made.valid_up_to,
-        "verdict": verdict,
-        "reasons": reasons,
+        "verdict": verdict_text(made),
+        "reasons": [str(reason) for reason in made.certificate.reasons],
         "calibration": str(path),
     }
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.errors import printable
 from omsm_ros.pipelines.progress import Progress, no_progress
 

@@ -6,7 +6,7 @@ import argparse
 from contextlib import ExitStack
 from pathlib import Path
 
-from omsm_ros import quantities
+from omsm_ros import __version__, quantities
 from omsm_ros.cli.arguments import (
     TABLE_SUFFIX,
     add_bags,
@@ -28,7 +28,8 @@ from omsm_ros.cli.command import (
     table,
     written,
 )
-from omsm_ros.core.calibration.calibration import Calibration, verdict_of
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import Origin
 from omsm_ros.core.estimation.sampled_model import BAND_LIMITED, SampledModel
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.sampled_identification import HOLDS
@@ -51,6 +52,7 @@ from omsm_ros.pipelines.identify import (
 )
 from omsm_ros.quantities import shown
 from omsm_ros.readable import count, measured, percent, plain, quantity
+from omsm_ros.report.verdict import verdict_text
 
 ENCODER = "encoder"
 _MAX_DELAY = 3
@@ -124,7 +126,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         order=args.order,
         input=args.input,
         settings=settings_of_bag(bag, args.settings or {}),
-        recorded_ns=recorded_ns_of_bag(bag),
+        origin=Origin(recorded_ns=recorded_ns_of_bag(bag), software=f"omsm_ros {__version__}"),
     )
     facts = calibration_facts(identified.calibration)
     path = output_path_for(args.out, facts["verdict"])
@@ -222,20 +224,20 @@ def _drawn(out: Path, model: SampledModel, record: SampledRecord, source: Path) 
 
 def calibration_facts(calibration: Calibration) -> Facts:
     """Return what a calibration says in a few words."""
-    verdict, reasons = verdict_of(calibration)
+    certificate = calibration.certificate
     return {
         "id": calibration.id,
-        "verdict": verdict,
-        "reasons": reasons,
-        "reservations": calibration.certificate.get("reservations", []),
-        "warnings": calibration.certificate.get("warnings", []),
+        "verdict": verdict_text(calibration),
+        "reasons": [str(reason) for reason in certificate.reasons],
+        "reservations": [str(reservation) for reservation in certificate.reservations],
+        "warnings": [str(warning) for warning in certificate.warnings],
         "order": len(calibration.dynamics.denominator) - 1,
         "low_frequency_delay": calibration.dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty": calibration.low_frequency_delay_uncertainty,
         "static_gain": calibration.static_gain,
-        "static_gain_uncertainty": calibration.certificate.get("static_gain_uncertainty"),
+        "static_gain_uncertainty": certificate.static_gain.uncertainty,
         "valid_up_to": calibration.valid_up_to,
-        "polarity": calibration.certificate.get("polarity"),
+        "polarity": certificate.static_gain.polarity,
     }
 
 

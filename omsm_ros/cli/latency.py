@@ -24,18 +24,13 @@ from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_HARMONICS,
     UNINFORMATIVE_GAIN,
 )
-from omsm_ros.core.calibration.calibration import (
-    Calibration,
-    declared_latency,
-    excess_latency_text,
-    latency_of,
-    verdict_of,
-    with_latency,
-)
+from omsm_ros.core.calibration.calibration import Calibration, excess_latency_text, with_latency
+from omsm_ros.core.calibration.latency import declared_latency, summary_of
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.pipelines.study_scans import SelfCalibrationOptions, reversal_of, self_calibration_of
 from omsm_ros.readable import measured, percent, quantity
+from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import RPM_RAD_S
 
 
@@ -101,21 +96,20 @@ def _selfcal(args: argparse.Namespace) -> Facts:
 
 def _kept(out: Path, calibration: Calibration) -> Path:
     """Write the calibration, and return where."""
-    path = output_path_for(out, verdict_of(calibration)[0])
+    path = output_path_for(out, calibration.certificate.verdict or "")
     save_calibration(path, calibration)
     return path
 
 
 def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
-    verdict, reasons = verdict_of(calibration)
-    spread = calibration.certificate.get("low_frequency_delay_uncertainty_s")
+    certificate = calibration.certificate
     return {
         "id": calibration.id,
-        "verdict": verdict,
-        "reasons": reasons,
+        "verdict": verdict_text(calibration),
+        "reasons": [str(reason) for reason in certificate.reasons],
         "lag": calibration.dynamics.low_frequency_delay,
-        "lag_uncertainty": spread,
-        "latency": latency_of(calibration).entry(),
+        "lag_uncertainty": certificate.response.low_frequency_delay_uncertainty_s,
+        "latency": summary_of(calibration.latency),
         "valid_up_to": calibration.valid_up_to,
     }
 
@@ -206,7 +200,7 @@ def _latency(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     lag = calibration.dynamics.low_frequency_delay
     if (wrong := excess_latency_text(calibration, args.delay, args.uncertainty)) is not None:
-        raise ConfigurationError(wrong)
+        raise ConfigurationError(wrong.code, **wrong.values)
     latency = declared_latency(lag, args.delay, args.uncertainty, args.reason)
     made = with_latency(calibration, latency)
     path = _kept(args.out, made)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.core.calibration import calibration as plausibility
-from omsm_ros.core.calibration.calibration import SCHEMA, Calibration, content_id
+from omsm_ros.core.calibration.calibration import SCHEMA, SCHEMA_1, Calibration, content_id
 from omsm_ros.core.calibration.calibration_set import (
     AXES,
     MOST_MEMBERS,
     SET_SCHEMA,
+    SET_SCHEMA_1,
     set_from_content,
 )
 from omsm_ros.errors import CalibrationError, FileError
@@ -26,7 +26,7 @@ MAX_CALIBRATION_BYTES = 4_000_000
 
 _COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 64}
 _PROPERTIES = {
-    "schema": {"const": SCHEMA},
+    "schema": {"enum": [SCHEMA, SCHEMA_1]},
     "id": {"type": "string", "pattern": "^[0-9a-f]{64}$"},
     "numerator": _COEFFICIENTS,
     "denominator": _COEFFICIENTS,
@@ -43,7 +43,7 @@ _FORM = form(_PROPERTIES, tuple(_PROPERTIES))
 
 _MEMBER = form({"position": NUMBER, "calibration": _FORM}, ("position", "calibration"))
 _SET_PROPERTIES = {
-    "schema": {"const": SET_SCHEMA},
+    "schema": {"enum": [SET_SCHEMA, SET_SCHEMA_1]},
     "id": _PROPERTIES["id"],
     "along": {"enum": list(AXES)},
     "members": {"type": "array", "items": _MEMBER, "maxItems": MOST_MEMBERS},
@@ -53,17 +53,20 @@ _SET_FORM = form(_SET_PROPERTIES, tuple(_SET_PROPERTIES))
 
 
 def save_calibration(path: Path | str, calibration: Calibration) -> None:
-    """Write ``CAL.json`` (schema "omsm-calibration/1"), or a set of them."""
+    """Write ``CAL.json`` (schema "omsm-calibration/2"), or a set of them."""
     save_json(path, {"id": calibration.id, **calibration.content()})
 
 
 def load_calibration(path: Path | str) -> Calibration:
-    """Read ``CAL.json``, or a set of them; CalibrationError if malformed, altered, implausible."""
+    """Read ``CAL.json`` of either version, or a set of them.
+
+    Raises CalibrationError if it is malformed, altered or implausible.
+    """
     return _calibration_in(_text_of(path), path)
 
 
 def load_for_others(path: Path | str) -> Calibration:
-    """Read ``CAL.json`` for who may not see the file; no error shows what stands in it.
+    """Read ``CAL.json`` for a caller that may not see the file: errors show none of its content.
 
     Raises CalibrationError.
     """
@@ -71,7 +74,7 @@ def load_for_others(path: Path | str) -> Calibration:
     try:
         return _calibration_in(text, path)
     except CalibrationError:
-        # Without its cause, which would be in the log that everybody can subscribe to.
+        # The cause is left out because everybody can subscribe to the log.
         raise CalibrationError(
             f"{str(path)!r} is there, but no calibration that can be used; on that computer, "
             f"'omsm compare {str(path)!r} {str(path)!r}' says why"
@@ -88,11 +91,11 @@ def _calibration_in(text: str, path: Path | str) -> Calibration:
 
 
 def calibration_of(content: dict[str, Any], what: str) -> Calibration:
-    """Return the calibration, or the set, of a file's ``content``, which messages call ``what``.
+    """Return the calibration or the set of a file's ``content``; errors name it ``what``.
 
     Raises CalibrationError if it is malformed, altered or implausible.
     """
-    is_set = content.get("schema") == SET_SCHEMA
+    is_set = content.get("schema") in (SET_SCHEMA, SET_SCHEMA_1)
     check_form(content, _SET_FORM if is_set else _FORM, CalibrationError, what)
     try:
         return _set_of(content) if is_set else _calibration_of(content)
@@ -101,28 +104,42 @@ def calibration_of(content: dict[str, Any], what: str) -> Calibration:
 
 
 def _calibration_of(content: dict[str, Any]) -> Calibration:
-    _check_id(content)
-    return Calibration.from_content(content)
+    stored = _check_id(content)
+    return calibration_from(content, stored)
+
+
+def calibration_from(content: dict[str, Any], stored: str) -> Calibration:
+    """Return the calibration of ``content`` whose id ``stored`` is right.
+
+    One of version 1 keeps its id as ``certificate.origin.made_from``. Raises CalibrationError if
+    it is implausible.
+    """
+    calibration = Calibration.from_content(content)
+    if content["schema"] == SCHEMA:
+        return calibration
+    certificate = calibration.certificate
+    origin = replace(certificate.origin, made_from=stored)
+    return replace(calibration, certificate=replace(certificate, origin=origin))
 
 
 def _set_of(content: dict[str, Any]) -> Calibration:
     _check_id(content)
-    plausibility.check_certificate(content["certificate"])
     members = [_calibration_of(dict(member["calibration"])) for member in content["members"]]
     return set_from_content(content, members)
 
 
-def _check_id(content: dict[str, Any]) -> None:
-    """Take the id away from ``content``, and raise CalibrationError if it is not its own."""
+def _check_id(content: dict[str, Any]) -> str:
+    """Remove the id from ``content`` and return it; CalibrationError if it is of other content."""
     stored = content.pop("id")
     if stored != content_id(content):
         raise CalibrationError(
             f"it was altered after it was made: id {stored!r} does not match its content "
             f"{content_id(content)!r}; identify it again"
         )
+    return str(stored)
 
 
-# Where calibrations are kept: none is ever overwritten, and a link names the one in force.
+# The folder of calibrations: none is overwritten, and a link names the one in force.
 
 _ID_CHARACTERS = 12
 
@@ -141,7 +158,7 @@ class CalibrationFolder:
 
         A file that holds it already is linked again. Raises FileError.
         """
-        self._rename_non_link()
+        self._rename_file()
         short = calibration.id[:_ID_CHARACTERS]
         kept = sorted(self.link.parent.glob(f"{self.link.stem}.*.{short}{self.link.suffix}"))
         target = kept[-1] if kept else self._named(since_ns, short)
@@ -164,8 +181,8 @@ class CalibrationFolder:
         name = f"{self.link.stem}.{when:%Y%m%dT%H%M%SZ}.{short}{self.link.suffix}"
         return self.link.with_name(name)
 
-    def _rename_non_link(self) -> None:
-        """Rename a calibration that stands where the link belongs, as it was made before."""
+    def _rename_file(self) -> None:
+        """Rename a calibration file that has the name of the link."""
         if self.link.is_symlink() or not self.link.is_file():
             return
         old, since_ns = load_calibration(self.link), self.link.stat().st_mtime_ns
@@ -186,7 +203,7 @@ class CalibrationFolder:
 
 
 def since(path: Path) -> int:
-    """Return since when a calibration is in force that ``path``, a file or a link, names [ns].
+    """Return since when the calibration at ``path``, a file or a link, is in force [ns].
 
     Raises CalibrationError if there is none.
     """

@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.calibration import SCHEMA, SCHEMA_1, Calibration, content_id
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
 from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.calibration_file import calibration_of
+from omsm_ros.io.calibration_file import calibration_from, calibration_of
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -121,25 +121,26 @@ def calibration(message: Any) -> Calibration:
     certificate = _json_object("certificate", message.certificate)
     if isinstance(content := certificate.get(_SET), dict):
         return calibration_of({**content, "id": message.id}, "calibration message")
-    record = Calibration.from_content(
-        {
-            "numerator": message.numerator,
-            "denominator": message.denominator,
-            "delay": message.delay,
-            "static_gain": message.static_gain,
-            "sample_period": message.sample_period,
-            "valid_up_to": message.valid_up_to,
-            "covariance": message.covariance,
-            "settings": _json_object("settings", message.settings),
-            "certificate": certificate,
-        }
-    )
-    if message.id != record.id:
+    content = {
+        "numerator": list(message.numerator),
+        "denominator": list(message.denominator),
+        "delay": float(message.delay),
+        "static_gain": float(message.static_gain),
+        "sample_period": float(message.sample_period),
+        "valid_up_to": float(message.valid_up_to),
+        "covariance": list(message.covariance),
+        "settings": _json_object("settings", message.settings),
+        "certificate": certificate,
+    }
+    # The message does not name its schema; its id does.
+    schemas = (SCHEMA, SCHEMA_1)
+    own = [s for s in schemas if content_id({**content, "schema": s}) == message.id]
+    if not own:
         raise CalibrationError(
-            f"calibration message carries id {message.id!r} but its content hashes to "
-            f"{record.id!r}: it was altered on the way; identify or load it again"
+            f"calibration message carries id {message.id!r}, which is not that of its content: "
+            "it was altered on the way; identify or load it again"
         )
-    return record
+    return calibration_from({**content, "schema": own[0]}, message.id)
 
 
 def probe_settings(message: Any) -> dict[str, object]:
@@ -228,7 +229,7 @@ def acceleration_message(messages: Messages, block: AccelerationBlock, frame: st
 
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
     """Return ``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
-    certificate = dict(record.certificate)
+    certificate = record.certificate.content()
     if isinstance(record, CalibrationSet):
         certificate[_SET] = record.content()
     return messages.make(

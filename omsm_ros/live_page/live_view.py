@@ -13,18 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from omsm_ros.core.calibration.calibration import (
-    ACCEPTED,
-    REJECTED,
-    RESERVED,
-    Calibration,
-    verdict_of,
-)
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import ACCEPTED, REJECTED, RESERVED
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.ripple.density import density
 from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray, IntArray
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import LENGTH
+from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import NANOMETRE_M
 
 # Which map do the points of a scan make while it grows, in bounded memory?
@@ -278,14 +274,13 @@ class LiveView:
 
     def set_calibration(self, calibration: Calibration) -> None:
         """Take in the calibration in force; another one begins another map."""
-        verdict, reasons = verdict_of(calibration)
         with self._lock:
             if self._calibration and self._calibration["id"] != calibration.id:
                 self._restart()
             self._calibration = {
                 "id": calibration.id,
-                "verdict": verdict,
-                "reasons": list(reasons)[:10],
+                "verdict": verdict_text(calibration),
+                "reasons": [str(reason) for reason in calibration.certificate.reasons[:10]],
                 "delay": calibration.dynamics.low_frequency_delay,
                 "valid_up_to": calibration.valid_up_to,
             }

@@ -45,7 +45,6 @@ TEMPLATES: dict[str, str] = {
         "of the structure, for surfaces that Z follows as closely; a step test would determine the "
         "latency"
     ),
-    "adjustment.accepted": "accepted up to {frequency:Hz}",
     "adjustment.origin": "{scans} scans of one part at {speeds:list} rpm",
     "adjustment.latency_undetermined": (
         "latency: where Z follows the surface it has no effect; a step test ({opt.calibration}) "

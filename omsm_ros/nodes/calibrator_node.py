@@ -12,8 +12,9 @@ from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import Identify
 from std_msgs.msg import String
 
-from omsm_ros import quantities
-from omsm_ros.core.calibration.calibration import REJECTED, Calibration, settings_with, verdict_of
+from omsm_ros import __version__, quantities
+from omsm_ros.core.calibration.calibration import Calibration, settings_with
+from omsm_ros.core.calibration.certificate import REJECTED, Origin
 from omsm_ros.core.streams.monitoring import RecentIncrease
 from omsm_ros.core.streams.motion_record import BlockBuffer, MotionRecord, assemble
 from omsm_ros.core.streams.stamps import check_period
@@ -31,6 +32,7 @@ from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.quantities import Parameter
+from omsm_ros.report.verdict import verdict_text
 
 # What identifies takes seconds to load on a small computer, and samples are kept without it: each
 # piece of work loads its own, beside them.
@@ -128,9 +130,9 @@ class CalibratorNode(ManagedNode):
 
     def _adopt(self, calibration: Calibration, since_ns: int) -> None:
         """Keep what another node put in force; it is published even if it cannot be kept."""
-        verdict, reasons = verdict_of(calibration)
-        if verdict == REJECTED:
-            raise ConfigurationError(f"rejected: {'; '.join(reasons)}")
+        certificate = calibration.certificate
+        if certificate.verdict == REJECTED:
+            raise ConfigurationError(f"rejected: {'; '.join(map(str, certificate.reasons))}")
         self._keep_file(calibration, since_ns)
 
     def _keep_file(self, calibration: Calibration, since_ns: int) -> str:
@@ -167,13 +169,13 @@ class CalibratorNode(ManagedNode):
         response.message = self._last
 
     def _judge(self, calibration: Calibration, since_ns: int) -> tuple[bool, str]:
-        verdict, reasons = verdict_of(calibration)
-        if verdict == REJECTED:
+        certificate = calibration.certificate
+        if certificate.verdict == REJECTED:
             # An earlier, good calibration stays in its file and in use.
-            return False, f"rejected: {'; '.join(reasons)}"
+            return False, f"rejected: {'; '.join(map(str, certificate.reasons))}"
         kept = self._keep_file(calibration, since_ns)
         self._topic.announce(calibration, since_ns)
-        return True, f"{verdict}; {calibration.id[:12]} {kept}"
+        return True, f"{verdict_text(calibration)}; {calibration.id[:12]} {kept}"
 
     def _bag(self, given: str) -> Path | None:
         """Return the bag that a request names, None for the live recording."""
@@ -269,13 +271,17 @@ def _identified(*motion: Any, **options: Any) -> Identification:
 def _reported_settings_of_bag(bag: Path, stated: dict[str, object]) -> dict[str, Any]:
     from omsm_ros.pipelines.identify import recorded_ns_of_bag, settings_of_bag
 
-    return {"settings": settings_of_bag(bag, stated), "recorded_ns": recorded_ns_of_bag(bag)}
+    return {"settings": settings_of_bag(bag, stated), "origin": _origin(recorded_ns_of_bag(bag))}
 
 
 def _reported_settings_live(
     stated: dict[str, object], probe: dict[str, object], now_ns: int
 ) -> dict[str, Any]:
-    return {"settings": settings_with(stated, [probe]), "recorded_ns": now_ns}
+    return {"settings": settings_with(stated, [probe]), "origin": _origin(now_ns)}
+
+
+def _origin(recorded_ns: int | None) -> Origin:
+    return Origin(recorded_ns=recorded_ns, software=f"omsm_ros {__version__}")
 
 
 def main() -> None:

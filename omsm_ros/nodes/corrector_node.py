@@ -29,7 +29,7 @@ from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.core.streams.blocks import Account, StreamAccount, consecutive
 from omsm_ros.core.streams.monitoring import LoadMeter, RecentIncrease, SampleFlow
 from omsm_ros.core.streams.trigger_slips import TriggerSlip
-from omsm_ros.errors import BagError, CalibrationError, OmsmError
+from omsm_ros.errors import BagError, CalibrationError, Notice, OmsmError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import load_calibration, load_for_others, since
 from omsm_ros.io.descriptions import load_surface
@@ -279,7 +279,7 @@ class CorrectorNode(ManagedNode):
         self._motion: LiveOffset | None = None
         self._probe: dict[str, object] = {}
         self._foreign = ""
-        self._overridden: tuple[str, ...] = ()
+        self._overridden: tuple[Notice, ...] = ()
         self._state = CorrectionState()
         self._waiting: dict[str, list[Any]] = {}
         self._points = self.publish_on(undo, PointCloud2, "points")
@@ -311,7 +311,7 @@ class CorrectorNode(ManagedNode):
         self._use(calibration)
         self._topic.announce(calibration, since_ns)
 
-    def _objections(self, calibration: Calibration) -> tuple[str, ...]:
+    def _objections(self, calibration: Calibration) -> tuple[Notice, ...]:
         return objections(
             calibration,
             settings=self._settings or None,

@@ -320,7 +320,7 @@ class Correction:
     budget: dict[str, float]
     stamp_skew: float | None
     admission: dict[str, object]
-    reasons: tuple[str, ...]
+    reasons: tuple[Notice, ...]
     statistics: dict[str, FormStatistics]
     largest_uncertainty: float
     points: NDArray[np.void]
@@ -362,7 +362,7 @@ def correct_bag(
         progress=progress,
     )
     with scan:
-        overridden = "; ".join(["OVERRIDDEN", *scan.reasons]) if scan.reasons else ""
+        overridden = "; ".join(["OVERRIDDEN", *map(str, scan.reasons)]) if scan.reasons else ""
         comment = f"omsm_ros, metres, calibration {calibration.id} {overridden}"
         with PlyWriter(cloud, comment) as ply:
             found = _Findings(nominal, lateral, by_counter=by_stamps is None)

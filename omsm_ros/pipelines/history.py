@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import Calibration, verdict_of
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.trend import LinearTrend, trend
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.io import bags, json_and_yaml
@@ -20,6 +20,7 @@ from omsm_ros.io.catalogue import MOST_ROWS, Catalogue, time_of
 from omsm_ros.io.files import SUMMARY, read_text
 from omsm_ros.io.folders import MAX_RESULT_BYTES
 from omsm_ros.quantities import COUNTER, SIGNAL
+from omsm_ros.report.verdict import verdict_text
 
 _TABLES = ("calibrations", "measurements")
 
@@ -28,17 +29,16 @@ def keep_calibration(
     address: str, calibration: Calibration, path: Path, source: Path | None = None
 ) -> bool:
     """Add a calibration, its file and the bag that it came from; False if it is there already."""
-    certificate = calibration.certificate
     row = {
         "id": calibration.id,
         "recorded_at": time_of(_recorded(source)),
         "machine": _machine(calibration.settings),
-        "verdict": verdict_of(calibration)[0],
+        "verdict": verdict_text(calibration),
         "path": str(path.absolute()),
         "source": "" if source is None else str(source.absolute()),
         "settings": json_and_yaml.text_of(dict(calibration.settings)),
         "static_gain": float(calibration.static_gain),
-        "static_gain_uncertainty": _number(certificate.get("static_gain_uncertainty")),
+        "static_gain_uncertainty": calibration.certificate.static_gain.uncertainty,
         "delay": float(calibration.dynamics.low_frequency_delay),
         "delay_uncertainty": float(calibration.low_frequency_delay_uncertainty),
         "valid_up_to": float(calibration.valid_up_to),

@@ -12,13 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from omsm_ros import __version__
-from omsm_ros.core.calibration.calibration import (
-    Calibration,
-    age_at,
-    excess_latency_text,
-    latency_of,
-)
+from omsm_ros.core.calibration.calibration import Calibration, age_at, excess_latency_text
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
+from omsm_ros.core.calibration.latency import summary_of
 from omsm_ros.core.correction.budget import (
     ScanBudget,
     TrafficLight,
@@ -312,7 +308,7 @@ def summarise(
         "stamp_skew": done.stamp_skew,
         "conditions": conditions(done, calibration),
         "settings": dict(calibration.settings),
-        "latency": latency_of(calibration).entry(),
+        "latency": summary_of(calibration.latency),
         "versions": {
             "omsm_ros": __version__,
             "python": platform.python_version(),
@@ -332,7 +328,7 @@ def summarise(
     summary["warnings"] += judged.pop("warnings")
     summary["warnings"] += _mismatch_text(done, judgement.options.surface)
     if (late := excess_latency_text(calibration, judgement.options.lateral_lag or 0.0)) is not None:
-        summary["warnings"].append(late)
+        summary["warnings"].append(str(late))
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
 

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from omsm_ros.core.calibration.calibration import Calibration, latency_of
-from omsm_ros.errors import CalibrationError
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
 
 _OPEN = "not evaluated"
@@ -131,10 +130,7 @@ def sample_table(summary: Mapping[str, object]) -> Table:
 
 def latency_text(calibration: Calibration) -> str:
     """Return how much of the lag is latency, and who says so."""
-    try:
-        latency = latency_of(calibration)
-    except CalibrationError:
-        return NOTHING
+    latency = calibration.latency
     if latency.share is None:
         return f"not known ({latency.source})"
     return f"{measured(latency.delay_s, latency.uncertainty_s, 's')} ({latency.source})"
@@ -143,23 +139,20 @@ def latency_text(calibration: Calibration) -> str:
 def calibration_table(calibration: Calibration) -> Table:
     """Return what was identified and how well."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
-    gain = measured(calibration.static_gain, certificate.get("static_gain_uncertainty"), digits=6)
-    delay = measured(
-        certificate.get("low_frequency_delay_s", dynamics.low_frequency_delay),
-        certificate.get("low_frequency_delay_uncertainty_s"),
-        "s",
-    )
+    residual, response = certificate.residual, certificate.response
+    gain = measured(calibration.static_gain, certificate.static_gain.uncertainty, digits=6)
+    delay = measured(dynamics.low_frequency_delay, response.low_frequency_delay_uncertainty_s, "s")
     rows = [
-        ("verdict", str(certificate.get("verdict", NOTHING))),
+        ("verdict", certificate.verdict or NOTHING),
         ("trusted up to", quantity(calibration.valid_up_to, "Hz")),
         ("static gain, probe per encoder", gain),
         ("delay of slow motion", delay),
         ("of it latency of the probe", latency_text(calibration)),
-        ("chi-square per degree of freedom", plain(certificate.get("chi_square"))),
-        ("residual, rms", quantity(certificate.get("residual_rms_m"), "m")),
-        ("whiteness of the residual, p", plain(certificate.get("whiteness_p"))),
-        ("its independence of the motion, p", plain(certificate.get("independence_p"))),
-        ("edges used", count(certificate.get("edges"))),
+        ("chi-square per degree of freedom", plain(residual.chi_square)),
+        ("residual, rms", quantity(residual.rms_m, "m")),
+        ("whiteness of the residual, p", plain(residual.whiteness_p)),
+        ("its independence of the motion, p", plain(residual.independence_p)),
+        ("edges used", count(residual.edges)),
         ("sample period", quantity(calibration.sample_period, "s")),
     ]
     for number, mode in enumerate(dynamics.modes(), start=1):
@@ -176,8 +169,7 @@ def mapping_table(title: str, values: Mapping[str, object]) -> Table:
 
 def remarks_table(calibration: Calibration) -> Table:
     """Return what the identification has to say about its result."""
-    certificate: Mapping[str, Any] = calibration.certificate
-    remarks = [*(certificate.get("reasons") or ()), *(certificate.get("warnings") or ())]
+    remarks = [*calibration.certificate.reasons, *calibration.certificate.warnings]
     return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])
 
 

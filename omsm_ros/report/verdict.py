@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from omsm_ros.core.calibration.calibration import REMEDY, Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate
+from omsm_ros.errors import text_of
 from omsm_ros.readable import count, percent, quantity
 from omsm_ros.report.tables import part
 
@@ -23,6 +25,16 @@ class PageVerdict:
     reasons: tuple[str, ...]
 
 
+def verdict_text(calibration: Calibration) -> str:
+    """Return the verdict of the certificate and the band that it holds for; empty without one."""
+    certificate = calibration.certificate
+    if not certificate.accepted:
+        return certificate.verdict or ""
+    low, high = certificate.validity.from_hz, quantity(calibration.valid_up_to, "Hz")
+    start = f"from {quantity(low, 'Hz', 2)} to" if low else "up to"
+    return f"{certificate.verdict}, valid {start} {high}"
+
+
 def verdict_on_measurement(
     summary: Mapping[str, object], calibration: Calibration | None
 ) -> PageVerdict:
@@ -31,23 +43,27 @@ def verdict_on_measurement(
     Warnings are those of the measurement (``summary["warnings"]``); the certificate's own
     are about the calibration and do not count once it is accepted.
     """
-    certificate: Mapping[str, Any] = calibration.certificate if calibration else {}
-    stated = str(certificate.get("verdict", ""))
+    certificate = calibration.certificate if calibration else Certificate()
+    stated = certificate.verdict
     against = _accounting(summary)
-    if stated == "rejected":
-        against += ["the calibration was rejected", *map(str, certificate.get("reasons") or ())]
+    if stated == REJECTED:
+        against += ["the calibration was rejected", *map(str, certificate.reasons)]
     if against:
         return PageVerdict("bad", "Not to be trusted", tuple(against))
     warnings = [*map(str, part(summary, "warnings") or ())]
     if light := part(summary, "light"):
         return _of_light(light, warnings)
     doubts = [*warnings, *_losses(summary), *_latency(calibration)]
-    if not stated:
+    if calibration is None or not stated:
         missing = "the calibration has no certificate" if calibration else "no calibration is given"
         return PageVerdict("unknown", "Not judged", (missing, *doubts))
     if doubts:
         return PageVerdict("care", "Trusted with reservations", tuple(doubts))
-    return PageVerdict("good", "Trusted", (f"calibration {stated}", "every sample accounted for"))
+    return PageVerdict(
+        "good",
+        "Trusted",
+        (f"calibration {verdict_text(calibration)}", "every sample accounted for"),
+    )
 
 
 def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> PageVerdict:
@@ -77,12 +93,12 @@ def _accounting(summary: Mapping[str, object]) -> list[str]:
 
 def _latency(calibration: Calibration | None) -> list[str]:
     """Return what to do about a lag of which nobody knows whether X and C share it."""
-    if calibration is None or latency_of(calibration).resolved:
+    if calibration is None or calibration.latency.resolved:
         return []
     lag = calibration.dynamics.low_frequency_delay
     return [
         f"of the lag of {quantity(lag, 's', 4)} any part may be latency of the probe, by "
-        f"which X and C would have to be delayed (lateral_lag in the budget): {REMEDY}"
+        f"which X and C would have to be delayed (lateral_lag in the budget): {text_of('correction.latency_remedy', {})}"
     ]
 
 

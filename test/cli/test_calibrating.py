@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros import cli
 from omsm_ros.core.kinematics.trajectories import Chirp
@@ -92,7 +93,7 @@ def test_compare_sees_a_change_and_only_a_change(capsys, tmp_path, true_calibrat
     spread = np.zeros((p, p))
     spread[-1, -1] = (1e-6) ** 2
     certificate = {"verdict": "accepted", "static_gain_uncertainty": 3e-6}
-    old = replace(true_calibration, covariance=spread, certificate=certificate)
+    old = replace(true_calibration, covariance=spread, certificate=certified_by(certificate))
     g = old.dynamics
     late = replace(old, dynamics=TransferFunction(g.numerator, g.denominator, g.delay + 20e-6))
     for name, made in (("old", old), ("same", replace(old, settings={})), ("late", late)):
@@ -115,7 +116,12 @@ def test_compare_of_three_or_more_says_how_well_they_repeat(capsys, tmp_path, tr
         late = TransferFunction(g.numerator, g.denominator, g.delay + off)
         paths.append(tmp_path / f"{index}.json")
         certificate = {"verdict": "accepted"}
-        made = replace(true_calibration, dynamics=late, covariance=spread, certificate=certificate)
+        made = replace(
+            true_calibration,
+            dynamics=late,
+            covariance=spread,
+            certificate=certified_by(certificate),
+        )
         calibration_file.save_calibration(paths[-1], made)
     alike = facts(capsys, "compare", *paths[:3])
     assert alike["repeatable"]

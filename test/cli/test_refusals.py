@@ -190,6 +190,8 @@ def test_limits_in_another_unit_are_refused(capsys, tmp_path, calibration):
     assert "give it in metres" in said
 
 
-@pytest.mark.parametrize(("feed", "said"), [("10", "feed of a turn is 10.0 m"), ("0.5", "less than one")])
+@pytest.mark.parametrize(
+    ("feed", "said"), [("10", "feed of a turn is 10.0 m"), ("0.5", "less than one")]
+)
 def test_a_feed_that_makes_no_spiral_is_refused(capsys, tmp_path, feed, said):
     assert said in refused(capsys, "twin", "--out", tmp_path, "--radius", "0.001", "--feed", feed)

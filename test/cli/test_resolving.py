@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
@@ -61,7 +62,10 @@ def sum_of_lags(tmp_path, true_calibration):
     covariance = np.zeros_like(true_calibration.covariance)
     covariance[-1, -1] = 1e-12
     made = replace(
-        true_calibration, dynamics=late, covariance=covariance, certificate={"verdict": "accepted"}
+        true_calibration,
+        dynamics=late,
+        covariance=covariance,
+        certificate=Certificate(verdict="accepted"),
     )
     path = tmp_path / "step.json"
     calibration_file.save_calibration(path, made)
@@ -112,7 +116,7 @@ def test_a_latency_is_declared_with_a_reason(capsys, tmp_path, calibration):
     given = ["latency", calibration, "--delay", "1e-4", "--uncertainty", "5e-6", "--out", out]
     found = facts(capsys, *given, "--reason", "data sheet")
     assert found["latency"]["source"] == "declared"
-    assert calibration_file.load_calibration(out).certificate["latency"]["delay_s"] == 1e-4
+    assert calibration_file.load_calibration(out).certificate.latency["delay_s"] == 1e-4
     assert cli.main([*map(str, given), "--reason", " "]) == 2
     assert "needs a reason" in capsys.readouterr().err
     given[3] = "0.1"
@@ -134,7 +138,7 @@ def test_reversal_writes_what_it_found(capsys, tmp_path, sum_of_lags):
     ]  # fmt: skip
     out = tmp_path / "resolved.json"
     found = facts(capsys, "reversal", *scans, "--calibration", sum_of_lags, "--out", out)
-    latency = calibration_file.load_calibration(out).certificate["latency"]
+    latency = calibration_file.load_calibration(out).certificate.latency
     assert latency["source"] == "reversal"
     assert latency["delay_s"] == pytest.approx(found["lag"])
     assert found["latency"] is None

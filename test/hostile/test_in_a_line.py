@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from certified import certified_by
 from hostile import maps, trees
 from hostile.judge import Case, ask, judge
 
@@ -137,7 +138,8 @@ def test_a_covariance_of_noise_is_one_too(place, true_calibration):
     p = len(true_calibration.covariance)
     noise = [1.7e308 if k == 3 else 0.0 for k in range(p * p)]
     changed = dataclasses.replace(
-        true_calibration, certificate={**true_calibration.certificate, "noise_covariance": noise}
+        true_calibration,
+        certificate=certified_by({"noise_covariance": noise}, true_calibration.certificate),
     )
     save_calibration(place / "odd.json", changed)
     assert "not symmetric" in refused(place, "compare", "cal.json", "odd.json")

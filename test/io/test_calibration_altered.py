@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.calibration.calibration_set import calibration_set
 from omsm_ros.errors import CalibrationError
@@ -34,7 +35,9 @@ def single(true_calibration):
         "nested": {"list": [1, 2.5, None, True, "µ"], "deep": [{"a": -1e-300}]},
     }  # fmt: skip
     return replace(
-        true_calibration, settings={"machine": "a", "rate": 1000}, certificate=certificate
+        true_calibration,
+        settings={"machine": "a", "rate": 1000},
+        certificate=certified_by(certificate),
     )
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 from datetime import datetime
 
 import pytest
+from certified import certified_by
 
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.catalogue import Catalogue, time_of
@@ -37,7 +38,9 @@ def folder_with(path, **parts):
 
 def test_a_calibration_is_a_row_of_its_own_numbers(tmp_path, address, true_calibration):
     certificate = {"verdict": "accepted", "static_gain_uncertainty": 2e-6}
-    made = replace(true_calibration, certificate=certificate, settings={"machine": "ü 1", "n": 2})
+    made = replace(
+        true_calibration, certificate=certified_by(certificate), settings={"machine": "ü 1", "n": 2}
+    )
     assert keep_calibration(address, made, tmp_path / "cal.json", tmp_path / "gone.mcap")
     (row,) = rows(address, "calibrations")
     assert row["id"] == made.id

@@ -3,6 +3,7 @@ import struct
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.correction.surface_points import POINT_DTYPE
 from omsm_ros.core.streams.blocks import AccelerationBlock
@@ -136,7 +137,9 @@ def test_the_light_reads_the_verdict_of_a_certificate(clock, true_calibration, v
     view = LiveView(monotonic=clock)
     view.add_state("/omsm/corrector", "OK", "correcting", {})
     certificate = {"verdict": verdict} if verdict else {}
-    view.set_calibration(dataclasses.replace(true_calibration, certificate=certificate))
+    view.set_calibration(
+        dataclasses.replace(true_calibration, certificate=certified_by(certificate))
+    )
     assert view.state()["light"]["colour"] == colour
 
 

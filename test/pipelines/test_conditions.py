@@ -4,8 +4,9 @@ from dataclasses import replace
 from itertools import islice
 
 import pytest
+from certified import certified_by
 
-from omsm_ros.core.calibration.calibration import RECORDED, age_at
+from omsm_ros.core.calibration.calibration import age_at
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.message_mapping import typestore
@@ -31,8 +32,8 @@ def record(path, blocks, temperatures, start_ns=NOON_NS):
 
 
 def dated(calibration, recorded_ns):
-    certificate = {**calibration.certificate, RECORDED: recorded_ns}
-    return replace(calibration, certificate=certificate)
+    certificate = certified_by({"recorded_ns": recorded_ns}, calibration.certificate)
+    return replace(calibration, certificate=certified_by(certificate))
 
 
 def test_summary_and_page_tell_age_and_temperature(tmp_path, small_scan_blocks, true_calibration):

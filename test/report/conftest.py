@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
-from omsm_ros.core.calibration.calibration import declared_latency
+from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.report.measurement.surface_map import CloudView
 from omsm_ros.twin.part import FigureError
@@ -49,11 +50,12 @@ def certified(true_calibration):
     for index in range(1, len(true_calibration.dynamics.numerator)):
         covariance[index, index] = variance[index - 1]
     certificate = {"verdict": "accepted up to 100 Hz", "chi_square": 1.01, "edges": 20}
-    certificate["latency"] = declared_latency(
-        3.4e-4, 0.0, 1e-6, "the twin's probe is prompt"
-    ).entry()
+    latency = declared_latency(3.4e-4, 0.0, 1e-6, "the twin's probe is prompt")
     return replace(
-        true_calibration, covariance=covariance, certificate=certificate, valid_up_to=100.0
+        true_calibration,
+        covariance=covariance,
+        certificate=replace(certified_by(certificate), latency=latency),
+        valid_up_to=100.0,
     )
 
 

@@ -10,6 +10,7 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
+from certified import certified_by
 from page_tables import PageTables
 from parsed_page import Page
 
@@ -124,12 +125,12 @@ def campaign(text, calibration):
 
 def certificate(text, calibration):
     entries = {
-        "verdict": text, "reasons": [text], "warnings": [text], "reservations": [text],
+        "verdict": "rejected", "reasons": [text], "warnings": [text], "reservations": [text],
         "input": text, text: text, "samples": {text: 4}, "assumed": [text],
         "departures": [{"family": text, "size_m": 1e-9, "modelled": text}],
-        "could_hide": [{"family": text, "missed": 1e-9}], "consistency": [{"parts": text}],
+        "consistency": [{"parts": text}],
     }  # fmt: skip
-    hostile = replace(calibration, settings={text: text}, certificate=entries)
+    hostile = replace(calibration, settings={text: text}, certificate=certified_by(entries))
     return render_certificate(
         CertificatePage(calibration=hostile, date=text, source=text, version=text)
     )

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from certified import certified_by
+
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.readable import NOTHING
 from omsm_ros.report import tables
 
@@ -53,32 +56,34 @@ class TestSampleTable:
 
 class TestCalibrationTable:
     def test_has_what_a_metrologist_asks_for(self, certified):
-        certificate = {
-            **certified.certificate,
-            "static_gain_uncertainty": 3.4e-6,
-            "low_frequency_delay_s": 339.7e-6,
-            "low_frequency_delay_uncertainty_s": 1.13e-6,
-        }
+        certificate = certified_by(
+            {
+                "static_gain_uncertainty": 3.4e-6,
+                "low_frequency_delay_s": 339.7e-6,
+                "low_frequency_delay_uncertainty_s": 1.13e-6,
+            },
+            certified.certificate,
+        )
         given_calibration = replace(certified, certificate=certificate)
         rows = dict(tables.calibration_table(given_calibration).rows)
         assert rows["static gain, probe per encoder"] == "0.9921260 ± 0.0000034"
         assert rows["delay of slow motion"] == "339.7 µs ± 1.1 µs"
         assert rows["trusted up to"] == "100 Hz"
         assert rows["chi-square per degree of freedom"] == "1.01"
-        assert rows["verdict"] == "accepted up to 100 Hz"
+        assert rows["verdict"] == "accepted"
         # Eq. 12: 804 Hz of damping 0.19, and a real pole at 49 761 rad/s.
         assert rows["mode 1"] == "804 Hz, damping 0.192"
         assert rows["mode 2"] == "7.92 kHz, damping 1.00"
 
     def test_leaves_out_what_the_certificate_does_not_say(self, certified):
-        rows = dict(tables.calibration_table(replace(certified, certificate={})).rows)
+        rows = dict(tables.calibration_table(replace(certified, certificate=Certificate())).rows)
         assert "verdict" not in rows
         assert "edges used" not in rows
         assert rows["delay of slow motion"] == "339.7 µs"
 
     def test_remarks_are_reasons_and_warnings(self, certified):
         certificate = {"reasons": ["one"], "warnings": ["two", "three"]}
-        table = tables.remarks_table(replace(certified, certificate=certificate))
+        table = tables.remarks_table(replace(certified, certificate=certified_by(certificate)))
         assert [*table.rows] == [("one",), ("two",), ("three",)]
 
 

@@ -5,19 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from certified import certified_by
 
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.report.verdict import verdict_on_measurement
 
 
 def test_an_accepted_calibration_and_a_full_account_are_trusted(summary, certified):
     verdict = verdict_on_measurement(summary, certified)
     assert verdict.level == "good"
-    assert "calibration accepted up to 100 Hz" in verdict.reasons
+    assert "calibration accepted, valid up to 100 Hz" in verdict.reasons
 
 
 def test_a_rejected_calibration_is_not_trusted_and_says_why(summary, certified):
     rejected = {"verdict": "rejected", "reasons": ["residual is not white"]}
-    verdict = verdict_on_measurement(summary, replace(certified, certificate=rejected))
+    verdict = verdict_on_measurement(
+        summary, replace(certified, certificate=certified_by(rejected))
+    )
     assert verdict.level == "bad"
     assert "residual is not white" in verdict.reasons
 
@@ -52,12 +56,17 @@ def test_many_missing_points_are_a_reservation(summary, certified):
 
 
 def test_warnings_of_an_accepted_calibration_do_not_count(summary, certified):
-    warned = {**certified.certificate, "warnings": ["a pole stands for all that is faster"]}
+    warned = certified_by(
+        {"warnings": ["a pole stands for all that is faster"]}, certified.certificate
+    )
     assert verdict_on_measurement(summary, replace(certified, certificate=warned)).level == "good"
 
 
 def test_without_a_certificate_nothing_is_judged(summary, certified):
-    assert verdict_on_measurement(summary, replace(certified, certificate={})).level == "unknown"
+    assert (
+        verdict_on_measurement(summary, replace(certified, certificate=Certificate())).level
+        == "unknown"
+    )
     verdict = verdict_on_measurement(summary, None)
     assert verdict.level == "unknown"
     assert "no calibration is given" in verdict.reasons
@@ -66,7 +75,10 @@ def test_without_a_certificate_nothing_is_judged(summary, certified):
 def test_the_worst_decides(summary, certified):
     summary["warnings"] = ["late"]
     summary["samples"]["axes"]["received"] += 1
-    assert verdict_on_measurement(summary, replace(certified, certificate={})).level == "bad"
+    assert (
+        verdict_on_measurement(summary, replace(certified, certificate=Certificate())).level
+        == "bad"
+    )
 
 
 def test_nothing_at_all_is_not_judged():
@@ -75,7 +87,9 @@ def test_nothing_at_all_is_not_judged():
 
 def test_a_lag_that_nothing_divides_is_a_reservation_with_its_remedy(summary, certified):
     unresolved = {"verdict": "accepted"}
-    verdict = verdict_on_measurement(summary, replace(certified, certificate=unresolved))
+    verdict = verdict_on_measurement(
+        summary, replace(certified, certificate=certified_by(unresolved))
+    )
     assert verdict.level == "care"
     (reason,) = verdict.reasons
     assert "339.7 µs" in reason

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 from omsm_msgs.msg import AxisBlock as AxisMessage
 from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_msgs.msg import DistanceBlock as DistanceMessage
@@ -96,7 +97,9 @@ def test_settings_that_differ_are_refused_on_every_way_in(cell, true_calibration
 
 def test_a_refused_calibration_leaves_the_one_in_force(cell, true_calibration):
     cell.processes.start("corrector", calibration=saved(cell, "good.json", true_calibration))
-    rejected = replace(true_calibration, certificate={"verdict": "rejected", "reasons": ["loose"]})
+    rejected = replace(
+        true_calibration, certificate=certified_by({"verdict": "rejected", "reasons": ["loose"]})
+    )
     answer = cell.call(
         LoadCalibration, "corrector/load_calibration", path=saved(cell, "bad.json", rejected)
     )

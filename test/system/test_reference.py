@@ -56,7 +56,7 @@ def test_a_reference_over_dds_is_distinguished_and_can_be_the_input(cell, step_t
     assert by_reference.success, by_reference.message
     found = load_calibration(output)
     assert found.id == by_reference.calibration.id != by_encoder.calibration.id
-    assert found.certificate["input"] == "reference"
+    assert found.certificate.origin.input == "reference"
     assert found.static_gain == pytest.approx(expected, abs=5e-5)
     ratio = found.dynamics.response([1.0]) / Plant().dynamics.response([1.0])
     assert abs(np.angle(ratio[0], deg=True)) < 2e-3

@@ -8,7 +8,7 @@ calibration has the same effect, so the result is not better than that delay.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -25,15 +25,16 @@ from omsm_ros.core.adjustment.self_calibration import (
     SelfCalibration,
     self_calibrate,
 )
-from omsm_ros.core.calibration.calibration import (
-    ENTRY,
-    REJECTED,
-    REVERSAL,
-    SPEEDS,
-    Calibration,
-    Latency,
-    latency_share_of,
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import (
+    ACCEPTED,
+    Certificate,
+    Residual,
+    Response,
+    StaticGain,
 )
+from omsm_ros.core.calibration.finding import REJECTS, WARNING, Finding
+from omsm_ros.core.calibration.latency import REVERSAL, SPEEDS, Latency, latency_share_of
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
@@ -59,7 +60,7 @@ def unit_calibration(sample_period: float, static_gain: float = 1.0) -> Calibrat
         sample_period=sample_period,
         valid_up_to=0.5 / sample_period,
         covariance=np.zeros((2, 2)),
-        certificate={"verdict": "accepted"},
+        certificate=Certificate(verdict=ACCEPTED),
     )
 
 
@@ -102,18 +103,22 @@ def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
     change = prior - remaining
     covariance = sigma - gain @ change @ gain.T
     lag = g.low_frequency_delay
-    certificate = {
-        **calibration.certificate,
-        **_entries(found),
-        ENTRY: _latency(found, lag).entry(),
-        "low_frequency_delay_s": lag,
-        "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
-    }
+    certificate = replace(
+        calibration.certificate,
+        self_calibration=_entries(found),
+        latency=_latency(found, lag),
+        response=replace(
+            calibration.certificate.response,
+            low_frequency_delay_s=lag,
+            low_frequency_delay_uncertainty_s=float(np.sqrt(found.covariance[LAG, LAG])),
+        ),
+    )
+    findings = list(_findings(found))
     return replace(
         calibration,
         dynamics=g,
         covariance=(covariance + covariance.T) / 2,
-        certificate=_judged(certificate, found),
+        certificate=certificate.judged(findings) if findings else certificate,
     )
 
 
@@ -142,18 +147,20 @@ def from_scans_alone(
     by_found[5, LATENCY] = 1.0
     dynamics = TransferFunction(numerator, denominator, latency)
     trusted = min(_highest_excited(found), 0.5 / sample_period)
-    certificate: dict[str, object] = {
-        **_entries(found),
-        "static_gain": static_gain,
-        "static_gain_uncertainty": float(np.sqrt(found.covariance[GAIN, GAIN])) * static_gain,
-        ENTRY: _latency(found, dynamics.low_frequency_delay).entry(),
-        "noise_m": found.agreement.noise,
-        "low_frequency_delay_s": dynamics.low_frequency_delay,
-        "low_frequency_delay_uncertainty_s": float(np.sqrt(found.covariance[LAG, LAG])),
-        "warnings": [] if found.known[LATENCY] else [str(SCOPE)],
-        "reasons": _early_reason(total, float(np.sqrt(found.covariance[LAG, LAG]))),
-        "verdict": str(Notice("adjustment.accepted", frequency=trusted)),
-    }
+    scope = [] if found.known[LATENCY] else [Finding(SCOPE.code, WARNING)]
+    spread = float(np.sqrt(found.covariance[LAG, LAG]))
+    certificate = Certificate(
+        self_calibration=_entries(found),
+        latency=_latency(found, dynamics.low_frequency_delay),
+        static_gain=StaticGain(
+            uncertainty=float(np.sqrt(found.covariance[GAIN, GAIN])) * static_gain
+        ),
+        residual=Residual(noise_m=found.agreement.noise),
+        response=Response(
+            low_frequency_delay_s=dynamics.low_frequency_delay,
+            low_frequency_delay_uncertainty_s=spread,
+        ),
+    ).judged([*scope, *_early_reason(total, spread), *_findings(found)])
     return Calibration(
         dynamics=dynamics,
         static_gain=static_gain,
@@ -161,7 +168,7 @@ def from_scans_alone(
         valid_up_to=trusted,
         covariance=by_found @ found.covariance @ by_found.T,
         settings=settings,
-        certificate=_judged(certificate, found),
+        certificate=certificate,
     )
 
 
@@ -219,22 +226,20 @@ def _same(speeds: FloatArray) -> bool:
 
 def _entries(found: SelfCalibration) -> dict[str, object]:
     return {
-        "self_calibration": {
-            "speeds_rad_s": list(found.speeds),
-            "points": found.points,
-            "residual_rms_m": found.residual,
-            "left_on_this_surface_m": found.followed,
-            "agreement": asdict(found.agreement),
-            "surprise_chi2": found.prior_conflict,
-            "between_scans": [
-                {
-                    name: {"value": float(value), "uncertainty": float(spread)}
-                    for name, value, spread in zip(OWN, values, spreads, strict=True)
-                }
-                for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
-            ],
-            "not_told": [*map(str, undetermined(found))],
-        },
+        "speeds_rad_s": list(found.speeds),
+        "points": found.points,
+        "residual_rms_m": found.residual,
+        "left_on_this_surface_m": found.followed,
+        "agreement": asdict(found.agreement),
+        "surprise_chi2": found.prior_conflict,
+        "between_scans": [
+            {
+                name: {"value": float(value), "uncertainty": float(spread)}
+                for name, value, spread in zip(OWN, values, spreads, strict=True)
+            }
+            for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
+        ],
+        "not_told": [*map(str, undetermined(found))],
     }
 
 
@@ -248,39 +253,28 @@ def undetermined(found: SelfCalibration) -> list[Notice]:
     return [*notices, Notice("adjustment.gain_undetermined")]
 
 
-def _judged(certificate: dict[str, object], found: SelfCalibration) -> dict[str, object]:
-    """Return the certificate with the reasons that the scans add, rejected if there are any."""
-    reasons = []
+def _findings(found: SelfCalibration) -> Iterator[Finding]:
+    """Yield the reasons against the calibration that the scans give."""
     if not found.agreement.holds:
-        reasons.append(
-            Notice(
-                "adjustment.scans_disagree",
-                disagreement=found.agreement.disagreement,
-                ratio=found.agreement.ratio,
-            )
-        )
+        values = {
+            "disagreement": found.agreement.disagreement,
+            "ratio": found.agreement.ratio,
+        }
+        yield Finding("adjustment.scans_disagree", REJECTS, values)
     if stats.chi2.sf(found.prior_conflict, GAIN) < _PRIOR_CONFLICT_P:
-        shift = float(found.values[LAG])
-        reasons.append(
-            Notice("adjustment.step_test_conflict", shift=shift, chi2=found.prior_conflict)
-        )
+        values = {"shift": float(found.values[LAG]), "chi2": found.prior_conflict}
+        yield Finding("adjustment.step_test_conflict", REJECTS, values)
     latency, spread = (
         float(v) for v in (found.values[LATENCY], found.covariance[LATENCY, LATENCY])
     )
     if latency < -_PRIOR_CONFLICT_SIGMAS * np.sqrt(spread):
-        reasons.append(Notice("adjustment.negative_latency", latency=-latency))
-    before = certificate.get("reasons")
-    all_reasons = [*(before if isinstance(before, list) else []), *map(str, reasons)]
-    if not all_reasons:
-        return certificate
-    return certificate | {"reasons": all_reasons, "verdict": REJECTED}
+        yield Finding("adjustment.negative_latency", REJECTS, {"latency": -latency})
 
 
-def _early_reason(lag: float, uncertainty: float) -> list[str]:
-    """Return the reason to reject scans without a step test for a significantly negative lag."""
-    if lag >= -_PRIOR_CONFLICT_SIGMAS * uncertainty:
-        return []
-    return [str(Notice("adjustment.negative_lag", lag=-lag))]
+def _early_reason(lag: float, uncertainty: float) -> Iterator[Finding]:
+    """Yield the reason to reject scans without a step test for a significantly negative lag."""
+    if lag < -_PRIOR_CONFLICT_SIGMAS * uncertainty:
+        yield Finding("adjustment.negative_lag", REJECTS, {"lag": -lag})
 
 
 def _highest_excited(found: SelfCalibration) -> float:

@@ -1,8 +1,8 @@
-"""Does this calibration belong to these data?
+"""Decide whether a calibration applies to a recording.
 
-A calibration holds for the probe's rate, exposure and averaging, for the machine and the
-fixture it was made with. What differs is stated in full sentences; whoever corrects anyway
-records them with the result.
+A calibration holds for the rate, exposure and averaging of the probe, the machine and the fixture
+that it was made with. Each difference is an objection; a user who corrects anyway has them
+recorded with the result.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import numpy as np
 
 from omsm_ros.core.calibration.calibration import PROBE, Calibration
 from omsm_ros.core.streams.blocks import SAME_PERIOD
-from omsm_ros.errors import CalibrationError
+from omsm_ros.errors import CalibrationError, Notice
 
-# Settings are written by people or read back as float32.
+# Settings are written by people, or read back as float32.
 _SAME_VALUE = 1e-6
 
 
@@ -26,8 +26,8 @@ def objections(
     settings: Mapping[str, object] | None = None,
     probe: Sequence[Mapping[str, object]] = (),
     polarity: int | None = None,
-) -> tuple[str, ...]:
-    """Return why ``calibration`` should not be used; empty if nothing speaks against it.
+) -> tuple[Notice, ...]:
+    """Return why ``calibration`` should not be used; empty if there is no reason against it.
 
     sample_period: of the data [s];  polarity: that the correction will use
     settings: as they are now; a name that both sides know must have the same value, one that
@@ -38,7 +38,7 @@ def objections(
     found = [*_certificate(calibration, polarity)]
     expected = calibration.sample_period
     if sample_period is not None and abs(sample_period - expected) > SAME_PERIOD * expected:
-        found.append(f"sample period is {sample_period!r} s, calibrated at {expected!r} s")
+        found.append(Notice("calibration.other_period", period=sample_period, calibrated=expected))
     if settings is not None:
         stated = {n: v for n, v in calibration.settings.items() if not n.startswith(PROBE)}
         found += _differences(stated, settings)
@@ -48,51 +48,54 @@ def objections(
     return tuple(dict.fromkeys(found))
 
 
-def admit(calibration: Calibration, reasons: tuple[str, ...], override: bool) -> dict[str, object]:
+def admit(
+    calibration: Calibration, reasons: tuple[Notice, ...], override: bool
+) -> dict[str, object]:
     """Return what to record of the decision to use a calibration, as JSON values.
 
     Raises CalibrationError with all ``reasons`` unless there are none or ``override`` is set.
     """
     if reasons and not override:
         raise CalibrationError(
-            f"calibration {calibration.id[:12]} does not belong to these data: "
-            f"{'; '.join(reasons)}. Set the cell as it was, identify again, or use it all the same "
-            "(--override; parameter override)"
+            "calibration.not_applicable",
+            id=calibration.id[:12],
+            reasons="; ".join(map(str, reasons)),
         )
-    return {"calibration": calibration.id, "objections": list(reasons), "overridden": bool(reasons)}
+    return {
+        "calibration": calibration.id,
+        "objections": [str(reason) for reason in reasons],
+        "overridden": bool(reasons),
+    }
 
 
-def _certificate(calibration: Calibration, polarity: int | None) -> list[str]:
+def _certificate(calibration: Calibration, polarity: int | None) -> list[Notice]:
     certificate = calibration.certificate
     found = []
-    verdict = certificate.get("verdict")
-    if verdict is None:
-        found.append("its certificate states no verdict")
-    elif not str(verdict).startswith("accepted"):
-        found.append(f"its certificate says {verdict!r}{_reasons(certificate)}")
-    certified = certificate.get("polarity")
+    if certificate.verdict is None:
+        found.append(Notice("calibration.not_judged"))
+    elif not certificate.accepted:
+        reasons = "; ".join(map(str, certificate.reasons))
+        found.append(Notice("calibration.was_rejected", reasons=f" ({reasons})" if reasons else ""))
+    certified = certificate.static_gain.polarity
     if polarity is not None and certified is not None and certified != polarity:
-        moves = "rises" if certified == -1 else "falls"
-        found.append(
-            f"polarity is {polarity!r}, calibrated with {certified!r} (the distance {moves} as z "
-            "rises): turn the sign of distance where both recordings come from (map, driver), or "
-            f"state polarity {certified} (--polarity {certified})"
+        code = (
+            "calibration.other_polarity_rises"
+            if certified == -1
+            else ("calibration.other_polarity_falls")
         )
+        found.append(Notice(code, polarity=polarity, certified=certified))
     return found
 
 
-def _reasons(certificate: Mapping[str, object]) -> str:
-    reasons = certificate.get("reasons")
-    return f" ({'; '.join(map(str, reasons))})" if isinstance(reasons, list) and reasons else ""
-
-
-def _differences(then: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+def _differences(then: Mapping[str, object], now: Mapping[str, object]) -> list[Notice]:
     found = []
     for name, value in sorted(then.items()):
         if name not in now:
-            found.append(f"{name} is not known, calibrated with {value!r}")
+            found.append(Notice("calibration.unknown_setting", name=name, calibrated=value))
         elif not _same(value, now[name]):
-            found.append(f"{name} is {now[name]!r}, calibrated with {value!r}")
+            found.append(
+                Notice("calibration.other_setting", name=name, value=now[name], calibrated=value)
+            )
     return found
 
 

@@ -1,32 +1,26 @@
 """One machine, calibrated at several places: its dynamics vary along X, Z or B.
 
-The set stands wherever a calibration does. Where one response is asked for (a prediction, a page)
-it is that of the member nearest to the middle; a correction goes from member to member.
+A set may be used wherever a calibration may. Where one response is needed (a prediction, a page),
+it is that of the member nearest to the middle; a correction interpolates between members.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import (
-    ENTRY,
-    REJECTED,
-    Calibration,
-    Latency,
-    latency_of,
-    latency_share_of,
-    unresolved_latency,
-    verdict_of,
-)
+from omsm_ros.core.calibration.calibration import Calibration, certificate_from_content
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate
+from omsm_ros.core.calibration.latency import Latency, latency_share_of, unresolved_latency
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import CalibrationError
 from omsm_ros.quantities import POSITION, TABLE_ANGLE
 
-SET_SCHEMA = "omsm-calibration-set/1"
+SET_SCHEMA = "omsm-calibration-set/2"
+SET_SCHEMA_1 = "omsm-calibration-set/1"
 AXES = ("x", "z", "b")
 # Every 13 mm of a travel of 250 mm; each costs its filter at every sample.
 MOST_MEMBERS = 20
@@ -56,7 +50,7 @@ class CalibrationSet(Calibration):
                 {"position": position, "calibration": {"id": c.id, **c.content()}}
                 for position, c in zip(self.positions, self.members, strict=True)
             ],
-            "certificate": dict(self.certificate),
+            "certificate": self.certificate.content(),
         }
 
     def covered(self, position: FloatArray) -> BoolArray:
@@ -78,22 +72,19 @@ class CalibrationSet(Calibration):
 def calibration_set(
     along: str,
     placed: Sequence[tuple[float, Calibration]],
-    certificate: Mapping[str, object] | None = None,
+    certificate: Certificate | None = None,
 ) -> CalibrationSet:
     """Return the set of calibrations at their places [m], of b [rad].
 
-    certificate: of the set; None makes it of the members'
+    certificate: of the set; None combines those of the members
 
     Raises CalibrationError for members that are too few, too many, at one place, or of different
     sample periods, polarities or settings.
     """
     if along not in AXES:
-        raise CalibrationError(f"a set along {along!r}, expected one of {', '.join(AXES)}")
+        raise CalibrationError("calibration.set_axis", axis=repr(along), known=", ".join(AXES))
     if not 2 <= len(placed) <= MOST_MEMBERS:
-        raise CalibrationError(
-            f"a set of {len(placed)} calibrations, expected 2 to {MOST_MEMBERS}; calibrate at "
-            "both ends of the range at least"
-        )
+        raise CalibrationError("calibration.set_size", count=len(placed), most=MOST_MEMBERS)
     quantity = TABLE_ANGLE if along == "b" else POSITION
     for position, _ in placed:
         quantity.checked(position, CalibrationError, along)
@@ -101,9 +92,7 @@ def calibration_set(
     positions = tuple(float(position) for position, _ in ordered)
     members = tuple(calibration for _, calibration in ordered)
     if len(set(positions)) < len(positions):
-        raise CalibrationError(
-            f"two calibrations stand at one {along}: {positions!r}; give each a place of its own"
-        )
+        raise CalibrationError("calibration.set_places", axis=along, positions=repr(positions))
     _check_alike(members)
     middle = members[_nearest_to_middle(positions)]
     return CalibrationSet(
@@ -130,40 +119,53 @@ def _check_alike(members: Sequence[Calibration]) -> None:
     for other in members[1:]:
         for what, one, two in (
             ("sample_period", first.sample_period, other.sample_period),
-            ("polarity", first.certificate.get("polarity"), other.certificate.get("polarity")),
+            (
+                "polarity",
+                first.certificate.static_gain.polarity,
+                other.certificate.static_gain.polarity,
+            ),
             ("settings", dict(first.settings), dict(other.settings)),
         ):
             if one != two:
                 raise CalibrationError(
-                    f"{what} of a set's members is {one!r} and {two!r}; calibrate every place alike"
+                    "calibration.set_differs", what=what, first=repr(one), other=repr(two)
                 )
 
 
-def _certificate(middle: Calibration, members: Sequence[Calibration]) -> dict[str, object]:
+def _certificate(middle: Calibration, members: Sequence[Calibration]) -> Certificate:
     """Return what holds for all: the worst verdict, the largest uncertainties."""
-    found = dict(middle.certificate)
-    verdicts = [verdict_of(c) for c in members]
-    rejected = [verdict for verdict in verdicts if verdict[0] == REJECTED]
-    silent = [verdict for verdict in verdicts if not verdict[0]]
-    found["verdict"] = (rejected or silent or [verdict_of(middle)])[0][0]
-    found["reasons"] = [*dict.fromkeys(text for _, texts in verdicts for text in texts)]
-    if not found["verdict"]:
-        del found["verdict"]
-    for key in ("noise_m", "motion_error_m", "valid_from"):
-        sizes = [c.certificate.get(key) for c in members]
-        known = [float(size) for size in sizes if isinstance(size, int | float)]
-        if known:
-            found[key] = max(known)
+    every = [c.certificate for c in members]
+    own = middle.certificate
+    rejected = any(c.verdict == REJECTED for c in every)
+    silent = any(c.verdict is None for c in every)
+    reasons = [finding for c in every for finding in c.reasons]
+    kept = [*own.reservations, *own.warnings]
     gains = [c.static_gain for c in members]
-    own = max(c.static_gain_uncertainty for c in members)
-    found["static_gain_uncertainty"] = float(np.hypot(own, np.ptp(gains) / np.sqrt(12.0)))
-    found[ENTRY] = _latency(members).entry()
-    return found
+    largest = max(c.static_gain_uncertainty for c in members)
+    return replace(
+        own,
+        verdict=REJECTED if rejected else None if silent else own.verdict,
+        findings=tuple(f for i, f in enumerate(reasons) if f not in reasons[:i]) + tuple(kept),
+        residual=replace(own.residual, noise_m=_largest(c.residual.noise_m for c in every)),
+        model_errors=replace(
+            own.model_errors,
+            motion_error_m=_largest(c.model_errors.motion_error_m for c in every),
+        ),
+        validity=replace(own.validity, from_hz=_largest(c.validity.from_hz for c in every)),
+        static_gain=replace(
+            own.static_gain, uncertainty=float(np.hypot(largest, np.ptp(gains) / np.sqrt(12.0)))
+        ),
+        latency=_latency(members),
+    )
+
+
+def _largest(values: Iterable[float | None]) -> float | None:
+    return max((value for value in values if value is not None), default=None)
 
 
 def _latency(members: Sequence[Calibration]) -> Latency:
     """Return the latency of the probe, which is one wherever the slides stand."""
-    each = [latency_of(c) for c in members]
+    each = [c.latency for c in members]
     lag = max((c.dynamics.low_frequency_delay for c in members), key=abs)
     if not all(latency.resolved for latency in each):
         return unresolved_latency(lag)
@@ -185,4 +187,5 @@ def set_from_content(content: Mapping[str, Any], members: Sequence[Calibration])
     """Return the inverse of :meth:`CalibrationSet.content`, of members read already."""
     places = [float(member["position"]) for member in content["members"]]
     placed = list(zip(places, members, strict=True))
-    return calibration_set(content["along"], placed, content["certificate"])
+    certificate = certificate_from_content(content["certificate"])
+    return calibration_set(content["along"], placed, certificate)

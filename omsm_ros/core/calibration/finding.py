@@ -1,23 +1,51 @@
-"""What one check of an identification found: values, their limits, and words for a reader."""
+"""Findings: what a check says of a calibration, as a code with values."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+
+from omsm_ros.errors import CalibrationError, text_of
+
+REJECTS, RESERVATION, WARNING, NOTE = "rejects", "reservation", "warning", "note"
+SEVERITIES = (REJECTS, RESERVATION, WARNING, NOTE)
+
+TEXT = "calibration.text"
+"""Code of a finding that was stored as a sentence, in files of version 1."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Entries of the certificate, and what they mean for the verdict.
+    """One statement about a calibration.
 
-    entries: JSON values by their names in the certificate
-    limits: what the entries are compared with, so that a reader can repeat the verdict
-    reasons: why the calibration must not be used;  warnings: what a user has to know
-    reservations: what departs from a steady linear response, and is held by model or band
+    code: ``room.subject``, the key of its sentence in :mod:`omsm_ros.messages`
+    severity: "rejects", "reservation" (covered by the model or by a wider band), "warning" or
+        "note"
+    values: JSON values that the sentence names, SI;  limits: what they are compared with
+
+    ``str(finding)`` is the sentence. Raises CalibrationError for another severity.
     """
 
-    entries: Mapping[str, object] = field(default_factory=dict)
+    code: str
+    severity: str
+    values: Mapping[str, object] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
-    reasons: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
-    reservations: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.severity not in SEVERITIES:
+            raise CalibrationError(
+                "calibration.severity", severity=self.severity, known=", ".join(SEVERITIES)
+            )
+
+    def __str__(self) -> str:
+        return text_of(self.code, {**self.limits, **self.values})
+
+
+def stored_text(severity: str, text: str) -> Finding:
+    """Return the finding of a sentence from a file of version 1."""
+    return Finding(TEXT, severity, {"text": text})
+
+
+def of_severity(findings: Iterable[Finding], severity: str) -> tuple[Finding, ...]:
+    """Return those of ``findings`` that have ``severity``, in their order."""
+    return tuple(finding for finding in findings if finding.severity == severity)

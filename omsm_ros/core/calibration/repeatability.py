@@ -100,10 +100,7 @@ def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
     limits = [calibration.valid_up_to for calibration in calibrations]
     top = min(limits) * _COMPARED_PART
     if not top > _LEAST_BAND_HZ:
-        raise CalibrationError(
-            f"the calibrations have no common band: they are valid up to {limits!r} Hz; identify "
-            "the one that ends lowest again"
-        )
+        raise CalibrationError("calibration.no_common_band", limits=limits)
     return np.asarray(np.linspace(top / _LINES, top, _LINES))
 
 
@@ -191,7 +188,7 @@ def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
     """
     count = len(calibrations)
     if count < 3:
-        raise CalibrationError(f"{count!r} calibrations: repeatability needs three or more")
+        raise CalibrationError("calibration.too_few", count=count)
     lines = common_lines(calibrations)
     responses = np.array([np.log(c.dynamics.response(lines)) for c in calibrations])
     off = np.concatenate([responses.real, np.unwrap(responses.imag, axis=0)], axis=1)

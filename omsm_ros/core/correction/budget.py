@@ -13,12 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import (
-    REJECTED,
-    Calibration,
-    latency_of,
-    verdict_of,
-)
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.correction.machine_sources import (
     RANDOM,
     MachineSources,
@@ -258,11 +254,12 @@ def traffic_light_of(
     """
     uncertainty = 2 * sum(size**2 for size in heights.values()) ** 0.5
     asked = uncertainty if accuracy is None else accuracy
-    verdict, rejections = verdict_of(calibration)
+    certificate = calibration.certificate
     reasons: list[TrafficLightReason] = []
     level = RED
-    if verdict == REJECTED:
-        reasons += [_reason("rejected", "identify"), *map(TrafficLightReason, rejections)]
+    if certificate.verdict == REJECTED:
+        rejections = (TrafficLightReason(str(reason)) for reason in certificate.reasons)
+        reasons += [_reason("rejected", "identify"), *rejections]
     else:
         if uncertainty > asked:
             largest = max(heights, key=lambda name: heights[name])
@@ -270,7 +267,7 @@ def traffic_light_of(
             reasons.append(
                 _reason("too_large", largest=largest, part=2 * heights[largest], **values)
             )
-        if not verdict:
+        if certificate.verdict is None:
             reasons.append(_reason("no_certificate", "identify"))
         reasons += _latency(calibration, heights, accuracy)
         reasons += _not_evaluated(stated, pose_open, registered)
@@ -297,7 +294,7 @@ def _latency(
     calibration: Calibration, heights: Mapping[str, float], accuracy: float | None
 ) -> Iterator[TrafficLightReason]:
     share = 2 * heights.get("lateral_lag", 0.0)
-    resolved = latency_of(calibration).resolved
+    resolved = calibration.latency.resolved
     if not resolved and (accuracy is None or share > _NEGLIGIBLE_SHARE * accuracy):
         yield _reason("latency", uncertainty=share)
 

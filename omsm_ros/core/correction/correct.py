@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.motion_filter import (
     MOVED,
@@ -319,7 +319,7 @@ def _as_slice(chosen: BoolArray) -> BoolArray | slice:
 def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
     """Return the delay of X, Y, B and C [s]: the stated one, else the calibration's latency."""
     stated = options.lateral_lag
-    return latency_of(calibration).delay_s if stated is None else stated
+    return calibration.latency.delay_s if stated is None else stated
 
 
 def _axes_run(block: AxisBlock, arrival: Arrival) -> SampleRun:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
-from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.source_kinds import KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
@@ -164,7 +164,7 @@ def upper_bounds(calibration: Calibration, stated: MachineSources) -> tuple[str,
     These are the model error that the step test cannot detect and, without a test of the latency,
     the lag.
     """
-    open_lag = not latency_of(calibration).resolved and not stated.of("lateral_lag")
+    open_lag = not calibration.latency.resolved and not stated.of("lateral_lag")
     return ("could_hide", "lateral_lag") if open_lag else ("could_hide",)
 
 
@@ -175,6 +175,6 @@ def origin_of(
     if said := stated.of(name):
         return said[0].how, said[0].reason
     if name == "lateral_lag":
-        latency = latency_of(calibration)
+        latency = calibration.latency
         return EVALUATED if latency.source != "declared" else DECLARED, latency.reason
     return EVALUATED, Notice("correction.from_certificate")

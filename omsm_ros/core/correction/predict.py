@@ -298,8 +298,8 @@ def _longer_rest(
     None if it does not dominate. The uncertainty of a slow term falls with the square root of the
     duration of the step test, and so does the largest relaxation that remains undetected.
     """
-    plateau = calibration.certificate.get("plateau_s")
-    if type(plateau) is not float or not undetected**2 > 0.5 * residual**2:
+    plateau = calibration.certificate.undetected.plateau_s
+    if plateau is None or not undetected**2 > 0.5 * residual**2:
         return None
     return float(plateau * (2 * residual / budget) ** 2)
 
@@ -323,9 +323,10 @@ def _message(
         dwell = _longer_rest(calibration, residual, undetected, budget)
         better = Notice("correction.better" if dwell is None else "correction.dwell", dwell=dwell)
         advice = Notice(f"correction.{code}_dynamics", better=better, **values)
-    mostly = calibration.certificate.get("hidden_mostly")
+    largest = calibration.certificate.undetected.largest
     part: Notice | str = ""
-    if undetected and isinstance(mostly, str):
+    if undetected and largest is not None:
+        mostly = Notice(largest.code, parameter=largest.parameter)
         part = Notice("correction.undetected_part", part=2 * undetected, mostly=mostly)
     return Notice(
         "correction.within" if 2 * residual <= budget else "correction.exceeded",

@@ -8,21 +8,21 @@ follows the surface this is a height error of ``δ dH(z)/dt``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.polynomial import polynomial
 
-from omsm_ros.core.calibration.calibration import Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
 from omsm_ros.core.lti.recursion import past_motion, past_stationary
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import CalibrationError, ConfigurationError, DataError
+from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.quantities import (
     ANGLE_UNCERTAINTY,
     GAIN_UNCERTAINTY,
@@ -82,15 +82,11 @@ class ErrorSources:
         standstill, which includes the resolution of the probe.
         """
         return cls(
-            probe_noise=_standard_uncertainty(calibration.certificate, "noise_m"),
+            probe_noise=calibration.certificate.residual.noise_m or 0.0,
             static_gain=calibration.static_gain_uncertainty,
-            motion_error=_standard_uncertainty(calibration.certificate, "motion_error_m"),
-            lateral_lag=latency_of(calibration).beside_z_s,
+            motion_error=calibration.certificate.model_errors.motion_error_m or 0.0,
+            lateral_lag=calibration.latency.beside_z_s,
         )
-
-
-def _standard_uncertainty(certificate: Mapping[str, object], key: str) -> float:
-    return float(UNCERTAINTY.checked(certificate.get(key, 0.0), CalibrationError, key))
 
 
 def contributions(
@@ -189,7 +185,7 @@ def static_until(calibration: Calibration) -> float:
     The variance of the gain of a calibration, which stands for unknown slow relaxations, holds
     above the frequency ``valid_from`` of its certificate.
     """
-    lowest = _standard_uncertainty(calibration.certificate, "valid_from")
+    lowest = calibration.certificate.validity.from_hz or 0.0
     return 1 / (2 * np.pi * lowest) if lowest > 0 and calibration.covariance[0, 0] > 0 else 0.0
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.calibration.calibration import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
-from omsm_ros.core.calibration.calibration import checked_roots
+from omsm_ros.core.calibration.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
+from omsm_ros.core.calibration.plausibility import checked_roots
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.frequency_response import Band
 from omsm_ros.core.lti.recursion import Recursion

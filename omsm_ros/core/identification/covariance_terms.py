@@ -1,48 +1,35 @@
-"""What makes the response less certain than the noise of the probe does?
+"""Terms of the covariance beyond the noise of the probe: sources of error that data cannot show.
 
-A term is a source of error that the data cannot show. It adds to the covariance of the
-coefficients, and its finding stands in the certificate. To add one, write a function of the same
-signature as :func:`inter_sample_motion` and append it to :data:`COVARIANCE_TERMS`.
+Each adds to the covariance of the coefficients. To add one, write a function of the same signature
+as :func:`inter_sample_motion` and append it to :data:`COVARIANCE_TERMS`.
+
+Motion beyond half the sampling rate is aliased into the samples. Edges that are synchronous with
+the samples are aliased alike every time: the fit then finds a lag that does not exist, with white
+residuals. The content of the encoder near half the sampling rate bounds it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps
-from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
-from omsm_ros.core.model_errors.residual_diagnostics import (
-    FALSE_ALARM,
-    HALVES,
-    SIZES,
-    UP_DOWN,
-    Contrast,
-    ResidualDiagnostics,
-    contrasts,
-)
+from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.model_errors.residual_diagnostics import Contrast
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.linear_algebra import unit_columns
-from omsm_ros.readable import p_value_text, percent, quantity
 
-# Bound the bias of the lag from motion that an edge hides between samples.
-#
-# Motion beyond half the sampling rate folds into the samples. Edges locked to the sample clock fold
-# alike every time: the fit then finds a lag that is not there, with white residuals. The data
-# cannot show it, but the encoder's content near half the sampling rate bounds it.
-
-# How much stronger than the motion itself the probe may answer beyond half the rate.
+# Greatest |G| assumed beyond half the sampling rate.
 _GREATEST_GAIN_BEYOND = 5.0
-# Band of the encoder's spectrum, in parts of the sampling rate, from which to extrapolate.
+# Band of the spectrum of the encoder, in parts of the sampling rate, that is extrapolated.
 _TOP_BAND = (0.35, 0.5)
-# Of rest beside an edge: it begins and ends at nothing, so that its spectrum has no leakage.
+# Samples of rest on either side of an edge, so that its spectrum has no leakage.
 _MARGIN_SAMPLES = 20
 
 
@@ -76,9 +63,6 @@ def _top_energy(increments: FloatArray, noise: float) -> float:
     band = (frequency >= _TOP_BAND[0]) & (frequency <= _TOP_BAND[1])
     doubled = np.abs(1 - np.exp(-2j * np.pi * frequency[band])) ** 2
     return float(np.mean(power[band] - len(increments) * noise**2 * doubled))
-
-
-# How late is a reference sensor against the encoder that watches the same motion?
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,136 +104,36 @@ def reference_lag(record: MotionRecord) -> ReferenceLag | None:
     return ReferenceLag(float(found[1] / scale[1]) / gain, abs(spread / scale[1] / gain))
 
 
-HARMLESS_DELAY_S = 7e-6
-"""Five nanometres on the paper's scan, whose Z moves at 0.7 mm/s (rms)."""
-
-# A nanometre and a half on the paper's scan, whose Z moves at 0.7 mm/s (rms).
-_GREATEST_REFERENCE_LAG_S = 2e-6
-# Standard uncertainties beyond which a lag is no chance.
-_CLEARLY = 5.0
-
-
-@dataclass(frozen=True, eq=False)
-class CovarianceTerm:
-    """covariance: (p, p), order numerator, denominator[1:], delay;  finding: on its cause"""
-
-    covariance: FloatArray
-    finding: Finding = field(default_factory=Finding)
-
-
-def inter_sample_motion(prepared: Prepared, fit: Fit, from_noise: FloatArray) -> CovarianceTerm:
-    """Return the term of motion that an edge may hide between two samples.
-
-    from_noise: (p, p) covariance of the coefficients from the noise of probe and encoder
-    """
+def inter_sample_motion(prepared: Prepared, fit: Fit) -> FloatArray:
+    """Return the covariance (p, p) of motion that an edge may hide between two samples."""
     problem = prepared.problem
     bound = inter_sample_delay_bound(problem.input, prepared.steps, problem.period)
-    delay_noise = low_frequency_delay_uncertainty(fit.dynamics, from_noise)
-    return CovarianceTerm(
-        inter_sample_motion_covariance(fit.dynamics, bound, problem.period),
-        inter_sample_motion_finding(bound, delay_noise),
-    )
+    return inter_sample_motion_covariance(fit.dynamics, bound, problem.period)
 
 
-def inter_sample_motion_finding(bound: float, delay_noise: float) -> Finding:
-    """Reject edges whose bound on the bias of the delay [s] exceeds its noise [s]."""
-    reasons: tuple[str, ...] = ()
-    if bound > max(delay_noise, HARMLESS_DELAY_S):
-        reasons = (
-            f"motion between samples may shift the lag by {quantity(bound, 's')}: the edges are "
-            "too sharp for the sampling; use jerk-limited or dithered edges, or sample faster",
-        )
-    return Finding({"inter_sample_delay_bound_s": bound}, reasons=reasons)
+COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit], FloatArray], ...] = (inter_sample_motion,)
+"""Terms that add to the covariance (p, p) of every fit."""
 
 
-def reference_delay(record: MotionRecord, fit: Fit) -> CovarianceTerm:
-    """Return the term of the lag of the reference sensor, where it was the input.
+def delay_covariance(lag: ReferenceLag, size: int) -> FloatArray:
+    """Return the covariance (``size``, ``size``) of a delay that is off by ``lag``.
 
     A correction filters the encoder, so the lag of the reference would be missing from it.
     """
-    size = len(fit.dynamics.numerator) + len(fit.dynamics.denominator)
-    covariance, lag = np.zeros((size, size)), reference_lag(record)
-    if lag is None:
-        return CovarianceTerm(covariance)
+    covariance = np.zeros((size, size))
     covariance[-1, -1] = lag.value**2 + lag.uncertainty**2
-    return CovarianceTerm(covariance, reference_finding(lag))
+    return covariance
 
 
-def reference_finding(lag: ReferenceLag) -> Finding:
-    """Reject a reference that is clearly late, or early, against the encoder."""
-    entries = {"reference_lag_s": lag.value, "reference_lag_uncertainty_s": lag.uncertainty}
-    if abs(lag.value) <= max(_CLEARLY * lag.uncertainty, _GREATEST_REFERENCE_LAG_S):
-        return Finding(entries)
-    word = "late" if lag.value > 0 else "early"
-    return Finding(
-        entries,
-        {"reference_lag_greatest_s": _GREATEST_REFERENCE_LAG_S},
-        reasons=(
-            f"the reference sensor is {quantity(abs(lag.value), 's')} {word} against the encoder "
-            f"(u = {quantity(lag.uncertainty, 's', 2)}), and a correction filters the encoder: "
-            "identify with input 'encoder', or remove the filter or averaging of the reference",
-        ),
-    )
+def contrast_covariance(found: Sequence[Contrast], dynamics: TransferFunction) -> FloatArray:
+    """Return the covariance (p, p) of parts of a test that differ; zero where none do.
 
-
-COVARIANCE_TERMS: tuple[Callable[[Prepared, Fit, FloatArray], CovarianceTerm], ...] = (
-    inter_sample_motion,
-)
-
-
-# Where the parts of a step test contradict each other, the band holds what they differ by.
-
-_REMEDY = {
-    UP_DOWN: "look for what is loose or rubs, or is clamped on one side only",
-    HALVES: "let the machine warm up and settle before the test",
-    SIZES: "make steps as small as the deflections of a scan, and look for what is loose or rubs",
-}
-
-
-def consistency(diagnostics: ResidualDiagnostics) -> CovarianceTerm:
-    """Return the term of parts that differ, and its finding; nothing is added where none do.
-
-    The whole difference counts as a standard uncertainty: nothing says that a scan, which moves
-    less than a step, lies between the two.
+    The whole difference counts as a standard uncertainty: a scan moves less than a step, so its
+    response need not lie between those of the two parts.
     """
-    found = contrasts(diagnostics)
-    fitted = diagnostics.fitted
-    gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
+    gain = np.concatenate([dynamics.numerator, np.zeros(len(dynamics.denominator))])
     lag = np.zeros_like(gain)
     lag[-1] = 1.0
     rows = [row for c in found if c.significant for row in (c.gain * gain, c.lag * lag)]
-    return CovarianceTerm(_outer(rows, len(gain)), consistency_finding(found))
-
-
-def _outer(rows: Sequence[FloatArray], size: int) -> FloatArray:
-    stacked = np.asarray(rows).reshape(-1, size)
+    stacked = np.asarray(rows).reshape(-1, len(gain))
     return np.asarray(stacked.T @ stacked)
-
-
-def consistency_finding(found: Sequence[Contrast]) -> Finding:
-    """Reserve a test whose parts differ by more than chance."""
-    return Finding(
-        {"consistency": [_entry(contrast) for contrast in found]},
-        {"consistency_p_least": FALSE_ALARM} if found else {},
-        reservations=tuple(_contrast_text(contrast) for contrast in found if contrast.significant),
-    )
-
-
-def _entry(contrast: Contrast) -> dict[str, object]:
-    known = {
-        "gain_difference": contrast.gain,
-        "gain_difference_uncertainty": contrast.gain_uncertainty,
-        "lag_difference_s": contrast.lag,
-        "lag_difference_uncertainty_s": contrast.lag_uncertainty,
-    }
-    finite = {name: value if np.isfinite(value) else None for name, value in known.items()}
-    return {"parts": contrast.parts, **finite, "p": contrast.p}
-
-
-def _contrast_text(contrast: Contrast) -> str:
-    first, second = contrast.parts.split(" against ")
-    return (
-        f"{first} and {second} differ by {quantity(contrast.lag, 's', 2)} in lag and "
-        f"{percent(contrast.gain)} in gain (by chance: {p_value_text(contrast.p)}), and the band holds "
-        f"that: {_REMEDY[contrast.parts]}, and repeat the test"
-    )

@@ -1,18 +1,27 @@
-"""Everything that the checks of an identification may look at."""
+"""Everything that the checks of an identification use."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+from omsm_ros.core.calibration.certificate import Undetected
+from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared
+from omsm_ros.core.identification.covariance_terms import ReferenceLag
 from omsm_ros.core.identification.model_choice import ChosenModel
 from omsm_ros.core.identification.model_error_search import SearchResult
-from omsm_ros.core.identification.residual_tests import ResidualTests, residual_tests
+from omsm_ros.core.identification.residual_tests import (
+    ResidualTests,
+    residual_tests,
+    response_difference,
+)
 from omsm_ros.core.identification.response_uncertainty import ResponseUncertainty
 from omsm_ros.core.lti.frequency_response import ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.model_errors.residual_diagnostics import Contrast
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 
@@ -21,7 +30,10 @@ class IdentificationEvidence:
     """The record, the problem fitted, the chosen model, and how well it is known.
 
     limits: of the 95 % band, within which the response is trusted
-    searched: departures from a steady linear response that were looked for
+    searched: the model errors that were looked for;  undetected: those that may be left
+    contrasts: differences between parts of the test
+    reference: lag of the reference sensor, where it is the input
+    use: the scans that the calibration is for
     """
 
     record: MotionRecord
@@ -30,6 +42,10 @@ class IdentificationEvidence:
     known: ResponseUncertainty
     limits: ResponseLimits
     searched: SearchResult
+    undetected: Undetected = Undetected()
+    contrasts: Sequence[Contrast] = ()
+    reference: ReferenceLag | None = None
+    use: IntendedUse = PAPER_USE
 
     @property
     def fit(self) -> Fit:
@@ -45,3 +61,8 @@ class IdentificationEvidence:
     def residual(self) -> ResidualTests:
         """Tests of the residual."""
         return residual_tests(self.prepared.problem, self.fit, self.prepared.steps)
+
+    @cached_property
+    def response_difference(self) -> float | None:
+        """Mean square difference from the response without a model, over its variance."""
+        return response_difference(self.prepared.problem, self.fit, self.known.valid_up_to)

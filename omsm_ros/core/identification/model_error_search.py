@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.estimation.model_order import Candidate, information
 from omsm_ros.core.estimation.model_order import choose as choose_candidate
 from omsm_ros.core.estimation.model_structure import Structure
@@ -35,7 +34,6 @@ from omsm_ros.core.model_errors.families import (
 )
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics, ScoreTest
 from omsm_ros.core.model_errors.undetected import at_fitted_pole, fit_with_added_poles, poles_of
-from omsm_ros.errors import Notice
 
 # Rounds, each for one model error; a machine with more errors cannot be used to measure.
 _MOST_ROUNDS = 6
@@ -87,12 +85,6 @@ class SearchResult:
     unmodelled: Sequence[ScoreTest] = ()
     without: Sequence[ResidualDiagnostics] = ()
     incomplete: bool = False
-
-
-def completeness(searched: SearchResult) -> Finding:
-    """Return a reservation where the search was cut short."""
-    incomplete = str(Notice("estimation.search_incomplete"))
-    return Finding(reservations=(incomplete,) if searched.incomplete else ())
 
 
 Choose = Callable[[Prepared, EvaluationBudget], tuple[Prepared, ChosenModel]]

@@ -16,7 +16,7 @@ from omsm_ros.core.estimation.covariance import autoregression
 from omsm_ros.core.estimation.noise import motion_scatter, rate_of, reading_step, scatter_in_time
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Steps, extended
-from omsm_ros.core.lti.frequency_response import FrequencyResponse
+from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.linear_algebra import orthonormal
 
@@ -34,8 +34,12 @@ _LINES = 500
 _MOST, _SHOWS = 0.5, 0.1
 # Width of a band, as a logarithm, and the lines in it that tell its noise.
 _BAND, _LEAST_LINES = 0.05, 20
-# No probe tells less; a misfit below it is none.
+# Below the resolution of any probe; a misfit below it is none.
 _FINEST_READING_M = 1e-10
+# Resolves 1 Hz.
+_AGREEMENT_SEGMENT_S = 1.0
+# A response that is the mean of fewer segments is known to a third at best.
+_LEAST_SEGMENTS = 8
 
 
 @dataclass(frozen=True)
@@ -193,3 +197,17 @@ def response_agreement(residual: FrequencyResponse, up_to: float) -> float:
         return float("nan")
     # Bendat and Piersol's uncertainty is relative, to a response that is all difference.
     return float(np.mean(0.5 / residual.uncertainty[lines] ** 2))
+
+
+def response_difference(problem: Problem, best: Fit, up_to: float) -> float | None:
+    """Return the mean square difference from a response without a model, over its variance.
+
+    up_to: highest frequency compared [Hz]. None where the two cannot be compared: the estimate
+    takes the residual for noise that is alike everywhere, which rounding without noise is not.
+    """
+    residual = problem.on_grid(best.residual, 0.0)
+    segment = min(round(_AGREEMENT_SEGMENT_S / problem.period), len(residual) // _LEAST_SEGMENTS)
+    value = response_agreement(
+        frequency_response(problem.input, residual, problem.period, max(segment, 16)), up_to
+    )
+    return value if np.isfinite(value) and problem.shared == 0 else None

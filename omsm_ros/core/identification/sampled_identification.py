@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.estimation.model_order import held_out_rms
 from omsm_ros.core.estimation.output_error import Fit, Problem

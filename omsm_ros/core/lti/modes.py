@@ -100,7 +100,9 @@ def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[Kno
         return tuple(_known(dynamics, complex(pole), covariance) for pole in upper)
 
 
-def mode_entries(dynamics: TransferFunction, covariance: FloatArray) -> list[dict[str, object]]:
+def mode_entries(
+    dynamics: TransferFunction, covariance: FloatArray
+) -> list[dict[str, float | None]]:
     """Return the modes as JSON values for a certificate, with None for infinite values."""
     return [
         {

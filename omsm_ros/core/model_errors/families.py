@@ -146,7 +146,7 @@ class ModelErrorFamily:
 
 CREEP, MODE = "creep", "soft mode"
 BACKLASH, FRICTION = "backlash", "friction"
-STIFFENING, LINEARITY, PERIODIC = "stiffening", "probe linearity", "periodic probe error"
+STIFFENING, LINEARITY, PERIODIC = "stiffening", "probe linearity", "periodic error"
 VIBRATION, DRIFT = "vibration", "drift"
 
 # A faster relaxation is no slower than the structure itself.

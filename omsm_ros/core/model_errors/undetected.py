@@ -20,6 +20,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import stats
 
+from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.estimation.model_order import MAX_POLES
 from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
@@ -41,11 +42,6 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.linear_algebra import least_squares
 
-# Harmonics of the Z motion of the paper's scan (30 rpm over its mirror): frequency [Hz] and
-# area-weighted rms [m]; the mean of each turn moves over minutes and counts as static.
-PAPER_SCAN_LINES = ((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6))
-# Its rate [m/s], rms.
-_SCAN_RATE = float(np.sqrt(sum((2 * np.pi * f * rms) ** 2 for f, rms in PAPER_SCAN_LINES)))
 # A term 1.645 σ above the limit of a test is missed with a probability of 5 %.
 _POWER = 1.645
 # The families whose omission bends the response itself.
@@ -80,7 +76,7 @@ class UndetectedTerm:
         by a second
     above: relative error of the gain at all frequencies above ``valid_from``, per unit
     lag: delay of the same effect on a scan [s], per unit
-    effect: rms error on the paper's scan per unit [m]
+    effect: rms error on the intended scan per unit [m]
     """
 
     family: str
@@ -107,28 +103,30 @@ class UndetectedTerm:
 
 
 def undetected_terms(
-    diagnostics: ResidualDiagnostics, drift: Sequence[slice] = ()
+    diagnostics: ResidualDiagnostics, drift: Sequence[slice] = (), use: IntendedUse = PAPER_USE
 ) -> list[UndetectedTerm]:
     """Return the undetected model errors: the worst relaxation, then the families that shift G.
 
-    drift: columns of the background that model a drift
+    drift: columns of the background that model a drift;  use: the scans to be corrected
     """
     # Only the relaxations are tested again, up to slower ones.
     slow = with_slow_creep(diagnostics.thinned or diagnostics)
-    relaxations = [_undetected_terms(slow, judged) for judged in slow.creep]
+    relaxations = [_undetected_terms(slow, judged, use) for judged in slow.creep]
     for gone in _drift_models(drift):
         other = with_drift_as_noise(slow, gone).creep
         relaxations = [_better_relaxation(*pair) for pair in zip(relaxations, other, strict=True)]
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
     found = (
-        _worst_relaxation(known, fitted_relaxation(diagnostics.fitted.dynamics)) if known else []
+        _worst_relaxation(known, fitted_relaxation(diagnostics.fitted.dynamics), use)
+        if known
+        else []
     )
     for name in _BENDING:
         judged = diagnostics.best.get(name)
         if judged is None or not np.isfinite(judged.score.uncertainty):
             continue
         if _excited(diagnostics, judged) or _hinted_by_data(judged):
-            found.append(_undetected_terms(diagnostics, judged))
+            found.append(_undetected_terms(diagnostics, judged, use))
     return found
 
 
@@ -176,7 +174,9 @@ def _better_relaxation(term: UndetectedTerm, other: ScoreTest) -> UndetectedTerm
     return replace(term, size=size, uncertainty=uncertainty)
 
 
-def _worst_relaxation(relaxations: list[UndetectedTerm], found: float) -> list[UndetectedTerm]:
+def _worst_relaxation(
+    relaxations: list[UndetectedTerm], found: float, use: IntendedUse
+) -> list[UndetectedTerm]:
     """Return the relaxation of the largest effect, and the lag of another one if that is larger.
 
     found: size of the relaxation in the model. Creep of joints and piezos is about even in the
@@ -192,7 +192,8 @@ def _worst_relaxation(relaxations: list[UndetectedTerm], found: float) -> list[U
     worst = max(relaxations, key=lambda term: term.effect * term.carried)
     slower = _UNSEEN * found
     latest = max(
-        (_lag_beyond_noise(term) for term in relaxations), key=lambda term: term.lag * term.size
+        (_lag_beyond_noise(term, use) for term in relaxations),
+        key=lambda term: term.lag * term.size,
     )
     other = [latest] if latest.lag * latest.size > worst.lag * worst.carried else []
     if worst.above > 0 and worst.carried * worst.above < slower:
@@ -200,14 +201,14 @@ def _worst_relaxation(relaxations: list[UndetectedTerm], found: float) -> list[U
     return [worst, *other]
 
 
-def _lag_beyond_noise(term: UndetectedTerm) -> UndetectedTerm:
+def _lag_beyond_noise(term: UndetectedTerm, use: IntendedUse) -> UndetectedTerm:
     """Return the lag alone of ``term``, for its size in excess of noise.
 
     Many relaxations lag, and noise would mask a part of each; those that the data suggest are
     included.
     """
     excess = float(np.sqrt(max(term.size**2 - term.uncertainty**2, 0.0)))
-    effect = term.lag * _SCAN_RATE
+    effect = term.lag * use.speed_m_s
     return replace(term, size=excess, uncertainty=0.0, above=0.0, effect=effect)
 
 
@@ -233,16 +234,18 @@ def _hinted_by_data(judged: ScoreTest) -> bool:
     return judged.term.family == MODE and judged.log_p < np.log(_HINT)
 
 
-def _undetected_terms(diagnostics: ResidualDiagnostics, judged: ScoreTest) -> UndetectedTerm:
+def _undetected_terms(
+    diagnostics: ResidualDiagnostics, judged: ScoreTest, use: IntendedUse
+) -> UndetectedTerm:
     fitted, term, score = diagnostics.fitted, judged.term, judged.score
     shift = omission_shift(diagnostics, term.columns[:, 0])
-    frequency, rms = np.array(PAPER_SCAN_LINES).T
+    frequency, rms = use.frequencies_hz, use.rms_m
     imitated = _relative(fitted, frequency, shift)
     remaining = imitated - _response_error(term.family, term.parameter, term.damping, frequency)
     # Fitted coefficients cannot follow the resonance of a lightly damped mode.
     whole = term.family == CREEP or _hinted_by_data(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
-    lag = float(np.linalg.norm(remaining.imag * rms)) / _SCAN_RATE
+    lag = float(np.linalg.norm(remaining.imag * rms)) / use.speed_m_s
     return UndetectedTerm(
         term.family,
         term.parameter,

@@ -5,7 +5,7 @@ Every function returns a matplotlib Figure that belongs to the caller; all argum
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import CandidateFit, Structure
 from omsm_ros.core.estimation.sampled_model import FreeRun, SampledModel
 from omsm_ros.core.identification.fitted_record import (
     EdgeMean,
@@ -157,31 +158,30 @@ def draw_correlation(axes: Axes, left: FloatArray) -> None:
     style.label(axes, x="lag [samples]", y="correlation [1]", title="Its autocorrelation")
 
 
-def order(candidates: Sequence[Mapping[str, float]], chosen: int | None) -> Figure:
-    """Draw the residual of each candidate over its number of parameters.
-
-    candidates: ``parameters``, ``rms_m`` and ``bic`` of each;  chosen: index of one of them
-    """
+def order(candidates: Sequence[CandidateFit], chosen: Structure | None) -> Figure:
+    """Draw the residual of each candidate over its number of parameters."""
     made, axes = style.figure(6.1, 2.7)
     _draw_candidates(axes[0, 0], candidates, chosen)
     return made
 
 
 def _draw_candidates(
-    axes: Axes, candidates: Sequence[Mapping[str, float]], chosen: int | None
+    axes: Axes, candidates: Sequence[CandidateFit], chosen: Structure | None
 ) -> None:
-    size = np.asarray([c["parameters"] for c in candidates])
-    rms = np.asarray([c["rms_m"] for c in candidates]) / NANOMETRE_M
+    size = np.asarray([c.structure.parameters for c in candidates])
+    rms = np.asarray([c.rms_m for c in candidates]) / NANOMETRE_M
     if rms.max() > 3 * rms.min() > 0:
         style.logarithmic(axes.yaxis, every=(1.0, 2.0, 5.0))
     axes.plot(size, rms, "o", color=style.MUTED, markersize=4, label="tried")
-    best = int(np.argmin([c["bic"] for c in candidates]))
+    best = int(np.argmin([c.bic for c in candidates]))
     axes.plot(
         size[best], rms[best], "o", markersize=9, markerfacecolor="none",
         markeredgecolor=style.TRUTH, label="lowest BIC",
     )  # fmt: skip
-    if chosen is not None:
-        axes.plot(size[chosen], rms[chosen], "o", color=style.AFTER, markersize=6, label="chosen")
+    for at, candidate in enumerate(candidates):
+        if candidate.structure == chosen:
+            axes.plot(size[at], rms[at], "o", color=style.AFTER, markersize=6, label="chosen")
+            break
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.legend_above(axes)
     style.label(axes, x="parameters of the dynamics", y="residual rms [nm]", title="Candidates")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import REJECTED
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity

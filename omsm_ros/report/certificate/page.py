@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import REJECTED, Calibration, verdict_of
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedTerm
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.modes import KnownMode, known_modes
 from omsm_ros.core.model_errors.families import CREEP, MODE
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.readable import NOTHING, measured, number, percent, plain, quantity
+from omsm_ros.readable import NOTHING, measured, percent, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
-from omsm_ros.report.certificate import tables as tables
-from omsm_ros.report.certificate.tables import CertificateEntries, known_rows, listed, texts
+from omsm_ros.report.certificate import tables
+from omsm_ros.report.certificate.tables import known_rows
 from omsm_ros.report.page_parts import Headline, IssuedPage, Section, fill, picture, present
 from omsm_ros.report.response_figures import step_response
-from omsm_ros.report.tables import Table, latency_text, mapping_table, part
-from omsm_ros.report.verdict import PageVerdict
+from omsm_ros.report.tables import Table, latency_text, mapping_table
+from omsm_ros.report.verdict import PageVerdict, verdict_text
 from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, PPM
-
-# What the response says of the machine, and what could hide in it: modes, masses, shape.
 
 
 def mode_table(calibration: Calibration) -> Table:
@@ -63,25 +60,22 @@ _UNITS_PER_MASS = {
 _PROBE_ON = {False: "second mass, not the driven one (Eq. 7)", True: "driven mass (collocated)"}
 
 
-def two_mass_table(certificate: CertificateEntries) -> Table:
+def two_mass_table(certificate: Certificate) -> Table:
     """Return masses, springs and dampers, or each per mass of the table where that is not known."""
-    model: Mapping[str, Any] = part(certificate, "two_mass", "model") or {}
-    absolute = number(part(certificate, "two_mass", "table_mass_kg")) is not None
+    found, title = certificate.response.two_mass, "Two-mass model (Eq. 6, 7)"
+    if found is None:
+        return Table(title, (), [])
+    absolute = found.table_mass_kg is not None
     rows = []
     for name, unit in (_MECHANICAL_UNITS if absolute else _UNITS_PER_MASS).items():
-        value = number(part(model, name))
-        relative = number(part(certificate, "two_mass", "relative_uncertainty", name))
-        text = NOTHING if value is None else measured(value, (relative or 0.0) * value, unit)
-        if name == "m1" and value is not None:
-            text += ", as given"
-        rows.append((name if absolute else f"{name} / m1", text))
-    side = part(certificate, "two_mass", "collocated")
+        value = found.model[name]
+        text = measured(value, found.relative_uncertainty.get(name, 0.0) * value, unit)
+        rows.append((name if absolute else f"{name} / m1", text + ", as given" * (name == "m1")))
     rows += [
-        ("probe on the", _PROBE_ON[side] if isinstance(side, bool) else NOTHING),
-        ("misfit, over the stated uncertainty", plain(part(certificate, "two_mass", "misfit"))),
+        ("probe on the", _PROBE_ON[found.collocated]),
+        ("misfit, over the stated uncertainty", plain(found.misfit)),
     ]
-    title = "Two-mass model (Eq. 6, 7)"
-    return Table(title if absolute else f"{title}, per mass of the table", (), known_rows(rows, 1))
+    return Table(title if absolute else f"{title}, per mass of the table", (), rows)
 
 
 _SHAPE_ROWS = (
@@ -93,75 +87,56 @@ _SHAPE_ROWS = (
 
 
 def shape_table(calibration: Calibration) -> Table:
-    """Return what stands out in the identified response, and whether the band reaches it."""
-    certificate, trusted = calibration.certificate, calibration.valid_up_to
-    rows = [
-        (name, _point(certificate, place, gain), _response_up_to(certificate, place, trusted))
-        for name, place, gain in _SHAPE_ROWS
-    ]
-    left = number(certificate.get("modal_remainder"))
-    if left is not None:
-        rows.append(("not in the terms of Eq. 8, of the greatest gain", percent(left), "yes"))
-    columns = ("", "within the trusted band")
-    return Table("Shape of the response", columns, known_rows(rows, 1))
+    """Return the salient points of the identified response, and whether the band reaches them."""
+    found, trusted = calibration.certificate.response, calibration.valid_up_to
+    rows = []
+    for name, place, gain in _SHAPE_ROWS:
+        at = found.shape.get(place)
+        if at is not None:
+            size = "" if gain is None else f"{plain(found.shape.get(gain), 4)} at "
+            rows.append((name, size + quantity(at, "Hz"), "yes" if at <= trusted else "no"))
+    if found.modal_remainder is not None:
+        remainder = percent(found.modal_remainder)
+        rows.append(("not in the terms of Eq. 8, of the greatest gain", remainder, "yes"))
+    return Table("Shape of the response", ("", "within the trusted band"), rows)
 
 
-def _response_up_to(certificate: CertificateEntries, place: str, trusted: float) -> str:
-    at = number(part(certificate, "shape", place))
-    return "" if at is None else "yes" if at <= trusted else "no"
-
-
-def _point(certificate: CertificateEntries, place: str, gain: str | None) -> str:
-    at = quantity(part(certificate, "shape", place), "Hz")
-    if gain is None or at == NOTHING:
-        return at
-    return f"{plain(part(certificate, 'shape', gain), 4)} at {at}"
-
-
-def _size(delay_bound: Mapping[str, Any]) -> str:
+def _size(term: UndetectedTerm) -> str:
     """Return the largest size that was missed, in the unit of its family."""
-    missed = number(delay_bound.get("missed"))
-    if missed is None or delay_bound.get("family") not in (CREEP, MODE):
-        return quantity(missed, "m")
-    return f"{percent(missed)} of the motion"
+    if term.missed is None or term.family not in (CREEP, MODE):
+        return quantity(term.missed, "m")
+    return f"{percent(term.missed)} of the motion"
 
 
-def _family(entry: Mapping[str, Any]) -> str:
-    """Return a way to depart from linear and steady, with its own time or frequency."""
-    family, parameter = str(entry.get("family", NOTHING)), entry.get("parameter")
-    if family == CREEP:
-        return f"{family} over {quantity(parameter, 's', 2)}"
-    return f"{family} at {quantity(parameter, 'Hz', 2)}" if family == MODE else family
+def _family(term: UndetectedTerm) -> str:
+    """Return the name of a model error, with its time constant or frequency."""
+    if term.family == CREEP:
+        return f"{term.family} over {quantity(term.parameter, 's', 2)}"
+    if term.family == MODE:
+        return f"{term.family} at {quantity(term.parameter, 'Hz', 2)}"
+    return term.family
 
 
-def undetected_error_table(certificate: CertificateEntries) -> Table:
-    """Return what this very test would have missed, and what that costs on a scan."""
+def undetected_table(certificate: Certificate) -> Table:
+    """Return the model errors that this test could not detect, and what they cost on a scan."""
+    found = certificate.undetected
     rows = [
         (
-            _family(entry),
-            _size(entry),
-            quantity(entry.get("missed_effect_on_scan_m"), "m"),
-            quantity(entry.get("effect_on_scan_m"), "m"),
+            _family(term),
+            _size(term),
+            quantity(term.missed_effect_on_scan_m, "m"),
+            quantity(term.effect_on_scan_m, "m"),
         )
-        for entry in listed(certificate, "could_hide")
+        for term in found.terms
     ]
-    return Table(
-        "What could hide",
-        ("largest size missed", "its rms on the paper's scan", "carried in the band"),
-        rows
-        + known_rows(
-            [
-                (
-                    "plateau that would tell the slowest",
-                    quantity(certificate.get("plateau_that_would_tell_s"), "s"),
-                    "",
-                    "",
-                )
-            ],
-            1,
-        )
-        + [(f"assumed: {text}", "", "", "") for text in texts(certificate, "assumed")],
+    further = (
+        ("plateau that would show the slowest", quantity(found.plateau_needed_s, "s")),
+        ("assumed: no relaxation slower than", quantity(found.slowest_creep_s, "s")),
+        ("assumed: no mode below", quantity(found.lowest_mode_hz, "Hz", 2)),
     )
+    rows += [(name, value, "", "") for name, value in known_rows(further, 1)]
+    columns = ("largest size missed", "its rms on the intended scan", "carried in the band")
+    return Table("Undetected model errors", columns, rows)
 
 
 BAND = "band"
@@ -203,19 +178,11 @@ def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> di
     made = {
         BAND: certificate_figures.response_with_band(calibration, fitted.measured),
         "step": step_response(fitted.time, fitted.input, _bridged(fitted), fitted.modelled),
-        "residual": certificate_figures.residual(fitted, number(certificate.get("noise_m"))),
+        "residual": certificate_figures.residual(fitted, certificate.residual.noise_m),
     }
-    candidates = [c for c in tables.listed(certificate, "candidates") if _comparable(c)]
-    if candidates:
-        chosen = [i for i, c in enumerate(candidates) if tables.is_chosen(c, certificate)]
-        sized = [{**c, "parameters": c["poles"] + c["zeros"] + c["delay"]} for c in candidates]
-        made["order"] = certificate_figures.order(sized, chosen[0] if chosen else None)
+    if certificate.candidates:
+        made["order"] = certificate_figures.order(certificate.candidates, certificate.structure)
     return {name: style.png(figure) for name, figure in made.items()}
-
-
-def _comparable(candidate: Mapping[str, object]) -> bool:
-    counted = all(isinstance(candidate.get(key), int) for key in ("poles", "zeros", "delay"))
-    return counted and all(number(candidate.get(key)) is not None for key in ("rms_m", "bic"))
 
 
 def _bridged(fitted: FittedRecord) -> FloatArray:
@@ -241,28 +208,30 @@ def render(certificate: CertificatePage) -> str:
 
 
 def verdict_on_calibration(calibration: Calibration) -> PageVerdict:
-    """Return the certificate's own verdict, and why."""
-    stated, reasons = verdict_of(calibration)
-    if stated == REJECTED:
-        return PageVerdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
-    if not stated:
+    """Return the verdict of the certificate, and its reasons."""
+    certificate = calibration.certificate
+    reasons = tuple(map(str, certificate.reasons))
+    if certificate.verdict == REJECTED:
+        return PageVerdict("bad", "Rejected", reasons or ("no reason is given",))
+    if certificate.verdict is None:
         return PageVerdict("unknown", "Not judged", ("the calibration has no certificate",))
-    kept = tables.texts(calibration.certificate, "reservations")
-    level = "good" if stated.startswith("accepted") else "unknown"
+    kept = tuple(map(str, certificate.reservations))
+    stated = verdict_text(calibration)
     grounds = (*reasons, *kept, *_verdict_reasons(calibration))
-    return PageVerdict("care" if kept else level, stated[:1].upper() + stated[1:], grounds)
+    return PageVerdict("care" if kept else "good", stated[:1].upper() + stated[1:], grounds)
 
 
 def _verdict_reasons(calibration: Calibration) -> list[str]:
     certificate, found = calibration.certificate, []
-    if number(certificate.get("chi_square")) is not None:
+    if certificate.residual.chi_square is not None:
         found.append(
-            f"where the axis moves, only noise is left (χ² = {plain(certificate['chi_square'])})"
+            "where the axis moves, only noise is left "
+            f"(χ² = {plain(certificate.residual.chi_square)})"
         )
     if np.any(calibration.covariance):
         top = quantity(calibration.valid_up_to, "Hz")
         found.append(f"up to {top} the 95 % band is within {_band_text(calibration)}")
-    delay_bound = number(certificate.get("inter_sample_delay_bound_s"))
+    delay_bound = certificate.response.inter_sample_delay_bound_s
     if delay_bound is not None:
         found.append(
             f"motion between samples hides a lag of {quantity(delay_bound, 's', 2)} at most"
@@ -287,10 +256,10 @@ def headlines(calibration: Calibration) -> list[Headline]:
 
 def _all_headlines(calibration: Calibration) -> list[Headline]:
     certificate, dynamics = calibration.certificate, calibration.dynamics
+    residual, spread = certificate.residual, certificate.static_gain.uncertainty
     delay = measured(
-        dynamics.low_frequency_delay, certificate.get("low_frequency_delay_uncertainty_s"), "s"
+        dynamics.low_frequency_delay, certificate.response.low_frequency_delay_uncertainty_s, "s"
     )
-    spread = number(certificate.get("static_gain_uncertainty"))
     return [
         Headline("Low-frequency delay", delay, _k1(delay, "by which the probe lags slow motion")),
         Headline("Of it latency", latency_text(calibration), "by which X and C are delayed"),
@@ -298,13 +267,13 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
         _range_headline(calibration),
         Headline(
             "χ², residual over noise",
-            plain(certificate.get("chi_square")),
+            plain(residual.chi_square),
             "where the axis moves; 1 if only noise is left",
         ),
         Headline(
             "Noise of one reading",
-            quantity(certificate.get("noise_m"), "m"),
-            f"residual, rms: {quantity(certificate.get('residual_rms_m'), 'm')}",
+            quantity(residual.noise_m, "m"),
+            f"residual, rms: {quantity(residual.rms_m, 'm')}",
         ),
         _order_headline(calibration),
     ]
@@ -321,11 +290,10 @@ def _gain_headline(gain: float, spread: float | None) -> Headline:
 
 
 def _range_headline(calibration: Calibration) -> Headline:
-    verdict, _ = verdict_of(calibration)
     name, details = "Known within limits up to", ["rejected: not to be used"]
-    if verdict != REJECTED:
+    if calibration.certificate.verdict != REJECTED:
         nyquist = 0.5 / calibration.sample_period
-        shown = number(calibration.certificate.get("shown_up_to_hz"))
+        shown = calibration.certificate.validity.excited_up_to_hz
         name, details = "Valid up to", [f"half the sampling rate is {quantity(nyquist, 'Hz')}"]
         if shown is not None and calibration.valid_up_to < nyquist:
             known = calibration.valid_up_to < shown
@@ -335,58 +303,55 @@ def _range_headline(calibration: Calibration) -> Headline:
 
 
 def _order_headline(calibration: Calibration) -> Headline:
-    structure = calibration.certificate.get("structure")
-    known = structure if isinstance(structure, Mapping) else tables.own_structure(calibration)
-    return Headline("Structure", tables.structure_text(known), "")
+    return Headline("Structure", tables.structure_text(tables.structure_of(calibration)), "")
 
 
-def _model_error_texts(entries: tables.CertificateEntries) -> Section:
+def _model_errors(certificate: Certificate) -> Section:
     return Section(
-        "What departs, and what could hide",
+        "Model errors, found and undetected",
         (),
         (
-            tables.model_error_table(entries),
-            tables.consistency_table(entries),
-            undetected_error_table(entries),
+            tables.model_error_table(certificate),
+            tables.consistency_table(certificate),
+            undetected_table(certificate),
         ),
-        "Anything larger than the largest size missed, this very test would have shown with a "
+        "This test would have shown anything larger than the largest size missed with a "
         "probability of 95 %; the band carries what it cannot exclude. The rms is that of heights "
-        "on one well-known scan, the paper's mirror at 30 rpm; a report has that of its own scan.",
+        "on the intended scan; the report of a measurement has that of its own scan.",
     )
 
 
-def _order(entries: tables.CertificateEntries) -> Section:
+def _order(certificate: Certificate) -> Section:
     return Section(
         "Order",
         ("order",),
-        (tables.order_table(entries),),
+        (tables.order_table(certificate),),
         "Unless an order was asked for, the structure chosen has one parameter more than that "
         "of the lowest BIC, and three at least: the smallest that fits is biased by about its "
         "own uncertainty, and one parameter more trades that for a wider band.",
     )
 
 
-def sections(certificate: CertificatePage) -> list[Section]:
+def sections(page: CertificatePage) -> list[Section]:
     """Return all parts below the first screen that have anything to show."""
-    calibration = certificate.calibration
-    entries = calibration.certificate
-    warnings = [(text,) for text in tables.texts(entries, "warnings")]
-    identity = tables.identity_table(calibration, certificate.source, certificate.version)
+    calibration, certificate = page.calibration, page.calibration.certificate
+    warnings = [(str(warning),) for warning in certificate.warnings]
+    identity = tables.identity_table(calibration, page.source, page.version)
     every = [
         Section("Warnings", (), (Table("", (), warnings),)),
         Section(
             "Fit to the recording",
             ("step", "residual"),
-            (tables.residual_table(entries), tables.sample_account(entries)),
+            (tables.residual_table(certificate), tables.sample_account(certificate)),
         ),
-        _order(entries),
+        _order(certificate),
         Section(
             "Dynamics",
             (),
             (
                 mode_table(calibration),
-                two_mass_table(entries),
-                tables.limit_table(entries),
+                two_mass_table(certificate),
+                tables.limit_table(certificate),
                 shape_table(calibration),
                 tables.coefficient_table(calibration),
             ),
@@ -396,17 +361,17 @@ def sections(certificate: CertificatePage) -> list[Section]:
         Section(
             "Static gain and background",
             (),
-            (tables.gain_table(calibration), tables.background_table(entries)),
+            (tables.gain_table(calibration), tables.background_table(certificate)),
         ),
-        _model_error_texts(entries),
+        _model_errors(certificate),
         Section(
             "Records",
             (),
             (
                 identity,
                 mapping_table("Settings calibrated for", calibration.settings),
-                tables.further_table(entries),
+                tables.further_table(certificate),
             ),
         ),
     ]
-    return present(every, certificate.figures)
+    return present(every, page.figures)

@@ -1,114 +1,89 @@
 """The numbers of a certificate as rows of text, with units and uncertainties.
 
-Certificates of older versions lack entries; a row that would have no number is left out.
+A row without a number is left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.calibration.calibration import RECORDED, SCHEMA, Calibration
+from omsm_ros.core.calibration.calibration import SCHEMA, Calibration
+from omsm_ros.core.calibration.certificate import CandidateFit, Certificate, Structure
 from omsm_ros.readable import (
     NOTHING,
     count,
     date_text_of_stamp,
     measured,
-    number,
     plain,
     probability,
     quantity,
     superscript,
 )
-from omsm_ros.report.tables import Table, mapping_table, part
+from omsm_ros.report.tables import Table, mapping_table
 from omsm_ros.units import PPM
 
 # Where a p-value is called small.
 _SIGNIFICANT = 0.01
 # Coefficients are far more correlated than uncertain: to be of use they need their digits.
 _ALL_DIGITS = 10
-_SHOWN = {
-    "order", "structure", "candidates", "chi_square",
-    "residual_rms_m", "noise_m", "edges", "whiteness_p", "independence_p",
-    "low_frequency_delay_s", "low_frequency_delay_uncertainty_s", "inter_sample_delay_bound_s",
-    "modes", "static_gain", "static_gain_uncertainty", "polarity", "drift_m_s", "backlash_m",
-    "shape", "modal_remainder", "two_mass", "static_gains", "nonparametric_agreement", "samples",
-    "warnings", "reasons", "verdict", "limits", "input", "shown_up_to_hz",
-    "valid_from", "departures", "could_hide", "hidden_mostly", "plateau_s", "assumed",
-    "motion_error_m", "reservations", "timing_scatter_s", "axis_timing_scatter_s",
-    "encoder_noise_m",
-    "noise_covariance", "gain_above_rest_u", "plateau_that_would_tell_s", "reference_lag_s",
-    "reference_lag_uncertainty_s", "latency", "consistency", RECORDED,
-}  # fmt: skip
-
-CertificateEntries = Mapping[str, Any]
 
 
-def listed(certificate: CertificateEntries, name: str) -> list[Mapping[str, Any]]:
-    """Return the mappings in a list of the certificate; none if there is no such list."""
-    entries = certificate.get(name)
-    return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
-
-
-def texts(certificate: CertificateEntries, name: str) -> list[str]:
-    """Return the texts of a list of the certificate."""
-    entries = certificate.get(name)
+def texts(content: Mapping[str, Any], name: str) -> list[str]:
+    """Return the texts of a list of a model's certificate."""
+    entries = content.get(name)
     return [str(entry) for entry in entries] if isinstance(entries, list) else []
 
 
-def structure_text(structure: Mapping[str, Any]) -> str:
+def structure_text(structure: Structure) -> str:
     """Return ``2 poles, 1 zero, no delay``."""
-    counts = [(structure.get("poles"), "pole"), (structure.get("zeros"), "zero")]
-    parts = [f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts if isinstance(n, int)]
-    if isinstance(structure.get("delay"), bool):
-        parts.append("delay" if structure["delay"] else "no delay")
-    return ", ".join(parts) or NOTHING
+    counts = ((structure.poles, "pole"), (structure.zeros, "zero"))
+    parts = [f"{n} {name}{'' if n == 1 else 's'}" for n, name in counts]
+    return ", ".join([*parts, "delay" if structure.delay else "no delay"])
 
 
-def own_structure(calibration: Calibration) -> dict[str, object]:
-    """Return the structure of the coefficients themselves, whatever the certificate says of it."""
+def structure_of(calibration: Calibration) -> Structure:
+    """Return the structure that was chosen, or that of the coefficients where none is stated."""
     dynamics = calibration.dynamics
-    return {
-        "poles": len(dynamics.denominator) - 1,
-        "zeros": len(dynamics.numerator) - 1,
-        "delay": dynamics.delay > 0,
-    }
+    return calibration.certificate.structure or Structure(
+        len(dynamics.denominator) - 1, len(dynamics.numerator) - 1, dynamics.delay > 0
+    )
 
 
-def residual_table(certificate: CertificateEntries) -> Table:
-    """Return what the model leaves that it should have explained, if anything."""
-    white, free = (number(certificate.get(f"{n}_p")) for n in ("whiteness", "independence"))
+def residual_table(certificate: Certificate) -> Table:
+    """Return the tests of the residual."""
+    found = certificate.residual
     rows = [
-        (
-            "χ² where the axis moves",
-            plain(certificate.get("chi_square")),
-            "1 if only noise is left",
-        ),
-        ("residual, rms", quantity(certificate.get("residual_rms_m"), "m"), "everywhere"),
-        ("noise of one reading", quantity(certificate.get("noise_m"), "m"), "where the axis rests"),
+        ("χ² where the axis moves", plain(found.chi_square), "1 if only noise is left"),
+        ("residual, rms", quantity(found.rms_m, "m"), "everywhere"),
+        ("noise of one reading", quantity(found.noise_m, "m"), "where the axis rests"),
         (
             "whiteness, p",
-            probability(white),
-            _in_words(white, "white", "coloured; the uncertainties allow for it"),
+            probability(found.whiteness_p),
+            _in_words(found.whiteness_p, "white", "coloured; the uncertainties allow for it"),
         ),
         (
             "independence of the motion, p",
-            probability(free),
-            _in_words(free, "does not follow the motion", "follows the motion: dynamics missing"),
+            probability(found.independence_p),
+            _in_words(
+                found.independence_p,
+                "does not follow the motion",
+                "follows the motion: dynamics missing",
+            ),
         ),
         (
             "χ² against the estimate without a model",
-            plain(certificate.get("nonparametric_agreement")),
+            plain(found.response_agreement),
             "about 1 if the two agree",
         ),
         (
-            "shown up to",
-            quantity(certificate.get("shown_up_to_hz"), "Hz"),
+            "excited up to",
+            quantity(certificate.validity.excited_up_to_hz, "Hz"),
             "beyond it the motion would show no deviation as large as the limits",
         ),
-        ("edges", count(certificate.get("edges")), ""),
+        ("edges", count(found.edges), ""),
     ]
     return Table("Tests of the residual", ("", "in words"), known_rows(rows, 1))
 
@@ -117,126 +92,106 @@ def _in_words(p: float | None, good: str, bad: str) -> str:
     return "" if p is None else bad if p < _SIGNIFICANT else good
 
 
-def order_table(certificate: CertificateEntries) -> Table:
+def order_table(certificate: Certificate) -> Table:
     """Return every structure that was tried."""
-    candidates = sorted(listed(certificate, "candidates"), key=structure_text)
-    scores = [number(c.get("bic")) for c in candidates]
-    least = min((s for s in scores if s is not None), default=0.0)
+    candidates = sorted(certificate.candidates, key=lambda c: structure_text(c.structure))
+    least = min((c.bic for c in candidates), default=0.0)
     rows = [
         (
-            structure_text(candidate),
-            NOTHING if score is None else f"{score - least:.1f}",
-            quantity(candidate.get("rms_m"), "m", 5),
-            _remark(candidate, score == least, certificate),
+            structure_text(candidate.structure),
+            f"{candidate.bic - least:.1f}",
+            quantity(candidate.rms_m, "m", 5),
+            ", ".join(_remarks(candidate, least, certificate)),
         )
-        for candidate, score in zip(candidates, scores, strict=True)
+        for candidate in candidates
     ]
-    columns = ("BIC above lowest", "residual, rms", "")
-    return Table("Candidates", columns, rows)
+    return Table("Candidates", ("BIC above lowest", "residual, rms", ""), rows)
 
 
-def _remark(candidate: Mapping[str, Any], lowest: bool, certificate: CertificateEntries) -> str:
-    remarks = ["lowest BIC"] if lowest else []
-    if is_chosen(candidate, certificate):
-        remarks.append("✓ chosen")
-    return ", ".join(remarks)
-
-
-def is_chosen(candidate: Mapping[str, Any], certificate: CertificateEntries) -> bool:
-    """Return True for the candidate whose structure the certificate gives as its own."""
-    structure = certificate.get("structure")
-    return isinstance(structure, Mapping) and all(
-        candidate.get(key) == structure.get(key) for key in ("poles", "zeros", "delay")
-    )
-
-
-_GAINS = {
-    "probe_per_encoder": "probe per encoder, at rest",
-    "probe_per_reference": "probe per reference, at rest",
-    "reference_per_encoder": "reference per encoder, at rest",
-}
+def _remarks(candidate: CandidateFit, least: float, certificate: Certificate) -> Iterator[str]:
+    if candidate.bic == least:
+        yield "lowest BIC"
+    if candidate.structure == certificate.structure:
+        yield "✓ chosen"
 
 
 def gain_table(calibration: Calibration) -> Table:
     """Return the static gains: the probe's scale, or the encoder's? And how far each is from 1."""
-    certificate = calibration.certificate
-    spread = certificate.get("static_gain_uncertainty")
-    rows = [_gain_row("probe per encoder, fitted", calibration.static_gain, spread)]
-    for key, name in _GAINS.items():
-        gain = part(certificate, "static_gains", key) or {}
-        value, spread = part(gain, "value"), part(gain, "uncertainty")
-        rows.append(_gain_row(name, value, spread))
-    return Table("Static gain", ("travel per travel", "from 1 [ppm]"), known_rows(rows, 1))
+    found = calibration.certificate.static_gain
+    rows = [_gain_row("probe per encoder, fitted", calibration.static_gain, found.uncertainty)]
+    for name, gain in (
+        ("probe per encoder, plateaus", found.probe_per_encoder),
+        ("probe per reference, plateaus", found.probe_per_reference),
+        ("reference per encoder, plateaus", found.reference_per_encoder),
+    ):
+        if gain is not None:
+            rows.append(_gain_row(name, gain.value, gain.uncertainty))
+    return Table("Static gain", ("travel per travel", "from 1 [ppm]"), rows)
 
 
-def _gain_row(name: str, value: object, uncertainty: object) -> tuple[str, ...]:
-    known, spread = number(value), number(uncertainty)
-    if known is None:
-        return (name, NOTHING, NOTHING)
-    off = measured((known - 1) / PPM, None if spread is None else spread / PPM)
-    return (name, measured(known, spread, digits=6), off)
+def _gain_row(name: str, value: float, spread: float | None) -> tuple[str, ...]:
+    off = measured((value - 1) / PPM, None if spread is None else spread / PPM)
+    return (name, measured(value, spread, digits=6), off)
 
 
 _POLARITIES = {1: "falls when Z rises", -1: "rises when Z rises"}
 
 
-def background_table(certificate: CertificateEntries) -> Table:
-    """Return what the probe saw besides the motion."""
-    polarity = certificate.get("polarity")
+def background_table(certificate: Certificate) -> Table:
+    """Return what the readings contain besides the motion."""
+    errors, response = certificate.model_errors, certificate.response
+    polarity = certificate.static_gain.polarity
     rows = [
-        ("drift", quantity(certificate.get("drift_m_s"), "m/s")),
-        ("backlash", _or_none(certificate.get("backlash_m"), "m")),
+        ("drift", quantity(errors.drift_m_s, "m/s")),
+        ("backlash", _or_none(errors.backlash_m, "m")),
         (
             "lag that motion between samples may hide, at most",
-            _or_none(certificate.get("inter_sample_delay_bound_s"), "s"),
+            _or_none(response.inter_sample_delay_bound_s, "s"),
         ),
-        ("lag of the reference sensor", quantity(certificate.get("reference_lag_s"), "s")),
-        ("distance", _POLARITIES.get(polarity, NOTHING) if isinstance(polarity, int) else NOTHING),
+        ("lag of the reference sensor", quantity(response.reference_lag_s, "s")),
+        ("distance", NOTHING if polarity is None else _POLARITIES.get(polarity, NOTHING)),
     ]
     return Table("Besides the motion", (), known_rows(rows, 1))
 
 
-def _or_none(value: object, unit: str) -> str:
-    return "none found" if number(value) == 0 else quantity(value, unit)
+def _or_none(value: float | None, unit: str) -> str:
+    return "none found" if value == 0 else quantity(value, unit)
 
 
-def model_error_table(certificate: CertificateEntries) -> Table:
-    """Return what departs from a linear, steady response, and was modelled."""
+def model_error_table(certificate: Certificate) -> Table:
+    """Return the deviations from a linear, steady response that were modelled."""
+    found = certificate.model_errors
     rows = [
         (
-            str(entry.get("family", NOTHING)),
-            quantity(entry.get("size_m"), "m"),
-            quantity(entry.get("uncertainty_m"), "m"),
-            str(entry.get("modelled", NOTHING)),
+            error.family,
+            quantity(error.size_m, "m"),
+            quantity(error.uncertainty_m, "m"),
+            "in the response" if error.added_poles else "beside it",
         )
-        for entry in listed(certificate, "departures")
+        for error in found.modelled
     ]
     if rows:
-        together = quantity(certificate.get("motion_error_m"), "m")
-        rows.append(("together, on a height", together, "", ""))
-    return Table("Found beside a steady linear response", ("size", "u", "modelled"), rows)
+        rows.append(("together, on a height", quantity(found.motion_error_m, "m"), "", ""))
+    return Table("Found beside a linear, steady response", ("size", "u", "modelled"), rows)
 
 
-def consistency_table(certificate: CertificateEntries) -> Table:
-    """Return what differs between the parts of the test, the first less the second."""
+def consistency_table(certificate: Certificate) -> Table:
+    """Return the differences between the parts of the test, the first less the second."""
     rows = [
         (
-            str(entry.get("parts", NOTHING)),
-            measured(entry.get("lag_difference_s"), entry.get("lag_difference_uncertainty_s"), "s"),
-            measured(
-                _ppm(entry.get("gain_difference")), _ppm(entry.get("gain_difference_uncertainty"))
-            ),
-            probability(entry.get("p")),
+            part.parts,
+            measured(part.lag_difference_s, part.lag_difference_uncertainty_s, "s"),
+            measured(_ppm(part.gain_difference), _ppm(part.gain_difference_uncertainty)),
+            probability(part.p),
         )
-        for entry in listed(certificate, "consistency")
+        for part in certificate.consistency
     ]
     columns = ("lag differs by", "gain differs by [ppm]", "p, by chance")
-    return Table("Do the parts of the test agree?", columns, rows)
+    return Table("Agreement of the parts of the test", columns, rows)
 
 
-def _ppm(value: object) -> float | None:
-    known = number(value)
-    return None if known is None else known / PPM
+def _ppm(value: float | None) -> float | None:
+    return None if value is None else value / PPM
 
 
 def coefficient_table(calibration: Calibration) -> Table:
@@ -262,12 +217,11 @@ def _power(letter: str, k: int) -> str:
     return f"{letter}{k} [{unit}]"
 
 
-def sample_account(certificate: CertificateEntries) -> Table:
-    """Return what became of every sample."""
-    account = certificate.get("samples")
+def sample_account(certificate: Certificate) -> Table:
+    """Return the number of samples by what became of them."""
     rows = [
-        (str(reason).replace("_", " "), count(value))
-        for reason, value in (account.items() if isinstance(account, Mapping) else ())
+        (reason.replace("_", " "), count(number))
+        for reason, number in certificate.residual.samples.items()
     ]
     return Table("Samples", (), rows)
 
@@ -278,42 +232,60 @@ _LIMITS = (
     ("χ² where the axis moves, at least", "chi_square_least", ""),
     ("χ² where the axis moves, at most", "chi_square_greatest", ""),
     ("trusted band, to at least", "valid_up_to_least_hz", "Hz"),
+    ("delay that is harmless on the intended scan", "harmless_delay_s", "s"),
 )
 
 
-def limit_table(certificate: CertificateEntries) -> Table:
+def limit_table(certificate: Certificate) -> Table:
     """Return what the verdict was measured against."""
+    limits, use = certificate.limits, certificate.validity.use
     rows = [
-        (
-            name,
-            plain(part(certificate, "limits", key))
-            if not unit
-            else quantity(part(certificate, "limits", key), unit),
-        )
+        (name, quantity(limits.get(key), unit) if unit else plain(limits.get(key)))
         for name, key, unit in _LIMITS
     ]
-    source = certificate.get("input")
-    rows.append(("motion taken from", source if isinstance(source, str) else NOTHING))
+    rows.append(("motion taken from", certificate.origin.input or NOTHING))
+    if use is not None:
+        highest = quantity(float(np.max(use.frequencies_hz)), "Hz")
+        rows.append(("intended scan", f"{quantity(use.speed_m_s, 'm/s')} rms, up to {highest}"))
+        rows.append(("accuracy asked for, k = 2", quantity(use.accuracy_m, "m")))
     return Table("Limits of the verdict", (), known_rows(rows, 1))
+
+
+_ORIGINS = {
+    "machine": "machine",
+    "probe": "probe",
+    "probe_serial_number": "serial number of the probe",
+    "target": "target",
+    "operator": "operator",
+    "laboratory": "laboratory",
+    "method": "method",
+    "software": "software",
+    "made_from": "made from",
+}
 
 
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:
     """Return what the certificate is about."""
+    origin = calibration.certificate.origin
     rows = [
         ("identity", calibration.id),
         ("schema", SCHEMA),
         ("recording", source or NOTHING),
-        ("recorded", date_text_of_stamp(calibration.certificate.get(RECORDED))),
+        ("recorded", date_text_of_stamp(origin.recorded_ns)),
         ("sample period", quantity(calibration.sample_period, "s", 4)),
         ("half the sampling rate", quantity(0.5 / calibration.sample_period, "Hz", 4)),
+        *((name, getattr(origin, key) or NOTHING) for key, name in _ORIGINS.items()),
+        ("temperature", quantity(origin.temperature_c, "°C", 4)),
         ("omsm_ros", version or NOTHING),
     ]
     return Table("Identity", (), known_rows(rows, 1))
 
 
-def further_table(certificate: CertificateEntries) -> Table:
+def further_table(certificate: Certificate) -> Table:
     """Return the entries that have no other place on the page."""
-    rest = {str(key): value for key, value in certificate.items() if key not in _SHOWN}
+    rest = dict(certificate.further)
+    if certificate.self_calibration:
+        rest["self_calibration"] = certificate.self_calibration
     return mapping_table("Further entries", rest)
 
 

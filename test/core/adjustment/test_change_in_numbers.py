@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.calibration.repeatability import (
     Spread,
     common_lines,
@@ -71,7 +73,8 @@ def test_the_unit_of_the_probe_does_not_matter(unit: float) -> None:
     """A gain in µm per volt changes by as many parts, and as many sigmas, as one near 1."""
     reported = {"static_gain_uncertainty": unit * GAIN_U}
     found = compare_calibrations(
-        late(gain=unit, certificate=reported), late(gain=unit * 1.00001, certificate=reported)
+        late(gain=unit, certificate=certified_by(reported)),
+        late(gain=unit * 1.00001, certificate=certified_by(reported)),
     )
     assert found.static_gain == pytest.approx(1e-5)
     assert found.static_gain_sigmas == pytest.approx(1e-5 / GAIN_U / math.sqrt(2))
@@ -90,7 +93,7 @@ def test_a_phase_that_has_turned_round_is_near() -> None:
 
 
 def test_without_a_stated_uncertainty_nothing_is_known_of_the_gain() -> None:
-    silent = [late(gain=g, certificate={}) for g in (1.0, 1.5)]
+    silent = [late(gain=g, certificate=Certificate()) for g in (1.0, 1.5)]
     found = compare_calibrations(*silent)
     assert found.static_gain == pytest.approx(0.5)
     assert found.static_gain_sigmas == 0.0
@@ -99,7 +102,7 @@ def test_without_a_stated_uncertainty_nothing_is_known_of_the_gain() -> None:
 
 
 def test_one_stated_uncertainty_is_enough_to_judge_the_gain() -> None:
-    found = compare_calibrations(late(certificate={}), late(gain=1.0 + 3 * GAIN_U))
+    found = compare_calibrations(late(certificate=Certificate()), late(gain=1.0 + 3 * GAIN_U))
     assert found.static_gain_sigmas == pytest.approx(3.0)
 
 

@@ -5,9 +5,11 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from certified import certified_by
 from scipy import stats
 
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.calibration.repeatability import repeatability
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
@@ -43,7 +45,7 @@ def drawn(seed, count=COUNT, scale=1.0):
             sample_period=1e-3,
             valid_up_to=60.0,
             covariance=covariance,
-            certificate={"static_gain_uncertainty": gain},
+            certificate=certified_by({"static_gain_uncertainty": gain}),
         )
         for _ in range(count)
     ]
@@ -95,7 +97,7 @@ def test_scatter_of_the_response_is_that_of_its_lag():
 
 
 def test_without_a_stated_gain_uncertainty_its_ratio_is_unknown():
-    found = repeatability([replace(c, certificate={}) for c in drawn(3)])
+    found = repeatability([replace(c, certificate=Certificate()) for c in drawn(3)])
     assert np.isnan(found.static_gain.ratio)
     assert "nan" not in found.text()
     assert found.text().count("of stated") == 1

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.adjustment.resolved_calibration import (
     after_step_test,
@@ -18,7 +19,8 @@ from omsm_ros.core.adjustment.resolved_calibration import (
 )
 from omsm_ros.core.adjustment.scan_model import CURVATURE, GAIN, LAG, LATENCY
 from omsm_ros.core.adjustment.self_calibration import ScanConsistency, SelfCalibration
-from omsm_ros.core.calibration.calibration import REVERSAL, SPEEDS, Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.latency import REVERSAL, SPEEDS
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -62,7 +64,7 @@ def calibration(
         sample_period=PERIOD,
         valid_up_to=50.0,
         covariance=np.zeros((p, p)) if covariance is None else covariance,
-        certificate=certificate or {"verdict": "accepted"},
+        certificate=certified_by(certificate or {"verdict": "accepted"}),
     )
 
 
@@ -118,10 +120,10 @@ def test_the_lag_of_scans_alone_is_as_uncertain_as_found() -> None:
     made = of_scans()
     lag = np.sqrt(COVARIANCE[LAG, LAG])
     assert made.low_frequency_delay_uncertainty == pytest.approx(lag, rel=1e-6)
-    assert made.certificate["low_frequency_delay_uncertainty_s"] == pytest.approx(lag)
-    assert made.certificate["low_frequency_delay_s"] == pytest.approx(3.1e-4)
+    assert made.certificate.response.low_frequency_delay_uncertainty_s == pytest.approx(lag)
+    assert made.certificate.response.low_frequency_delay_s == pytest.approx(3.1e-4)
     gain = np.sqrt(COVARIANCE[GAIN, GAIN]) * 0.98
-    assert made.certificate["static_gain_uncertainty"] == pytest.approx(gain)
+    assert made.certificate.static_gain.uncertainty == pytest.approx(gain)
 
 
 def test_scans_alone_pass_the_door_for_calibrations() -> None:
@@ -227,7 +229,7 @@ def test_the_lag_found_is_added_to_that_of_the_step_test() -> None:
     expected = lag + 2e-6, curvature + 2e-6 * lag + 3e-10
     assert slow_series(after.dynamics) == pytest.approx(expected, rel=1e-6, abs=0)
     assert np.array_equal(after.dynamics.poles(), before.dynamics.poles())
-    assert after.certificate["low_frequency_delay_s"] == pytest.approx(lag + 2e-6)
+    assert after.certificate.response.low_frequency_delay_s == pytest.approx(lag + 2e-6)
     assert after.static_gain == before.static_gain
 
 
@@ -262,7 +264,7 @@ def test_a_curvature_that_has_no_room_counts_as_doubt() -> None:
 
 def test_latency_is_stated_with_its_speeds_and_its_share() -> None:
     before = calibration(*G2, covariance=SIGMA)
-    latency = latency_of(resolved(before, found_by(np.array([0.0, 0.0, 0.0, 1.5e-4]))))
+    latency = resolved(before, found_by(np.array([0.0, 0.0, 0.0, 1.5e-4]))).latency
     assert latency.source == SPEEDS
     assert latency.delay_s == 1.5e-4
     assert latency.uncertainty_s == pytest.approx(np.sqrt(COVARIANCE[LATENCY, LATENCY]))
@@ -284,7 +286,7 @@ def test_latency_is_stated_with_its_speeds_and_its_share() -> None:
     ],
 )
 def test_equal_speeds_are_a_reversal(speeds: tuple[float, ...], source: str) -> None:
-    assert latency_of(of_scans(speeds=speeds)).source == source
+    assert of_scans(speeds=speeds).latency.source == source
 
 
 def test_what_the_scans_do_not_tell_is_said() -> None:
@@ -295,14 +297,14 @@ def test_what_the_scans_do_not_tell_is_said() -> None:
     assert [str(text).split(":")[0] for text in words[:2]] == ["latency", "curvature of the gain"]
     assert words[2:] == [everything]
     made = of_scans(known=known)
-    latency = latency_of(made)
+    latency = made.latency
     assert (latency.delay_s, latency.uncertainty_s, latency.share) == (0.0, None, None)
-    assert made.certificate["warnings"] == [latency.reason]
-    assert of_scans().certificate["warnings"] == []
+    assert made.certificate.warnings == [latency.reason]
+    assert of_scans().certificate.warnings == []
 
 
 def test_what_was_fitted_besides_is_in_the_certificate() -> None:
-    entry = of_scans().certificate["self_calibration"]
+    entry = of_scans().certificate.self_calibration
     assert isinstance(entry, dict)
     (between,) = entry["between_scans"]
     assert between["clocking"] == {"value": 1e-7, "uncertainty": 1e-8}
@@ -325,25 +327,25 @@ BAD_AGREEMENT = ScanConsistency(ratio=9.0, disagreement=31e-9, noise=10e-9)
 )
 def test_contradictions_reject_with_their_reason(wrong: dict[str, object], said: str) -> None:
     stated: dict[str, object] = {"verdict": "accepted", "reasons": ["an old one"]}
-    before = calibration(*G2, covariance=SIGMA, certificate=stated)
+    before = calibration(*G2, covariance=SIGMA, certificate=certified_by(stated))
     after = resolved(before, replace(found_by(), **wrong))  # type: ignore[arg-type]
-    assert after.certificate["verdict"] == "rejected"
-    old, new = after.certificate["reasons"]  # type: ignore[misc]
+    assert after.certificate.verdict == "rejected"
+    old, new = after.certificate.reasons  # type: ignore[misc]
     assert old == "an old one"
     assert said in new
-    assert before.certificate["verdict"] == "accepted"
+    assert before.certificate.verdict == "accepted"
 
 
 def test_all_contradictions_are_reported_at_once() -> None:
     before = calibration(*G2, covariance=SIGMA)
     early = np.array([0.0, 0.0, 0.0, -1e-4])
     after = resolved(before, found_by(early, agreement=BAD_AGREEMENT, prior_conflict=40.0))
-    assert len(after.certificate["reasons"]) == 3  # type: ignore[arg-type]
+    assert len(after.certificate.reasons) == 3  # type: ignore[arg-type]
 
 
 def test_a_latency_below_zero_within_its_uncertainty_is_none() -> None:
     slightly = -2 * float(np.sqrt(COVARIANCE[LATENCY, LATENCY]))
     before = calibration(*G2, covariance=SIGMA)
     after = resolved(before, found_by(np.array([0.0, 0.0, 0.0, slightly])))
-    assert after.certificate["verdict"] == "accepted"
-    assert latency_of(after).delay_s == 0.0
+    assert after.certificate.verdict == "accepted"
+    assert after.latency.delay_s == 0.0

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.adjustment.resolved_calibration import (
     after_step_test,
@@ -18,7 +19,8 @@ from omsm_ros.core.adjustment.resolved_calibration import (
 from omsm_ros.core.adjustment.scan_model import CURVATURE, GAIN, LAG, LATENCY
 from omsm_ros.core.adjustment.scan_reader import ScanColumns, read_scan
 from omsm_ros.core.adjustment.self_calibration import Prior, self_calibrate
-from omsm_ros.core.calibration.calibration import REVERSAL, SPEEDS, Calibration, latency_of
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.latency import REVERSAL, SPEEDS
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.kinematics.trajectories import Spiral
@@ -76,7 +78,7 @@ def step_test(latency: float, off: float = 0.0) -> Calibration:
         sample_period=1e-3,
         valid_up_to=100.0,
         covariance=covariance,
-        certificate={"verdict": "accepted", "noise_m": 10e-9},
+        certificate=certified_by({"verdict": "accepted", "noise_m": 10e-9}),
     )
 
 
@@ -98,7 +100,7 @@ def test_two_speeds_and_a_step_test_divide_the_lag(share: float) -> None:
     calibrated = self_calibrate(pair, after_step_test(known))
     assert np.allclose(calibrated.speeds, [np.pi, 2 * np.pi], rtol=1e-3)
     result = resolved(known, calibrated)
-    found = latency_of(result)
+    found = result.latency
     assert found.source == SPEEDS
     assert found.uncertainty_s is not None
     assert found.uncertainty_s < 1.6e-6
@@ -108,7 +110,7 @@ def test_two_speeds_and_a_step_test_divide_the_lag(share: float) -> None:
         # Without the scans the correction itself makes an error of this size.
         assert error_left(known, latency) > 400e-9
     else:
-        assert result.certificate["verdict"] == "accepted"
+        assert result.certificate.verdict == "accepted"
 
 
 def test_without_a_step_test_the_surface_scanned_is_corrected() -> None:
@@ -121,10 +123,10 @@ def test_without_a_step_test_the_surface_scanned_is_corrected() -> None:
     assert abs(structure - LAG_S) < 3 * uncertainty < 3e-6
     assert any("latency" in str(text) for text in undetermined(found))
     result = from_scans_alone(found, 1e-3, TRUE_GAIN, {})
-    assert latency_of(result).share is None
-    assert latency_of(result).uncertainty_s is None
+    assert result.latency.share is None
+    assert result.latency.uncertainty_s is None
     assert error_left(result, latency) < 5e-9
-    assert str(result.certificate["verdict"]).startswith("accepted up to")
+    assert str(result.certificate.verdict).startswith("accepted up to")
     # Both speeds reach further than a few turns a second, and no further than the harmonics.
     assert 3.0 < result.valid_up_to < 12.0
 
@@ -133,7 +135,7 @@ def test_two_directions_are_the_same_estimator() -> None:
     latency = 0.5 * LAG_S
     known = step_test(latency)
     pair = [scanned(made(rpm, s, disturbed(latency)), known) for s, rpm in ((1, 30.0), (2, -30.0))]
-    found = latency_of(resolved(known, self_calibrate(pair, after_step_test(known))))
+    found = resolved(known, self_calibrate(pair, after_step_test(known))).latency
     assert found.source == REVERSAL
     assert found.share == pytest.approx(1 / 3, abs=0.005)
 
@@ -190,8 +192,8 @@ def test_scans_of_different_parts_contradict_each_other() -> None:
     other = scanned(made(60.0, 2, disturbed()), known)
     dented = replace(other, height=other.height + 30e-9 * np.cos(5 * other.angle))
     result = resolved(known, self_calibrate([one, dented], after_step_test(known)))
-    assert result.certificate["verdict"] == "rejected"
-    assert "contradict each other by" in str(result.certificate["reasons"])
+    assert result.certificate.verdict == "rejected"
+    assert "contradict each other by" in str(result.certificate.reasons)
 
 
 def test_a_step_test_that_the_scans_contradict_is_reported() -> None:
@@ -201,16 +203,16 @@ def test_a_step_test_that_the_scans_contradict_is_reported() -> None:
     pair = [scanned(made(rpm, s, disturbed()), slow) for s, rpm in ((1, 30.0), (2, 60.0))]
     found = self_calibrate(pair, after_step_test(slow))
     result = resolved(slow, found)
-    assert result.certificate["verdict"] == "rejected"
-    assert "scans and step test contradict each other" in str(result.certificate["reasons"])
+    assert result.certificate.verdict == "rejected"
+    assert "scans and step test contradict each other" in str(result.certificate.reasons)
 
 
 def test_a_probe_that_would_be_early_is_reported() -> None:
     stiff = step_test(0.0, off=-30e-6)
     pair = [scanned(made(rpm, s, disturbed()), stiff) for s, rpm in ((1, 30.0), (2, 60.0))]
     result = resolved(stiff, self_calibrate(pair, after_step_test(stiff)))
-    assert result.certificate["verdict"] == "rejected"
-    assert "µs early" in str(result.certificate["reasons"])
+    assert result.certificate.verdict == "rejected"
+    assert "µs early" in str(result.certificate.reasons)
 
 
 def test_one_speed_and_direction_tell_nothing() -> None:

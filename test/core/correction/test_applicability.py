@@ -7,13 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration, settings_with
+from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
 
 SETTINGS = {"exposure_s": 0.5e-3, "averaging": 1, "machine": "Nanoform 250", "triggered": True}
+
+
+def told_of(known: Calibration, **options: object) -> tuple[str, ...]:
+    return tuple(map(str, objections(known, **options)))  # type: ignore[arg-type]
 
 
 def calibration(**certificate: object) -> Calibration:
@@ -24,7 +30,7 @@ def calibration(**certificate: object) -> Calibration:
         valid_up_to=100.0,
         covariance=np.zeros((3, 3)),
         settings=SETTINGS,
-        certificate={"verdict": "accepted"} | certificate,
+        certificate=certified_by({"verdict": "accepted", **certificate}),
     )
 
 
@@ -47,14 +53,14 @@ PROBE = {"probe.averaging": 4.0, "probe.model": "A"}
 )
 def test_what_the_probe_tells_is_compared_where_both_know(reported, reasons):
     known = replace(calibration(), settings=SETTINGS | PROBE)
-    assert objections(known, probe=reported) == reasons
-    assert objections(known, settings=SETTINGS, probe=reported) == reasons
+    assert told_of(known, probe=reported) == reasons
+    assert told_of(known, settings=SETTINGS, probe=reported) == reasons
 
 
 def test_a_calibration_belongs_to_one_setting_of_the_probe():
     assert settings_with({"machine": "A"}, []) == {"machine": "A"}
     assert settings_with({"machine": "A"}, [PROBE, PROBE]) == {"machine": "A", **PROBE}
-    with pytest.raises(CalibrationError, match=r"averaging is 4\.0, then 8\.0 of one motion"):
+    with pytest.raises(CalibrationError, match=r"averaging is 4\.0, then 8\.0 in one motion"):
         settings_with({}, [PROBE, {"probe.averaging": 8.0}])
 
 
@@ -68,8 +74,8 @@ def test_what_is_not_asked_is_not_objected_to() -> None:
 
 
 def test_a_calibration_that_nobody_judged_is_objected_to() -> None:
-    unjudged = replace(calibration(), certificate={})
-    assert objections(unjudged) == ("its certificate states no verdict",)
+    unjudged = replace(calibration(), certificate=Certificate())
+    assert told_of(unjudged) == ("its certificate states no verdict",)
 
 
 @pytest.mark.parametrize(
@@ -85,12 +91,12 @@ def test_a_calibration_that_nobody_judged_is_objected_to() -> None:
 def test_a_setting_that_differs_is_reported_with_both_values(
     name: str, value: object, text: str
 ) -> None:
-    assert objections(calibration(), settings=SETTINGS | {name: value}) == (text,)
+    assert told_of(calibration(), settings=SETTINGS | {name: value}) == (text,)
 
 
 def test_a_setting_that_is_no_longer_known_is_reported() -> None:
     now = {k: v for k, v in SETTINGS.items() if k != "averaging"}
-    assert objections(calibration(), settings=now) == ("averaging is not known, calibrated with 1",)
+    assert told_of(calibration(), settings=now) == ("averaging is not known, calibrated with 1",)
 
 
 def test_numbers_are_compared_as_numbers() -> None:
@@ -99,21 +105,21 @@ def test_numbers_are_compared_as_numbers() -> None:
 
 
 def test_another_rate_is_reported() -> None:
-    found = objections(calibration(), sample_period=0.5e-3)
+    found = told_of(calibration(), sample_period=0.5e-3)
     assert found == ("sample period is 0.0005 s, calibrated at 0.001 s",)
 
 
 def test_a_failed_certificate_tells_its_reasons() -> None:
     failed = calibration(verdict="rejected", reasons=["too noisy", "too few edges"])
-    (text,) = objections(failed)
+    (text,) = told_of(failed)
     assert text == "its certificate says 'rejected' (too noisy; too few edges)"
 
 
 def test_a_probe_turned_round_since_is_reported() -> None:
-    (text,) = objections(calibration(polarity=1), polarity=-1)
+    (text,) = told_of(calibration(polarity=1), polarity=-1)
     assert text.startswith("polarity is -1, calibrated with 1 (the distance falls as z rises)")
-    assert text.endswith("state polarity 1 (--polarity 1)")
-    assert "rises as z rises" in objections(calibration(polarity=-1), polarity=1)[0]
+    assert text.endswith("state polarity 1 ('polarity')")
+    assert "rises as z rises" in told_of(calibration(polarity=-1), polarity=1)[0]
 
 
 def test_objections_refuse_unless_overridden_and_are_recorded() -> None:
@@ -123,7 +129,11 @@ def test_objections_refuse_unless_overridden_and_are_recorded() -> None:
         admit(known, reasons, override=False)
     assert known.id[:12] in str(refusal.value)
     recorded = json.loads(json.dumps(admit(known, reasons, override=True)))
-    assert recorded == {"calibration": known.id, "objections": list(reasons), "overridden": True}
+    assert recorded == {
+        "calibration": known.id,
+        "objections": list(map(str, reasons)),
+        "overridden": True,
+    }
 
 
 def test_without_objections_nothing_is_overridden() -> None:

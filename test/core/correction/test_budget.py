@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
-from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, with_latency
+from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.machine_sources import (
@@ -102,8 +104,8 @@ def test_what_a_step_test_could_not_show_is_a_row_of_its_own(
 ) -> None:
     p = len(true_calibration.covariance)
     known = replace(true_calibration, covariance=np.diag([1.0] + [0.0] * (p - 1)) * 1e-8)
-    certificate = {**known.certificate, "noise_covariance": [0.0] * p**2}
-    known = replace(known, certificate=certificate)
+    certificate = certified_by({"noise_covariance": [0.0] * p**2}, known.certificate)
+    known = replace(known, certificate=certified_by(certificate))
     trace = replace(
         spiral_points(),
         dynamics=np.stack([spiral_points().x, spiral_points().y]) * 1e-6,

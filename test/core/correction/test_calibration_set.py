@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
-from omsm_ros.core.calibration.calibration import (
-    Calibration,
-    declared_latency,
-    latency_of,
-    with_latency,
-)
+from omsm_ros.core.calibration.calibration import Calibration, with_latency
 from omsm_ros.core.calibration.calibration_set import CalibrationSet, calibration_set
+from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
@@ -144,20 +141,21 @@ def test_a_set_goes_into_a_file_and_back(tmp_path, ends: CalibrationSet, scan: R
 def test_the_worst_of_the_members_is_said_of_the_set(true_calibration: Calibration) -> None:
     def said(**certificate: object) -> Calibration:
         return replace(
-            true_calibration, certificate={**true_calibration.certificate, **certificate}
+            true_calibration,
+            certificate=certified_by({**certificate}, true_calibration.certificate),
         )
 
     bad = said(verdict="rejected", reasons=["not linear"], noise_m=2e-8)
     made = calibration_set("z", [(0.0, said(noise_m=1e-8)), (1e-3, bad)])
-    assert made.certificate["verdict"] == "rejected"
-    assert made.certificate["reasons"] == ["not linear"]
-    assert made.certificate["noise_m"] == 2e-8
-    assert not latency_of(made).resolved
+    assert made.certificate.verdict == "rejected"
+    assert list(map(str, made.certificate.reasons)) == ["not linear"]
+    assert made.certificate.residual.noise_m == 2e-8
+    assert not made.latency.resolved
     known = [
         with_latency(true_calibration, declared_latency(3e-4, delay, 1e-6, "maker"))
         for delay in (1e-4, 1.2e-4)
     ]
-    latency = latency_of(calibration_set("z", list(zip((0.0, 1e-3), known, strict=True))))
+    latency = calibration_set("z", list(zip((0.0, 1e-3), known, strict=True))).latency
     assert latency.delay_s == pytest.approx(1.1e-4)
     assert latency.beside_z_s == pytest.approx(np.hypot(1e-6, 0.2e-4 / np.sqrt(12)))
 
@@ -167,8 +165,8 @@ def test_members_that_do_not_belong_together_are_refused(true_calibration: Calib
     for along, placed, says in (
         ("y", [(0.0, true_calibration), (1.0, true_calibration)], "along 'y'"),
         ("x", [(0.0, true_calibration)], "set of 1 calibrations"),
-        ("x", [(0.0, true_calibration)] * 2, "stand at one x"),
-        ("x", [(0.0, true_calibration), (1.0, other)], "sample_period of a set's members"),
+        ("x", [(0.0, true_calibration)] * 2, "are at the same x"),
+        ("x", [(0.0, true_calibration), (1.0, other)], "sample_period of the members of a set"),
         ("x", [(0.0, true_calibration), (1e3, true_calibration)], "x is 1000.0 m"),
     ):
         with pytest.raises(CalibrationError, match=says):

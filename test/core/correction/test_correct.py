@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.calibration.calibration import declared_latency, with_latency
+from omsm_ros.core.calibration.calibration import with_latency
+from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, lateral_lag
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources

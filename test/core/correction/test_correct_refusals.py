@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
@@ -73,7 +74,7 @@ def test_senseless_options_are_named(wrong: dict[str, float]) -> None:
 
 def test_a_certificate_with_a_senseless_noise_is_refused() -> None:
     with pytest.raises(CalibrationError, match="noise_m is 'low'"):
-        Corrector(calibration(certificate={"noise_m": "low"}))
+        Corrector(calibration(certificate=certified_by({"noise_m": "low"})))
 
 
 def test_joining_nothing_gives_no_points() -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from certified import certified_by
 
-from omsm_ros.core.calibration.calibration import Calibration, declared_latency, with_latency
+from omsm_ros.core.calibration.calibration import Calibration, with_latency
+from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.correction.budget import (
     AMBER,
     GREEN,
@@ -111,11 +113,11 @@ def test_red_when_what_is_known_is_too_much(settled: Calibration) -> None:
 def test_red_for_a_rejected_calibration_and_amber_without_a_certificate(
     settled: Calibration,
 ) -> None:
-    refused = {**settled.certificate, "verdict": "rejected", "reasons": ["not linear"]}
+    refused = certified_by({"verdict": "rejected", "reasons": ["not linear"]}, settled.certificate)
     found = light(replace(settled, certificate=refused), all_but())
     assert found.level == RED
     assert TrafficLightReason("not linear") in found.reasons
-    silent = {k: v for k, v in settled.certificate.items() if k != "verdict"}
+    silent = replace(settled.certificate, verdict=None)
     assert light(replace(settled, certificate=silent), all_but()).level == AMBER
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -26,7 +27,10 @@ TRUSTED = 40.0
 
 def calibration(**parts: object) -> Calibration:
     """Uncertain of its pole alone: H(z) varies by the rate of z, through G²."""
-    stated: dict[str, object] = {"covariance": np.diag([0.0, LAG_U**2, 0.0]), "certificate": {}}
+    stated: dict[str, object] = {
+        "covariance": np.diag([0.0, LAG_U**2, 0.0]),
+        "certificate": certified_by({}),
+    }
     return Calibration(
         dynamics=G,
         static_gain=1.0,
@@ -87,7 +91,7 @@ def test_where_the_slide_stands_does_not_matter() -> None:
 
 
 def test_what_does_not_follow_linearly_is_left_at_rest_too() -> None:
-    backlash = replace(EXACT, certificate={"motion_error_m": 7e-9})
+    backlash = replace(EXACT, certificate=certified_by({"motion_error_m": 7e-9}))
     assert Residual(backlash, PERIOD).largest(np.zeros(COUNT)) == pytest.approx(7e-9)
     assert Residual(EXACT, PERIOD).largest(np.zeros(COUNT)) == 0.0
 
@@ -95,7 +99,9 @@ def test_what_does_not_follow_linearly_is_left_at_rest_too() -> None:
 def test_noise_and_undetected_error_are_kept_separate() -> None:
     """Of a variance of which a quarter is noise, three quarters could hide."""
     noise = np.diag([0.0, LAG_U**2 / 4, 0.0])
-    reported = calibration(certificate={"noise_covariance": [float(v) for v in noise.ravel()]})
+    reported = calibration(
+        certificate=certified_by({"noise_covariance": [float(v) for v in noise.ravel()]})
+    )
     known, undetected = Residual(reported, PERIOD).variances(sine(5.0))
     np.testing.assert_allclose(undetected[1000:-1000], 3 * known[1000:-1000], rtol=1e-3, atol=1e-24)
     both = Residual(calibration(), PERIOD).variances(sine(5.0))
@@ -108,7 +114,10 @@ def test_the_largest_is_where_the_motion_is_fastest() -> None:
     z = sine(5.0) * (1.5 + 0.5 * np.tanh((TIME - 3.0) / 0.3))
     noise = [float(v) for v in np.diag([0.0, LAG_U**2 / 4, 0.0]).ravel()]
     expected = 2 * AMPLITUDE * 2 * np.pi * 5.0 * LAG_U * abs(G.response(np.array([5.0]))[0]) ** 2
-    for known in (calibration(), calibration(certificate={"noise_covariance": noise})):
+    for known in (
+        calibration(),
+        calibration(certificate=certified_by({"noise_covariance": noise})),
+    ):
         assert Residual(known, PERIOD).largest(z) == pytest.approx(expected, rel=0.02)
 
 

@@ -7,22 +7,18 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from certified import certified_by
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.calibration.calibration import (
-    Calibration,
-    declared_latency,
-    latency_of,
-    unresolved_latency,
-    with_latency,
-)
+from omsm_ros.core.calibration.calibration import Calibration, with_latency
 from omsm_ros.core.calibration.calibration_set import (
     MOST_MEMBERS,
     CalibrationSet,
     calibration_set,
     set_from_content,
 )
+from omsm_ros.core.calibration.latency import declared_latency, unresolved_latency
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
 
@@ -32,7 +28,7 @@ def member(lag: float = 3e-4, **other: object) -> Calibration:
         "static_gain": 0.99,
         "valid_up_to": 80.0,
         "settings": {"probe.rate": 1000},
-        "certificate": {"verdict": "accepted"},
+        "certificate": certified_by({"verdict": "accepted"}),
     }
     return Calibration(
         dynamics=TransferFunction(np.array([1.0, 1e-3 - lag]), np.array([1.0, 1e-3])),
@@ -43,7 +39,7 @@ def member(lag: float = 3e-4, **other: object) -> Calibration:
 
 
 def certified(**entries: object) -> Calibration:
-    return member(certificate={"verdict": "accepted", **entries})
+    return member(certificate=certified_by({"verdict": "accepted", **entries}))
 
 
 def together(*members: Calibration, along: str = "x") -> CalibrationSet:
@@ -94,7 +90,9 @@ def test_a_set_is_trusted_as_far_as_its_least_member() -> None:
 def test_gains_that_differ_are_uncertain_by_a_uniform_distribution() -> None:
     own = {"verdict": "accepted", "static_gain_uncertainty": 3e-4}
     made = together(
-        member(static_gain=0.98, certificate=own), member(static_gain=1.0), member(static_gain=0.99)
+        member(static_gain=0.98, certificate=certified_by(own)),
+        member(static_gain=1.0),
+        member(static_gain=0.99),
     )
     assert made.static_gain == pytest.approx(0.99)
     expected = np.hypot(3e-4, 0.02 / np.sqrt(12))
@@ -107,9 +105,11 @@ def test_the_largest_of_what_each_states_is_stated() -> None:
         certified(noise_m=3e-8),
         certified(valid_from=0.2),
     )
-    stated = [made.certificate[name] for name in ("noise_m", "motion_error_m", "valid_from")]
-    assert stated == [3e-8, 5e-9, 0.2]
-    assert "noise_m" not in together(member(), member()).certificate
+    stated = made.certificate
+    assert stated.residual.noise_m == 3e-8
+    assert stated.model_errors.motion_error_m == 5e-9
+    assert stated.validity.from_hz == 0.2
+    assert together(member(), member()).certificate.residual.noise_m is None
 
 
 @pytest.mark.parametrize(
@@ -125,27 +125,27 @@ def test_the_largest_of_what_each_states_is_stated() -> None:
 def test_one_that_may_not_be_used_spoils_the_set(
     verdicts: list[str | None], expected: str | None
 ) -> None:
-    each = [member(certificate={"verdict": v} if v else {}) for v in verdicts]
-    assert together(*each).certificate.get("verdict") == expected
+    each = [member(certificate=certified_by({"verdict": v} if v else {})) for v in verdicts]
+    assert together(*each).certificate.verdict == expected
 
 
 def test_each_reason_is_reported_once() -> None:
     made = together(certified(reasons=["a", "b"]), certified(reasons=["b", "c"]), certified())
-    assert made.certificate["reasons"] == ["a", "b", "c"]
+    assert list(map(str, made.certificate.reasons)) == ["a", "b", "c"]
 
 
 @pytest.mark.parametrize("lags", [(3e-4, 1e-4), (1e-4, -3e-4), (-1e-4, -3e-4)])
 def test_an_open_latency_may_be_any_part_of_the_largest_lag(lags: tuple[float, float]) -> None:
     """Of a lead too: what counts is how far the probe may be from the slides."""
-    latency = latency_of(together(*map(member, lags)))
+    latency = together(*map(member, lags)).latency
     assert not latency.resolved
     assert latency.beside_z_s == pytest.approx(unresolved_latency(3e-4).beside_z_s)
 
 
 def test_one_open_latency_leaves_that_of_the_set_open() -> None:
     known = with_latency(member(), declared_latency(3e-4, 1e-4, 1e-6, "maker"))
-    assert latency_of(together(known, known)).resolved
-    assert not latency_of(together(known, member())).resolved
+    assert together(known, known).latency.resolved
+    assert not together(known, member()).latency.resolved
 
 
 def test_latencies_that_differ_are_uncertain_by_as_much() -> None:
@@ -156,7 +156,7 @@ def test_latencies_that_differ_are_uncertain_by_as_much() -> None:
             for k, (delay, u) in enumerate(zip(delays, own, strict=True))
         )
     )
-    found = latency_of(made)
+    found = made.latency
     assert found.delay_s == pytest.approx(np.mean(delays))
     assert found.uncertainty_s == pytest.approx(np.hypot(4e-6, 0.3e-4 / np.sqrt(12)))
     assert found.beside_z_s == found.uncertainty_s
@@ -173,15 +173,18 @@ def test_a_set_comes_back_from_its_content() -> None:
 
 
 def test_a_certificate_that_is_given_is_kept() -> None:
-    given = {"verdict": "rejected", "reasons": ["by hand"]}
+    given = certified_by({"verdict": "rejected", "reasons": ["by hand"]})
     assert calibration_set("x", [(0.0, member()), (0.1, member())], given).certificate == given
 
 
 @pytest.mark.parametrize(
     ("one", "said"),
     [
-        ({"settings": {"probe.rate": 2000}}, "settings of a set's members is"),
-        ({"certificate": {"verdict": "accepted", "polarity": 1}}, "polarity of a set's members"),
+        ({"settings": {"probe.rate": 2000}}, "settings of the members of a set is"),
+        (
+            {"certificate": certified_by({"verdict": "accepted", "polarity": 1})},
+            "polarity of the members of a set",
+        ),
     ],
 )
 def test_members_that_were_not_made_alike_are_refused(one: dict[str, object], said: str) -> None:

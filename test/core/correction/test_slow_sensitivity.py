@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -30,13 +31,22 @@ def with_noise(scale: float = 1.0) -> Calibration:
     known = calibration()
     certificate = {
         "noise_covariance": (scale * noise).ravel().tolist(),
-        "hidden_mostly": "creep of 10.5 s",
+        "could_hide": [
+            {
+                "family": "creep",
+                "parameter": 10.5,
+                "size": 0.0,
+                "uncertainty": 0.0,
+                "carried": 0.0,
+                "effect_on_scan_m": 1e-9,
+            }
+        ],  # fmt: skip
         "plateau_s": 0.5,
     }
     return replace(
         known,
         covariance=known.covariance + noise,
-        certificate={**known.certificate, **certificate},
+        certificate=certified_by({**certificate}, known.certificate),
     )
 
 
@@ -61,7 +71,9 @@ def test_noise_and_undetected_error_are_two_terms_of_the_budget():
         LAG_NOISE * 2 * np.pi * AMPLITUDE / np.sqrt(2), rel=0.02
     )
     assert budget["could_hide"] == pytest.approx(OPEN * AMPLITUDE / np.sqrt(2), rel=0.03)
-    total = corrected(replace(with_noise(), certificate={"valid_from": VALID_FROM}), z).budget
+    total = corrected(
+        replace(with_noise(), certificate=certified_by({"valid_from": VALID_FROM})), z
+    ).budget
     assert total["could_hide"] == 0.0
     assert total["dynamics"] == pytest.approx(
         np.hypot(budget["dynamics"], budget["could_hide"]), rel=0.02
@@ -84,7 +96,7 @@ def test_the_prediction_states_the_undetected_error_and_the_dwell_that_would_rev
     found = predict_error(with_noise(), path, 50e-9, unlimited)
     assert found.residual_hidden == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
     assert found.residual == pytest.approx(found.residual_hidden, rel=0.01)
-    assert "cannot detect, mostly creep of 10.5 s" in found.message
+    assert "cannot detect, mostly slow relaxation (creep) of 10.5 s" in found.message
     # 100 nm against 50 nm: four times as long.
     assert "rests of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message
 
@@ -98,7 +110,7 @@ def calibration() -> Calibration:
         sample_period=PERIOD,
         valid_up_to=60.0,
         covariance=covariance,
-        certificate={"verdict": "accepted", "valid_from": VALID_FROM},
+        certificate=certified_by({"verdict": "accepted", "valid_from": VALID_FROM}),
     )
 
 

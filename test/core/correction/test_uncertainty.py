@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 from numpy.polynomial import polynomial
 from scipy import signal
 
@@ -181,7 +182,7 @@ def test_a_numerator_of_the_degree_of_the_denominator_has_sensitivities(
     deviations = 1e-3 * values
     if not certificate:
         deviations[0] = 0.0
-    known = calibration(np.diag(deviations**2), dynamics=g, certificate=certificate)
+    known = calibration(np.diag(deviations**2), dynamics=g, certificate=certified_by(certificate))
     frequency = np.array([1.0, 10.0, 40.0])
     total = sum(abs(f.response(frequency)) ** 2 for f in sensitivity_filters(known, PERIOD))
     m = len(g.numerator)
@@ -262,7 +263,8 @@ def test_lateral_uncertainty_counts_by_the_slope() -> None:
 
 def test_the_certificate_tells_noise_and_gain() -> None:
     known = calibration(
-        np.zeros((7, 7)), certificate={"noise_m": 11e-9, "static_gain_uncertainty": 3e-5}
+        np.zeros((7, 7)),
+        certificate=certified_by({"noise_m": 11e-9, "static_gain_uncertainty": 3e-5}),
     )
     # Any part of the lag may be latency.
     lag = G.low_frequency_delay / np.sqrt(3)

@@ -72,10 +72,10 @@ def test_plateaus_are_counted_between_edges():
 def test_coarse_readings_are_accepted_with_a_band_that_holds_the_truth(seed):
     found = identify(recorded(seed)).calibration
     # Rounding is an error periodic in the travel, and may be found as one beside the response.
-    assert str(found.certificate["verdict"]).startswith("accepted")
+    assert str(found.certificate.verdict).startswith("accepted")
     lines = np.array([1.0, 5.0, 15.0])
     off = np.abs(np.log(found.dynamics.response(lines)) + 2j * np.pi * lines * LAG_S)
     band = response_band(found.dynamics, found.covariance, lines)
     assert np.all(off < 3 * np.hypot(band.gain, band.phase))
     # The noise of readings that hardly change is that of rounding, not of the rests.
-    assert found.certificate["noise_m"] > 0.5 * STEP_M / np.sqrt(12)
+    assert found.certificate.residual.noise_m > 0.5 * STEP_M / np.sqrt(12)

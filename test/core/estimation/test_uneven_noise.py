@@ -51,11 +51,11 @@ def test_a_probe_that_scatters_is_accepted_with_a_warning(seed):
     when = TIME - LAG_S + rng.normal(0, SCATTER_S, len(TIME))
     seen = TEST.positions(when).z + rng.normal(0, 10e-9, len(TIME))
     certificate = identify(MotionRecord.from_arrays(PERIOD, z, -seen)).calibration.certificate
-    assert str(certificate["verdict"]).startswith("accepted with reservations")
-    assert certificate["timing_scatter_s"] == pytest.approx(SCATTER_S, rel=0.2)
-    (reported,) = certificate["reservations"]
+    assert str(certificate.verdict).startswith("accepted with reservations")
+    assert certificate.residual.timing_scatter_s == pytest.approx(SCATTER_S, rel=0.2)
+    (reported,) = certificate.reservations
     assert "scatter in time by" in reported
-    assert certificate["chi_square"] < 1.2
+    assert certificate.residual.chi_square < 1.2
 
 
 @pytest.mark.parametrize("scatter", [10e-6, 50e-6])
@@ -82,7 +82,7 @@ def test_an_axis_that_scatters_is_named_as_the_cause():
     seen = signal.lfilter(system[0].ravel(), system[1], TEST.positions(TIME).z)
     record = MotionRecord.from_arrays(PERIOD, z, -seen + rng.normal(0, 10e-9, len(TIME)))
     certificate = identify(record).calibration.certificate
-    assert certificate["axis_timing_scatter_s"] == pytest.approx(SCATTER_S, rel=0.2)
-    reported = [*certificate["reasons"], *certificate["reservations"]]
+    assert certificate.residual.axis_timing_scatter_s == pytest.approx(SCATTER_S, rel=0.2)
+    reported = [*certificate.reasons, *certificate.reservations]
     assert any("readings of the axis scatter in time" in text for text in reported)
-    assert not any("loose" in text for text in certificate["reasons"])
+    assert not any("loose" in text for text in certificate.reasons)

@@ -42,7 +42,7 @@ def identified(seed=1):
 def from_noise(calibration: Calibration):
     """Covariance of the coefficients from noise alone, without what could hide."""
     size = len(calibration.covariance)
-    return np.reshape(calibration.certificate["noise_covariance"], (size, size))
+    return np.reshape(calibration.certificate.noise_covariance, (size, size))
 
 
 def errors(calibration: Calibration, truth: TransferFunction, frequency):

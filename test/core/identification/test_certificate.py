@@ -1,13 +1,22 @@
-"""Findings become one certificate, and any reason rejects."""
+"""Evidence and findings become one certificate, and any reason rejects."""
 
+import json
 from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.calibration.finding import Finding
+from omsm_ros.core.calibration.certificate import (
+    ACCEPTED,
+    REJECTED,
+    RESERVED,
+    Certificate,
+    Origin,
+)
+from omsm_ros.core.calibration.finding import NOTE, REJECTS, RESERVATION, WARNING, Finding
+from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.estimation.preparation import prepare
+from omsm_ros.core.identification.certify import certificate_of
 from omsm_ros.core.identification.evidence import IdentificationEvidence
-from omsm_ros.core.identification.identify import certificate_of, verdict
 from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.model_error_search import SearchResult
 from omsm_ros.core.identification.response_uncertainty import response_uncertainty
@@ -28,47 +37,51 @@ def evidence(step_test):
     )
 
 
-def test_the_verdict_says_what_the_data_support():
-    assert verdict([], [], 0.015, 80.0) == "accepted, supported by data from 0.015 Hz to 80.0 Hz"
-    kept = verdict([], ["creep"], 0.015, 80.0)
-    assert kept == "accepted with reservations, supported by data from 0.015 Hz to 80.0 Hz"
-    assert verdict(["sharp edges"], ["creep"], 0.015, 80.0) == "rejected"
+ORIGIN = Origin(operator="A. Meyer")
 
 
-def test_what_every_check_found_stands_in_it(evidence):
-    findings = [
-        Finding({"chi_square": 1.0}, {"chi_square_greatest": 1.3}, warnings=("a warning",)),
-        Finding({"creep_ppm": 12.0}, {"creep_ppm_greatest": 100.0}, ("first", "second")),
-    ]
-    certificate = certificate_of(evidence, findings, None)
-    assert certificate["chi_square"] == 1.0
-    assert certificate["creep_ppm"] == 12.0
-    assert certificate["limits"] == {"chi_square_greatest": 1.3, "creep_ppm_greatest": 100.0}
-    assert certificate["warnings"] == ["a warning"]
-    assert certificate["reasons"] == ["first", "second"]
-    assert certificate["verdict"] == "rejected"
+def finding(severity):
+    return Finding("calibration.text", severity, {"text": severity})
 
 
-def test_without_a_reason_it_is_accepted(evidence):
-    accepted = certificate_of(evidence, [Finding(warnings=("a warning",))], None)
-    assert accepted["verdict"].startswith("accepted")
+@pytest.mark.parametrize(
+    ("severities", "verdict"),
+    [
+        ((), ACCEPTED),
+        ((NOTE, WARNING), ACCEPTED),
+        ((WARNING, RESERVATION), RESERVED),
+        ((RESERVATION, REJECTS, WARNING), REJECTED),
+    ],
+)
+def test_the_gravest_finding_decides(evidence, severities, verdict):
+    findings = [finding(severity) for severity in severities]
+    certificate = certificate_of(evidence, findings, ORIGIN, None)
+    assert certificate.verdict == verdict
+    assert list(certificate.findings) == findings
 
 
-def test_a_finding_may_say_more_than_the_description(evidence):
-    """What a check found last is what is written: a check knows better than the plain value."""
-    changed = certificate_of(evidence, [Finding({"backlash_m": 1e-9})], None)
-    assert changed["backlash_m"] == 1e-9
+def test_it_says_who_measured_and_what_it_was_compared_with(evidence):
+    certificate = certificate_of(evidence, [], ORIGIN, None)
+    assert certificate.origin.operator == "A. Meyer"
+    assert certificate.limits["valid_up_to_least_hz"] == 5.0
+    assert certificate.validity.use == PAPER_USE
+
+
+def test_it_comes_back_from_json_as_it_was(evidence):
+    certificate = certificate_of(evidence, [finding(REJECTS)], ORIGIN, None)
+    text = json.dumps(certificate.content(), allow_nan=False)
+    assert Certificate.from_content(json.loads(text)) == certificate
 
 
 def test_the_samples_are_accounted_for(evidence):
-    counts = certificate_of(evidence, [], None)["samples"]
+    counts = certificate_of(evidence, [], ORIGIN, None).residual.samples
     assert counts["compared"] == evidence.fit.samples
 
 
 def test_the_uncertainty_of_the_delay_grows_with_the_covariance(evidence):
     def stated(known):
-        entries = certificate_of(replace(evidence, known=known), [], None)
-        return entries["low_frequency_delay_uncertainty_s"]
+        made = certificate_of(replace(evidence, known=known), [], ORIGIN, None)
+        return made.response.low_frequency_delay_uncertainty_s
 
     wider = replace(evidence.known, covariance=9 * evidence.known.covariance)
     assert stated(wider) == pytest.approx(3 * stated(evidence.known))

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.calibration.finding import RESERVATION
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.covariance_terms import consistency
+from omsm_ros.core.identification.checks import consistency
+from omsm_ros.core.identification.covariance_terms import contrast_covariance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepPlan
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
@@ -104,24 +106,27 @@ def test_only_parts_that_the_test_has_are_compared(heights, parts):
 
 def test_the_band_holds_the_difference():
     diagnostics = survey_of(stepped(LAG + np.where(FIRST[SIZES], 20e-6, 0.0)))
-    term = consistency(diagnostics)
-    lag = low_frequency_delay_uncertainty(diagnostics.fitted.dynamics, term.covariance)
-    assert lag >= 19e-6
-    assert "small steps and large differ by" in term.finding.reservations[0]
-    assert "by chance" in term.finding.reservations[0]
+    compared, dynamics = contrasts(diagnostics), diagnostics.fitted.dynamics
+    covariance = contrast_covariance(compared, dynamics)
+    assert low_frequency_delay_uncertainty(dynamics, covariance) >= 19e-6
+    (said,) = consistency(compared)
+    assert said.severity == RESERVATION
+    assert "small steps and large differ by" in str(said)
+    assert "by chance" in str(said)
 
 
 def test_a_clean_test_is_neither_widened_nor_reserved():
-    term = consistency(survey_of(stepped(alike())))
-    assert not np.any(term.covariance)
-    assert term.finding.reservations == ()
-    assert {entry["parts"] for entry in term.finding.entries["consistency"]} == EVERY
+    diagnostics = survey_of(stepped(alike()))
+    compared = contrasts(diagnostics)
+    assert {contrast.parts for contrast in compared} == EVERY
+    assert not np.any(contrast_covariance(compared, diagnostics.fitted.dynamics))
+    assert not list(consistency(compared))
 
 
 def test_the_certificate_states_every_comparison():
     certificate = identify(stepped(alike())).calibration.certificate
-    assert {entry["parts"] for entry in certificate["consistency"]} == EVERY
-    assert certificate["limits"]["consistency_p_least"] == 1e-4
+    assert {entry.parts for entry in certificate.consistency} == EVERY
+    assert certificate.limits["consistency_p_least"] == 1e-4
 
 
 def test_what_rang_before_the_record_is_no_part_of_the_answer_to_the_motion():

@@ -6,20 +6,22 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from omsm_ros.core.calibration.finding import REJECTS
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.checks import agreement, independence, model_errors
+from omsm_ros.core.identification.checks import agreement, dynamic_gain_finding, independence
 from omsm_ros.core.identification.covariance_terms import reference_lag
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.identification.model_error_checks import model_errors_of
 from omsm_ros.core.identification.model_error_search import (
     SearchResult,
     _select_nuisance_terms,
     _with_columns,
     search_model_errors,
 )
-from omsm_ros.core.identification.response_uncertainty import dynamic_gain_finding
+from omsm_ros.core.identification.residual_tests import response_difference
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -159,7 +161,7 @@ def test_a_light_mode_takes_the_place_of_poles_that_imitated_it():
     z, distance = seen[1][::finer], 49e-6 - seen[3][::finer]
     z, distance = (v + random.normal(0, n, len(v)) for v, n in ((z, 0.5e-9), (distance, 5e-9)))
     calibration = identify(MotionRecord.from_arrays(PERIOD, z, distance)).calibration
-    assert str(calibration.certificate["verdict"]).startswith("accepted")
+    assert str(calibration.certificate.verdict).startswith("accepted")
     lines = np.array([0.5, 1.0, 1.5, 2.0])
     s = 2j * np.pi * lines
     truth = np.prod([np.polyval(n, s) / np.polyval(d, s) for n, d in passes[1:]], axis=0)
@@ -191,11 +193,11 @@ def played(width):
 def test_backlash_is_named_with_its_size_and_leaves_the_lag_alone():
     calibration = identify(record_of(played(30e-9))).calibration
     certificate = calibration.certificate
-    assert certificate["backlash_m"] == pytest.approx(30e-9, rel=0.2)
-    assert certificate["motion_error_m"] == pytest.approx(15e-9, rel=0.2)
-    assert any("backlash" in text for text in certificate["reservations"])
-    assert str(certificate["verdict"]).startswith("accepted with reservations")
-    assert certificate["low_frequency_delay_s"] == pytest.approx(LAG, abs=3e-6)
+    assert certificate.model_errors.backlash_m == pytest.approx(30e-9, rel=0.2)
+    assert certificate.model_errors.motion_error_m == pytest.approx(15e-9, rel=0.2)
+    assert any("backlash" in text for text in map(str, certificate.reservations))
+    assert str(certificate.verdict).startswith("accepted with reservations")
+    assert certificate.response.low_frequency_delay_s == pytest.approx(LAG, abs=3e-6)
 
 
 def test_backlash_and_friction_cancel_each_other_and_only_their_sum_is_lost():
@@ -206,9 +208,9 @@ def test_backlash_and_friction_cancel_each_other_and_only_their_sum_is_lost():
     assert len(_select_nuisance_terms(diagnostics, alike)) == 1
     prepared, both = _with_columns(prepared, alike)
     prepared, model = model_from_start(prepared)
-    entries = model_errors(SearchResult(prepared, model, diagnostics, both)).entries
-    assert sum(entry["uncertainty_m"] for entry in entries["departures"]) > 5e-9
-    assert entries["motion_error_m"] == pytest.approx(5e-9, rel=0.2)
+    found = model_errors_of(SearchResult(prepared, model, diagnostics, both), STEPS.duration)
+    assert sum(error.uncertainty_m for error in found.modelled) > 5e-9
+    assert found.motion_error_m == pytest.approx(5e-9, rel=0.2)
 
 
 @pytest.mark.parametrize(("size", "time_constant"), [(1e-4, 5.0), (2e-4, 0.15), (2e-4, 60.0)])
@@ -257,12 +259,13 @@ class TestUndetectedTerms:
         free = identify(record_of()).calibration
         reported = identify(record_of(), settings={"priors": {CREEP: 1e-6}}).calibration
         assert reported.covariance[0, 0] < 0.01 * free.covariance[0, 0]
-        entry = next(e for e in reported.certificate["could_hide"] if e["family"] == CREEP)
-        assert entry["prior"] == entry["carried"] == 1e-6
+        terms = reported.certificate.undetected.terms
+        entry = next(term for term in terms if term.family == CREEP)
+        assert entry.prior == entry.carried == 1e-6
         # Both costs on a scan are of one effect per unit: of what is carried, of what is missed.
-        for each in reported.certificate["could_hide"]:
-            effect = each["effect_on_scan_m"] / each["carried"]
-            assert each["missed_effect_on_scan_m"] == pytest.approx(effect * each["missed"])
+        for each in terms:
+            effect = each.effect_on_scan_m / each.carried
+            assert each.missed_effect_on_scan_m == pytest.approx(effect * each.missed)
 
     @pytest.mark.parametrize("prior", [0.0, -1.0, "small", True])
     def test_a_prior_is_a_positive_number(self, prior):
@@ -279,8 +282,8 @@ class TestUndetectedTerms:
 
 
 def test_a_residual_that_follows_the_motion_rejects():
-    assert independence(1e-5).reasons
-    assert not independence(1e-3).reasons
+    assert [finding.severity for finding in independence(1e-5)] == [REJECTS]
+    assert not list(independence(1e-3))
 
 
 def stepped(delay):
@@ -293,8 +296,9 @@ def test_a_response_that_the_data_contradict_without_a_model_rejects():
     problem = stepped(0.5e-3)
     right = fit(problem, Structure(0, 0, True), [np.array([0.1])])
     wrong = fit(problem, Structure(0, 0, False), [np.empty(0)])
-    assert not agreement(problem, right, 50.0).reasons
-    assert agreement(problem, wrong, 50.0).reasons
+    assert not list(agreement(response_difference(problem, right, 50.0)))
+    (finding,) = agreement(response_difference(problem, wrong, 50.0))
+    assert finding.severity == REJECTS
 
 
 def test_independence_is_uniform_where_nothing_follows():
@@ -319,22 +323,23 @@ def test_the_lag_of_a_reference_is_found_whatever_its_sign_and_scale(late):
 def test_a_late_reference_rejects_and_names_the_remedy():
     record = with_reference(200e-6)
     certificate = identify(record, input="reference").calibration.certificate
-    assert certificate["verdict"] == "rejected"
-    assert any("reference sensor is 20" in reason for reason in certificate["reasons"])
-    assert any("input 'encoder'" in reason for reason in certificate["reasons"])
+    assert certificate.verdict == "rejected"
+    assert any("reference sensor is 20" in reason for reason in map(str, certificate.reasons))
+    assert any("'input' encoder" in reason for reason in map(str, certificate.reasons))
 
 
 def test_a_reference_on_time_is_accepted():
     certificate = identify(with_reference(0.0), input="reference").calibration.certificate
-    assert certificate["reasons"] == []
-    assert abs(certificate["reference_lag_s"]) < 1e-6
+    assert certificate.reasons == ()
+    assert abs(certificate.response.reference_lag_s) < 1e-6
 
 
 def test_a_gain_that_drift_leaves_open_rejects_with_the_plateau_that_would_tell():
-    assert not dynamic_gain_finding(1e-4, 5.0, 0.5, 5e-3).reasons
-    (reason,) = dynamic_gain_finding(1e-2, 5.0, 0.5, 5e-3).reasons
-    assert "by 2.0 %" in reason
-    assert "rest 5.0 s on each plateau" in reason
+    assert not list(dynamic_gain_finding(1e-4, 5.0, 0.5, 5e-3))
+    (reason,) = dynamic_gain_finding(1e-2, 5.0, 0.5, 5e-3)
+    assert reason.severity == REJECTS
+    assert "by 2.0 %" in str(reason)
+    assert "rest 5.0 s on each plateau" in str(reason)
 
 
 def test_a_failure_of_the_algebra_is_one_clear_error(monkeypatch):

@@ -69,7 +69,7 @@ def test_only_a_significant_drift_can_mask_a_relaxation():
 def test_a_machine_that_wanders_a_little_is_calibrated():
     """6 nm in a second: the response is known, and what it is open by is said."""
     calibration = identify(late_record(-walk(6e-9))).calibration
-    assert str(calibration.certificate["verdict"]).startswith("accepted with reservations")
+    assert str(calibration.certificate.verdict).startswith("accepted with reservations")
     at = np.array([1.0])
     off = abs(calibration.dynamics.response(at) * np.exp(2j * np.pi * at * LAG) - 1)
     band = response_band(calibration.dynamics, calibration.covariance, at)

@@ -47,9 +47,9 @@ def rms(values):
 
 def test_the_residual_is_the_one_that_was_certified(fitted, identified):
     certificate = identified.calibration.certificate
-    assert rms(fitted.residual) == pytest.approx(certificate["residual_rms_m"], rel=1e-12)
+    assert rms(fitted.residual) == pytest.approx(certificate.residual.rms_m, rel=1e-12)
     compared = int(np.sum(np.isfinite(fitted.residual)))
-    assert compared == certificate["samples"]["compared"]
+    assert compared == certificate.residual.samples["compared"]
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ class TestRecordThatStartsRinging:
 
     def test_the_page_draws_the_residual_that_is_certified(self, ringing):
         drawn = fitted_record(ringing).residual
-        certified = ringing.calibration.certificate["residual_rms_m"]
+        certified = ringing.calibration.certificate.residual.rms_m
         assert certified == pytest.approx(10e-9, rel=0.1)
         assert rms(drawn) == pytest.approx(certified, rel=1e-9)
 

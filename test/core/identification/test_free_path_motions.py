@@ -44,9 +44,9 @@ def identified(motion, plant, part, seed):
 def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, part, reaches, seed):
     calibration = identified(motion, plant, part, seed)
     assert calibration.valid_up_to < 1.3 * reaches
-    if calibration.certificate["verdict"] == "rejected":
+    if calibration.certificate.verdict == "rejected":
         # A motion cut out of full swing, or without a slow part, does not tell creep from gain.
-        assert "drift or creep" in calibration.certificate["reasons"][0]
+        assert "drift or creep" in calibration.certificate.reasons[0]
         assert part == FROM_THE_MIDDLE or isinstance(motion, Multisine)
     elif isinstance(motion, Chirp):
         assert calibration.valid_up_to > 0.9 * reaches
@@ -67,8 +67,8 @@ def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
     """Gain and phase at one frequency are two numbers; static gain, lag and curvature are three."""
     sine = Multisine(frequencies=(frequency,), amplitude=20e-6)
     certificate = identified(sine, plant, WHOLE, seed).certificate
-    assert certificate["verdict"] == "rejected"
-    assert "does not separate the static gain from the dynamics" in certificate["reasons"][0]
+    assert certificate.verdict == "rejected"
+    assert "does not separate the static gain from the dynamics" in certificate.reasons[0]
 
 
 def test_a_second_frequency_tells_them_apart():
@@ -108,7 +108,7 @@ def test_too_little_left_between_the_ends_is_said(lost):
 
 def first_reasons(calibration):
     """The first reason against it, if there is any."""
-    return calibration.certificate["reasons"][:1]
+    return calibration.certificate.reasons[:1]
 
 
 def refusal(record):
@@ -117,12 +117,12 @@ def refusal(record):
         certificate = identify(record).calibration.certificate
     except IdentificationError as error:
         return str(error)
-    return certificate["reasons"][0]
+    return certificate.reasons[0]
 
 
 def test_what_the_motion_cannot_show_at_all_is_unknown_and_the_calibration_can_be_written():
     """Of a half sweep, in which a relaxation of a minute is wholly taken for drift."""
     made = identified(Chirp(), Plant(), slice(12_500, None), 3)
-    assert made.certificate["verdict"] == "rejected"
-    assert made.certificate["could_hide"][0]["missed"] is None
+    assert made.certificate.verdict == "rejected"
+    assert made.certificate.undetected.terms[0]["missed"] is None
     assert len(made.id) == 64  # of its content as strict JSON

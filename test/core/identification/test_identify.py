@@ -44,7 +44,7 @@ class TestStepTest:
     def test_static_gain_is_known_to_1e_5_and_says_so(self):
         calibration = identified()
         error = abs(calibration.static_gain / PAPER_STATIC_GAIN - 1)
-        stated = calibration.certificate["static_gain_uncertainty"]
+        stated = calibration.certificate.static_gain.uncertainty
         assert error < 1.5e-5
         assert error < 4 * stated < 4e-5
 
@@ -81,9 +81,9 @@ class TestStepTest:
     def test_certificate_is_json_and_accepts(self):
         certificate = identified().certificate
         assert json.loads(json.dumps(dict(certificate), allow_nan=False)) == certificate
-        assert str(certificate["verdict"]).startswith("accepted")
-        assert certificate["reasons"] == []
-        assert certificate["edges"] == 20
+        assert str(certificate.verdict).startswith("accepted")
+        assert certificate.reasons == []
+        assert certificate.residual.edges == 20
 
     def test_trust_ends_below_nyquist_and_above_the_scan(self):
         assert 30 < identified().valid_up_to < 500
@@ -92,12 +92,12 @@ class TestStepTest:
         certificate = identified().certificate
         sigma = identified().low_frequency_delay_noise
         assert 0.2e-6 < sigma < 3e-6
-        assert abs(certificate["low_frequency_delay_s"] - 339.7e-6) < 4 * sigma
+        assert abs(certificate.response.low_frequency_delay_s - 339.7e-6) < 4 * sigma
         # What could hide comes on top.
-        assert sigma < certificate["low_frequency_delay_uncertainty_s"] < 3 * sigma
+        assert sigma < certificate.response.low_frequency_delay_uncertainty_s < 3 * sigma
 
     def test_a_candidate_names_its_scores(self):
-        candidates = identified().certificate["candidates"]
+        candidates = identified().certificate.candidates
         assert all(np.isfinite(c["bic"]) for c in candidates)
 
     def test_blocks_cut_anywhere_give_the_same(self):
@@ -131,7 +131,7 @@ class TestOtherMotions:
         gain, phase = errors(calibration, TRUTH, np.array([1.0]))
         assert abs(gain[0]) < 20e-6
         assert abs(np.degrees(phase[0])) < 2e-3
-        gains = calibration.certificate["static_gains"]
+        gains = calibration.certificate.static_gain
         assert gains["reference_per_encoder"]["value"] == pytest.approx(1.0, abs=1e-5)
         assert gains["probe_per_reference"]["value"] == pytest.approx(PAPER_STATIC_GAIN, abs=5e-5)
 
@@ -185,5 +185,5 @@ class TestOtherPlants:
     def test_a_lower_order_than_the_true_one_is_rejected(self):
         truth = resonance(60.0, 0.02)
         calibration = identify(record_of(recorded(plant=Plant(truth))), order=1).calibration
-        assert calibration.certificate["verdict"] == "rejected"
-        assert "misses something" in calibration.certificate["reasons"][0]
+        assert calibration.certificate.verdict == "rejected"
+        assert "misses something" in calibration.certificate.reasons[0]

@@ -37,8 +37,8 @@ class TestImperfectData:
         gain, phase = errors(calibration, TRUTH, frequency)
         assert np.all(np.abs(gain) < 4 * band.gain)
         assert np.all(np.abs(phase) < 4 * band.phase)
-        assert calibration.certificate["samples"]["spikes"] == whole == 7
-        assert calibration.certificate["drift_m_s"] == pytest.approx(
+        assert calibration.certificate.residual.samples["spikes"] == whole == 7
+        assert calibration.certificate.model_errors.drift_m_s == pytest.approx(
             PAPER_STATIC_GAIN * 100e-9 / 60, rel=0.5
         )
 
@@ -61,13 +61,13 @@ class TestImperfectData:
             played[k] = value - position
         distance = recording.distance.distance + PAPER_STATIC_GAIN * played
         calibration = identify(record_of(recording, distance=distance)).calibration
-        assert calibration.certificate["backlash_m"] == pytest.approx(40e-9, rel=0.2)
+        assert calibration.certificate.model_errors.backlash_m == pytest.approx(40e-9, rel=0.2)
         assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
 
     def test_sharp_edges_are_rejected_by_name_and_the_band_holds_the_truth(self):
         calibration = identify(record_of(recorded(motion=StepTest(rise=0.0)))).calibration
-        assert calibration.certificate["verdict"] == "rejected"
-        assert "between samples" in " ".join(calibration.certificate["reasons"])
+        assert calibration.certificate.verdict == "rejected"
+        assert "between samples" in " ".join(calibration.certificate.reasons)
         frequency = np.array([0.5, 1.0, 5.0, 15.0])
         band = response_band(calibration.dynamics, calibration.covariance, frequency)
         gain, phase = errors(calibration, TRUTH, frequency)
@@ -77,8 +77,8 @@ class TestImperfectData:
     def test_a_probe_mounted_the_other_way_is_reported_by_its_polarity(self):
         recording = recorded()
         turned = identify(record_of(recording, distance=-recording.distance.distance)).calibration
-        assert turned.certificate["polarity"] == -1
-        assert identified().certificate["polarity"] == 1
+        assert turned.certificate.static_gain.polarity == -1
+        assert identified().certificate.static_gain.polarity == 1
         np.testing.assert_allclose(
             turned.dynamics.denominator, identified().dynamics.denominator, rtol=1e-6
         )
@@ -89,8 +89,8 @@ class TestImperfectData:
         z[1000:1030] = np.nan
         z[3000:3300] = np.nan
         calibration = identify(record_of(recording, z=z)).calibration
-        assert str(calibration.certificate["verdict"]).startswith("accepted")
-        assert calibration.certificate["samples"]["missing_axis"] == 330
+        assert str(calibration.certificate.verdict).startswith("accepted")
+        assert calibration.certificate.residual.samples["missing_axis"] == 330
         _, phase = errors(calibration, TRUTH, np.array([1.0]))
         assert abs(np.degrees(phase[0])) < 2e-3
 
@@ -104,7 +104,7 @@ class TestImperfectData:
         seen = np.where(recording.distance.ok, recording.distance.distance, np.nan)
         late = MotionRecord.from_arrays(1e-3, recording.axes.z[start:], seen[start:])
         calibration = identify(late).calibration
-        assert str(calibration.certificate["verdict"]).startswith("accepted")
+        assert str(calibration.certificate.verdict).startswith("accepted")
         band = response_band(calibration.dynamics, calibration.covariance, frequency)
         gain, phase = errors(calibration, truth, frequency)
         assert np.all(np.abs(gain) < 3 * band.gain)
@@ -183,9 +183,9 @@ def test_a_wrong_bit_of_the_encoder_costs_nothing():
     z[[2600, 5011]] += 3e-6
     found = identify(record_of(recording, z=z)).calibration
     right = identify(record_of(recording)).calibration
-    assert str(found.certificate["verdict"]).startswith("accepted,")
-    assert found.certificate["samples"]["axis_spikes"] == 2
-    assert any("stood apart" in warning for warning in found.certificate["warnings"])
+    assert str(found.certificate.verdict).startswith("accepted,")
+    assert found.certificate.residual.samples["axis_spikes"] == 2
+    assert any("stood apart" in warning for warning in found.certificate.warnings)
     frequency = np.array([1.0, 15.0])
     ratio = found.dynamics.response(frequency) / right.dynamics.response(frequency)
     np.testing.assert_allclose(np.abs(ratio - 1), 0, atol=2e-5)

@@ -75,7 +75,7 @@ def test_a_pure_delay():
 def test_the_pole_pair_of_eq_12_at_10_khz():
     short = StepTest(rise=0.0, dwell=0.1, count=5)
     found = identified(EQ_12, 1, motion=short, period=1e-4)
-    pair = min(found.certificate["modes"], key=lambda m: abs(m["frequency_hz"] - 804.0))
+    pair = min(found.certificate.response.modes, key=lambda m: abs(m["frequency_hz"] - 804.0))
     assert pair["frequency_hz"] == pytest.approx(804.0, rel=0.01)
     assert pair["damping"] == pytest.approx(0.192, rel=0.05)
     assert abs(off(found, EQ_12, 0)[0]) < 4
@@ -95,8 +95,8 @@ def test_of_another_order_the_band_holds_or_the_cause_is_named(truth, order):
     for seed in (1, 2):
         found = identified(truth, seed, order)
         certificate = found.certificate
-        if certificate["verdict"] == "rejected":
-            assert "the order asked for is wrong" in certificate["reasons"][0]
+        if certificate.verdict == "rejected":
+            assert "the order asked for is wrong" in certificate.reasons[0]
             continue
         lines = np.linspace(0.1, 1.0, 10) * found.valid_up_to
         band = response_band(found.dynamics, found.covariance, lines)
@@ -106,9 +106,9 @@ def test_of_another_order_the_band_holds_or_the_cause_is_named(truth, order):
 
 
 def test_an_order_asked_for_that_leaves_things_open_says_so():
-    (warning,) = (w for w in identified(EQ_12, 1, 1).certificate["warnings"] if "asked" in w)
+    (warning,) = (w for w in identified(EQ_12, 1, 1).certificate.warnings if "asked" in w)
     assert "times as large" in warning
-    assert not any("asked" in w for w in identified(EQ_12, 1).certificate["warnings"])
+    assert not any("asked" in w for w in identified(EQ_12, 1).certificate.warnings)
 
 
 @pytest.mark.soak
@@ -116,7 +116,7 @@ def test_masses_and_springs_scatter_as_stated():
     """The whole chain, from the recording; m1 is the unit."""
     over = []
     for seed in range(1, 9):
-        entry = identified(MACHINE.non_collocated(), seed).certificate["two_mass"]
+        entry = identified(MACHINE.non_collocated(), seed).certificate.response.two_mass
         model, stated = entry["model"], entry["relative_uncertainty"]
         over.append(
             [np.log(model[n] * MACHINE.m1 / getattr(MACHINE, n)) / stated[n] for n in FITTED]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.identification.identify import identify, table_mass, two_mass_entry
+from omsm_ros.core.identification.certify import two_mass_model
+from omsm_ros.core.identification.identify import identify, table_mass
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -30,41 +31,41 @@ def calibrated(collocated, mass):
 
 @pytest.mark.parametrize("collocated", [False, True])
 def test_an_identified_machine_is_known_within_its_uncertainty(collocated):
-    entry = calibrated(collocated, 10.0).certificate["two_mass"]
-    assert entry["collocated"] is collocated
+    entry = calibrated(collocated, 10.0).certificate.response.two_mass
+    assert entry.collocated is collocated
     # Of two degrees of freedom; a right model is worse once in a thousand.
-    assert stats.chi2.sf(2 * entry["misfit"] ** 2, 2) > 1e-3
-    assert entry["model"]["m1"] == 10.0
-    assert entry["table_mass_kg"] == 10.0
+    assert stats.chi2.sf(2 * entry.misfit**2, 2) > 1e-3
+    assert entry.model["m1"] == 10.0
+    assert entry.table_mass_kg == 10.0
     for name in FITTED:
-        off = np.log(entry["model"][name] / getattr(MACHINE, name))
-        assert abs(off) < 4 * entry["relative_uncertainty"][name], name
+        off = np.log(entry.model[name] / getattr(MACHINE, name))
+        assert abs(off) < 4 * entry.relative_uncertainty[name], name
 
 
 def test_a_response_says_nothing_of_the_scale():
     """Twice the mass is twice of everything, at the same misfit."""
     once = calibrated(False, 10.0)
     arguments = once.dynamics, once.covariance, once.valid_up_to
-    first, second = (two_mass_entry(*arguments, mass) for mass in (10.0, 20.0))
+    first, second = (two_mass_model(*arguments, mass) for mass in (10.0, 20.0))
     for name in FITTED:
-        assert second["model"][name] == pytest.approx(2 * first["model"][name], rel=1e-3)
+        assert second.model[name] == pytest.approx(2 * first.model[name], rel=1e-3)
 
 
 @pytest.mark.parametrize("collocated", [False, True])
 def test_without_a_mass_all_is_per_mass_of_the_table(collocated):
     """The truth over m1, within the stated uncertainty, and the fit with a mass over it."""
-    entry = calibrated(collocated, None).certificate["two_mass"]
-    with_mass = calibrated(collocated, 10.0).certificate["two_mass"]
-    assert entry["table_mass_kg"] is None
-    assert entry["model"]["m1"] == 1.0
-    assert entry["collocated"] is collocated
-    assert entry["misfit"] == pytest.approx(with_mass["misfit"], rel=1e-3)
+    entry = calibrated(collocated, None).certificate.response.two_mass
+    with_mass = calibrated(collocated, 10.0).certificate.response.two_mass
+    assert entry.table_mass_kg is None
+    assert entry.model["m1"] == 1.0
+    assert entry.collocated is collocated
+    assert entry.misfit == pytest.approx(with_mass.misfit, rel=1e-3)
     for name in FITTED:
-        ratio, spread = entry["model"][name], entry["relative_uncertainty"][name]
+        ratio, spread = entry.model[name], entry.relative_uncertainty[name]
         off = np.log(ratio * MACHINE.m1 / getattr(MACHINE, name))
         assert abs(off) < 4 * spread, name
-        assert ratio == pytest.approx(with_mass["model"][name] / 10.0, rel=1e-3 * spread)
-        assert spread == pytest.approx(with_mass["relative_uncertainty"][name], rel=1e-3)
+        assert ratio == pytest.approx(with_mass.model[name] / 10.0, rel=1e-3 * spread)
+        assert spread == pytest.approx(with_mass.relative_uncertainty[name], rel=1e-3)
 
 
 def test_what_is_not_two_masses_is_not_called_so():
@@ -74,12 +75,12 @@ def test_what_is_not_two_masses_is_not_called_so():
     odd = TransferFunction(np.array(anti_resonance), chain.denominator)
     covariance = np.diag([0.0, *(1e-3 * np.abs([1e-4, odd.numerator[2], *chain.denominator[1:]]))])
     covariance = np.pad(covariance, (0, 1)) ** 2
-    assert two_mass_entry(odd, covariance, 150.0, 10.0) is None
+    assert two_mass_model(odd, covariance, 150.0, 10.0) is None
 
 
 def test_one_mode_is_no_pair_of_masses():
     one = TransferFunction.from_ascending([1.0], [1.0, 1e-4, 1e-6])
-    assert two_mass_entry(one, np.zeros((4, 4)), 100.0, 10.0) is None
+    assert two_mass_model(one, np.zeros((4, 4)), 100.0, 10.0) is None
 
 
 def test_masses_do_not_explain_a_latency():
@@ -87,8 +88,8 @@ def test_masses_do_not_explain_a_latency():
     late = TransferFunction(chain.numerator, chain.denominator, 5e-4)
     recording = record(Cell(plant=Plant(late)), StepTest(), Flat(), stand_off=-49e-6)
     found = identify(assemble([recording.axes], [recording.distance])).calibration
-    assert found.certificate["verdict"] != "rejected"
-    assert found.certificate["two_mass"] is None
+    assert found.certificate.verdict != "rejected"
+    assert found.certificate.response.two_mass is None
 
 
 @pytest.mark.soak  # many fits

@@ -25,7 +25,7 @@ def test_a_lag_of_half_a_period_is_no_other_gain():
         PERIOD, z + rng.normal(0, 0.3e-9, len(z)), -seen + rng.normal(0, 10e-9, len(z))
     )
     found = identify(record).calibration
-    assert str(found.certificate["verdict"]).startswith("accepted,")
+    assert str(found.certificate.verdict).startswith("accepted,")
     assert found.dynamics.low_frequency_delay == pytest.approx(lag, abs=20e-6)
     assert found.static_gain == pytest.approx(1.0, abs=1e-3)
 
@@ -49,8 +49,8 @@ def test_exchanged_channels_are_named():
     z = test.positions(time).z + rng.normal(0, 0.3e-9, len(time))
     seen = test.positions(time - lag).z + rng.normal(0, 10e-9, len(time))
     certificate = identify(MotionRecord.from_arrays(PERIOD, seen, -z)).calibration.certificate
-    assert certificate["verdict"] == "rejected"
-    assert any("channels are exchanged" in reason for reason in certificate["reasons"])
+    assert certificate.verdict == "rejected"
+    assert any("channels are exchanged" in reason for reason in certificate.reasons)
 
 
 @pytest.mark.parametrize(
@@ -81,8 +81,8 @@ def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
     budget = EvaluationBudget()
     found = identify(MotionRecord.from_arrays(1e-3, z, 40e-6 - seen), budget=budget)
     certificate = found.calibration.certificate
-    assert certificate["verdict"] == "rejected"
-    assert any("cut short" in text for text in certificate["reservations"])
+    assert certificate.verdict == "rejected"
+    assert any("cut short" in str(text) for text in certificate.reservations)
     # 1500, and those of the fit that was begun by then.
     assert 1000 < budget.evaluations < 2200
 

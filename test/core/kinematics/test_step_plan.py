@@ -52,7 +52,7 @@ def test_edges_are_spread_over_the_sample_period():
 def test_a_planned_test_identifies_without_objection():
     recording = record(Cell(seed=3), PLAN, Flat(), stand_off=0.0)
     calibration = identify(assemble([recording.axes], [recording.distance])).calibration
-    assert str(calibration.certificate["verdict"]).startswith("accepted")
+    assert str(calibration.certificate.verdict).startswith("accepted")
     ratio = calibration.dynamics.response(1.0) / Plant().dynamics.response(1.0)
     assert abs(np.degrees(np.angle(ratio))) < 2e-3
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.calibration import (
+from omsm_ros.core.calibration.calibration import Calibration, excess_latency_text, with_latency
+from omsm_ros.core.calibration.latency import (
     DECLARED,
     UNRESOLVED,
-    Calibration,
     declared_latency,
-    excess_latency_text,
-    latency_of,
     unresolved_latency,
-    with_latency,
 )
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -30,7 +27,7 @@ KNOWN = Calibration(
 
 
 def test_without_a_word_any_part_of_the_lag_may_be_latency() -> None:
-    found = latency_of(KNOWN)
+    found = KNOWN.latency
     assert found.source == UNRESOLVED
     assert not found.resolved
     assert found.delay_s == 0.0
@@ -46,7 +43,7 @@ def test_no_lag_leaves_nothing_open() -> None:
 
 def test_what_is_declared_counts_with_its_uncertainty() -> None:
     made = with_latency(KNOWN, declared_latency(LAG, LAG / 2, 5e-6, "data sheet, 0.3 ms exposure"))
-    found = latency_of(made)
+    found = made.latency
     assert (found.source, found.resolved, found.share) == (DECLARED, True, pytest.approx(0.5))
     assert ErrorSources.of(made).lateral_lag == 5e-6
     assert made.id != KNOWN.id
@@ -76,4 +73,4 @@ def test_a_delay_within_the_lag_is_a_part_of_it(delay: float, uncertainty: float
 def test_a_delay_in_a_wrong_unit_is_more_than_the_lag(delay: float, uncertainty: float) -> None:
     said = excess_latency_text(KNOWN, delay, uncertainty)
     assert said is not None
-    assert "is more than the whole lag of Z, 300 µs ± 0 s" in said
+    assert "is more than the whole lag of Z, 300 µs ± 0 s" in str(said)

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.calibration import (
-    MAX_TIME_CONSTANT_SAMPLES,
-    Calibration,
-    latency_of,
-    unresolved_latency,
-)
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import Certificate
+from omsm_ros.core.calibration.latency import unresolved_latency
+from omsm_ros.core.calibration.plausibility import MAX_TIME_CONSTANT_SAMPLES
+from omsm_ros.core.calibration.typed_json import to_json
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
@@ -24,7 +23,7 @@ GOOD = Calibration(
     sample_period=1e-3,
     valid_up_to=100.0,
     covariance=np.diag([0.0, 1e-14, 1e-14, 1e-20, 1e-14]),
-    certificate={"verdict": "accepted"},
+    certificate=Certificate(verdict="accepted"),
 )
 
 
@@ -119,7 +118,7 @@ def test_any_correlation_is_a_covariance(correlation: float) -> None:
     assert changed(covariance=_with((1, 2), correlation * 1e-14)) is not None
 
 
-@pytest.mark.parametrize("verdict", [None, 1, True, ["accepted"], {}])
+@pytest.mark.parametrize("verdict", [1, True, ["accepted"], {}, "perhaps"])
 def test_a_verdict_that_is_no_text_is_refused(verdict: object) -> None:
     with pytest.raises(CalibrationError, match="verdict is"):
         changed(certificate={"verdict": verdict})
@@ -131,20 +130,26 @@ def test_reasons_that_are_no_texts_are_refused(texts: object) -> None:
         changed(certificate={"reasons": texts})
 
 
-GOOD_LATENCY = unresolved_latency(1e-4).entry()
+GOOD_LATENCY = to_json(unresolved_latency(1e-4)) | {"uncertainty_s": 1e-5}
 
 
 @pytest.mark.parametrize(
     ("entry", "named"),
     [
-        ("late", "latency is 'late'"),
-        ({"delay_s": 1e-4}, "beside_z_s, delay_s"),
+        ("late", "latency is 'late', expected an object"),
+        ({"delay_s": 1e-4}, "latency.beside_z_s is missing"),
         (GOOD_LATENCY | {"delay_s": -1e-3}, "latency is -0.001 s"),
-        (GOOD_LATENCY | {"uncertainty_s": "none"}, "latency is 'none' s"),
-        (GOOD_LATENCY | {"beside_z_s": None}, "latency beside Z is None s"),
+        (
+            GOOD_LATENCY | {"uncertainty_s": "none"},
+            "latency.uncertainty_s is 'none', expected a finite number",
+        ),
+        (
+            GOOD_LATENCY | {"beside_z_s": None},
+            "latency.beside_z_s is None, expected a finite number",
+        ),
         (GOOD_LATENCY | {"source": "hearsay"}, "latency by 'hearsay'"),
-        (GOOD_LATENCY | {"reason": " "}, "needs a reason"),
-        (GOOD_LATENCY | {"share": "half"}, "share of the latency is 'half'"),
+        (GOOD_LATENCY | {"source": "declared", "reason": " "}, "needs a reason"),
+        (GOOD_LATENCY | {"share": "half"}, "latency.share is 'half', expected a finite number"),
     ],
 )
 def test_a_latency_that_no_probe_has_is_refused(entry: object, named: str) -> None:
@@ -153,8 +158,8 @@ def test_a_latency_that_no_probe_has_is_refused(entry: object, named: str) -> No
 
 
 def test_a_latency_comes_back_as_it_was() -> None:
-    found = latency_of(changed(certificate={"latency": GOOD_LATENCY}))
-    assert found.entry() == GOOD_LATENCY
+    found = changed(certificate={"latency": GOOD_LATENCY}).latency
+    assert to_json(found) == GOOD_LATENCY
 
 
 @pytest.mark.parametrize(("place", "power"), [(1, 1), (2, 1), (3, 2), (4, 1)])

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
+from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import CREEP, MODE, STIFFENING
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
 from omsm_ros.core.model_errors.undetected import (
-    PAPER_SCAN_LINES,
     UndetectedTerm,
     fitted_relaxation,
     omission_shift,
@@ -21,7 +21,7 @@ from omsm_ros.core.model_errors.undetected import (
     with_slow_creep,
 )
 
-SCAN_RMS = np.sqrt(sum(rms**2 for _, rms in PAPER_SCAN_LINES))
+SCAN_RMS = np.sqrt(np.sum(PAPER_USE.rms_m**2))
 
 
 def coefficients(fitted):

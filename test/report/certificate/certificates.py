@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from certified import certified_by
+
 from omsm_ros.report.certificate.page import (
     CertificatePage,
     headlines,
@@ -13,7 +15,7 @@ ATTACK = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 
 
 def certified(calibration, **entries):
-    return replace(calibration, certificate=entries)
+    return replace(calibration, certificate=certified_by(entries))
 
 
 def bare(calibration):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.core.calibration.certificate import CandidateFit, Structure
 from omsm_ros.core.lti.frequency_response import FrequencyResponse
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.report.certificate import figures as certificate_figures
@@ -63,9 +64,9 @@ class TestFigures:
         assert (rows(fitted), rows(replace(fitted, edges=()))) == (3, 2)
 
     def test_the_chosen_candidate_is_marked(self):
-        tried = [{"parameters": n, "rms_m": r, "bic": b} for n, r, b in
+        tried = [CandidateFit(Structure(n, 0, False), b, r) for n, r, b in
                  ((1, 30e-9, 9.0), (2, 11e-9, 1.0), (3, 10e-9, 2.0))]  # fmt: skip
-        (axes,) = certificate_figures.order(tried, 2).get_axes()
+        (axes,) = certificate_figures.order(tried, Structure(3, 0, False)).get_axes()
         marks = {line.get_label(): line.get_xydata()[0].tolist() for line in axes.get_lines()}
         assert marks["lowest BIC"] == pytest.approx([2, 11.0])
         assert marks["chosen"] == pytest.approx([3, 10.0])

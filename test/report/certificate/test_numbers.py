@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from certified import certified_by
 
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.report.certificate.page import (
     mode_table,
     shape_table,
     two_mass_table,
-    undetected_error_table,
+    undetected_table,
 )
 from omsm_ros.report.certificate.tables import order_table
 
@@ -24,13 +25,15 @@ class TestNumbers:
     def test_headlines(self, calibration):
         entries, found = calibration.certificate, by_name(calibration)
         delay = re.fullmatch(r"([\d.]+) µs ± ([\d.]+) µs", found["Low-frequency delay"])
-        assert float(delay[1]) == pytest.approx(1e6 * entries["low_frequency_delay_s"], abs=0.06)
-        uncertainty = 1e6 * entries["low_frequency_delay_uncertainty_s"]
+        assert float(delay[1]) == pytest.approx(
+            1e6 * entries.response.low_frequency_delay_s, abs=0.06
+        )
+        uncertainty = 1e6 * entries.response.low_frequency_delay_uncertainty_s
         assert float(delay[2]) == pytest.approx(uncertainty, rel=0.05)
         gain = re.fullmatch(r"([\d.]+) ± ([\d.]+)", found["Static gain, probe per encoder"])
         assert float(gain[1]) == pytest.approx(calibration.static_gain, abs=1e-6)
-        assert float(gain[2]) == pytest.approx(entries["static_gain_uncertainty"], rel=0.05)
-        assert found["Noise of one reading"] == f"{1e9 * entries['noise_m']:.1f} nm"
+        assert float(gain[2]) == pytest.approx(entries.static_gain.uncertainty, rel=0.05)
+        assert found["Noise of one reading"] == f"{1e9 * entries.residual.noise_m:.1f} nm"
         assert found["Structure"].startswith("2 poles")
 
     def test_the_lowest_bic_has_none_below_it(self, calibration):
@@ -76,7 +79,7 @@ class TestNumbers:
             "table_mass_kg": mass, "model": model, "relative_uncertainty": spreads,
             "misfit": 0.9, "collocated": False,
         }  # fmt: skip
-        table = two_mass_table({"two_mass": entry})
+        table = two_mass_table(certified_by({"two_mass": entry}))
         return table.title, {name: text.replace("\u202f", " ") for name, text in table.rows}
 
     def test_a_two_mass_model_has_units_and_uncertainties(self):
@@ -96,24 +99,28 @@ class TestNumbers:
         assert texts["c2 / m1"] == "80.0 N·s/(m·kg) ± 4.0 N·s/(m·kg)"
 
 
+UNDETECTED = {
+    "parameter": 0.0, "size": 0.0, "uncertainty": 0.0, "carried": 0.0, "effect_on_scan_m": 11e-9,
+}  # fmt: skip
+
+
 def test_undetected_error_states_its_time_or_frequency_and_its_unit():
     """A share of the motion for what follows it, a length for the rest."""
     entries = {
         "could_hide": [
-            {"family": "creep", "parameter": 20.0, "missed": 4e-4, "effect_on_scan_m": 11e-9},
-            {"family": "soft mode", "parameter": 8.0, "missed": 1e-3, "effect_on_scan_m": 5e-9},
-            {"family": "backlash", "missed": 3e-9, "effect_on_scan_m": 2e-9},
+            UNDETECTED | {"family": "creep", "parameter": 20.0, "missed": 4e-4},
+            UNDETECTED
+            | {"family": "soft mode", "parameter": 8.0, "missed": 1e-3, "effect_on_scan_m": 5e-9},
+            UNDETECTED | {"family": "backlash", "missed": 3e-9, "effect_on_scan_m": 2e-9},
         ],
         "plateau_that_would_tell_s": 60.0,
     }
-    rows = [
-        [text.replace("\u202f", " ") for text in row]
-        for row in undetected_error_table(entries).rows
-    ]
+    found = undetected_table(certified_by(entries))
+    rows = [[text.replace("\u202f", " ") for text in row] for row in found.rows]
     assert [row[:2] for row in rows[:3]] == [
         ["creep over 20 s", "0.040 % of the motion"],
         ["soft mode at 8.0 Hz", "0.10 % of the motion"],
         ["backlash", "3.00 nm"],
     ]
     assert [row[3] for row in rows[:3]] == ["11.0 nm", "5.00 nm", "2.00 nm"]
-    assert rows[3][:2] == ["plateau that would tell the slowest", "60.0 s"]
+    assert rows[3][:2] == ["plateau that would show the slowest", "60.0 s"]

@@ -7,6 +7,7 @@ from base64 import b64decode
 from dataclasses import replace
 
 import pytest
+from certified import certified_by
 from parsed_page import Page
 
 from omsm_ros.errors import ConfigurationError
@@ -70,8 +71,8 @@ def test_everything_from_outside_is_escaped(summary, certified):
     }
     summary["samples"]["distance"]["counted"] = {ATTACK: 40}
     summary["samples"][ATTACK] = summary["samples"].pop("axes")
-    certificate = {"verdict": ATTACK, "warnings": [ATTACK], "reasons": [ATTACK]}
-    hostile = replace(certified, settings={ATTACK: ATTACK}, certificate=certificate)
+    certificate = {"verdict": "rejected", "warnings": [ATTACK], "reasons": [ATTACK]}
+    hostile = replace(certified, settings={ATTACK: ATTACK}, certificate=certified_by(certificate))
     page = Page(render(Report(ATTACK, ATTACK, summary, hostile)))
     assert "script" not in page.tags
     assert "img" not in page.tags
@@ -105,7 +106,7 @@ def test_settings_that_are_those_of_the_calibration_are_said_once(summary, certi
     [({"verdict": "accepted"}, "✓ Trusted"), ({"verdict": "rejected"}, "✕ Not to be trusted")],
 )
 def test_the_verdict_is_a_sign_and_a_word_before_all_else(summary, certified, certificate, word):
-    stated = {**certified.certificate, **certificate}
+    stated = certified_by({**certificate}, certified.certificate)
     page = Page(render(Report("a", "b", summary, replace(certified, certificate=stated))))
     text = page.text
     assert word in text

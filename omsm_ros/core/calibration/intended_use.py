@@ -1,0 +1,104 @@
+"""What a calibration is for: the Z motion of the scans to be corrected, and the accuracy asked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import FREQUENCY, UNCERTAINTY
+
+# Harmonics below this share of the motion's mean square are left out of a spectrum.
+_LEAST_SHARE = 1e-6
+
+
+@dataclass(frozen=True)
+class IntendedUse:
+    """The motion along Z of the scans that a calibration will correct.
+
+    spectrum: frequency [Hz] and rms [m] of each component of Z; what moves over minutes counts
+        as rest and is no part of it
+    accuracy_m: asked for, of a height, k = 2 [m]; None where nothing is asked for
+
+    Raises ConfigurationError for a spectrum without motion, or values that no machine has.
+    """
+
+    spectrum: tuple[tuple[float, ...], ...]
+    accuracy_m: float | None = None
+
+    # Twice this is the accuracy that limits are derived from where none is asked for: errors of
+    # 5 nm on the scan are then harmless, a tenth of the figure of a good optical surface.
+    UNASKED_ACCURACY_M: ClassVar[float] = 20e-9
+    # An error of this share of the accuracy (k = 2) is half a standard uncertainty: it makes the
+    # combined uncertainty larger by an eighth.
+    HARMLESS_SHARE: ClassVar[float] = 0.25
+    # Transients, and harmonics that a spectrum leaves out, reach some three times its content.
+    BAND_OVER_CONTENT: ClassVar[float] = 10.0 / 3.0
+
+    def __post_init__(self) -> None:
+        if not self.spectrum or any(len(line) != 2 for line in self.spectrum):
+            raise ConfigurationError("calibration.empty_spectrum")
+        for frequency, rms in self.spectrum:
+            FREQUENCY.checked(frequency, ConfigurationError, "frequency of the intended use")
+            UNCERTAINTY.checked(rms, ConfigurationError, "rms of the intended use")
+        if not self.speed_m_s > 0:
+            raise ConfigurationError("calibration.empty_spectrum")
+        if self.accuracy_m is not None:
+            UNCERTAINTY.checked(self.accuracy_m, ConfigurationError, "accuracy")
+            if not self.accuracy_m > 0:
+                raise ConfigurationError("calibration.accuracy")
+
+    @cached_property
+    def frequencies_hz(self) -> FloatArray:
+        """Frequencies of the spectrum (k,) [Hz]."""
+        return np.array([frequency for frequency, _ in self.spectrum])
+
+    @cached_property
+    def rms_m(self) -> FloatArray:
+        """Rms of Z at each frequency (k,) [m]."""
+        return np.array([rms for _, rms in self.spectrum])
+
+    @cached_property
+    def speed_m_s(self) -> float:
+        """Rms speed of Z [m/s]."""
+        return float(np.sqrt(np.sum((2 * np.pi * self.frequencies_hz * self.rms_m) ** 2)))
+
+    @property
+    def harmless_delay_s(self) -> float:
+        """Delay of Z [s] whose error on the scan is small against the accuracy asked for."""
+        accuracy = self.UNASKED_ACCURACY_M if self.accuracy_m is None else self.accuracy_m
+        return self.HARMLESS_SHARE * accuracy / self.speed_m_s
+
+    @property
+    def least_valid_up_to_hz(self) -> float:
+        """Frequency [Hz] up to which a response must be known to be of use."""
+        return self.BAND_OVER_CONTENT * float(np.max(self.frequencies_hz))
+
+
+def use_of_motion(
+    z: FloatArray, sample_period: float, accuracy_m: float | None = None
+) -> IntendedUse:
+    """Return the intended use of a scan that moves as ``z`` (n,) [m], sampled evenly [s].
+
+    The linear trend is taken out, and components that add nothing to the rms are left out.
+    Raises ConfigurationError for a motion without samples or without movement.
+    """
+    if len(z) < 4 or not np.all(np.isfinite(z)):
+        raise ConfigurationError("calibration.empty_spectrum")
+    slope = np.linspace(-1.0, 1.0, len(z))
+    still = z - np.mean(z) - slope * float(slope @ z) / float(slope @ slope)
+    line = np.abs(np.fft.rfft(still)) ** 2
+    mean_square = 2 * line / len(z) ** 2
+    frequency = np.fft.rfftfreq(len(z), sample_period)
+    kept = (frequency > 0) & (mean_square > _LEAST_SHARE * np.sum(mean_square))
+    pairs = zip(frequency[kept].tolist(), np.sqrt(mean_square[kept]).tolist(), strict=True)
+    return IntendedUse(tuple(pairs), accuracy_m)
+
+
+# The paper's scan, 30 rpm over its mirror: harmonics of Z, rms weighted by area.
+PAPER_USE = IntendedUse(((0.5, 22.3e-6), (1.0, 114.4e-6), (1.5, 4.4e-6)))
+"""The default of the command where no scan is stated."""

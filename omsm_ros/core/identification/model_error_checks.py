@@ -1,0 +1,185 @@
+"""Name the deviations from a linear, steady response that were found, and state what they cost.
+
+A deviation that was modelled is a reservation: its uncertainty is in the band and in the budget.
+One that is significant and could not be modelled rejects the calibration. A cause is named only
+where the final fit still shows it: what was modelled before a better explanation was found may
+have taken a part of that explanation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from omsm_ros.core.calibration.certificate import ModelError, ModelErrors
+from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, Finding
+from omsm_ros.core.estimation.covariance import parameter_covariance
+from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.model_error_search import Searched
+from omsm_ros.core.lti.frequency_response import response_band
+from omsm_ros.core.model_errors.families import (
+    BACKLASH,
+    CREEP,
+    DRIFT,
+    FRICTION,
+    LINEARITY,
+    MODE,
+    PERIODIC,
+    STIFFENING,
+    VIBRATION,
+    Term,
+)
+from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
+from omsm_ros.core.streams.blocks import FloatArray
+
+# Standard uncertainty of a height over the size of an error: the rms of a sine. Backlash and
+# friction lag by their whole half widths together; drift and linearity are no errors of motion.
+_PER_SIZE = {PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
+_AT_REVERSALS = (BACKLASH, FRICTION)
+_BESIDE_CODES = {
+    BACKLASH: "identification.backlash",
+    FRICTION: "identification.friction",
+    LINEARITY: "identification.linearity",
+    PERIODIC: "identification.periodic",
+    VIBRATION: "identification.vibration",
+    DRIFT: "identification.drift",
+}
+_IN_RESPONSE_CODES = {CREEP: "identification.creep", MODE: "identification.mode"}
+_UNMODELLED_CODES = {
+    BACKLASH: "identification.unmodelled_backlash",
+    FRICTION: "identification.unmodelled_friction",
+    LINEARITY: "identification.unmodelled_linearity",
+    PERIODIC: "identification.unmodelled_periodic",
+    VIBRATION: "identification.unmodelled_vibration",
+    DRIFT: "identification.unmodelled_drift",
+    CREEP: "identification.unmodelled_creep",
+    MODE: "identification.unmodelled_mode",
+    STIFFENING: "identification.unmodelled_stiffening",
+}
+# What the parameter of a family is, for its sentence.
+_PARAMETERS = {
+    CREEP: "time_constant_s",
+    MODE: "frequency_hz",
+    VIBRATION: "frequency_hz",
+    FRICTION: "travel_m",
+    PERIODIC: "period_m",
+}
+
+
+@dataclass(frozen=True)
+class Size:
+    """Size of a term that was fitted beside the response and its standard uncertainty [m].
+
+    significant: whether the final fit still shows it
+    """
+
+    value: float
+    uncertainty: float
+    significant: bool
+
+
+def model_errors(searched: Searched) -> Iterator[Finding]:
+    """Yield a reservation for each deviation that was modelled, a rejection for each other one."""
+    period = searched.prepared.problem.period
+    for judged in searched.unmodelled:
+        size = float(np.linalg.norm(judged.score.size))
+        values = _values(judged.term, size, period)
+        values["p"] = float(np.exp(max(judged.log_p, -690)))
+        limits = {"false_alarm_p": FALSE_ALARM}
+        yield Finding(_UNMODELLED_CODES[judged.term.family], REJECTS, values, limits)
+    sizes, _ = _sizes(searched)
+    for modelled, found in zip(searched.beside, sizes, strict=True):
+        if found.significant:
+            values = _values(modelled.term, found.value, period)
+            yield Finding(_BESIDE_CODES[modelled.term.family], RESERVATION, values)
+    for term in searched.added_poles:
+        values = _values(term, None, period)
+        yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)
+
+
+def model_errors_of(searched: Searched, duration: float) -> ModelErrors:
+    """Return what was modelled and what it costs, for the certificate; ``duration`` [s]."""
+    sizes, at_reversals = _sizes(searched)
+    pairs = list(zip(searched.beside, sizes, strict=True))
+    costs = [at_reversals] + [
+        _PER_SIZE.get(modelled.term.family, 0.0) * float(np.hypot(found.value, found.uncertainty))
+        for modelled, found in pairs
+    ]
+    beside = [
+        ModelError(
+            family=modelled.term.family,
+            parameter=modelled.term.parameter,
+            size_m=found.value,
+            uncertainty_m=found.uncertainty,
+        )
+        for modelled, found in pairs
+    ]
+    added_poles = [ModelError(family=t.family, parameter=t.parameter) for t in searched.added_poles]
+    backlash = [2 * found.value for m, found in pairs if m.term.family == BACKLASH]
+    return ModelErrors(
+        modelled=(*beside, *added_poles),
+        motion_error_m=float(np.sqrt(np.sum(np.square(costs)))),
+        backlash_m=max(backlash, default=0.0),
+        drift_m_s=2 * float(searched.model.chosen.fit.background[1]) / duration,
+    )
+
+
+def accuracy_on(evidence: Evidence) -> float:
+    """Return the standard uncertainty [m] of a height of the intended scan from the response."""
+    use, duration = evidence.use, len(evidence.record) * evidence.record.sample_period
+    band = response_band(evidence.dynamics, evidence.known.covariance, use.frequencies_hz)
+    errors = np.hypot(band.gain, band.phase) * use.rms_m
+    beside = model_errors_of(evidence.searched, duration).motion_error_m or 0.0
+    return float(np.hypot(np.linalg.norm(errors), beside))
+
+
+def _values(term: Term, size: float | None, period: float) -> dict[str, object]:
+    values: dict[str, object] = {} if size is None else {"size_m": size}
+    if term.family in _PARAMETERS:
+        values[_PARAMETERS[term.family]] = term.parameter
+    if term.family == VIBRATION:
+        values["alias_hz"] = 1 / period - term.parameter
+    return values
+
+
+def _sizes(searched: Searched) -> tuple[Sequence[Size], float]:
+    """Return the size of each term beside the response, and what those at reversals cost [m].
+
+    Backlash and friction look alike, and what one has too much the other has too little.
+    """
+    fit, problem = searched.model.chosen.fit, searched.prepared.problem
+    if not searched.beside:
+        return [], 0.0
+    columns = problem.sensitivity(fit)
+    covariance = parameter_covariance(problem, columns, fit.residual)
+    first = columns.shape[1] - problem.background.shape[1]
+    of_background = covariance[first:, first:]
+    at_reversals = np.zeros(problem.background.shape[1])
+    found = []
+    for modelled in searched.beside:
+        coefficients = fit.background[modelled.columns]
+        spread = of_background[modelled.columns, modelled.columns]
+        if modelled.term.family in _AT_REVERSALS:
+            # The further column is its unknown state at the start.
+            coefficients, spread = coefficients[:1], spread[:1, :1]
+            at_reversals[modelled.columns.start] = 1.0
+        significant = _significant(coefficients, spread, modelled.term.trials)
+        if modelled.term.family == DRIFT:
+            value = float(np.std(problem.background[:, modelled.columns] @ coefficients))
+            uncertainty = float(np.sqrt(max(np.trace(spread), 0.0) / 2))
+        else:
+            value = float(np.linalg.norm(coefficients))
+            uncertainty = float(np.sqrt(max(np.trace(spread), 0.0)))
+        found.append(Size(value, uncertainty, significant))
+    variance = max(float(at_reversals @ of_background @ at_reversals), 0.0)
+    return found, float(np.hypot(at_reversals @ fit.background, np.sqrt(variance)))
+
+
+def _significant(coefficients: FloatArray, covariance: FloatArray, trials: float) -> bool:
+    """Return whether ``coefficients`` (c,) differ from zero (Wald's test) by more than chance."""
+    inverse = np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+    chi_square = float(coefficients @ inverse @ coefficients)
+    return bool(stats.chi2.sf(chi_square, len(coefficients)) * trials < FALSE_ALARM)
