@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import omsm_ros
+from omsm_ros.core.calibration.finding import REJECTS, Finding
 from omsm_ros.errors import DataError, Notice
 from omsm_ros.messages import COMMAND, NODE, PYTHON, templates, written_for
 
@@ -28,13 +29,18 @@ def stated() -> Iterator[tuple[str, set[str] | None]]:
                 room, _, subject = code.value.partition(".")
                 if room in ROOMS and subject.isidentifier() and _states(node.func):
                     names = {each.arg for each in node.keywords}
-                    values = None if None in names else {str(name) for name in names}
-                    yield code.value, values
+                    # A finding has its values in a mapping, which a check makes.
+                    unknown = None in names or _called(node.func) == "Finding"
+                    yield code.value, None if unknown else {str(name) for name in names}
+
+
+def _called(function: ast.expr) -> str:
+    return str(getattr(function, "id", getattr(function, "attr", "")))
 
 
 def _states(function: ast.expr) -> bool:
-    name = getattr(function, "id", getattr(function, "attr", ""))
-    return name.endswith("Error") or name in ("Notice", "Finding")
+    name = _called(function)
+    return name.endswith("Error") or name in ("Notice", "Finding", "text_of")
 
 
 def fields(template: str) -> set[str]:
@@ -54,9 +60,33 @@ def test_every_code_has_a_sentence() -> None:
 
 @pytest.mark.parametrize(("code", "values"), [(c, v) for c, v in STATED if v is not None])
 def test_a_sentence_uses_values_that_are_given(code: str, values: set[str]) -> None:
-    # A finding has further keywords of its own, such as its severity and values.
-    if not values & {"values", "limits", "severity"}:
-        assert fields(templates()[code]) <= values
+    assert fields(templates()[code]) <= values
+
+
+def literals() -> set[str]:
+    """Return every literal text in the core."""
+    return {
+        node.value
+        for path in CORE.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
+
+
+def test_every_code_of_a_calibration_is_a_literal_of_the_core_and_the_reverse() -> None:
+    rooms = ("calibration.", "identification.")
+    used = {text for text in literals() if text.startswith(rooms) and text.isascii()}
+    known = {code for code in templates() if code.startswith(rooms)}
+    assert len(known) > 80
+    assert used == known
+
+
+@pytest.mark.parametrize("code", [c for c in templates() if c.startswith("identification.")])
+def test_a_sentence_of_a_finding_is_written_from_its_values(code: str) -> None:
+    values = dict.fromkeys(fields(templates()[code]), 0.5)
+    sentence = str(Finding(code, REJECTS, values))
+    assert sentence != code
+    assert "{" not in sentence
 
 
 def test_an_option_is_named_for_its_audience() -> None:

@@ -25,7 +25,7 @@ from omsm_ros.core.adjustment.self_calibration import (
     UNINFORMATIVE_GAIN,
 )
 from omsm_ros.core.calibration.calibration import Calibration, excess_latency_text, with_latency
-from omsm_ros.core.calibration.latency import declared_latency, summary_of
+from omsm_ros.core.calibration.latency import declared_latency, latency_summary
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.pipelines.study_scans import SelfCalibrationOptions, reversal_of, self_calibration_of
@@ -109,7 +109,7 @@ def _resolved_facts(calibration: Calibration) -> dict[str, Any]:
         "reasons": [str(reason) for reason in certificate.reasons],
         "lag": calibration.dynamics.low_frequency_delay,
         "lag_uncertainty": certificate.response.low_frequency_delay_uncertainty_s,
-        "latency": summary_of(calibration.latency),
+        "latency": latency_summary(calibration.latency),
         "valid_up_to": calibration.valid_up_to,
     }
 

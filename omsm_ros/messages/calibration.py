@@ -98,11 +98,6 @@ TEMPLATES: dict[str, str] = {
     "calibration.undetected_stiffening": "a stiffness that grows with the deflection",
     "calibration.undetected_other": "an undetected model error",
     # Comparison and repeatability.
-    "calibration.same": "the same ({p:chance})",
-    "calibration.changed": (
-        "changed: lag by {delay} ({delay_sigmas:.1f} sigma), static gain by {gain} "
-        "({gain_sigmas:.1f} sigma), {p:chance}"
-    ),
     "calibration.no_common_band": (
         "the calibrations have no common band: they are valid up to {limits!r} Hz; identify the "
         "one that ends lowest again"

@@ -14,7 +14,7 @@ import numpy as np
 from omsm_ros import __version__
 from omsm_ros.core.calibration.calibration import Calibration, age_at, excess_latency_text
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
-from omsm_ros.core.calibration.latency import summary_of
+from omsm_ros.core.calibration.latency import latency_summary
 from omsm_ros.core.correction.budget import (
     ScanBudget,
     TrafficLight,
@@ -308,7 +308,7 @@ def summarise(
         "stamp_skew": done.stamp_skew,
         "conditions": conditions(done, calibration),
         "settings": dict(calibration.settings),
-        "latency": summary_of(calibration.latency),
+        "latency": latency_summary(calibration.latency),
         "versions": {
             "omsm_ros": __version__,
             "python": platform.python_version(),

@@ -175,7 +175,7 @@ class Response:
 
 
 @dataclass(frozen=True)
-class Gain:
+class GainEstimate:
     """A ratio of travels [1] and its standard uncertainty."""
 
     value: float
@@ -191,9 +191,9 @@ class StaticGain:
 
     uncertainty: float | None = None
     polarity: int | None = None
-    probe_per_encoder: Gain | None = None
-    probe_per_reference: Gain | None = None
-    reference_per_encoder: Gain | None = None
+    probe_per_encoder: GainEstimate | None = None
+    probe_per_reference: GainEstimate | None = None
+    reference_per_encoder: GainEstimate | None = None
 
     def __post_init__(self) -> None:
         if self.uncertainty is not None:
@@ -236,7 +236,7 @@ class ModelErrors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class UndetectedTerm:
+class UndetectedEntry:
     """A model error of one family that the test could not detect.
 
     parameter: time constant [s] or frequency [Hz]
@@ -270,7 +270,7 @@ class Undetected:
     slowest_creep_s, lowest_mode_hz: beyond which none is assumed to exist
     """
 
-    terms: tuple[UndetectedTerm, ...] = ()
+    terms: tuple[UndetectedEntry, ...] = ()
     gain_u: float | None = None
     plateau_s: float | None = None
     plateau_needed_s: float | None = None
@@ -278,7 +278,7 @@ class Undetected:
     lowest_mode_hz: float | None = None
 
     @property
-    def largest(self) -> UndetectedTerm | None:
+    def largest(self) -> UndetectedEntry | None:
         """The term with the largest effect on the intended scan."""
         return max(self.terms, key=lambda term: term.effect_on_scan_m, default=None)
 

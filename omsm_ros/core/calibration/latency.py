@@ -57,13 +57,13 @@ class Latency:
         return self.source != UNRESOLVED
 
 
-def summary_of(latency: Latency) -> dict[str, object]:
+def latency_summary(latency: Latency) -> dict[str, object]:
     """Return ``latency`` as JSON values for a summary, its reason as a sentence."""
     reason = latency.reason or text_of("calibration.latency_unresolved", {})
     return {**asdict(latency), "reason": reason}
 
 
-def unresolved(lag: float) -> Latency:
+def unresolved_latency(lag: float) -> Latency:
     """Return the latency where no test separates it: any part of ``lag`` [s] may be latency.
 
     X and C are not delayed, for nothing says that they should be. The true delay is distributed
@@ -73,7 +73,7 @@ def unresolved(lag: float) -> Latency:
     return Latency(delay_s=0.0, uncertainty_s=spread, beside_z_s=spread, source=UNRESOLVED)
 
 
-def declared(lag: float, delay: float, uncertainty: float, reason: str) -> Latency:
+def declared_latency(lag: float, delay: float, uncertainty: float, reason: str) -> Latency:
     """Return a latency of ``delay`` ± ``uncertainty`` [s] of the whole ``lag`` [s], as stated.
 
     Raises ConfigurationError for a delay or uncertainty that no probe has, or without a reason.
@@ -82,12 +82,12 @@ def declared(lag: float, delay: float, uncertainty: float, reason: str) -> Laten
         delay_s=delay,
         uncertainty_s=uncertainty,
         beside_z_s=uncertainty,
-        share=share_of(delay, lag),
+        share=latency_share_of(delay, lag),
         source=DECLARED,
         reason=reason,
     )
 
 
-def share_of(delay: float, lag: float) -> float | None:
+def latency_share_of(delay: float, lag: float) -> float | None:
     """Return ``delay`` over ``lag`` [s], None if there is no lag."""
     return delay / lag if lag else None

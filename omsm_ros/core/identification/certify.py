@@ -20,11 +20,11 @@ from omsm_ros.core.calibration.certificate import (
     Validity,
 )
 from omsm_ros.core.calibration.finding import Finding
-from omsm_ros.core.calibration.latency import unresolved
+from omsm_ros.core.calibration.latency import unresolved_latency
 from omsm_ros.core.estimation.model_order import Candidate
 from omsm_ros.core.identification.checks import limits_of
 from omsm_ros.core.identification.covariance_terms import inter_sample_delay_bound
-from omsm_ros.core.identification.evidence import Evidence
+from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_error_checks import model_errors_of
 from omsm_ros.core.identification.static_gains import static_gains
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
@@ -36,7 +36,7 @@ from omsm_ros.core.lti.modes import (
     modal_remainder,
     mode_entries,
     oscillations,
-    shape,
+    response_features,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.residual_diagnostics import Contrast
@@ -53,7 +53,10 @@ _GREATEST_UNCERTAINTY = 0.5
 
 
 def certificate_of(
-    evidence: Evidence, findings: Iterable[Finding], origin: Origin, table_mass: float | None
+    evidence: IdentificationEvidence,
+    findings: Iterable[Finding],
+    origin: Origin,
+    table_mass: float | None,
 ) -> Certificate:
     """Return the certificate with the verdict that ``findings`` support.
 
@@ -70,7 +73,7 @@ def certificate_of(
             phase_rad=evidence.limits.phase,
             use=evidence.use,
         ),
-        latency=unresolved(evidence.dynamics.low_frequency_delay),
+        latency=unresolved_latency(evidence.dynamics.low_frequency_delay),
         structure=_structure(evidence.model.chosen),
         candidates=tuple(
             CandidateFit(_structure(c), c.bic, c.fit.rms) for c in evidence.model.candidates
@@ -90,7 +93,7 @@ def _structure(candidate: Candidate) -> Structure:
     return Structure(structure.poles, structure.zeros, structure.delay)
 
 
-def _residual(evidence: Evidence) -> Residual:
+def _residual(evidence: IdentificationEvidence) -> Residual:
     prepared, tests, problem = evidence.prepared, evidence.residual, evidence.prepared.problem
     compared = {"spikes": prepared.spikes, "compared": evidence.fit.samples}
     compared |= {"axis_spikes": prepared.axis_spikes} if prepared.axis_spikes else {}
@@ -110,7 +113,7 @@ def _residual(evidence: Evidence) -> Residual:
     )
 
 
-def _response(evidence: Evidence, table_mass: float | None) -> Response:
+def _response(evidence: IdentificationEvidence, table_mass: float | None) -> Response:
     dynamics, known, prepared = evidence.dynamics, evidence.known, evidence.prepared
     problem, reference = prepared.problem, evidence.reference
     return Response(
@@ -123,14 +126,14 @@ def _response(evidence: Evidence, table_mass: float | None) -> Response:
         ),
         reference_lag_s=None if reference is None else reference.value,
         reference_lag_uncertainty_s=None if reference is None else reference.uncertainty,
-        shape=finite_values(shape(dynamics, 0.5 / problem.period)),
+        shape=finite_values(response_features(dynamics, 0.5 / problem.period)),
         modes=tuple(mode_entries(dynamics, known.covariance)),
         modal_remainder=modal_remainder(dynamics, known.valid_up_to),
         two_mass=two_mass_model(dynamics, known.covariance, known.valid_up_to, table_mass),
     )
 
 
-def _static_gain(evidence: Evidence) -> StaticGain:
+def _static_gain(evidence: IdentificationEvidence) -> StaticGain:
     try:
         found = static_gains(evidence.record)
     except StepTestError:

@@ -17,8 +17,8 @@ from scipy import stats
 from omsm_ros.core.calibration.certificate import ModelError, ModelErrors
 from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, Finding
 from omsm_ros.core.estimation.covariance import parameter_covariance
-from omsm_ros.core.identification.evidence import Evidence
-from omsm_ros.core.identification.model_error_search import Searched
+from omsm_ros.core.identification.evidence import IdentificationEvidence
+from omsm_ros.core.identification.model_error_search import SearchResult
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
@@ -30,7 +30,7 @@ from omsm_ros.core.model_errors.families import (
     PERIODIC,
     STIFFENING,
     VIBRATION,
-    Term,
+    ModelErrorTerm,
 )
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
 from omsm_ros.core.streams.blocks import FloatArray
@@ -81,7 +81,7 @@ class Size:
     significant: bool
 
 
-def model_errors(searched: Searched) -> Iterator[Finding]:
+def model_errors(searched: SearchResult) -> Iterator[Finding]:
     """Yield a reservation for each deviation that was modelled, a rejection for each other one."""
     period = searched.prepared.problem.period
     for judged in searched.unmodelled:
@@ -91,7 +91,7 @@ def model_errors(searched: Searched) -> Iterator[Finding]:
         limits = {"false_alarm_p": FALSE_ALARM}
         yield Finding(_UNMODELLED_CODES[judged.term.family], REJECTS, values, limits)
     sizes, _ = _sizes(searched)
-    for modelled, found in zip(searched.beside, sizes, strict=True):
+    for modelled, found in zip(searched.nuisance_terms, sizes, strict=True):
         if found.significant:
             values = _values(modelled.term, found.value, period)
             yield Finding(_BESIDE_CODES[modelled.term.family], RESERVATION, values)
@@ -100,10 +100,10 @@ def model_errors(searched: Searched) -> Iterator[Finding]:
         yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)
 
 
-def model_errors_of(searched: Searched, duration: float) -> ModelErrors:
+def model_errors_of(searched: SearchResult, duration: float) -> ModelErrors:
     """Return what was modelled and what it costs, for the certificate; ``duration`` [s]."""
     sizes, at_reversals = _sizes(searched)
-    pairs = list(zip(searched.beside, sizes, strict=True))
+    pairs = list(zip(searched.nuisance_terms, sizes, strict=True))
     costs = [at_reversals] + [
         _PER_SIZE.get(modelled.term.family, 0.0) * float(np.hypot(found.value, found.uncertainty))
         for modelled, found in pairs
@@ -127,7 +127,7 @@ def model_errors_of(searched: Searched, duration: float) -> ModelErrors:
     )
 
 
-def accuracy_on(evidence: Evidence) -> float:
+def accuracy_on(evidence: IdentificationEvidence) -> float:
     """Return the standard uncertainty [m] of a height of the intended scan from the response."""
     use, duration = evidence.use, len(evidence.record) * evidence.record.sample_period
     band = response_band(evidence.dynamics, evidence.known.covariance, use.frequencies_hz)
@@ -136,7 +136,7 @@ def accuracy_on(evidence: Evidence) -> float:
     return float(np.hypot(np.linalg.norm(errors), beside))
 
 
-def _values(term: Term, size: float | None, period: float) -> dict[str, object]:
+def _values(term: ModelErrorTerm, size: float | None, period: float) -> dict[str, object]:
     values: dict[str, object] = {} if size is None else {"size_m": size}
     if term.family in _PARAMETERS:
         values[_PARAMETERS[term.family]] = term.parameter
@@ -145,13 +145,13 @@ def _values(term: Term, size: float | None, period: float) -> dict[str, object]:
     return values
 
 
-def _sizes(searched: Searched) -> tuple[Sequence[Size], float]:
+def _sizes(searched: SearchResult) -> tuple[Sequence[Size], float]:
     """Return the size of each term beside the response, and what those at reversals cost [m].
 
     Backlash and friction look alike, and what one has too much the other has too little.
     """
     fit, problem = searched.model.chosen.fit, searched.prepared.problem
-    if not searched.beside:
+    if not searched.nuisance_terms:
         return [], 0.0
     columns = problem.sensitivity(fit)
     covariance = parameter_covariance(problem, columns, fit.residual)
@@ -159,7 +159,7 @@ def _sizes(searched: Searched) -> tuple[Sequence[Size], float]:
     of_background = covariance[first:, first:]
     at_reversals = np.zeros(problem.background.shape[1])
     found = []
-    for modelled in searched.beside:
+    for modelled in searched.nuisance_terms:
         coefficients = fit.background[modelled.columns]
         spread = of_background[modelled.columns, modelled.columns]
         if modelled.term.family in _AT_REVERSALS:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omsm_ros.core.calibration.certificate import Gain, StaticGain
+from omsm_ros.core.calibration.certificate import GainEstimate, StaticGain
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
@@ -17,7 +17,7 @@ from omsm_ros.linear_algebra import unit_columns
 
 # Rest after an edge that is not averaged, for the response to settle.
 _SETTLE_S = 0.1
-# Gain, drift and offset are three unknowns.
+# GainEstimate, drift and offset are three unknowns.
 _LEAST_PLATEAUS = 4
 
 
@@ -62,7 +62,7 @@ def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:
     return np.asarray(means)
 
 
-def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> Gain:
+def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> GainEstimate:
     known = np.isfinite(travel) & np.isfinite(other)
     if np.sum(known) < _LEAST_PLATEAUS:
         raise StepTestError(
@@ -76,4 +76,4 @@ def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> Gain:
     residual = y - unit @ solved
     variance = float(residual @ residual) / max(len(y) - 3, 1)
     uncertainty = np.sqrt(variance * (inverse[0] @ inverse[0])) / scale[0]
-    return Gain(float(abs(solved[0]) / scale[0]), float(uncertainty))
+    return GainEstimate(float(abs(solved[0]) / scale[0]), float(uncertainty))

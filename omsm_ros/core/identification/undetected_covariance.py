@@ -12,13 +12,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from omsm_ros.core.calibration.certificate import Undetected, UndetectedTerm
+from omsm_ros.core.calibration.certificate import Undetected, UndetectedEntry
 from omsm_ros.core.calibration.intended_use import IntendedUse
 from omsm_ros.core.estimation.output_error import Fit
-from omsm_ros.core.model_errors.families import CREEP, MODE, Term
+from omsm_ros.core.model_errors.families import CREEP, MODE, ModelErrorTerm
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.model_errors.undetected import (
-    HIDING,
+    UNDETECTED,
     UndetectedTerm,
     alternative_mode_covariance,
     undetected_terms,
@@ -61,7 +61,7 @@ def undetected_covariance(
 
 
 def alternative_modes(
-    without: Sequence[ResidualDiagnostics], terms: Sequence[Term], fitted: Fit
+    without: Sequence[ResidualDiagnostics], terms: Sequence[ModelErrorTerm], fitted: Fit
 ) -> list[FloatArray]:
     """Return covariances (p, p) of what each light mode among ``terms`` may be instead.
 
@@ -79,8 +79,8 @@ def _priors(settings: Mapping[str, object]) -> dict[str, float]:
     if not isinstance(stated, Mapping):
         raise ConfigurationError("identification.priors", value=repr(stated))
     for name, value in stated.items():
-        if name not in HIDING:
-            known = ", ".join(map(repr, HIDING))
+        if name not in UNDETECTED:
+            known = ", ".join(map(repr, UNDETECTED))
             raise ConfigurationError(
                 "identification.unknown_prior", family=shown(name), known=known
             )
@@ -93,9 +93,9 @@ def _carried(term: UndetectedTerm, priors: Mapping[str, float]) -> float:
     return min(term.carried, priors.get(term.family, np.inf))
 
 
-def _entry(term: UndetectedTerm, priors: Mapping[str, float]) -> UndetectedTerm:
+def _entry(term: UndetectedTerm, priors: Mapping[str, float]) -> UndetectedEntry:
     carried, missed = _carried(term, priors), term.effect * term.missed
-    return UndetectedTerm(
+    return UndetectedEntry(
         family=term.family,
         parameter=float(term.parameter),
         size=term.size,

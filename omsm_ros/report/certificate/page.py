@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedTerm
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedEntry
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.modes import KnownMode, known_modes
@@ -101,14 +101,14 @@ def shape_table(calibration: Calibration) -> Table:
     return Table("Shape of the response", ("", "within the trusted band"), rows)
 
 
-def _size(term: UndetectedTerm) -> str:
+def _size(term: UndetectedEntry) -> str:
     """Return the largest size that was missed, in the unit of its family."""
     if term.missed is None or term.family not in (CREEP, MODE):
         return quantity(term.missed, "m")
     return f"{percent(term.missed)} of the motion"
 
 
-def _family(term: UndetectedTerm) -> str:
+def _family(term: UndetectedEntry) -> str:
     """Return the name of a model error, with its time constant or frequency."""
     if term.family == CREEP:
         return f"{term.family} over {quantity(term.parameter, 's', 2)}"

@@ -32,7 +32,7 @@ def late(delay: float = LAG, gain: float = 1.0, **other: object) -> Calibration:
     """A pure delay: its phase alone is uncertain, by ω times the uncertainty of the delay."""
     parts: dict[str, object] = {
         "covariance": np.diag([0.0, LAG_U**2]),
-        "certificate": {"static_gain_uncertainty": GAIN_U},
+        "certificate": certified_by({"static_gain_uncertainty": GAIN_U}),
         "valid_up_to": 60.0,
     }
     return Calibration(
@@ -115,7 +115,7 @@ def test_undetected_error_in_both_alike_does_not_excuse_a_change() -> None:
     """Ten times the noise is stated besides; repeated tests of one machine do not scatter so."""
     noise = [0.0, 0.0, 0.0, LAG_U**2]
     reported = {"static_gain_uncertainty": GAIN_U, "noise_covariance": noise}
-    broad = {"covariance": np.diag([0.0, (10 * LAG_U) ** 2]), "certificate": reported}
+    broad = {"covariance": np.diag([0.0, (10 * LAG_U) ** 2]), "certificate": certified_by(reported)}
     found = compare_calibrations(late(**broad), late(LAG + 6 * LAG_U, **broad))  # type: ignore[arg-type]
     assert found.delay_sigmas == pytest.approx(6 / math.sqrt(2))
     assert found.changed

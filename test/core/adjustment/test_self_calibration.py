@@ -126,7 +126,7 @@ def test_without_a_step_test_the_surface_scanned_is_corrected() -> None:
     assert result.latency.share is None
     assert result.latency.uncertainty_s is None
     assert error_left(result, latency) < 5e-9
-    assert str(result.certificate.verdict).startswith("accepted up to")
+    assert str(result.certificate.verdict).startswith("accepted")
     # Both speeds reach further than a few turns a second, and no further than the harmonics.
     assert 3.0 < result.valid_up_to < 12.0
 
@@ -193,7 +193,7 @@ def test_scans_of_different_parts_contradict_each_other() -> None:
     dented = replace(other, height=other.height + 30e-9 * np.cos(5 * other.angle))
     result = resolved(known, self_calibrate([one, dented], after_step_test(known)))
     assert result.certificate.verdict == "rejected"
-    assert "contradict each other by" in str(result.certificate.reasons)
+    assert "contradict each other by" in str(result.certificate.reasons[0])
 
 
 def test_a_step_test_that_the_scans_contradict_is_reported() -> None:
@@ -204,7 +204,7 @@ def test_a_step_test_that_the_scans_contradict_is_reported() -> None:
     found = self_calibrate(pair, after_step_test(slow))
     result = resolved(slow, found)
     assert result.certificate.verdict == "rejected"
-    assert "scans and step test contradict each other" in str(result.certificate.reasons)
+    assert "scans and step test contradict each other" in str(result.certificate.reasons[0])
 
 
 def test_a_probe_that_would_be_early_is_reported() -> None:
@@ -212,7 +212,7 @@ def test_a_probe_that_would_be_early_is_reported() -> None:
     pair = [scanned(made(rpm, s, disturbed()), stiff) for s, rpm in ((1, 30.0), (2, 60.0))]
     result = resolved(stiff, self_calibrate(pair, after_step_test(stiff)))
     assert result.certificate.verdict == "rejected"
-    assert "µs early" in str(result.certificate.reasons)
+    assert "µs early" in str(result.certificate.reasons[0])
 
 
 def test_one_speed_and_direction_tell_nothing() -> None:

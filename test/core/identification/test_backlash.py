@@ -63,8 +63,8 @@ def overshooting(seed, half_gap):
 def test_backlash_behind_an_overshooting_servo_is_found_and_bends_no_pole():
     found = identify(overshooting(3, HALF_GAP_M)).calibration
     (model_error,) = found.certificate.model_errors.modelled
-    assert model_error["family"] == "backlash"
-    assert model_error["size_m"] == pytest.approx(HALF_GAP_M, rel=0.1)
+    assert model_error.family == "backlash"
+    assert model_error.size_m == pytest.approx(HALF_GAP_M, rel=0.1)
     assert found.certificate.structure.poles <= 2
     off = found.dynamics.response(1.0) * (1 + 2j * np.pi * LAG_S) - 1
     # Three nanometres on a tenth of a millimetre.
@@ -74,4 +74,4 @@ def test_backlash_behind_an_overshooting_servo_is_found_and_bends_no_pole():
 def test_an_overshooting_servo_without_a_gap_shows_none():
     certificate = identify(overshooting(4, 0.0)).calibration.certificate
     assert certificate.model_errors.modelled == []
-    assert str(certificate.verdict).startswith("accepted,")
+    assert certificate.verdict == "accepted"

@@ -46,8 +46,8 @@ def calibration():
 def test_a_curved_scale_leaves_the_lag_alone(calibration):
     certificate = calibration.certificate
     assert certificate.verdict != "rejected"
-    (found,) = (d for d in certificate.model_errors.modelled if d["family"] == "probe linearity")
-    assert found["size_m"] == pytest.approx(CURVATURE_M, rel=0.05)
+    (found,) = (d for d in certificate.model_errors.modelled if d.family == "probe linearity")
+    assert found.size_m == pytest.approx(CURVATURE_M, rel=0.05)
     off = calibration.dynamics.low_frequency_delay - sum(LAGS_S) - DELAY_S
     # A bend of the axis's position put it 11 µs off.
     assert abs(off) < min(3 * certificate.response.low_frequency_delay_uncertainty_s, 5e-6)

@@ -49,8 +49,7 @@ class TestImperfectData:
             identify(record_of(recording, distance=recording.distance.distance + extra)).calibration
             for extra in (signal.lfilter([1.0], [1.0, -0.9], noise), noise)
         )
-        key = "low_frequency_delay_uncertainty_s"
-        assert broad.certificate[key] > 1.5 * narrow.certificate[key]
+        assert broad.low_frequency_delay_uncertainty > 1.5 * narrow.low_frequency_delay_uncertainty
 
     def test_backlash_is_found_and_stated(self):
         recording = recorded(seed=13)
@@ -67,7 +66,7 @@ class TestImperfectData:
     def test_sharp_edges_are_rejected_by_name_and_the_band_holds_the_truth(self):
         calibration = identify(record_of(recorded(motion=StepTest(rise=0.0)))).calibration
         assert calibration.certificate.verdict == "rejected"
-        assert "between samples" in " ".join(calibration.certificate.reasons)
+        assert "between samples" in " ".join(map(str, calibration.certificate.reasons))
         frequency = np.array([0.5, 1.0, 5.0, 15.0])
         band = response_band(calibration.dynamics, calibration.covariance, frequency)
         gain, phase = errors(calibration, TRUTH, frequency)
@@ -183,9 +182,11 @@ def test_a_wrong_bit_of_the_encoder_costs_nothing():
     z[[2600, 5011]] += 3e-6
     found = identify(record_of(recording, z=z)).calibration
     right = identify(record_of(recording)).calibration
-    assert str(found.certificate.verdict).startswith("accepted,")
+    assert found.certificate.verdict == "accepted"
     assert found.certificate.residual.samples["axis_spikes"] == 2
-    assert any("stood apart" in warning for warning in found.certificate.warnings)
+    assert any(
+        warning.code == "identification.axis_spikes" for warning in found.certificate.warnings
+    )
     frequency = np.array([1.0, 15.0])
     ratio = found.dynamics.response(frequency) / right.dynamics.response(frequency)
     np.testing.assert_allclose(np.abs(ratio - 1), 0, atol=2e-5)

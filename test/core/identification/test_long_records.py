@@ -58,7 +58,7 @@ def test_fewer_samples_choose_what_all_would(of_mode, monkeypatch):
 
 def test_what_is_stated_holds_the_truth(of_mode):
     calibration = identify(of_mode).calibration
-    assert str(calibration.certificate.verdict).startswith("accepted,")
+    assert calibration.certificate.verdict == "accepted"
     band = response_band(calibration.dynamics, calibration.covariance, LINES)
     off = np.log(calibration.dynamics.response(LINES) / MODE.response(LINES))
     assert np.all(abs(off) < 3 * np.hypot(band.gain, band.phase))

@@ -27,7 +27,7 @@ def test_a_slow_mode_that_the_steps_keep_ringing_is_in_the_response_or_in_the_ba
     """By a nanometre it looks like a line, and is tenfold in the response at its frequency."""
     size, frequency, damping = 1e-4, 0.5, 0.05
     calibration = identify(late_record(-ringing(size, frequency, damping), seed)).calibration
-    families = {d["family"] for d in calibration.certificate.model_errors.modelled}
+    families = {d.family for d in calibration.certificate.model_errors.modelled}
     assert families == ({MODE} if modelled else set())
     lines = np.array([0.5, 1.0, 1.5])
     ratio = 1j * lines / frequency
