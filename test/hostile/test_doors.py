@@ -23,7 +23,6 @@ from hypothesis import strategies as st
 
 from omsm_ros import cli
 from omsm_ros.core.calibration.calibration_set import calibration_set
-from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.lti.transfer_function import TransferFunction
@@ -47,7 +46,7 @@ MODEL = SampledModel(
     valid_from=1.0,
     valid_up_to=100.0,
     working_point=(0.0, 0.0),
-    certificate=Certificate(verdict="accepted"),
+    certificate={"verdict": "accepted"},
 )
 CASES = int(os.environ.get("OMSM_HOSTILE_CASES", "12000"))
 BLOCKS = 12

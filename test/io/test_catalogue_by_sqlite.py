@@ -44,7 +44,7 @@ def test_a_calibration_is_a_row_of_its_own_numbers(tmp_path, address, true_calib
     assert keep_calibration(address, made, tmp_path / "cal.json", tmp_path / "gone.mcap")
     (row,) = rows(address, "calibrations")
     assert row["id"] == made.id
-    assert (row["machine"], row["verdict"]) == ("ü 1", "accepted")
+    assert (row["machine"], row["verdict"]) == ("ü 1", "accepted, valid up to 100 Hz")
     assert json.loads(row["settings"]) == {"machine": "ü 1", "n": 2}
     assert row["path"] == str(tmp_path / "cal.json")
     assert row["source"] == str(tmp_path / "gone.mcap")

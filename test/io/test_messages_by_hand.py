@@ -167,7 +167,7 @@ def test_a_calibration_is_the_bytes_of_the_standard(true_calibration):
     cdr.put("d", true_calibration.valid_up_to)
     cdr.row("d", true_calibration.covariance.ravel().tolist())
     cdr.text(json.dumps(dict(true_calibration.settings), sort_keys=True))
-    cdr.text(json.dumps(dict(true_calibration.certificate), sort_keys=True))
+    cdr.text(json.dumps(true_calibration.certificate.content(), sort_keys=True))
     assert raw.rstrip(b"\0") == cdr.message.rstrip(b"\0")
     heard = message_mapping.calibration(read(cdr.message, "omsm_msgs/msg/Calibration"))
     assert heard.id == true_calibration.id

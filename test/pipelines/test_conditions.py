@@ -7,6 +7,7 @@ import pytest
 from certified import certified_by
 
 from omsm_ros.core.calibration.calibration import age_at
+from omsm_ros.errors import CalibrationError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.message_mapping import typestore
@@ -61,9 +62,14 @@ def test_what_nobody_recorded_is_not_known(tmp_path, small_scan_blocks, true_cal
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("entry", [None, "yesterday", 1.5, True])
-def test_a_certificate_without_a_date_has_no_age(true_calibration, entry):
-    assert age_at(dated(true_calibration, entry), NOON_NS) is None
+def test_a_certificate_without_a_date_has_no_age(true_calibration):
+    assert age_at(dated(true_calibration, None), NOON_NS) is None
+
+
+@pytest.mark.parametrize("entry", ["yesterday", 1.5, True])
+def test_a_date_that_is_none_is_refused(true_calibration, entry):
+    with pytest.raises(CalibrationError, match="recorded_ns is"):
+        dated(true_calibration, entry)
 
 
 def test_an_implausible_temperature_is_reported(tmp_path, small_scan_blocks, true_calibration):

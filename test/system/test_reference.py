@@ -47,7 +47,7 @@ def test_a_reference_over_dds_is_distinguished_and_can_be_the_input(cell, step_t
 
     by_encoder = cell.call(Identify, "calibrator/identify", input="encoder")
     assert by_encoder.success, by_encoder.message
-    gains = json.loads(by_encoder.calibration.certificate)["static_gains"]
+    gains = json.loads(by_encoder.calibration.certificate)["static_gain"]
     assert gains["reference_per_encoder"]["value"] == pytest.approx(SCALE, abs=1e-5)
     expected = PAPER_STATIC_GAIN / SCALE
     assert gains["probe_per_reference"]["value"] == pytest.approx(expected, abs=5e-5)

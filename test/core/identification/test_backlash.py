@@ -73,5 +73,5 @@ def test_backlash_behind_an_overshooting_servo_is_found_and_bends_no_pole():
 
 def test_an_overshooting_servo_without_a_gap_shows_none():
     certificate = identify(overshooting(4, 0.0)).calibration.certificate
-    assert certificate.model_errors.modelled == []
+    assert certificate.model_errors.modelled == ()
     assert certificate.verdict == "accepted"

@@ -124,5 +124,5 @@ def test_what_the_motion_cannot_show_at_all_is_unknown_and_the_calibration_can_b
     """Of a half sweep, in which a relaxation of a minute is wholly taken for drift."""
     made = identified(Chirp(), Plant(), slice(12_500, None), 3)
     assert made.certificate.verdict == "rejected"
-    assert made.certificate.undetected.terms[0]["missed"] is None
+    assert made.certificate.undetected.terms[0].missed is None
     assert len(made.id) == 64  # of its content as strict JSON
