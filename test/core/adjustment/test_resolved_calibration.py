@@ -299,7 +299,7 @@ def test_what_the_scans_do_not_tell_is_said() -> None:
     made = of_scans(known=known)
     latency = made.latency
     assert (latency.delay_s, latency.uncertainty_s, latency.share) == (0.0, None, None)
-    assert made.certificate.warnings[0].code == "calibration.scans_scope"
+    assert made.certificate.warnings[0].code == "adjustment.latency_scope"
     assert of_scans().certificate.warnings == ()
 
 
