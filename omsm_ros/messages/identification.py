@@ -58,11 +58,6 @@ TEMPLATES: dict[str, str] = {
         )
         for name, (words, remedy) in _NAMES.items()
     },
-    "identification.search_incomplete": (
-        "the search for a model was cut short: its budget of evaluations was exhausted before the "
-        "residual was free of significant model errors; another model may describe the record "
-        "better"
-    ),
     # The record and its channels.
     "identification.exchanged_channels": (
         "the probe moves {lead_s:s} before the encoder, and the encoder is noisier "
@@ -219,27 +214,5 @@ TEMPLATES: dict[str, str] = {
     ),
     "identification.prior": (
         "settings: the prior of {family!r} is {value}, expected a positive number"
-    ),
-    # Models between any two sampled quantities.
-    "identification.hold": "hold {hold!r}, expected one of {known}",
-    "identification.few_samples": (
-        "{used} samples are used, at least {least} are needed, and a finite input everywhere; "
-        "record more"
-    ),
-    "identification.not_predictive": (
-        "free runs over parts of the record that were not fitted account for {predicted:%/3} of "
-        "the variance there, less than {predicted_least:%}: the model describes only what was "
-        "fitted; record longer, or look for a further input or a drift"
-    ),
-    "identification.no_range": (
-        "at no frequency is the response known to {gain:%/1} of gain and {phase_rad:rad/2}; record "
-        "longer, or excite more"
-    ),
-    "identification.follows_input": (
-        "the residual follows the input ({p:chance}): more poles, a longer delay, or a nonlinearity"
-    ),
-    "identification.other_order": (
-        "order {order} was asked for, {free_order} would have been chosen: its uncertainties are "
-        "taken {factor:plain/2} times as large"
     ),
 }

@@ -155,7 +155,7 @@ def two_clocks(by_stamps: bool) -> Findings:
 def complete_search(incomplete: bool) -> Findings:
     """Reserve a model whose search was cut short."""
     if incomplete:
-        yield Finding("identification.search_incomplete", RESERVATION)
+        yield Finding("estimation.search_incomplete", RESERVATION)
 
 
 def independence(p_value: float, scatter: float = 0.0) -> Findings:
