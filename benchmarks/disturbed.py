@@ -160,13 +160,12 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
         [
             "# Disturbed step tests",
             "",
-            "What `omsm identify` says of a step test on a machine that is not as it should be, "
-            "against the truth of the twin. `python -m benchmarks disturbed --full` writes this "
-            f"anew, from {_SEEDS} tests a case and {_PAIRS} pairs; how many it is from stands "
-            "below. "
-            "Error and stated uncertainty are of the linear response on the paper's scan, in the "
-            "test that is farthest off; σ is the largest error of the response over what is "
-            "stated, from 0.1 Hz to where it is trusted.",
+            "Verdict of `omsm identify` on step tests of disturbed machines, compared with the "
+            "truth of the twin. `python -m benchmarks disturbed --full` writes this page, from "
+            f"{_SEEDS} tests a case and {_PAIRS} pairs; the numbers actually tested are below. "
+            "Error and stated uncertainty are those of the linear response on the paper's scan, "
+            "in the test with the largest error. σ is the largest error of the response over its "
+            "stated uncertainty, from 0.1 Hz to the end of the valid range.",
             "",
             f"Alone: {_summary(alone)} Each of {len(by_name)} cases was tested "
             f"{_times(by_name.values())}.",
@@ -201,7 +200,7 @@ def _times(groups: Iterable[Sequence[Outcome]]) -> str:
 
 def _table(by_name: Mapping[str, Sequence[Outcome]]) -> list[str]:
     return [
-        "| disturbance | verdict | error [nm] | stated [nm] | σ | in its words |",
+        "| disturbance | verdict | error [nm] | stated [nm] | σ | reservation or reason |",
         "|---|---|---|---|---|---|",
         *(_line(name, outcomes) for name, outcomes in by_name.items()),
     ]

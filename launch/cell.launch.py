@@ -101,7 +101,7 @@ Parameters = dict[str, object]
 
 
 def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str, Parameters]]:
-    """Return the parameters of the emulator, of its driver, and of a second driver if there is one."""
+    """Return the parameters of the emulator, of its driver, and of a second driver, if any."""
     if device not in EMULATED:
         raise ValueError(f"device {device!r} has no emulator, expected one of {sorted(EMULATED)}")
     known = emulated(device)

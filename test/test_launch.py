@@ -1,4 +1,4 @@
-"""What the launch file starts, on stand-ins for launch and launch_ros, which wheels lack."""
+"""Check what the launch file starts, with substitutes for launch and launch_ros."""
 
 import os
 import subprocess
@@ -88,10 +88,10 @@ def test_nodes_end_with_a_launch_that_cannot_tell_them(launch):
 
 @pytest.mark.parametrize(
     ("argument", "hint"),
-    [("recrod:=scan.mcap", "did you mean record:=?"), ("xyz:=1", "--show-args tells them all")],
+    [("recrod:=scan.mcap", "did you mean record:=?"), ("xyz:=1", "--show-args lists them")],
 )
 def test_an_unknown_argument_is_reported(launch, caplog, argument, hint):
-    """Else a scan would not be recorded, or a real device be driven, for a letter."""
+    """A misspelt argument would leave a scan unrecorded, or start a real device."""
     launch(argv=[argument])
     (said,) = caplog.messages
     assert f"no argument {argument.split(':=')[0]!r}; {hint}" in said

@@ -120,7 +120,7 @@ def workshop(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def programs(tmp_path_factory):
-    """Return a folder with the programs that the pages call: omsm, and substitutes for ros2 and make."""
+    """Return a folder with the programs of the pages: omsm, and substitutes for ros2 and make."""
     folder = tmp_path_factory.mktemp("bin")
     python = f'exec "{sys.executable}"'
     for name, line in (

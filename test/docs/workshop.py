@@ -105,7 +105,7 @@ def recordings(shop, path):
 
 
 def datx(shop, path):
-    """Write an interferometer's map of the middle of the mirror, from public documents of the format."""
+    """Write an interferometer's map of the middle of the mirror, in the published format."""
     import h5py
 
     side = np.arange(-40, 41) * 25e-6
