@@ -1,7 +1,7 @@
-"""What a program settles before it loads: how it ends until then, and its threads.
+"""Signals and BLAS threads of a program while it loads.
 
-Asked to end while it only loads, it does at once, and without a traceback. Nothing is imported here
-that takes time: what loads before its handlers are in force has none.
+A signal while the program only loads ends it at once, without a traceback. This module imports
+nothing that takes time, because signals are not handled before.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 STDERR = 2
-# Of BLAS, which takes one of each core for a sum over a long array: they wait for each other, on a
-# busy computer for ten times as long as the sum takes, and sums depend on how many there are.
+# Number of BLAS threads. With several, long sums depend on their number, and on a busy computer
+# they wait for each other for ten times as long as they compute.
 _THREADS = "OMP_NUM_THREADS"
 
 
 def one_thread_of_blas() -> None:
-    """Let BLAS, once it is loaded, compute in the thread that asks, unless the user has chosen."""
+    """Limit BLAS to one thread, unless the user has set their number; call before it is loaded."""
     os.environ.setdefault(_THREADS, "1")
 
 
@@ -27,12 +27,12 @@ def one_thread_of_blas() -> None:
 def exit_on_signal_while_loading(
     numbers: Collection[signal.Signals], code: int = 0, said: str = ""
 ) -> Iterator[None]:
-    """Let each of the signals ``numbers`` end the process at once, while it only loads.
+    """End the process at once on the signals ``numbers`` while it only loads.
 
-    code: it exits with;  said: on stderr, if anything
+    code: exit status;  said: text for stderr, if any
     """
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's
+        yield  # only the main thread handles signals
         return
 
     def end(*_: object) -> None:
@@ -41,7 +41,7 @@ def exit_on_signal_while_loading(
 
     before = {number: signal.getsignal(number) for number in numbers}
     for number, handler in before.items():
-        if handler is not signal.SIG_IGN:  # as SIGHUP is below nohup
+        if handler is not signal.SIG_IGN:  # as SIGHUP is under nohup
             signal.signal(number, end)
     yield
     for number, handler in before.items():

@@ -1,9 +1,9 @@
-"""What may come from outside: every quantity with its name, unit and plausible range.
+"""Quantities of input data with their names, units and plausible ranges; parameters of nodes.
 
-A number enters the package through one door (a message, a bag, JSON, YAML, CSV, a parameter, an
-argument) and is held against this table there, once. A range is wide enough for any machine that
-this package could serve, and narrow enough that whatever is computed from it stays finite and
-fits into memory. What lies outside is a wrong unit, a damaged file or a forgery.
+A number that enters the package (message, bag, JSON, YAML, CSV, parameter, argument) is checked
+once, where it enters, against this table. A range is wide enough for any machine, and narrow enough
+that all results stay finite and fit into memory. A number outside has a wrong unit, or comes from a
+damaged or forged file.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _SHOWN_CHARACTERS = 60
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A number with a meaning.
+    """A physical quantity or another number.
 
-    name: as people read it;  unit: SI, empty for a pure number
-    low, high: the plausible range, both included
-    whole: an integer;  signed: the range is that of the magnitude, either sign may stand before it
-    remedy: what to do about a number outside
+    name: for messages;  unit: SI, empty for a pure number
+    low, high: plausible range, both included
+    whole: an integer;  signed: the range is that of the magnitude
+    remedy: for a number outside the range
     """
 
     name: str
@@ -41,10 +41,10 @@ class Quantity:
     def checked(self, value: object, error: type[OmsmError] = DataError, name: str = "") -> Any:
         """Return ``value`` as float, or as int if ``whole``; raise ``error`` if it is implausible.
 
-        name: what the value is called where it came from; empty takes the quantity's own name.
+        name: of the value in messages; empty takes the name of the quantity
         """
         if type(value) is (int if self.whole else float) and self.low <= value <= self.high:  # type: ignore[operator]
-            return value  # what nearly all values are, without further ado
+            return value  # the usual case, kept fast
         number = _number(value, self.whole)
         if number is None or not self._in_range(number):
             raise error(self._refusal(value, name))
@@ -53,7 +53,7 @@ class Quantity:
     def checked_all(
         self, values: NDArray[Any], error: type[OmsmError] = DataError, name: str = ""
     ) -> NDArray[Any]:
-        """Return an array (n,) of plausible numbers; raise ``error`` naming the first other one."""
+        """Return the array (n,); raise ``error`` with the first number that is implausible."""
         good = self._plausible(values)
         if good is not None:
             place = int(np.argmin(good))
@@ -61,20 +61,19 @@ class Quantity:
         return values
 
     def nan_if_implausible(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return an array (n,) with NaN, which means "lost", where a number is not plausible.
+        """Return the array (n,) with NaN in place of implausible numbers.
 
-        A single corrupt reading must not cost the scan that it is in; it is counted as invalid.
+        A single corrupt reading is counted as lost and does not stop a scan.
         """
         good = self._plausible(values)
         return values if good is None else np.where(good, values, np.nan)
 
     def _plausible(self, values: NDArray[Any]) -> NDArray[np.bool_] | None:
-        """Return True where a number lies in the range, or None if all do."""
+        """Return True where a number is in the range, or None if all are."""
         low, high = self.low, self.high
-        if values.dtype.kind == "f":  # else a narrow float would take the bounds into its own range
+        if values.dtype.kind == "f":  # a float32 would round the bounds otherwise
             low, high = np.float64(low), np.float64(high)
-        # Two fast passes prove most arrays. A product of BLAS would be one, but of long arrays it
-        # wakes threads, which wait for each other for as long as all else of a correction takes.
+        # Minimum and maximum are the fastest check of most arrays that starts no BLAS threads.
         if values.size and low <= values.min() and values.max() <= high:
             return None
         good = (values >= low) & (values <= high)
@@ -82,7 +81,7 @@ class Quantity:
 
     @property
     def range_text(self) -> str:
-        """The range in words, with its unit."""
+        """The range with its unit, for messages."""
         sign, unit = "±" if self.signed else "", f" {self.unit}" if self.unit else ""
         return f"from {sign}{self.low:g} to {sign}{self.high:g}{unit}"
 
@@ -103,7 +102,7 @@ def _number(value: object, whole: bool) -> float | int | None:
     if isinstance(value, bool | np.bool_):
         return None
     if isinstance(value, int | np.integer):
-        # An integer of hundreds of digits has no float.
+        # An integer of hundreds of digits cannot be converted to float.
         if whole:
             return int(value)
         return float(value) if abs(int(value)) < 2**63 else None
@@ -115,7 +114,7 @@ def _number(value: object, whole: bool) -> float | int | None:
 
 
 def shown(value: object) -> str:
-    """Return a foreign value as a message shows it: on one line, and short, with its end."""
+    """Return ``repr(value)`` for a message, shortened in its middle."""
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of thousands of digits, a nest of lists
@@ -126,37 +125,35 @@ def shown(value: object) -> str:
 # Sampled data.
 
 SAMPLE_PERIOD = Quantity("sample period", "s", 1e-7, 10.0, "give it in seconds")
-# From 2**53 on a float no longer tells neighbours apart. A block begins so far below it that all
-# its samples are too; at 1 MHz the counter lasts 285 years.
+# A float represents integers up to 2**53 exactly; the margin holds the samples of one block. At
+# 1 MHz this is 285 years.
 COUNTER = Quantity(
     "trigger counter", "", 0, 2**53 - 2**40, "the device's counter is corrupt", whole=True
 )
-# ROS time has 32 bits of seconds.
+# Seconds of ROS time have 32 bits.
 _MAX_STAMP_NS = 2**31 * 10**9
 STAMP = Quantity(
     "stamp", "ns", -_MAX_STAMP_NS, _MAX_STAMP_NS, "set the clock of the sender", whole=True
 )
-# Any quantity in any unit: its square, summed over a record, stays finite.
-# Products of four of them are floats.
+# Any quantity in any unit; products of four of them are finite.
 SIGNAL = Quantity("signal", "", -1e50, 1e50, "scale it")
 POSITION = Quantity("position", "m", -100.0, 100.0, "give it in metres")
 DISTANCE = Quantity("distance", "m", -100.0, 100.0, "give it in metres")
-# A spindle's angle is counted on over its turns: a year at 30 rpm makes 1e8 rad.
+# The angle of a spindle is unwrapped: a year at 30 rpm is 1e8 rad.
 ANGLE = Quantity("angle", "rad", -1e9, 1e9, "give it in radians")
 ACCELERATION = Quantity("acceleration", "m/s²", -1e6, 1e6, "give it in m/s²")
 TEMPERATURE = Quantity("temperature", "°C", -100.0, 200.0, "give it in degrees Celsius")
 TIME = Quantity("time", "s", -1e10, 1e10, "give it in seconds")
-# A minute at 20 kHz waits in a quarter of a gigabyte.
+# Waiting samples of a minute at 20 kHz need 250 MB.
 WAIT = Quantity("waiting time", "s", 1e-3, 60.0, "give it in seconds")
 DURATION = Quantity("duration", "s", 0.0, 1e7, "give it in seconds; 0 = all")
 
 # Dynamics.
 
 DELAY = Quantity("delay", "s", 0.0, 1.0, "identify again; the loop's delay is milliseconds")
-# Drift over minutes is no dynamics of a servo; a nanosecond is beyond every sensor.
+# A drift over hours is no dynamics of a servo; below a nanosecond no sensor resolves it.
 TIME_CONSTANT = Quantity("time constant", "s", 1e-10, 1000.0, "identify again")
 FREQUENCY = Quantity("frequency", "Hz", 1e-6, 1e9, "give it in hertz")
-# Coefficients of s^k are these powers of time; beyond them their products overflow.
 GAIN = Quantity("static gain", "", 1e-6, 1e6, "check the units of encoder and probe")
 MAX_DELAY_SAMPLES = Quantity("longest delay", "samples", 0, 50, "0 = none", whole=True)
 ORDER = Quantity("order", "", 0, 20, "0 = choose", whole=True)
@@ -168,9 +165,9 @@ RADIUS = Quantity("radius", "m", 1e-6, 1e5, "give it in metres, negative if conv
 FEED = Quantity("feed of a turn", "m", 1e-9, 1.0, "give it in metres")
 FOCAL_LENGTH = Quantity("focal length", "m", 1e-6, 1e5, "give it in metres")
 CONIC_CONSTANT = Quantity("conic constant", "", -1e4, 1e4, "0 is a sphere, -1 a paraboloid")
-# Of a term of a surface: with the greatest power and length its square stays finite.
+# Coefficient of a surface term; its square is finite at the largest power and length.
 COEFFICIENT = Quantity("coefficient", "", -1e40, 1e40, "check its unit and its sign")
-# Of a term over a disc: with the smallest disc and the highest order its square stays finite.
+# Coefficient of a term over a disc; its square is finite at the smallest disc and highest order.
 TERM_SIZE = Quantity("coefficient", "m", -10.0, 10.0, "give it in metres")
 DISC_RADIUS = Quantity("radius of the disc", "m", 1e-4, 1e2, "give it in metres")
 TERM_ORDER = Quantity("power", "", 0, 20, "give a smaller one", whole=True)
@@ -181,13 +178,13 @@ SLOPE = Quantity("slope", "", -1.0, 1.0, "give the tangent of the angle")
 PITCH = Quantity("pitch", "rad", -1.0, 1.0, "give it in radians")
 MASS = Quantity("mass", "kg", 1e-6, 1e6, "give it in kilograms")
 SPACING = Quantity("spacing", "m", 1e-9, 1.0, "give it in metres")
-# From a tenth of an atom to a metre; places that lie closer are one.
+# Positions closer than a tenth of an atom are equal.
 MAP_SPACING = Quantity("spacing of the map", "m", 1e-12, 1.0, "give it in metres")
-# As many as the largest camera of an interferometer has, 3.4 k × 3.4 k; 0.7 GB while they are read.
+# Pixels of the largest interferometer camera, 3.4 k × 3.4 k; reading them needs 0.7 GB.
 MAP_POINTS = Quantity(
     "number of points", "", 1, 12_000_000, "write their true number, or thin them", whole=True
 )
-# Records whose number the length of their file proves; 24 bytes each while they are used.
+# Records of a file whose length confirms their number; each needs 24 bytes.
 CLOUD_POINTS = Quantity(
     "number of points", "", 1, 40_000_000, "write their true number, or thin them", whole=True
 )
@@ -224,7 +221,7 @@ EXPOSURE = Quantity("exposure", "s", 0.0, 10.0, "give it in seconds")
 DWELL = Quantity("dwell", "s", 1e-6, 100.0, "give it in seconds")
 RISE = Quantity("rise", "s", 1e-7, 100.0, "give it in seconds")
 
-# An hour at 20 kHz; five channels of it are three gigabytes.
+# An hour at 20 kHz; five channels need 3 GB.
 BUFFER_SAMPLES = Quantity(
     "samples kept", "", 1000, 72_000_000, "keep as many as memory holds", whole=True
 )
@@ -233,12 +230,12 @@ PROCESSES = Quantity("processes", "", 1, 1024, "one a core serves best", whole=T
 SEED = Quantity("seed", "", 0, 2**63 - 1, "give a whole number", whole=True)
 PLAY_RATE = Quantity("rate of playing", "", 0.0, 1e4, "1 = as recorded, 0 = as fast as can be")
 PLAY_TIME = Quantity("time within a recording", "s", 0.0, 1e8, "give it in seconds")
-# A day of blocks of 0.1 s.
+# Messages of a day in blocks of 0.1 s.
 QUEUE_DEPTH = Quantity("depth of a queue", "", 1, 1e6, "give a number of messages", whole=True)
 DOMAIN = Quantity("domain", "", 0, 232, "below 102 Linux leaves its ports to it", whole=True)
 LISTENERS = Quantity("listeners", "", 0, 1000, "0 = begin at once", whole=True)
 TIME_LAPSE = Quantity("time lapse", "", 1e-3, 1e4, "1 = real time")
-# Noise may make a latency a little negative, or more than a lag of next to nothing.
+# Noise may make a latency negative, or larger than a very small lag.
 SHARE = Quantity("share", "", -1e6, 1e6, "give it as a share")
 HARMONICS = Quantity("harmonics of a turn", "", 1, 60, "12 serve most surfaces", whole=True)
 SPEED = Quantity("spindle speed", "rpm", 1e-3, 1e5, "give it in turns a minute", signed=True)
@@ -267,20 +264,19 @@ SENSOR_HEAD = Quantity("sensor head", "", 0, 15, "count from 0", whole=True)
 CHANNEL = Quantity("channel", "", 1, 64, "count from 1", whole=True)
 
 
-# What can be set on a node or a device: name, type, unit, range and meaning, each stated once.
-
-_EXACT = 2**53  # beyond it a float is another number
+# Integers up to here are exact as floats.
+_EXACT = 2**53
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One thing that can be set; the same name in ROS, YAML and here.
+    """A parameter of a node or a device, with the same name in ROS and YAML.
 
-    default: its type is the parameter's
-    quantity: range and unit of a number;  choices: the only values, where they can be listed
-    unset: value that means "not stated", outside the range;  required: the default will not do
-    fixed: read once, when the node starts
+    default: gives the type of the parameter
+    quantity: range and unit of a number;  choices: the allowed values, if they can be listed
+    unset: value outside the range that means "not stated"
+    required: the default is not allowed;  fixed: read once, when the node starts
     """
 
     name: str
@@ -294,7 +290,7 @@ class Parameter:
 
     @property
     def text(self) -> str:
-        """Meaning, range and choices in words."""
+        """Meaning, range and choices, for help texts."""
         parts = [self.description]
         if self.quantity is not None:
             parts.append(self.quantity.range_text)
@@ -305,9 +301,9 @@ class Parameter:
         return "; ".join(parts)
 
     def checked(self, value: object) -> Any:
-        """Return ``value`` in the parameter's type; raise ConfigurationError if it will not do.
+        """Return ``value`` in the parameter's type; raise ConfigurationError if not allowed.
 
-        A whole number is taken where a number is expected, never the other way round.
+        An integer is accepted for a float, but not a float for an integer.
         """
         called = f"parameter {self.name!r} ({self.description})"
         kind = type(self.default)

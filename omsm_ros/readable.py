@@ -1,9 +1,9 @@
-"""Numbers as people read them: SI prefixes, units, rounding, uncertainties.
+"""Numbers in texts: SI prefixes, units, rounding, uncertainties.
 
-Every text for people (messages, verdicts, tables of the command line, pages) takes its numbers
-from here. Plain characters throughout, so that a terminal shows and a search finds them; pages
-replace them by typographic ones (:mod:`omsm_ros.report.page_parts`). A number that the
-reader is to type back stays in the unit of its field instead.
+All texts (messages, verdicts, tables of the command line, pages) format their numbers here. Values
+that are not finite numbers give a dash. The characters are plain, for terminals and searches;
+pages replace them by typographic ones (:mod:`omsm_ros.report.page_parts`). A number that the user
+has to type is given in the unit of its field instead.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from datetime import datetime, timezone
 from omsm_ros.units import DAY_S, NANOSECONDS_PER_S
 
 NOTHING = "–"
-# Nothing smaller than nano: lengths below it are read as 0.31 nm.
+# The smallest prefix is nano: smaller lengths are written as 0.31 nm.
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 _WITHOUT_PREFIX = {"", "%", "°", "°C", "K", "d", "ppm", "kg", "rpm"}
-# A value far smaller than its uncertainty, or far larger, gets no absurd row of digits.
+# Limit for values that are far smaller or larger than their uncertainty.
 _MOST_DECIMALS = 9
-# 0.000319 nm can be read; with more zeros it is 3.19 · 10⁻⁵ nm.
+# Zeros after the decimal point: 0.000319 nm, but 3.19 · 10⁻⁵ nm.
 _MOST_ZEROS = 4
 _FIGURES = {
     "robust_peak_to_valley": "PV of 99.5 %",
@@ -38,18 +38,19 @@ _ZERNIKE_NAMES = {
     (3, -3): "oblique trefoil",
     (4, 0): "spherical aberration",
 }
+# Probabilities below this are written as "< 0.0001".
 _LEAST_PROBABILITY = 1e-4
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def counts_text(counts: Mapping[str, int]) -> str:
-    """Return counts in words, those of none left out: ``3 not ok, 1 duplicate``."""
+    """Return the counts that are not zero as text: ``3 not ok, 1 duplicate``."""
     words = [f"{n} {name.replace('_', ' ')}" for name, n in counts.items() if n]
     return ", ".join(words) or "none"
 
 
 def number(value: object) -> float | None:
-    """Return ``value`` as float if it is a finite number, None if it is anything else."""
+    """Return ``value`` as float if it is a finite number, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     return float(value) if math.isfinite(value) else None
@@ -58,13 +59,12 @@ def number(value: object) -> float | None:
 def quantity(value: object, unit: str, digits: int = 3, signed: bool = False) -> str:
     """Return a number with an SI prefix, rounded to ``digits``: ``83.1 nm``.
 
-    value: in ``unit``, which has no prefix of its own; what is no number gives a dash
-    signed: a plus before what is positive
+    value: in ``unit``, which has no prefix;  signed: write a plus before positive values
     """
     known = number(value)
     if known is None:
         return NOTHING
-    # Rounded first: 999.96 becomes 1.00 k, not 1000.
+    # Rounded first, so that 999.96 becomes 1.00 k, not 1000.
     rounded = _rounded(known, digits)
     exponent = _exponent(rounded, unit)
     tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
@@ -73,22 +73,22 @@ def quantity(value: object, unit: str, digits: int = 3, signed: bool = False) ->
 
 
 def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4) -> str:
-    """Return a value and its standard uncertainty as the GUM wants them: ``339.7 µs ± 1.1 µs``.
+    """Return a value and its standard uncertainty: ``339.7 µs ± 1.1 µs``.
 
-    Two digits of the uncertainty, the value to the same place. Without an uncertainty the value
-    alone, to ``digits``; without a unit no prefix either.
+    The uncertainty has two digits and the value the same decimals (GUM, 7.2.6). Without an
+    uncertainty the value has ``digits``; without a unit there is no prefix.
     """
     known, spread = number(value), number(uncertainty)
     if known is None:
         return NOTHING
     if not spread or spread < 0:
         return quantity(known, unit, digits) if unit else plain(known, digits)
-    # Rounded first: an uncertainty of 0.996 is one of 1.0.
+    # Rounded first, so that 0.996 becomes 1.0.
     spread = _rounded(spread, 2)
     exponent = _exponent(max(abs(known), spread), unit)
     decimals = min(max(1 - math.floor(math.log10(spread)) + exponent, 0), _MOST_DECIMALS)
     tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
-    # What rounds to zero has no sign: adding 0 to -0 gives 0.
+    # Adding 0 removes the sign of -0.
     shown = (round(part / 10.0**exponent, decimals) + 0.0 for part in (known, spread))
     return " ± ".join(f"{part:.{decimals}f}{tail}" for part in shown)
 
@@ -96,8 +96,8 @@ def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4
 def expanded(value: object, uncertainty: object, unit: str = "", signed: bool = False) -> str:
     """Return a value and its expanded uncertainty: ``10.9 nm ± 4.5 nm (k = 2)``.
 
-    uncertainty: standard;  signed: the value may be negative. Of one that may not, and is less
-    than its expanded uncertainty, the bound is all that is known: ``at most 32.0 nm (k = 2)``
+    uncertainty: standard;  signed: the value may be negative. A value that may not, and that is
+        less than its expanded uncertainty, is written as its bound: ``at most 32.0 nm (k = 2)``
     """
     known, spread = number(value), number(uncertainty)
     if known is None or not spread:
@@ -109,7 +109,7 @@ def expanded(value: object, uncertainty: object, unit: str = "", signed: bool = 
 
 
 def figure(name: str) -> str:
-    """Return how a figure of a form is called: ``PV of 99.5 %``, ``rms of points``."""
+    """Return the name of a figure of a form: ``PV of 99.5 %``, ``rms of points``."""
     for field, word in _FIGURES.items():
         name = name.replace(field, word)
     return name.replace("_", " ")
@@ -122,7 +122,7 @@ def zernike(n: int, m: int) -> str:
 
 
 def plain(value: object, digits: int = 3) -> str:
-    """Return a number without a unit, to ``digits``; a dash for anything else."""
+    """Return a number without a unit, to ``digits``."""
     known = number(value)
     if known is None:
         return NOTHING
@@ -135,20 +135,20 @@ def plain(value: object, digits: int = 3) -> str:
 
 
 def percent(share: object, digits: int = 2) -> str:
-    """Return a share as ``0.12 %``; a dash for no number."""
+    """Return a share as ``0.12 %``."""
     known = number(share)
     return NOTHING if known is None else quantity(100 * known, "%", digits)
 
 
 def count(value: object) -> str:
-    """Return a number of things, its thousands apart: ``290 011``; a dash for no number."""
+    """Return an integer with its thousands separated: ``290 011``."""
     if isinstance(value, bool) or not isinstance(value, int):
         return NOTHING
     return f"{value:,}".replace(",", " ")
 
 
 def probability(value: object) -> str:
-    """Return a p-value to three digits, or that it is smaller than one could care for."""
+    """Return a p-value to three digits, or ``< 0.0001``."""
     known = number(value)
     if known is None:
         return NOTHING
@@ -168,7 +168,7 @@ def superscript(power: int) -> str:
 
 
 def _rounded(value: float, digits: int) -> float:
-    """Return the number to so many digits; the largest of all are not rounded up to infinity."""
+    """Return the number rounded to ``digits``, but not up to infinity."""
     rounded = float(f"{value:.{digits - 1}e}")
     return rounded if math.isfinite(rounded) else value
 
@@ -178,7 +178,7 @@ def _exponent(value: float, unit: str) -> int:
     if unit in _WITHOUT_PREFIX or not value:
         return 0
     exponent = 3 * (math.floor(math.log10(abs(value))) // 3)
-    # A millihertz is easily taken for a megahertz.
+    # No millihertz, which is easily read as megahertz.
     least = 0 if unit == "Hz" else min(_PREFIXES)
     return min(max(exponent, least), max(_PREFIXES))
 
@@ -194,18 +194,18 @@ def _fixed(rounded: float, digits: int, exponent: int) -> str:
 
 
 def days(seconds: object) -> str:
-    """Return a time in days, "0.12 d"; what is no number gives a dash."""
+    """Return a time in days, ``0.12 d``."""
     known = number(seconds)
     return NOTHING if known is None else quantity(known / DAY_S, "d", 2)
 
 
 def date_text(when: datetime) -> str:
-    """Return a date and time for a page, "2026-01-31 23:59 UTC"; ``when`` knows its time zone."""
+    """Return date and time of ``when``, with a time zone: ``2026-01-31 23:59 UTC``."""
     return when.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
 def date_text_of_stamp(stamp_ns: object) -> str:
-    """Return a ROS time [ns] as :func:`moment` does; what is no number gives a dash."""
+    """Return a ROS time [ns] as :func:`date_text` does."""
     known = number(stamp_ns)
     if known is None:
         return NOTHING

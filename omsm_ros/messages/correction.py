@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# What the standard uncertainty of each source is of.
+# Name of each source.
 _SOURCES = {
     "probe_noise": "noise of a reading",
     "probe_resolution": "step of a reading",

@@ -1,8 +1,8 @@
 """Uncertainty budget of a scan, and the traffic light that compares it with the accuracy asked for.
 
 A source is *evaluated* from data, *declared*, or *not evaluated*; then its contribution is unknown,
-not zero. The light is green if every source that matters was evaluated or declared and is small
-enough, amber if one was not, and red if a known one is too large or the calibration was rejected.
+not zero. The light is green if all sources are known and small enough. It is amber if a source is
+not evaluated, and red if the uncertainty is too large or the calibration was rejected.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ def traffic_light_of(
     accuracy: asked for, k = 2 [m]; None takes the uncertainty that is stated
     pose_open: sources of the part's pose that matter; none if the scan is not compared with a
         nominal surface, or is fitted to it
-    registered: True if other degrees of freedom of the pose are fitted
+    registered: True if other parameters of the pose are fitted
     doubts: further reasons against green
     """
     uncertainty = 2 * sum(size**2 for size in heights.values()) ** 0.5

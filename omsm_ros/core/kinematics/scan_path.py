@@ -138,8 +138,8 @@ def content_frequency(z: FloatArray, sample_period: float) -> float:
 
     It is 0 at standstill. The white noise of the encoder is estimated in the upper half of the
     band and subtracted. A slow change of the velocity from end to end would be a jump of the
-    periodic continuation with all frequencies in it, so a cubic is subtracted. Whole turns have no
-    such jump, but a cubic would make one; therefore the lower frequency of both ways is returned.
+    periodic continuation with all frequencies in it, so a cubic is subtracted. For whole turns,
+    which have no such jump, a cubic would make one. The lower frequency of both ways is returned.
     """
     velocity = np.diff(z)
     if len(velocity) > _LONG:

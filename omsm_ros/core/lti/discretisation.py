@@ -8,8 +8,8 @@ samples, over which the differential equation of G is integrated exactly:
 Poles are mapped by exp(pT): one far above the Nyquist frequency becomes a response within the
 sample, while the bilinear transform would make it oscillate at Nyquist. The zeros are those of the
 Rosenbrock pencil of this system. The state space is a series of sections of first and second
-order, each scaled by its own frequency, because in companion form poles that lie decades apart
-lose the digits of the slow ones. The delay is a Lagrange interpolator of the same order. At 0 Hz
+order, each scaled by its own frequency. A companion form would lose the digits of slow poles. The
+delay is a Lagrange interpolator of the same order. At 0 Hz
 the gain is G(0).
 """
 

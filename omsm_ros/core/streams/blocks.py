@@ -180,8 +180,8 @@ class AccelerationBlock(Block):
 class AngleUnwrapper:
     """Unwraps an angle [rad] block by block, so that it can be delayed and interpolated.
 
-    A jump is a step that differs by a whole turn from the median of the steps around it, so that
-    a spindle may turn by more than half a turn from sample to sample.
+    A jump is a step that differs by a whole turn from the median of the steps around it. A
+    spindle may turn by more than half a turn from sample to sample.
     """
 
     def __init__(self) -> None:

@@ -121,7 +121,7 @@ def assemble(
 ) -> MotionRecord:
     """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
 
-    by_stamps: pair them by their stamps also at equal rates
+    by_stamps: pair them by their stamps also at equal rates.
 
     Raises DataError if nothing can be paired, for more than one recording, or if the counters of
     axes and distance slipped against each other.

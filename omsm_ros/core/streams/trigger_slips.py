@@ -12,9 +12,9 @@ wanders while it is estimated from arrivals. The error of that estimate is bound
 a mean of n arrivals moves by 1/n of their scatter with the next one and is wrong by 1/√n of it,
 which is √n times the movement.
 
-A pair waits for a verdict: until stamps of both streams that agree have come after it, at the start
-until the first verdict, and after a stamp that is off until the stamps that follow it are judged.
-Blocks of one driver carry the same stamps to the nanosecond and never wait.
+A pair waits until stamps of both streams that agree have come after it. At the start it waits for
+the first verdict, and after a stamp that is off for the verdict on the stamps that follow. Blocks
+of one driver carry the same stamps to the nanosecond and never wait.
 
 A decision uses only the stamps of blocks up to its count, so that live and offline agree.
 """

@@ -20,6 +20,7 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import Gradient
+from omsm_ros.core.surface.zernike_terms import jacobi_step
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, Quantity
 
@@ -245,8 +246,8 @@ def con_series(coefficients: Sequence[float], x: FloatArray) -> Series:
 def freeform_series(coefficients: Sequence[float], m: int, x: FloatArray) -> Series:
     """Return Σ a_n Q_n^m(x) of freeforms, m ≥ 1, and its derivative by x.
 
-    By definition (2012, sec. 3) Q_n^m has degree n, a leading coefficient of sign (−1)ⁿ, and
-    ``u^m cos mθ Q_n^m(u²)`` is orthonormal in the gradient, averaged over θ and, with the weight
+    Q_n^m has degree n and a leading coefficient of sign (−1)ⁿ (2012, sec. 3). The functions
+    ``u^m cos mθ Q_n^m(u²)`` are orthonormal in the gradient, averaged over θ and, with the weight
     1/√(1 − u²), over u.
     """
     # Jacobi polynomials of this weight are well conditioned up to high degrees.
@@ -278,19 +279,13 @@ def _jacobi_series(
     coefficients: Sequence[float], alpha: float, beta: float, x: FloatArray
 ) -> Series:
     """Return Σ a_k P_k^(α,β)(2x − 1) and its derivative by x, by the three-term recurrence."""
-    t, zero, both = 2 * x - 1, np.zeros_like(x), alpha + beta
+    t, zero = 2 * x - 1, np.zeros_like(x)
     before: Series = (zero, zero)
     now: Series = (zero + 1, zero)
     total, slope = zero, zero
     for k, coefficient in enumerate(coefficients):
         total, slope = total + coefficient * now[0], slope + coefficient * now[1]
-        if k == 0:
-            a, b, c = (both + 2) / 2, (alpha - beta) / 2, 0.0
-        else:
-            scale = 2 * (k + 1) * (k + 1 + both) * (2 * k + both)
-            a = (2 * k + both + 1) * (2 * k + both + 2) * (2 * k + both) / scale
-            b = (2 * k + both + 1) * (alpha**2 - beta**2) / scale
-            c = 2 * (k + alpha) * (k + beta) * (2 * k + both + 2) / scale
+        a, b, c = jacobi_step(k, alpha, beta)
         factor = a * t + b
         value = factor * now[0] - c * before[0]
         rate = factor * now[1] + 2 * a * now[0] - c * before[1]

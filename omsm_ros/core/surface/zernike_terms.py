@@ -84,6 +84,18 @@ def rms_of(term: ZernikeIndex) -> float:
     return float(1 / np.sqrt((1 if term.m == 0 else 2) * (term.n + 1)))
 
 
+def jacobi_step(k: int, alpha: float, beta: float) -> tuple[float, float, float]:
+    """Return a, b, c of ``P_(k+1)(t) = (a t + b) P_k(t) − c P_(k−1)(t)``, P = P^(alpha, beta)."""
+    both = alpha + beta
+    if k == 0:
+        return (both + 2) / 2, (alpha - beta) / 2, 0.0
+    scale = 2 * (k + 1) * (k + 1 + both) * (2 * k + both)
+    a = (2 * k + both + 1) * (2 * k + both + 2) * (2 * k + both) / scale
+    b = (2 * k + both + 1) * (alpha**2 - beta**2) / scale
+    c = 2 * (k + alpha) * (k + beta) * (2 * k + both + 2) / scale
+    return a, b, c
+
+
 def _jacobi(
     t: FloatArray, m: int, highest: int, slopes: bool
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
@@ -92,13 +104,7 @@ def _jacobi(
     before_slope, slope = (np.zeros_like(t) if slopes else np.zeros(()) for _ in range(2))
     yield value, slope
     for k in range(highest):
-        if k == 0:
-            a, b, c = (m + 2) / 2, -m / 2, 0.0
-        else:
-            scale = 2 * (k + 1) * (k + 1 + m) * (2 * k + m)
-            a = (2 * k + m + 1) * (2 * k + m + 2) * (2 * k + m) / scale
-            b = -(2 * k + m + 1) * m**2 / scale
-            c = 2 * k * (k + m) * (2 * k + m + 2) / scale
+        a, b, c = jacobi_step(k, 0, m)
         factor = a * t + b
         if slopes:
             slope, before_slope = factor * slope + a * value - c * before_slope, slope
