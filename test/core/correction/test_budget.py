@@ -232,7 +232,7 @@ def test_a_declared_tilt_is_in_the_uncertainty_of_each_point(
     radius = 1e-5 * np.hypot(*(getattr(corrector.trace.points(), name) for name in "xy"))
     added = np.sqrt(np.mean(tilted**2 - without**2))
     assert added == pytest.approx(np.sqrt(np.mean(radius**2)), rel=1e-3)
-    # What shifts a point needs the slope there.
+    # A lateral shift needs the slope at the point.
     assert "decentre" not in corrector.budget
     known = replace(options, surface=PAPER_MIRROR)
     corrector, both = corrected(true_calibration, small_scan, known)

@@ -152,6 +152,7 @@ def test_points_carry_the_time_of_their_own_first_sample(scan: Recording) -> Non
         for whole in (scan.axes, scan.distance)
     )
     corrector = Corrector(CALIBRATION)
+    assert len(distance) == 20
     for axis_block, _ in zip(axes, distance, strict=True):
         corrector.push_axes(axis_block)  # type: ignore[arg-type]
     for block in distance:

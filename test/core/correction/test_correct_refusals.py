@@ -1,4 +1,4 @@
-"""What the correction refuses, and names."""
+"""Input that the correction refuses, with messages."""
 
 from __future__ import annotations
 

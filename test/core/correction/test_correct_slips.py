@@ -79,7 +79,7 @@ def test_live_and_offline_agree_to_the_last_bit(
     offline, expected, _ = corrected(*streams, 0, CorrectionOptions())
     live, account, _ = corrected(*streams, together, CorrectionOptions())
     assert account == expected
-    # Of blocks that waited together, a point is stamped by the first one.
+    # Points of blocks that waited together have the stamp of the first block.
     assert same_points(replace(live, stamp_ns=0), replace(offline, stamp_ns=0))
 
 

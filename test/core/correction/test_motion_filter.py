@@ -85,7 +85,7 @@ def test_a_spindle_that_begins_anew_on_every_turn_is_delayed_alike(
         both[0] += counting.push(turned)
         both[1] += anew.push(wrapped)
     expected, found = (np.concatenate([r.values[C] for r in runs]) for runs in both)
-    # Of the first samples nobody knows which way they turn.
+    # The direction of rotation is unknown in the first samples.
     settled = slice(settling(), None)
     assert np.allclose(np.exp(1j * found)[settled], np.exp(1j * expected)[settled], atol=1e-9)
     lag = speed * (10 + np.arange(len(expected))) * 1e-3 - expected
@@ -163,7 +163,7 @@ def test_a_run_just_long_enough_to_start_on_is_filtered() -> None:
 
 
 def test_a_slow_pole_of_small_share_is_forgotten_before_its_decay_ends():
-    """Beside a pole of 1 ms a relaxation of 0.01 % with 2 s: its start is soon small."""
+    """A relaxation of 0.01 % with 2 s next to a pole of 1 ms settles soon."""
     size, slow, fast = 1e-4, 2.0, 1e-3
     dynamics = TransferFunction.from_ascending(
         [1.0, slow * (1 - size)], [1.0, slow + fast, slow * fast]

@@ -59,7 +59,7 @@ UNLIMITED = MachineLimits(
 
 
 def predicted(calibration: Calibration, z: np.ndarray, budget: float = 50e-9) -> Prediction:
-    """What the dynamics alone allow."""
+    """Return the prediction without limits of the machine."""
     return predict_error(calibration, ScanPath(z=z, sample_period=PERIOD), budget, UNLIMITED)
 
 

@@ -1,4 +1,4 @@
-"""What the correction leaves of a motion: closed forms on sines, and what scales with what."""
+"""Residual after the correction: closed forms for sines, and laws of scale."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_within_the_band_only_the_covariance_is_left(hertz: float) -> None:
     passed = abs(G.response(np.array([hertz]))[0]) ** 2
     rms = AMPLITUDE * omega * LAG_U * passed / np.sqrt(2)
     assert np.sqrt(np.mean(left(calibration(), sine(hertz)))) == pytest.approx(rms, rel=0.01)
-    # What passes the band's filter is a millionth of the motion, of which 1 - G is left.
+    # The filter of the band passes a millionth of the motion, of which 1 - G is left.
     missed = abs(1 - G.response(np.array([hertz]))[0])
     assert np.sqrt(np.max(left(EXACT, sine(hertz)))) < 1e-4 * missed * AMPLITUDE
 
@@ -97,7 +97,7 @@ def test_what_does_not_follow_linearly_is_left_at_rest_too() -> None:
 
 
 def test_noise_and_undetected_error_are_kept_separate() -> None:
-    """Of a variance of which a quarter is noise, three quarters could hide."""
+    """A quarter of the variance is noise, three quarters are undetected model error."""
     noise = np.diag([0.0, LAG_U**2 / 4, 0.0])
     reported = calibration(
         certificate=certified_by({"noise_covariance": [float(v) for v in noise.ravel()]})
@@ -110,7 +110,7 @@ def test_noise_and_undetected_error_are_kept_separate() -> None:
 
 
 def test_the_largest_is_where_the_motion_is_fastest() -> None:
-    """All of the covariance counts, of noise and what could hide: rate times lag, through G²."""
+    """The whole covariance contributes: rate times lag, through G²."""
     z = sine(5.0) * (1.5 + 0.5 * np.tanh((TIME - 3.0) / 0.3))
     noise = [float(v) for v in np.diag([0.0, LAG_U**2 / 4, 0.0]).ravel()]
     expected = 2 * AMPLITUDE * 2 * np.pi * 5.0 * LAG_U * abs(G.response(np.array([5.0]))[0]) ** 2

@@ -18,7 +18,7 @@ from omsm_ros.core.streams.statistics import RunningScatter
 NOISE = 10e-9
 COUNT = 20_000
 SAMPLE = np.arange(COUNT)
-# What the paper's mirror makes Z do at four times the paper's speed.
+# Motion of Z on the paper's mirror at four times the paper's speed.
 SURFACE = 150e-6 * np.sin(2 * np.pi * 4 * SAMPLE * 1e-3)
 
 

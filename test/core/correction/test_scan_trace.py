@@ -75,7 +75,7 @@ def test_a_scan_in_any_pieces_leaves_the_same_points(cuts: list[int], most: int)
     expected, found = whole(most).points(), trace.points()
     for name in ("time", "z", *NAMES, "dynamics"):
         assert np.array_equal(column(found, name), column(expected, name)), name
-    # What each piece is returned as are its own points, all of them.
+    # Each call returns all points of its own piece.
     assert sum(map(len, seen)) == trace.seen == COUNT
     together = np.concatenate([piece.z for piece in seen])
     assert np.array_equal(together, whole().points().z)

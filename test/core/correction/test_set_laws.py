@@ -136,7 +136,7 @@ def test_each_reason_is_reported_once() -> None:
 
 @pytest.mark.parametrize("lags", [(3e-4, 1e-4), (1e-4, -3e-4), (-1e-4, -3e-4)])
 def test_an_open_latency_may_be_any_part_of_the_largest_lag(lags: tuple[float, float]) -> None:
-    """Of a lead too: what counts is how far the probe may be from the slides."""
+    """A lead counts too: the distance of the probe from the slides matters."""
     latency = together(*map(member, lags)).latency
     assert not latency.resolved
     assert latency.beside_z_s == pytest.approx(unresolved_latency(3e-4).beside_z_s)

@@ -26,7 +26,7 @@ LAG_NOISE = 1e-6
 
 
 def with_noise(scale: float = 1.0) -> Calibration:
-    """The gain could hide, and the lag is known to a microsecond of noise."""
+    """The gain may be undetected, and the lag is known to a microsecond."""
     noise = np.diag([0.0, 0.0, LAG_NOISE**2])
     known = calibration()
     certificate = {
@@ -116,7 +116,7 @@ def calibration() -> Calibration:
 
 @pytest.mark.parametrize("phase", [0.0, 1.0, 2.5, 4.0])
 def test_uncertainty_of_a_sine_is_the_open_share_of_its_swing(phase):
-    """Whatever the speed and curvature at the first sample."""
+    """For any speed and curvature at the first sample."""
     z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME + phase)
     # In blocks, for a queue of minutes is not kept.
     corrector, found = Corrector(calibration(), OPTIONS), []

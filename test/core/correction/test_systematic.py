@@ -102,6 +102,7 @@ def test_geometry_is_what_the_kinematics_say(name: str, points: ScanPoints) -> N
 def test_the_spindle_is_the_twins(points: ScanPoints) -> None:
     """Both quadratures: the second is a quarter of a turn of the vector later."""
     wave = [Harmonic(amplitude=1.0, per_turn=2, phase_rad=phase) for phase in (0.0, np.pi / 2)]
+    assert len(fields("spindle_axial", points)) == len(wave)
     for number, harmonic in enumerate(wave):
         axes = type("Axes", (), {"x": points.slide_x, "y": points.slide_y, "c": points.c})()
         axial = SpindleError(axial_m=(harmonic,)).shift(points.time, axes, [])
@@ -111,7 +112,7 @@ def test_the_spindle_is_the_twins(points: ScanPoints) -> None:
         shifted = Sphere(0.1).height(points.x, points.y)
         on_sphere = replace(points, height=shifted).with_slopes(Sphere(0.1))
         across = fields("spindle_radial", on_sphere)[number]
-        # Of a sphere only what goes along the radius counts, here X of the machine.
+        # On a sphere only the component along the radius matters, here X of the machine.
         expected = radial.x * points.slide_x / 0.1
         # To second order in the aperture over the radius of curvature.
         assert np.allclose(across, -expected, atol=0.01 * np.max(abs(expected)))
@@ -150,6 +151,7 @@ def test_places_that_are_one_but_for_their_last_bits_have_no_slope(points: ScanP
 
 def test_without_slopes_what_needs_them_is_refused() -> None:
     blind = replace(spiral_points(50), slope_x=None, slope_y=None)
+    assert 5 < sum(kind.needs_slope for kind in KINDS.values()) < len(KINDS)
     for name, kind in KINDS.items():
         if kind.needs_slope:
             with pytest.raises(DataError, match="give a nominal surface"):

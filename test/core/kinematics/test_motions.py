@@ -113,7 +113,7 @@ def test_each_turn_of_a_spiral_is_a_feed_nearer(speed):
 
 
 def test_a_spindle_that_turns_backwards_sees_the_mirror_image():
-    """Of a surface that is its own mirror image, the same heights."""
+    """A surface with mirror symmetry has the same heights in both directions."""
     time = np.linspace(0, 3, 200)
     there, back = (Spiral(Toroid(0.05, 0.08), 5e-3, 1e-3, v).positions(time) for v in (40.0, -40.0))
     np.testing.assert_allclose(back.z, there.z, atol=1e-18)
@@ -173,7 +173,7 @@ def test_a_multisine_swings_before_its_start_and_repeats_after_a_common_period()
 
 
 def test_schroeders_phases_keep_the_peak_below_that_of_equal_phases():
-    """Of sixteen lines in step the peak is sixteen amplitudes; of white noise four."""
+    """Sixteen lines in phase have a peak of sixteen amplitudes, white noise of four."""
     motion = Multisine(frequencies=tuple(0.5 * np.arange(1, 17)), amplitude=1.0)
     z = motion.positions(np.linspace(0, 2, 20_001)).z
     assert np.std(z) == pytest.approx(np.sqrt(8), rel=1e-3)

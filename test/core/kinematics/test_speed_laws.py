@@ -1,4 +1,4 @@
-"""What a path says of its speed: polynomials, units, reversal, any cut into blocks."""
+"""Speed limits of a path: polynomials, units, reversal, any division into blocks."""
 
 from __future__ import annotations
 
@@ -126,6 +126,7 @@ def test_a_path_that_is_run_faster_may_be_run_less_fast_by_as_much(factor):
 
 
 def test_at_its_own_speed_factor_each_limit_is_just_reached():
+    assert len(limits_of(SCAN)) > 5
     for name, limit in limits_of(SCAN).items():
         if name == "spacing at the rim":
             continue
@@ -176,6 +177,7 @@ def test_the_spacing_is_the_longest_way_between_neighbours():
 
 def test_a_path_without_motion_may_be_run_as_fast_as_is_ever_said():
     still = ScanPath(z=np.full(3000, 1e-3), sample_period=PERIOD)
+    assert limits_of(still)
     for limit in limits_of(still).values():
         assert limit.speed_factor == FASTEST
 
@@ -195,7 +197,7 @@ def test_a_constant_offset_of_the_path_is_followed():
 
 
 def test_a_delay_behind_the_encoder_costs_its_time_times_the_velocity():
-    """Of a ramp: 5 ms at 20 mm/s, and two time constants of the servo."""
+    """The following error of a ramp: 5 ms at 20 mm/s, and two time constants of the servo."""
     ramp, delayed = 0.02 * TIME, TransferFunction(np.ones(1), np.ones(1), 5e-3)
     late = 2 / (2 * np.pi * 50.0)
     assert following_error(ramp, PERIOD, 50.0) == pytest.approx(0.02 * late, rel=1e-6)

@@ -26,7 +26,7 @@ def test_the_plan_comes_home():
 
 
 def test_a_motion_about_its_middle_tells_creep_from_drift():
-    """What is left of a relaxation as slow as the test beside gain, lag, offset and drift."""
+    """Part of a slow relaxation that gain, lag, offset and drift do not explain."""
     time = np.arange(0.0, PLAN.duration, 1e-3)
     to_the_end = StepPlan(PLAN.starts, (9.8e-6,) * 10 + (-9.8e-6,) * 10, PLAN.rise, PLAN.duration)
     left = [

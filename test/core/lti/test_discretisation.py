@@ -193,7 +193,7 @@ def test_a_resonance_that_folds_to_slow_motion_is_refused() -> None:
 
 
 def test_a_late_differentiator_keeps_its_gain():
-    """Without a gain at rest to hold on to, the scale comes from slow motion, delay and all."""
+    """With G(0) = 0 the gain is matched at slow motion, including the delay."""
     late = TransferFunction([0.0, 1.0], [1.0, 1e-2], 5.3e-3)
     frequency = np.array([0.5, 1.0, 3.0])
     found = discretise(late, 1e-3).response(frequency)

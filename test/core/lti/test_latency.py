@@ -1,4 +1,4 @@
-"""What a calibration says of its latency, and what it costs where nobody knows."""
+"""Latency of a calibration, and its uncertainty where it is not resolved."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def test_the_scale_of_the_response_does_not_count(identified):
 
 
 def test_what_the_terms_leave_is_the_real_pole():
-    """One pair and one real pole, parallel: the real pole's share of G(0) is left at rest."""
+    """One pair and one real pole, parallel: the real pole's share of G(0) is left at 0 Hz."""
     term, rate, share = ModalTerm(1.0, 40.0, 0.1), 2 * np.pi * 300.0, 0.1
     omega = 2 * np.pi * term.frequency
     pair = ModalTerm((1 - share) * omega**2, term.frequency, term.damping)
@@ -166,6 +166,7 @@ def test_entries_are_json_with_units(identified):
 def test_of_poles_that_coincide_nothing_is_known():
     double = TransferFunction([1.0], [1.0, 2e-3, 1e-6])
     entries = mode_entries(double, 1e-12 * np.eye(4))
+    assert len(entries) == 2
     for mode, entry in zip(known_modes(double, 1e-12 * np.eye(4)), entries, strict=True):
         assert mode.frequency_uncertainty == np.inf
         assert entry["frequency_uncertainty_hz"] is None

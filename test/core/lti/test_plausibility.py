@@ -28,7 +28,7 @@ GOOD = Calibration(
 
 
 def changed(**parts: Any) -> Calibration:
-    """What comes through the door when ``parts`` of a good calibration were changed."""
+    """Return the calibration read from a good one with changed ``parts``."""
     dynamics = parts.pop("dynamics", GOOD.dynamics)
     content = GOOD.content() | {
         "numerator": dynamics.numerator.tolist(),

@@ -60,7 +60,7 @@ def test_noise_of_the_motion_counts_where_a_resonance_lifts_it():
     samples, period, omega = 8192, 1e-3, 2 * np.pi * 60
     resonance = TransferFunction.from_ascending([1.0], [1.0, 0.04 / omega, omega**-2])
     rng, time = np.random.default_rng(6), period * np.arange(samples)
-    # What a step excites, and its derivative by the frequency.
+    # Response to a step, and its derivative with respect to the frequency.
     ringing = np.exp(-0.02 * omega * (time % 1.0)) * np.array([np.cos(omega * time), time % 1.0])
     ringing[1] *= np.sin(omega * time)
     columns, motion = ringing.T, 1e3 * np.sign(np.sin(2 * np.pi * time))
@@ -249,7 +249,7 @@ def test_a_known_disagreement_of_the_phase_alone_narrows_the_trust():
 
 
 def test_uncertainty_of_the_low_frequency_delay_with_a_gain_at_rest():
-    """Of a numerator that does not begin with 1: by finite differences."""
+    """Finite differences, for a numerator that does not begin with 1."""
     g = TransferFunction([2.0, -3e-3], [1.0, 5e-3], 1e-3)
     values = np.array([2.0, -3e-3, 5e-3, 1e-3])
 
@@ -299,7 +299,7 @@ def test_what_is_known_exactly_has_no_uncertainty():
 
 
 def test_noise_through_rows_is_the_same_in_blocks_as_at_once(monkeypatch):
-    """Of white noise it is their Gram matrix times the variance, however many are in memory."""
+    """For white noise it is the Gram matrix of the rows times the variance."""
     rows = np.random.default_rng(9).normal(size=(7, 90))
     for length in (90, 96, 101):
         noise = np.full(length // 2 + 1, 2.5)

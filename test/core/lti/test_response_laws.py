@@ -83,6 +83,8 @@ def test_partial_fractions_add_up_to_the_response() -> None:
 
 
 def test_zeros_and_poles_are_where_the_response_ends() -> None:
+    assert len(G.zeros())
+    assert len(G.poles())
     for zero in G.zeros():
         assert abs(G.at(np.array([zero]))[0]) < 1e-9
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -163,7 +165,7 @@ def test_slow_phase_is_as_uncertain_as_the_lag() -> None:
     assert band.phase[0] == pytest.approx(2 * np.pi * 0.01 * lag, rel=1e-4)
     along = slow_motion_jacobian(G)[0]
     assert np.sqrt(along @ covariance @ along) == pytest.approx(lag, rel=1e-9)
-    # At rest the relative gain is as uncertain as the first coefficient.
+    # At 0 Hz the relative gain is as uncertain as the first coefficient.
     expected = np.sqrt(covariance[0, 0]) / G.dc_gain
     assert band.gain[0] == pytest.approx(expected, rel=1e-4)
 
@@ -228,7 +230,7 @@ def test_the_stated_uncertainty_is_the_scatter_over_repetitions() -> None:
         inside = (found.frequency > 5) & (found.frequency < 100)
         off.append((found.response - 1)[inside])
         stated.append(found.uncertainty[inside])
-    # Of gain and of phase each; overlapping segments are a little worth less than they count.
+    # Per part, gain or phase; overlapping segments are worth a little less than they count.
     scatter = np.sqrt(np.mean(np.abs(off) ** 2) / 2)
     assert scatter == pytest.approx(np.sqrt(np.mean(np.square(stated))), rel=0.2)
 

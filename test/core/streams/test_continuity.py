@@ -1,4 +1,4 @@
-"""What the trigger count and the stamp tell about a stream."""
+"""Gaps, repetitions and restarts of a stream by trigger count and stamp."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_after_an_end_everything_is_new(stream: Stream) -> None:
 
 
 def test_a_clock_set_back_is_seen_after_messages_that_a_bag_joined() -> None:
-    """Of a block of a minute the last message counts, as where each comes by itself."""
+    """The last message of a joined block counts, as when messages come singly."""
     parts = np.array([(100 * k, 100_000_000 * k) for k in range(600)])
     for joined in (False, True):
         sequence = TriggerCount()

@@ -1,4 +1,4 @@
-"""What is kept of a long stream: even, bounded, and the same however it was cut."""
+"""The selection from a long stream is even, bounded and independent of its division."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def test_a_slip_just_before_the_end_is_kept_back_too(last: int) -> None:
 
 @pytest.mark.parametrize("missed", [0, 10])
 def test_a_pause_settles_what_came_before_it_as_the_end_does(missed: int) -> None:
-    """What is settled live in the silence is settled alike by the stamps, offline."""
+    """Pairs that a live node settles in a pause are settled alike offline, by their stamps."""
     before = LONG[:12_100]
     after = Device(np.arange(20_000, 26_000), first=12_100, jitter=2e-5, seed=3).blocks()
     axes = Device(before, jitter=2e-5, seed=1).blocks()

@@ -129,7 +129,7 @@ def test_a_false_start_of_one_stream_does_not_cost_the_scan() -> None:
 def test_one_block_with_a_wrong_stamp_costs_blocks_and_not_the_scan(
     wrong_s: float, swap: bool
 ) -> None:
-    """Of a stamp far ahead the stream's next block begins anew; of one long ago it goes on."""
+    """After a stamp far ahead the next block starts a session; after an old one it continues."""
     now = 1.7e9
     good = [run(0, k, 100, now + k * 1e-3) for k in range(0, 60_000, 100)]
     fits = [run(0, k, 100, now + k * 1e-3) for k in range(0, 10_000, 100)]

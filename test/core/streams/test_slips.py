@@ -66,7 +66,7 @@ class Device:
 
 @dataclass
 class Joined:
-    """What became of two streams."""
+    """Pairs and accounts of two streams."""
 
     axes: list[int] = field(default_factory=list)
     distance: list[int] = field(default_factory=list)
@@ -133,9 +133,6 @@ ALL = np.arange(6000)
 
 def without(numbers: np.ndarray, first: int, samples: int) -> np.ndarray:
     return np.delete(numbers, np.arange(first, first + samples))
-
-
-# What slips.
 
 
 @pytest.mark.parametrize("missed", [1, 10, 100])
@@ -212,9 +209,6 @@ def test_it_heals_when_the_counts_agree_again() -> None:
     assert np.all((done.wrong >= 2000) & (done.wrong < 4000))
     assert done.axes[-1000:] == done.distance[-1000:]
     assert 1000 < done.slipped < 2600
-
-
-# What does not.
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -297,7 +291,7 @@ def test_time_lapse_raises_no_alarm(lengths: tuple[int, int]) -> None:
     done = join(*streams)
     assert set(done.slips) == {0}
     assert done.seen_from is None
-    # Nor if one of the two links is late by so many of its short samples.
+    # Nor if one of the two links is late by several of its short samples.
     late = [(_stamped(block, block.stamp_ns + 5_000_000), n) for block, n in streams[0]]
     assert set(join(late, streams[1]).slips) == {0}
 
@@ -317,9 +311,6 @@ def test_a_link_known_to_be_late_is_tolerated() -> None:
     done = join(late, Device(ALL).blocks(), CommonTrigger(stamp_tolerance=0.016))
     assert set(done.slips) == {0}
     assert done.seen_from == 17
-
-
-# Whatever the order.
 
 
 @pytest.mark.parametrize("seed", range(4))

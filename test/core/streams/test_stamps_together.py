@@ -116,7 +116,7 @@ def test_few_stamps_are_looked_at_by_themselves(name: str, monkeypatch: pytest.M
     monkeypatch.setattr(trigger_slips.TriggerSlipDetector, "_observe", counted)
     axes, probe = RECORDINGS[name]()
     join(as_a_bag_gives_them(axes), as_a_bag_gives_them(probe), CommonTrigger())
-    # Of 1537: those of the first two seconds, and a few where streams are cut.
+    # At most 400 of 1537: those of the first two seconds, and a few where streams are cut.
     assert len(seen) < 400
 
 

@@ -1,4 +1,4 @@
-"""What counters and stamps say, of recordings whose faults are known because they were made."""
+"""Faults found in recordings with known faults."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ def test_off_the_axis_a_partly_covered_rim_counts_by_its_covered_part(off, clipp
     assert weights.max() < 20
     assert weights[weights > 5].sum() < 1e-3 * weights.sum()
     assert np.mean(weights) ** 2 / np.mean(weights**2) > 0.7
-    # What evenly laid places say of the same region.
+    # Evenly spaced points in the same region.
     line = np.linspace(-1.1 * RADIUS, 1.1 * RADIUS, 1500)
     u, v = (axis.ravel() for axis in np.meshgrid(line, line))
     inside = np.hypot(u + dx, v + dy) <= RADIUS
@@ -163,7 +163,7 @@ def test_a_hole_that_nobody_scanned_has_no_area() -> None:
     kept = np.hypot(x, y) > 0.5 * RADIUS
     weights = area_weights(x[kept], y[kept])
     square = np.average(x[kept] ** 2, weights=weights) / RADIUS**2
-    # Of the square (-1, 1)² without a disc of half its width: (4/3 - π/64) / (4 - π/4).
+    # Mean square over (-1, 1)² without a disc of half its width: (4/3 - π/64) / (4 - π/4).
     assert square == pytest.approx((4 / 3 - np.pi / 64) / (4 - np.pi / 4), rel=0.01)
 
 
@@ -233,9 +233,6 @@ def test_a_line_scanned_to_and_fro_has_the_integral_of_one_way() -> None:
     along = np.concatenate([there, there[::-1][1:] + 1e-4])
     weights = area_weights(RADIUS * along, 0 * along)
     assert np.average(along**2, weights=weights) == pytest.approx(1 / 3, rel=1e-2)
-
-
-# Whatever the frame.
 
 
 @pytest.mark.parametrize("path", [lambda: spiral(9000, 30.0), raster])

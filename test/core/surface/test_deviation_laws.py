@@ -20,7 +20,7 @@ WHOLE = RNG.integers(1, 5, 400)
 
 @pytest.mark.parametrize("tilt", [False, True])
 def test_a_point_of_weight_three_is_three_points(tilt):
-    """And these by numpy's least squares of them all."""
+    """Weights are repetitions, by least squares of numpy."""
     left = form.level(X, Y, ERROR, tilt=tilt, weights=WHOLE.astype(float))
     x, y, error = (np.repeat(v, WHOLE) for v in (X, Y, ERROR))
     design = np.column_stack([np.ones_like(x), x * 1e3, y * 1e3])[:, : 3 if tilt else 1]

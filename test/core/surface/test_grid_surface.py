@@ -71,7 +71,7 @@ def test_a_missing_place_silences_the_four_cells_around_it_and_no_other():
     np.testing.assert_array_equal(np.isnan(surface.height(x, y)), silent)
     for slope in surface.gradient(x, y):
         np.testing.assert_array_equal(np.isnan(slope), silent)
-    # What stands in for the missing place bends the cells beside it by far less than the map.
+    # The value for the missing place changes the cells next to it much less than the map varies.
     near = np.abs(surface.height(x, y) - whole.height(x, y))[~silent]
     assert near.max() < 0.1 * np.ptp(grid.height)
 

@@ -1,4 +1,4 @@
-"""What is a map, and what only looks like one."""
+"""Points that are a map, and points that only resemble one."""
 
 import numpy as np
 import pytest

@@ -232,7 +232,7 @@ def test_freeform_terms_are_orthonormal_in_the_gradient():
 
 @pytest.mark.parametrize(("n", "m"), [(0, 1), (3, 1), (2, 2), (5, 4), (12, 9)])
 def test_a_freeform_term_is_a_polynomial_of_its_degree_with_alternating_sign(n, m):
-    """What the gradient leaves open: the degree in u², and the sign of its highest power."""
+    """Degree in u² and sign of the highest power, which the gradient does not determine."""
     x = np.linspace(0.05, 1, n + 3)
     along = QFreeform(1.0, (QTerm(n, m, 1.0),)).height(np.sqrt(x), 0 * x) / np.sqrt(x) ** m
     differences = np.diff(along, n)
