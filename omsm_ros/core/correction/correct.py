@@ -232,7 +232,7 @@ class Corrector:
             raise CalibrationError("correction.other_rate", period=period, calibrated=expected)
         self._period = period
         known = self._calibration
-        lag = lateral_lag(known, self._options)
+        lag = latency_in_use(known, self._options)
         members = known.members if isinstance(known, CalibrationSet) else (known,)
         filters = [MotionFilters.of(member, period, lag) for member in members]
         self._noise_gain = max(each.height.noise_gain for each in filters)
@@ -316,7 +316,7 @@ def _as_slice(chosen: BoolArray) -> BoolArray | slice:
     return slice(first, last) if np.sum(chosen) == last - first else chosen
 
 
-def lateral_lag(calibration: Calibration, options: CorrectionOptions) -> float:
+def latency_in_use(calibration: Calibration, options: CorrectionOptions) -> float:
     """Return the delay of X, Y, B and C [s]: the stated one, else the calibration's latency."""
     stated = options.lateral_lag
     return calibration.latency.delay_s if stated is None else stated

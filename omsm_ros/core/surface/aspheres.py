@@ -41,7 +41,7 @@ def curvature_of(radius: float | None) -> float:
     return 0.0 if radius is None else 1 / radius
 
 
-def root_of(argument: FloatArray) -> FloatArray:
+def real_root(argument: FloatArray) -> FloatArray:
     """Return the square root, NaN unless the argument is positive."""
     return np.where(argument > 0, np.sqrt(np.maximum(argument, 0.0)), np.nan)
 
@@ -71,7 +71,7 @@ class Asphere:
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the conic has ended."""
         s, c = np.square(x) + np.square(y), curvature_of(self.radius)
-        height = c * s / (1 + root_of(1 - (1 + self.conic_constant) * c**2 * s))
+        height = c * s / (1 + real_root(1 - (1 + self.conic_constant) * c**2 * s))
         if self.even_terms:
             height = height + s * _polynomial(self.even_terms, s)
         if self.odd_terms:
@@ -82,7 +82,7 @@ class Asphere:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]; zero at the tip of a cone."""
         s, c = np.square(x) + np.square(y), curvature_of(self.radius)
         # (dz/dr)/r, which is finite at the centre.
-        each = c / root_of(1 - (1 + self.conic_constant) * c**2 * s)
+        each = c / real_root(1 - (1 + self.conic_constant) * c**2 * s)
         if self.even_terms:
             powers = [2 * (i + 1) * a for i, a in enumerate(self.even_terms)]
             each = each + _polynomial(powers, s)
@@ -126,13 +126,13 @@ class Toroid:
         return np.asarray(x / root), np.asarray((self.radius_x - profile) * slope / root)
 
     def _root(self, x: FloatArray, profile: FloatArray) -> FloatArray:
-        root = root_of((self.radius_x - profile) ** 2 - np.square(x))
+        root = real_root((self.radius_x - profile) ** 2 - np.square(x))
         return np.asarray(np.sign(self.radius_x) * root)
 
     def _profile(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return height and slope of the conic in the plane of y."""
         c = curvature_of(self.radius_y)
-        root = root_of(1 - (1 + self.conic_constant) * c**2 * np.square(y))
+        root = real_root(1 - (1 + self.conic_constant) * c**2 * np.square(y))
         return np.asarray(c * np.square(y) / (1 + root)), np.asarray(c * y / root)
 
 
@@ -175,7 +175,7 @@ class Biconic:
     def _parts(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
         cx, cy = curvature_of(self.radius_x), curvature_of(self.radius_y)
         p, q = (1 + self.conic_x) * cx**2, (1 + self.conic_y) * cy**2
-        root = root_of(1 - p * np.square(x) - q * np.square(y))
+        root = real_root(1 - p * np.square(x) - q * np.square(y))
         return np.asarray(cx * np.square(x) + cy * np.square(y)), root, p, q
 
 

@@ -25,7 +25,7 @@ from omsm_ros.core.surface.aspheres import (
     con_series,
     curvature_of,
     freeform_series,
-    root_of,
+    real_root,
 )
 from omsm_ros.core.surface.height_grid import Gradient
 from omsm_ros.core.surface.posed import OffAxisSection, Sum
@@ -198,7 +198,7 @@ class QBfs:
         """Return the height over s = r², and its derivative by s."""
         c, area = curvature_of(self.radius), self.aperture_radius**2
         u = s / area
-        root = root_of(1 - c**2 * s)
+        root = real_root(1 - c**2 * s)
         q, slope = bfs_series(self.coefficients, u)
         bump, bump_slope = u * (1 - u) * q, (1 - 2 * u) * q + u * (1 - u) * slope
         rate = c / (2 * root) + bump_slope / (area * root) + bump * c**2 / (2 * root**3)
@@ -292,14 +292,14 @@ class QFreeform:
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
         square, c = np.square(x) + np.square(y), curvature_of(self.radius)
-        root = root_of(1 - c**2 * square)
+        root = real_root(1 - c**2 * square)
         deviation, _, _ = self._bump(x, y)
         return np.asarray(c * square / (1 + root) + deviation / root, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         c = curvature_of(self.radius)
-        root = root_of(1 - c**2 * (np.square(x) + np.square(y)))
+        root = real_root(1 - c**2 * (np.square(x) + np.square(y)))
         deviation, along_x, along_y = self._bump(x, y)
         # Slopes of the sphere and of 1/root, divided by x or y.
         rate = c / root + deviation * c**2 / root**3

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from omsm_ros.core.calibration.calibration import with_latency
 from omsm_ros.core.calibration.latency import declared_latency
-from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, lateral_lag
+from omsm_ros.core.correction.correct import CorrectionOptions, Corrector, latency_in_use
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.kinematics.kinematics import Geometry
@@ -217,9 +217,9 @@ def test_stated_noise_is_the_scatter_of_the_heights(scan: Recording) -> None:
 def test_latency_is_assumed_only_where_it_is_known() -> None:
     lag = CALIBRATION.dynamics.low_frequency_delay
     late = with_latency(CALIBRATION, declared_latency(lag, 0.7 * lag, 1e-6, "data sheet"))
-    assert lateral_lag(CALIBRATION, CorrectionOptions()) == 0.0
-    assert lateral_lag(late, CorrectionOptions()) == 0.7 * lag
-    assert lateral_lag(late, CorrectionOptions(lateral_lag=0.0)) == 0.0
+    assert latency_in_use(CALIBRATION, CorrectionOptions()) == 0.0
+    assert latency_in_use(late, CorrectionOptions()) == 0.7 * lag
+    assert latency_in_use(late, CorrectionOptions(lateral_lag=0.0)) == 0.0
 
 
 def test_a_late_probe_looks_where_the_spindle_was(quiet_scan: Recording) -> None:
