@@ -140,7 +140,7 @@ TEMPLATES: dict[str, str] = {
     "correction.no_parameter": "{source} has no parameter {parameters:list}",
     "correction.stated_twice": "{source} is stated {times} times; state it once",
     "correction.parameter": "{source} has no parameter {parameter!r}, expected one of {known:list}",
-    "correction.needs_parameter": "{source} needs {parameter} [{unit}]; state it beside value",
+    "correction.needs_parameter": "{source} needs {parameter} [{unit}]; state it with value",
     "correction.no_slope": "the slope of the surface is not known; give a nominal surface",
     "correction.negative_uncertainty": (
         "{source}: standard uncertainty {value!r} {unit}, expected zero or more"

@@ -179,8 +179,8 @@ class Corrector:
         self._correct(self._pairing.end())
         for queue in (self._pairing.axes, self._pairing.distance):
             queue.clear()
-        for intake in (self._axes, self._distance):
-            intake.end()
+        for stream in (self._axes, self._distance):
+            stream.end()
         return self.take()
 
     @property

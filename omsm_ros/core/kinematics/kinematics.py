@@ -125,7 +125,7 @@ class PitchCurve:
             raise ConfigurationError("kinematics.pitch")
 
     def over(self, arm: float, z: FloatArray) -> FloatArray:
-        """Return the Abbe error ``arm · α`` [m] of an encoder ``arm`` [m] beside the beam, (n,)."""
+        """Return the Abbe error ``arm · α`` [m] of an encoder ``arm`` [m] from the beam, (n,)."""
         return np.asarray(arm * np.interp(z, self.position, self.angle), np.float64)
 
 

@@ -147,10 +147,10 @@ def _ordered(blocks: Iterable[B]) -> list[B]:
     return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
 
 
-def _runs(blocks: Iterable[Block], values: Values, intake: StreamInput) -> Iterator[SampleRun]:
+def _runs(blocks: Iterable[Block], values: Values, stream: StreamInput) -> Iterator[SampleRun]:
     """Yield the new samples of each block; ``values`` gives its channel and validity, each (n,)."""
     for block in _ordered(blocks):
-        if (arrival := intake.new(block)) is not None:
+        if (arrival := stream.new(block)) is not None:
             value, ok = values(block)
             reasons = np.where(ok, RejectionReason.NONE, RejectionReason.INVALID).astype(np.uint8)
             yield SampleRun.of(block, arrival, reasons, np.asarray(value, np.float64)[np.newaxis])
@@ -176,8 +176,8 @@ class _Grid:
 
     @classmethod
     def of(cls, axes: Sequence[AxisBlock]) -> _Grid:
-        intake = StreamInput()
-        runs = list(_runs(axes, _position, intake))
+        stream = StreamInput()
+        runs = list(_runs(axes, _position, stream))
         sessions = len({run.session for run in runs})
         first, samples = runs[0].first, runs[-1].end - runs[0].first
         if sessions > 1 or samples > MAX_RECORD_SAMPLES:
@@ -188,7 +188,7 @@ class _Grid:
         for run in runs:
             place = slice(run.first - first, run.end - first)
             z[place], known[place] = run.values[0], run.reasons == RejectionReason.NONE
-        return cls(runs, first, z, known, intake.tally.snapshot(0))
+        return cls(runs, first, z, known, stream.tally.snapshot(0))
 
     def matched(
         self, name: str, blocks: Sequence[DistanceBlock], trigger: CommonTrigger
@@ -197,12 +197,12 @@ class _Grid:
 
         Raises DataError if its counter slipped against that of the axes.
         """
-        axes, intake = StreamInput(), StreamInput(trigger.counter_offset)
-        pairing = Pairing(axes, intake, trigger)
+        axes, stream = StreamInput(), StreamInput(trigger.counter_offset)
+        pairing = Pairing(axes, stream, trigger)
         for run in self.runs:
             axes.stamps.add(run.session, run.first, run.stamp_ns)
             pairing.axes.push(run)
-        for run in _runs(blocks, _reading, intake):
+        for run in _runs(blocks, _reading, stream):
             pairing.distance.push(run)
         seen, ok = np.full(len(self.z), np.nan), np.zeros(len(self.z), np.bool_)
         for axis, reading in chain(pairing.pairs(), pairing.end()):
@@ -213,7 +213,7 @@ class _Grid:
         if pairing.watch.found is not None:
             slip = pairing.watch.found.notice()
             raise DataError("streams.slip_of", stream=name, **slip.values)
-        return seen, ok, intake.tally.snapshot(0)
+        return seen, ok, stream.tally.snapshot(0)
 
 
 def _by_counter(

@@ -186,7 +186,7 @@ def line_profile(
 ) -> Profile:
     """Return the profile through the origin at ``angle`` [rad] from x: 0 is along x, π/2 along y.
 
-    Points up to ``half_width`` [m] beside the line are averaged over every ``spacing`` [m].
+    Points within ``half_width`` [m] of the line are averaged over every ``spacing`` [m].
     """
     _check(x=x, y=y, deviation=deviation)
     along = x * np.cos(angle) + y * np.sin(angle)
