@@ -411,9 +411,11 @@ class _Findings:
             stated = scan.options.sources
             resolution = stated.encoder_resolution if stated else 0.0
             found += self._axes.step_faults(resolution, self._lateral)
-            found += skew_fault(skew, scan.sample_period, scan.trigger)
             samples = scan.account.distance.counted.get("slipped", 0)
-            found += [f"{samples} samples were not corrected: {scan.slip}"] * bool(samples)
+            if samples:
+                found.append(f"{samples} samples were not corrected: {scan.slip}")
+            else:
+                found += skew_fault(skew, scan.sample_period, scan.trigger)
         return (*map(str, found), *self._beyond(scan.options.pitch))
 
     def _beyond(self, pitch: PitchCurve | None) -> Iterator[str]:

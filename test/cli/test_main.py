@@ -84,7 +84,7 @@ def test_a_scan_of_which_nothing_can_be_corrected_is_reported(
     arguments = ("correct", tmp_path / "dark.mcap", "--calibration", folder / "cal.json")
     status, text, err = run(capsys, *arguments, "--out", tmp_path / "out")
     assert (status, err) == (0, "")
-    assert "not one of 2000 readings is valid" in text
+    assert "none of 2000 readings is valid" in text
     assert "not one sample could be corrected" in text
 
 

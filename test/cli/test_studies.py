@@ -46,7 +46,7 @@ def test_predict_over_a_gap_judges_the_longest_run_and_names_the_rest(
     truth = (small_scan.probe_motion - small_scan.axes.z)[3000:]
     assert found["peak_to_valley"] == pytest.approx(np.ptp(truth), rel=0.1)
     assert "1 000 are missing (2000 to 2999)" in found["left_out"]
-    assert f"judged are only {kept - 2000:,} of {kept:,}".replace(",", " ") in found["left_out"]
+    assert f"only {kept - 2000:,} of {kept:,} samples are judged".replace(",", " ") in found["left_out"]
     assert found["message"].endswith(found["left_out"])
 
 

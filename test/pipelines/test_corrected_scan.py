@@ -133,7 +133,7 @@ def test_overridden_it_says_so_in_the_cloud(bag, true_calibration, tmp_path):
     foreign = Admission({"machine": "another"}, override=True)
     done = correct_bag(bag, true_calibration, tmp_path / "cloud.ply", admission=foreign)
     assert done.admission["overridden"]
-    assert any("another" in reason for reason in done.reasons)
+    assert any("another" in str(reason) for reason in done.reasons)
     assert b"OVERRIDDEN" in (tmp_path / "cloud.ply").read_bytes()[:512]
 
 
@@ -177,9 +177,8 @@ def test_a_probe_whose_counter_is_off_gives_no_points_and_is_reported(
     assert account["corrected"] == 0
     assert account["counted"]["slipped"] >= 2000 - samples - 21  # but for what settles
     said = summary["warnings"]
-    assert any(f"{samples} samples: their counters were not started together" in s for s in said)
     assert any(f"slipped by {samples} samples" in s for s in said)
-    assert any(f"{samples} samples: their counters" in s for s in inspect_bag(path).faults)
+    assert any(f"slipped by {samples} samples" in s for s in inspect_bag(path).faults)
 
 
 def test_trigger_numbers_missing_from_both_streams_take_the_green_away(
