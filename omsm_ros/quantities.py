@@ -43,7 +43,7 @@ class Quantity:
 
         name: of the value in messages; empty takes the name of the quantity
         """
-        if type(value) is (int if self.whole else float) and self.low <= value <= self.high:  # type: ignore[operator]
+        if type(value) is (int if self.whole else float) and self.low <= value <= self.high:
             return value  # the usual case, kept fast
         number = _number(value, self.whole)
         if number is None or not self._in_range(number):

@@ -46,7 +46,8 @@ def test_predict_over_a_gap_judges_the_longest_run_and_names_the_rest(
     truth = (small_scan.probe_motion - small_scan.axes.z)[3000:]
     assert found["peak_to_valley"] == pytest.approx(np.ptp(truth), rel=0.1)
     assert "1 000 are missing (2000 to 2999)" in found["left_out"]
-    assert f"only {kept - 2000:,} of {kept:,} samples are judged".replace(",", " ") in found["left_out"]
+    judged = f"only {kept - 2000:,} of {kept:,} samples are judged".replace(",", " ")
+    assert judged in found["left_out"]
     assert found["message"].endswith(found["left_out"])
 
 
@@ -138,8 +139,9 @@ def test_align_tells_the_noise_by_which_the_points_scatter(capsys, tmp_path, cal
 
 def test_align_refuses_another_sphere_and_names_its_radius(capsys, tmp_path, calibration):
     assert sphere_aligned(tmp_path, calibration, 0.99 * SPHERE_RADIUS_M) == 2
-    found = re.search(r"of radius ([\d.]+) mm ± ([\d.]+) mm", capsys.readouterr().err)
-    radius, uncertainty = float(found[1]), float(found[2])
+    pattern = r"of radius ([\d.]+) mm with a standard uncertainty of ([\d.]+) µm"
+    found = re.search(pattern, capsys.readouterr().err)
+    radius, uncertainty = float(found[1]), 1e-3 * float(found[2])
     assert abs(radius - SPHERE_RADIUS_M * 1e3) < 3 * uncertainty < 0.05
     assert not (tmp_path / "geometry.yaml").exists()
 
