@@ -1,7 +1,7 @@
-"""What each constant of the departures is worth: ``python -m benchmarks.constants [name …]``.
+"""Ablation of the constants of identification: ``python -m benchmarks.constants [name …]``.
 
-Each is halved and doubled alone, and ten step tests of the twin are identified again: five of clean
-machines, five of disturbed ones. The table goes into docs/design/identification-ablation.md.
+Each constant is halved and doubled alone, and ten step tests of the twin are identified again: five
+of clean machines, five of disturbed ones. The table is in docs/design/identification-ablation.md.
 """
 
 from __future__ import annotations
@@ -30,8 +30,18 @@ from omsm_ros.units import NANOMETRE_M
 _SEED = 12_000
 _DISTURBED = ("creep, 0.2 s", "base mode, 8 Hz", "backlash", "friction", "vibration, 13.7 Hz")
 _MEDIUM = 1
+_ESTIMATION = "omsm_ros.core.estimation"
 _ROOT = "omsm_ros.core.model_errors"
+_IDENTIFICATION = "omsm_ros.core.identification"
 _PLACES = {
+    "_CLEARLY": f"{_ESTIMATION}.noise",
+    "_INTERVAL": f"{_ESTIMATION}.noise",
+    "_DAMPED_BEYOND": f"{_ESTIMATION}.model_order",
+    "_GUESSED_RATE": f"{_ESTIMATION}.model_order",
+    "_LINEAR_ITERATIONS": f"{_ESTIMATION}.model_order",
+    "_ADDED_POLE": f"{_ESTIMATION}.model_order",
+    "_BRIDGE_S": f"{_ESTIMATION}.output_error",
+    "_SMOOTHING_BINS": f"{_ESTIMATION}.output_error",
     "FASTEST_CREEP_S": f"{_ROOT}.families",
     "_CREEPS_A_DECADE": f"{_ROOT}.families",
     "_DAMPINGS": f"{_ROOT}.families",
@@ -48,10 +58,17 @@ _PLACES = {
     "_HALF_WIDTH": f"{_ROOT}.residual_diagnostics",
     "FALSE_ALARM": f"{_ROOT}.residual_diagnostics",
     "_LAGS": f"{_ROOT}.residual_diagnostics",
-    "_MOST_ROUNDS": "omsm_ros.core.identification.model_error_search",
-    "_UNDECIDED": "omsm_ros.core.identification.model_error_search",
-    "_LEAST_DECAYS": "omsm_ros.core.identification.model_error_search",
-    "_PLAIN_POLES": "omsm_ros.core.identification.model_error_search",
+    "_HINT": f"{_ROOT}.undetected",
+    "_LEAST_LIKELY": f"{_ROOT}.undetected",
+    "_LITTLE": f"{_ROOT}.undetected",
+    "_ALIKE_BIC": f"{_IDENTIFICATION}.model_choice",
+    "_MAY_BE_CHOSEN_BIC": f"{_IDENTIFICATION}.model_choice",
+    "_MOST_ROUNDS": f"{_IDENTIFICATION}.model_error_search",
+    "_UNDECIDED": f"{_IDENTIFICATION}.model_error_search",
+    "_LEAST_DECAYS": f"{_IDENTIFICATION}.model_error_search",
+    "_PLAIN_POLES": f"{_IDENTIFICATION}.model_error_search",
+    "_SETTLED_DECAYS": f"{_IDENTIFICATION}.model_error_search",
+    "_SAME_LINE": f"{_IDENTIFICATION}.model_error_search",
 }
 
 

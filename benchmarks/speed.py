@@ -19,9 +19,10 @@ from benchmarks.identification import record_once
 from benchmarks.row import Row, at_least, at_most, not_compared
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.estimation.model_order import MAX_POLES
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
-from omsm_ros.core.estimation.sampled_choice import MAX_ORDER, choose_sampled
+from omsm_ros.core.estimation.sampled_choice import choose_sampled
 from omsm_ros.core.estimation.sampled_fit import (
     DiscreteStarts,
     ScaledDiscreteStructure,
@@ -106,8 +107,8 @@ def _choice_factor() -> tuple[float, str, float, str]:
         problem = ZeroOrderHoldProblem(
             u, np.where(used, y, 0.0), used, 0.1, np.ones((1200, 1)), 5.0
         )
-        starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_ORDER)
-        for order in range(1, MAX_ORDER + 1):
+        starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_POLES)
+        for order in range(1, MAX_POLES + 1):
             structure = Structure(order, order, False)
             scaled = ScaledDiscreteStructure(structure, problem.rate)
             fit(problem, structure, [scaled.of_discrete(starts.arx(order))])

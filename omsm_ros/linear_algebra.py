@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
-# Rows factorised at a time: half a megabyte a column.
-_ROWS = 65_536
+# Rows and values of a matrix held in memory at a time, where a long record is processed in blocks:
+# half a megabyte a column, 32 MB in all.
+BLOCK_ROWS, BLOCK_VALUES = 65_536, 4_000_000
 
 
 def unit_columns(columns: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -56,8 +57,8 @@ def triangle(*parts: FloatArray) -> FloatArray:
     Block by block, so that a long record's columns are never in memory twice.
     """
     found = np.zeros((0, sum(part.shape[1] for part in parts)))
-    for first in range(0, len(parts[0]), _ROWS):
-        block = np.column_stack([part[first : first + _ROWS] for part in parts])
+    for first in range(0, len(parts[0]), BLOCK_ROWS):
+        block = np.column_stack([part[first : first + BLOCK_ROWS] for part in parts])
         found = np.asarray(np.linalg.qr(np.concatenate([found, block]), mode="r"))
     return found
 

@@ -9,11 +9,10 @@ from omsm_ros.core.estimation.noise import scatter_in_time, uneven_rows
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.linear_algebra import BLOCK_VALUES
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
-# Values of transforms held in memory at a time: 32 MB.
-_VALUES = 4_000_000
 # Directions of the parameter space weaker than this part of the strongest are lost in rounding.
 _RANK_TOLERANCE = 1e-11
 
@@ -70,7 +69,7 @@ def weighted_gram(rows: FloatArray, length: int, noise: FloatArray) -> FloatArra
         return found
 
     # A long record is transformed in blocks: all rows at once would double the memory.
-    step = max(_VALUES // length, 1)
+    step = max(BLOCK_VALUES // length, 1)
     blocks = [slice(first, first + step) for first in range(0, len(rows), step)]
     gram = np.empty((len(rows), len(rows)))
     for i, block in enumerate(blocks):

@@ -24,7 +24,7 @@ from omsm_ros.core.estimation.optimisation import EvaluationBudget, Projection, 
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.linear_algebra import least_squares
+from omsm_ros.linear_algebra import BLOCK_VALUES, least_squares
 
 # Duration of the bridge: across the whole travel it adds nothing near the fastest motion.
 _BRIDGE_S = 0.3
@@ -83,8 +83,6 @@ def motion_spectrum(motion: FloatArray, period: float, noise: float) -> ComplexA
 _RANK_TOLERANCE = 1e-12
 # Block size of LAPACK.
 _BLOCK = 32
-# Values of columns held in memory at a time beside the result.
-_VALUES = 4_000_000
 # Iterations from each start; held inputs need five (docs/design/identification-ablation.md).
 _RACE_EVALUATIONS = 5
 # Most iterations from the best start: it bounds fits along a flat valley, others converge.
@@ -191,7 +189,7 @@ class Problem:
     def _in_time(self, spectra: ComplexArray) -> FloatArray:
         found = np.empty((len(spectra), len(self._places)))
         # In blocks: all at once would double the memory of a long record.
-        step = max(_VALUES // self.closed_length, 1)
+        step = max(BLOCK_VALUES // self.closed_length, 1)
         for first in range(0, len(spectra), step):
             part = slice(first, first + step)
             values = fft.irfft(spectra[part], self.closed_length, axis=-1)

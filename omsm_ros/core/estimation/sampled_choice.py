@@ -20,6 +20,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.estimation.covariance import autoregression
+from omsm_ros.core.estimation.model_order import MAX_POLES
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import Fit, fit
 from omsm_ros.core.estimation.sampled_fit import (
@@ -33,8 +34,6 @@ from omsm_ros.core.estimation.sampled_fit import (
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 
-# As in the table of quantities.
-MAX_ORDER = 20
 # Parts of the used samples: all but the first are held out in turn, and the last ones together.
 _PARTS = 6
 # Share of the used samples to which every order is fitted first.
@@ -109,7 +108,7 @@ def choose_sampled(
     order: number of poles, 0 to choose;  max_delay: whole samples to try
 
     Raises IdentificationError when too few samples are used for the order asked for, or the input
-    has too few frequencies, for an order beyond MAX_ORDER, or where a value is not finite.
+    has too few frequencies, for an order beyond MAX_POLES, or where a value is not finite.
     """
     most = check_record(input, output, used, order)
     centred = np.where(used, output - np.mean(output[used]), 0.0)
@@ -162,8 +161,8 @@ def proposed_starts(
 
 
 def _highest_order(samples: int, order: int) -> int:
-    if not 0 <= order <= MAX_ORDER:
-        raise IdentificationError("estimation.order", order=order, most=MAX_ORDER)
+    if not 0 <= order <= MAX_POLES:
+        raise IdentificationError("estimation.order", order=order, most=MAX_POLES)
     if samples > _MOST_SAMPLES:
         raise IdentificationError(
             "estimation.too_many_samples", samples=samples, most=_MOST_SAMPLES
@@ -173,7 +172,7 @@ def _highest_order(samples: int, order: int) -> int:
         raise IdentificationError(
             "estimation.too_few_samples", samples=samples, least=needed, order=max(order, 1)
         )
-    return min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
+    return min(MAX_POLES, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
 
 
 def excited_parameters(input: FloatArray, most: int) -> int:
@@ -389,7 +388,7 @@ def most_exciting_part(input: FloatArray, used: BoolArray) -> slice:
 
     def information(part: slice) -> tuple[int, float]:
         varied = input[part]
-        excited = excited_parameters(varied, 2 * MAX_ORDER + 1) if np.ptp(varied) > 0 else 0
+        excited = excited_parameters(varied, 2 * MAX_POLES + 1) if np.ptp(varied) > 0 else 0
         return excited, float(np.var(varied))
 
     return max(every, key=information)
@@ -397,7 +396,7 @@ def most_exciting_part(input: FloatArray, used: BoolArray) -> slice:
 
 def _on_full_record(problem: ZeroOrderHoldProblem, choice: SampledChoice) -> SampledChoice:
     part = parts(problem.used)
-    starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_ORDER)
+    starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_POLES)
     lowest: list[Fit] = []
     while len(lowest) <= _LOWEST:
         lowest.append(next_order(problem, lowest, starts))
@@ -427,7 +426,7 @@ def _with_further_poles(
     problem: ZeroOrderHoldProblem, found: SampledCandidate, starts: DiscreteStarts
 ) -> list[SampledCandidate]:
     order = found.order + _POLES_MORE
-    if order > MAX_ORDER:
+    if order > MAX_POLES:
         return []
     grown = found.fit.nonlinear
     for _ in range(_POLES_MORE):

@@ -11,6 +11,7 @@ from scipy import signal
 
 from omsm_ros.core.calibration.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
 from omsm_ros.core.calibration.plausibility import checked_roots
+from omsm_ros.core.estimation.steps import LEAST_SAMPLES
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.frequency_response import Band
 from omsm_ros.core.lti.recursion import Recursion
@@ -217,8 +218,6 @@ def _discrete_content(discrete: Discrete) -> dict[str, object]:
     }
 
 
-# Enough samples for an initial state of 20 poles and an offset.
-_LEAST_SAMPLES = 50
 # The square of a smaller change underflows.
 _LEAST_CHANGE = 1e-50
 
@@ -250,12 +249,12 @@ def free_run(
     Raises IdentificationError for a record that is too short or constant, or for gaps of the input.
     """
     counted = np.isfinite(output) if used is None else used & np.isfinite(output)
-    if np.sum(counted) < _LEAST_SAMPLES or len(input) != len(output):
+    if np.sum(counted) < LEAST_SAMPLES or len(input) != len(output):
         raise IdentificationError(
             "estimation.short_columns",
             input=len(input),
             output=int(np.sum(counted)),
-            least=_LEAST_SAMPLES,
+            least=LEAST_SAMPLES,
         )
     check_input(input)
     check_varies(output[counted], "output")

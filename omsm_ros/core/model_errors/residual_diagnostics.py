@@ -33,14 +33,12 @@ from omsm_ros.core.model_errors.families import (
     ModelErrorTerm,
 )
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.linear_algebra import unit_columns
+from omsm_ros.linear_algebra import BLOCK_ROWS, BLOCK_VALUES, unit_columns
 
 # A column with a weaker remainder is collinear with the fitted parameters but for rounding.
 _COLLINEAR_SHARE = 1e-4
 # Directions this much weaker than the strongest are rounding.
 _SPANNED = 1e-9
-# Samples held in memory at a time beside the result.
-_SAMPLES = 65_536
 # Fewest lines over which noise is averaged: its level is then known to a quarter,
 _LEAST_LINES = 8
 # and the factor of frequency on either side where lines are dense, half an octave.
@@ -118,7 +116,7 @@ class ResidualSpace:
     def _free(self, rows: FloatArray) -> None:
         """Project ``rows`` (c, n) orthogonally to the fit, with 0 where nothing is compared."""
         rows[:, ~self.problem.used] = 0.0
-        parts = [slice(i, i + _SAMPLES) for i in range(0, len(self._places), _SAMPLES)]
+        parts = [slice(i, i + BLOCK_ROWS) for i in range(0, len(self._places), BLOCK_ROWS)]
         imitated = np.zeros((len(rows), self._basis.shape[1]))
         for part in parts:
             imitated += rows[:, self._places[part]] @ self._basis[part]
@@ -236,8 +234,6 @@ FALSE_ALARM = 1e-4
 _LAGS = 25
 # A lagged rate weaker than this part of the strongest is rounding.
 _ABOVE_ROUNDING = 1e-6
-# Rows, and values of columns, held in memory at a time.
-_ROWS, _VALUES = 65_536, 8_000_000
 # Largest share of moving samples of a step test that is decimated.
 _MOSTLY = 0.5
 # Families tested with all samples: reversals and lines need them, and their terms are few.
@@ -313,7 +309,7 @@ class ResidualDiagnostics:
     def screening_scores(self, family: ModelErrorFamily) -> FloatArray:
         """Return χ² in white noise of each term of ``family``."""
         every = len(family.parameters)
-        step = max(_VALUES // (len(self.problem.input) * family.width), 1)
+        step = max(BLOCK_VALUES // (len(self.problem.input) * family.width), 1)
         return np.concatenate(
             [
                 self.space.screen(family.part(i, min(i + step, every)), family.width)
@@ -357,8 +353,8 @@ class ResidualDiagnostics:
         # The last values of the rate, the newest last, 0 before the record.
         past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
         gram = np.zeros((_LAGS, _LAGS))
-        for first in range(0, len(past), _ROWS):
-            rows = np.ascontiguousarray(past[first : first + _ROWS])
+        for first in range(0, len(past), BLOCK_ROWS):
+            rows = np.ascontiguousarray(past[first : first + BLOCK_ROWS])
             gram += rows.T @ rows
         powers, directions = np.linalg.eigh(gram)
         kept = powers > _ABOVE_ROUNDING**2 * powers[-1]
@@ -366,8 +362,8 @@ class ResidualDiagnostics:
             return 1.0
         mixed = directions[:, kept] / np.sqrt(powers[kept])
         columns = np.empty((mixed.shape[1], len(past)))
-        for first in range(0, len(past), _ROWS):
-            columns[:, first : first + _ROWS] = (past[first : first + _ROWS] @ mixed).T
+        for first in range(0, len(past), BLOCK_ROWS):
+            columns[:, first : first + BLOCK_ROWS] = (past[first : first + BLOCK_ROWS] @ mixed).T
         return float(np.exp(self.space.judged(columns).log_p))
 
     def significant(self, but: Collection[str] = ()) -> list[ScoreTest]:

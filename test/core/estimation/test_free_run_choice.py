@@ -8,7 +8,8 @@ import pytest
 from scipy import io, signal
 
 from omsm_ros.core.estimation import sampled_choice
-from omsm_ros.core.estimation.sampled_choice import MAX_ORDER, SampledCandidate, choose_sampled
+from omsm_ros.core.estimation.model_order import MAX_POLES
+from omsm_ros.core.estimation.sampled_choice import SampledCandidate, choose_sampled
 from omsm_ros.errors import IdentificationError
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data" / "daisy"
@@ -80,7 +81,7 @@ def test_twenty_poles_may_be_asked_for():
     clean = signal.lfilter([0.0, 1.0], np.poly(poles).real, u)
     y = clean + 0.01 * np.std(clean) * rng.normal(size=1600)
     used = first_half(1600)
-    found = choose_sampled(u, y, used, 1.0, order=MAX_ORDER)
+    found = choose_sampled(u, y, used, 1.0, order=MAX_POLES)
     missed = np.std((output_of(found, y, used) - y)[~used])
     assert missed < 0.015 * np.std(clean)
 
