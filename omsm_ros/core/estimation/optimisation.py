@@ -33,7 +33,7 @@ class EvaluationBudget:
     """Count the evaluations of a model search and limit them: counted work, never elapsed time.
 
     most_evaluations: of all samples of the record, or at least half of them
-    most_samples: samples of all evaluations together, beside ``most_full_evaluations`` of the
+    most_samples: samples of all evaluations together, besides ``most_full_evaluations`` of the
         longest record
     evaluations, samples, longest: used so far; longest is the most samples of one evaluation
     incomplete: a search was cut short because the budget was exhausted

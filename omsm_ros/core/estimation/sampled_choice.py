@@ -178,7 +178,7 @@ def _highest_order(samples: int, order: int) -> int:
 def excited_parameters(input: FloatArray, most: int) -> int:
     """Return the number of parameters that ``input`` (n,) determines, at most ``most``.
 
-    That is its order of persistent excitation beside a constant (Ljung 1999, ch. 13): the rank of
+    That is its order of persistent excitation with a constant (Ljung 1999, ch. 13): the rank of
     all its windows of ``most`` samples. Each sine gives two, noise gives all.
     """
     windows = np.lib.stride_tricks.sliding_window_view(input, most)

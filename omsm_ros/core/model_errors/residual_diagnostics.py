@@ -117,11 +117,11 @@ class ResidualSpace:
         """Project ``rows`` (c, n) orthogonally to the fit, with 0 where nothing is compared."""
         rows[:, ~self.problem.used] = 0.0
         parts = [slice(i, i + BLOCK_ROWS) for i in range(0, len(self._places), BLOCK_ROWS)]
-        imitated = np.zeros((len(rows), self._basis.shape[1]))
+        collinear = np.zeros((len(rows), self._basis.shape[1]))
         for part in parts:
-            imitated += rows[:, self._places[part]] @ self._basis[part]
+            collinear += rows[:, self._places[part]] @ self._basis[part]
         for part in parts:
-            rows[:, self._places[part]] -= imitated @ self._basis[part].T
+            rows[:, self._places[part]] -= collinear @ self._basis[part].T
 
     def screen(self, columns: FloatArray, terms: int) -> FloatArray:
         """Return χ² in white noise of each group of ``terms`` neighbouring columns of (n, c).
@@ -129,13 +129,13 @@ class ResidualSpace:
         It finds the best of many terms; :meth:`score` then tests it.
         """
         compared = self._compared(columns)
-        imitated = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
+        collinear = (self._basis.T @ compared).reshape(self._basis.shape[1], -1, terms)
         moment = (compared.T @ self.fitted.residual).reshape(-1, terms)
         gram = np.empty((len(moment), terms, terms))
         for i in range(terms):
             for j in range(i + 1):
                 both = np.einsum("kg,kg->g", compared[:, i::terms], compared[:, j::terms])
-                both -= np.einsum("kg,kg->g", imitated[..., i], imitated[..., j])
+                both -= np.einsum("kg,kg->g", collinear[..., i], collinear[..., j])
                 gram[:, i, j] = gram[:, j, i] = both
         inverse = np.linalg.pinv(gram, rcond=_COLLINEAR_SHARE, hermitian=True)
         explained = np.einsum("gi,gij,gj->g", moment, inverse, moment)

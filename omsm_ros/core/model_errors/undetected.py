@@ -240,8 +240,8 @@ def _undetected_terms(
     fitted, term, score = diagnostics.fitted, judged.term, judged.score
     shift = omission_shift(diagnostics, term.columns[:, 0])
     frequency, rms = use.frequencies_hz, use.rms_m
-    imitated = _relative(fitted, frequency, shift)
-    remaining = imitated - _response_error(term.family, term.parameter, term.damping, frequency)
+    collinear = _relative(fitted, frequency, shift)
+    remaining = collinear - _response_error(term.family, term.parameter, term.damping, frequency)
     # Fitted coefficients cannot follow the resonance of a lightly damped mode.
     whole = term.family == CREEP or _hinted_by_data(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
