@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks import named_causes
 from benchmarks.row import Row, at_most, shown
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED
+from omsm_ros.core.calibration.certificate import ACCEPTED, REJECTED
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
@@ -52,6 +53,7 @@ class Outcome:
     verdict: first words of it, or of the error;  why: its reasons and reservations
     error: on the paper's scan [m];  sigmas: largest error of the response over stated, in its band
     stated: standard uncertainty on the paper's scan [m]
+    named: whether the cause that it names is right; empty where it names nothing
     """
 
     name: str
@@ -60,6 +62,7 @@ class Outcome:
     error: float = 0.0
     sigmas: float = 0.0
     stated: float = 0.0
+    named: str = ""
 
     @property
     def accepted(self) -> bool:
@@ -76,7 +79,7 @@ class Outcome:
 def rows(full: bool) -> Iterator[Row]:
     """Accepted though wrong, and benign tests rejected; the table is written on the way."""
     clean = [outcome("clean", NOTHING, seed) for seed in range(100 if full else 10)]
-    alarms = [o for o in clean if not o.verdict.startswith("accepted,")]
+    alarms = [o for o in clean if o.verdict != ACCEPTED]
     yield at_most("false alarms on clean tests", _percent(alarms, clean), "%", 2, runs=len(clean))
     met = {k: v for k, v in CATALOGUE.items() if not k.startswith(_OF_THE_PART)}
     found = [
@@ -88,9 +91,11 @@ def rows(full: bool) -> Iterator[Row]:
     ]
     yield _lies("alone", found)
     yield shown("rejected, alone", _percent([o for o in found if not o.accepted], found), "%")
+    yield _wrong_causes("alone", found)
     if full:
         pairs = list(_pairs(met))
         yield _lies("in pairs", pairs)
+        yield _wrong_causes("in pairs", pairs)
         _TABLE.write_text(page([*clean[:1], *found], pairs))
 
 
@@ -112,6 +117,14 @@ def _lies(what: str, found: Sequence[Outcome]) -> Row:
     return at_most(f"accepted though wrong, {what}", len(wrong), "", 0, runs=len(found))
 
 
+def _wrong_causes(what: str, found: Sequence[Outcome]) -> Row:
+    """Of those with a reservation or rejected, the share that names a wrong cause."""
+    stated = [o for o in found if o.named]
+    wrong = [o for o in stated if o.named == named_causes.WRONG]
+    share = _percent(wrong, stated) if stated else 0.0
+    return at_most(f"wrong cause named, {what}", share, "%", 5, runs=len(stated))
+
+
 def _percent(part: Sequence[Outcome], whole: Sequence[Outcome]) -> float:
     return 100 * len(part) / len(whole)
 
@@ -126,15 +139,22 @@ def outcome(name: str, disturbances: Disturbances, seed: int) -> Outcome:
     except OmsmError as err:
         return Outcome(name, "refused", str(err))
     certificate = found.certificate
-    reasons = [*certificate.reasons, *certificate.reservations]  # type: ignore[misc]
-    verdict = str(certificate.verdict)
-    lowest = float(str(certificate.validity.from_hz))
+    findings = [*certificate.reasons, *certificate.reservations]
+    lowest = certificate.validity.from_hz or 0.0
     lines = np.geomspace(max(lowest, 0.1), max(found.valid_up_to, 0.2), 100)
     band = response_band(found.dynamics, found.covariance, lines)
     off = np.log(found.dynamics.response(lines) / made.truth.response.response(lines))
     sigmas = float(np.max(np.abs(off) / np.hypot(band.gain, band.phase)))
     error, stated = _on_scan(found, made.truth.response.response(_SCAN_HZ))
-    return Outcome(name, verdict, "; ".join(map(str, reasons)), error, sigmas, stated)
+    return Outcome(
+        name,
+        certificate.verdict or "",
+        "; ".join(map(str, findings)),
+        error,
+        sigmas,
+        stated,
+        named_causes.judged(name, findings) if findings else "",
+    )
 
 
 _SCAN_HZ, _SCAN_M = PAPER_USE.frequencies_hz, PAPER_USE.rms_m
@@ -144,7 +164,7 @@ def _on_scan(found: Calibration, truth: np.ndarray) -> tuple[float, float]:  # t
     off = np.abs(found.dynamics.response(_SCAN_HZ) - truth)
     band = response_band(found.dynamics, found.covariance, _SCAN_HZ)
     stated = np.hypot(band.gain, band.phase)
-    motion_error = float(str(found.certificate.model_errors.motion_error_m))
+    motion_error = found.certificate.model_errors.motion_error_m or 0.0
     return (
         float(np.linalg.norm(off * _SCAN_M)),
         float(np.hypot(np.linalg.norm(stated * _SCAN_M), motion_error)),
@@ -165,7 +185,8 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
             f"{_SEEDS} tests a case and {_PAIRS} pairs; the numbers actually tested are below. "
             "Error and stated uncertainty are those of the linear response on the paper's scan, "
             "in the test with the largest error. σ is the largest error of the response over its "
-            "stated uncertainty, from 0.1 Hz to the end of the valid range.",
+            "stated uncertainty, from 0.1 Hz to the end of the valid range. Named: whether the "
+            "cause that is stated is the disturbance that was made.",
             "",
             f"Alone: {_summary(alone)} Each of {len(by_name)} cases was tested "
             f"{_times(by_name.values())}.",
@@ -200,8 +221,8 @@ def _times(groups: Iterable[Sequence[Outcome]]) -> str:
 
 def _table(by_name: Mapping[str, Sequence[Outcome]]) -> list[str]:
     return [
-        "| disturbance | verdict | error [nm] | stated [nm] | σ | reservation or reason |",
-        "|---|---|---|---|---|---|",
+        "| disturbance | verdict | error [nm] | stated [nm] | σ | named | reservation or reason |",
+        "|---|---|---|---|---|---|---|",
         *(_line(name, outcomes) for name, outcomes in by_name.items()),
     ]
 
@@ -229,4 +250,13 @@ def _line(name: str, found: Sequence[Outcome]) -> str:
     error, stated = worst.error / NANOMETRE_M, worst.stated / NANOMETRE_M
     words = textwrap.shorten(worst.why.replace("|", "/"), 160, placeholder=" …")
     said = _verdict(worst) if len(found) == 1 else ", ".join(_counted(found))
-    return f"| {name} | {said} | {error:.1f} | {stated:.1f} | {worst.sigmas:.1f} | {words} |"
+    return (
+        f"| {name} | {said} | {error:.1f} | {stated:.1f} | {worst.sigmas:.1f} | {_named(found)} "
+        f"| {words} |"
+    )
+
+
+def _named(found: Sequence[Outcome]) -> str:
+    """Return how often the named cause was right, unknown or wrong."""
+    kinds = Counter(o.named for o in found if o.named)
+    return ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())

@@ -8,9 +8,7 @@ TEMPLATES: dict[str, str] = {
         "a spacing of {spacing:m} makes {columns:.4g} × {rows:.4g} places, expected {most:count} "
         "at most, which is as fine as points are resampled; widen {opt.spacing}"
     ),
-    "comparison.unknown_freedom": (
-        "pose parameter {name!r} is unknown, expected one of {known}"
-    ),
+    "comparison.unknown_freedom": ("pose parameter {name!r} is unknown, expected one of {known}"),
     "comparison.not_converged": (
         "shift and clocking of the second measurement do not converge; place it nearer, or fit "
         "fewer pose parameters with {opt.fit}"

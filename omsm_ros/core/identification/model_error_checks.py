@@ -91,10 +91,15 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         limits = {"false_alarm_p": FALSE_ALARM}
         yield Finding(_UNMODELLED_CODES[judged.term.family], REJECTS, values, limits)
     sizes, _ = _sizes(searched)
-    for modelled, found in zip(searched.nuisance_terms, sizes, strict=True):
-        if found.significant:
-            values = _values(modelled.term, found.value, period)
-            yield Finding(_BESIDE_CODES[modelled.term.family], RESERVATION, values)
+    pairs = zip(searched.nuisance_terms, sizes, strict=True)
+    shown = [(modelled.term, found.value) for modelled, found in pairs if found.significant]
+    drifts = any(term.family == DRIFT for term, _ in shown)
+    for term, size in shown:
+        # A drift that wanders has power at low frequencies, where a line is a part of it.
+        slow = term.parameter * searched.diagnostics.plateau < 1
+        if not (drifts and slow and term.family == VIBRATION):
+            values = _values(term, size, period)
+            yield Finding(_BESIDE_CODES[term.family], RESERVATION, values)
     for term in searched.added_poles:
         values = _values(term, None, period)
         yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)

@@ -225,10 +225,13 @@ def _with_errors_in_variables(
 
 
 def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:
-    """Return drift that is significant with a delay alone, before a slow pole can fit it."""
+    """Return drift that is significant with a delay alone, before a slow pole can fit it.
+
+    A nonlinear scale of the probe competes with it: steps that climb and return make both alike.
+    """
     problem = prepared.problem
     lag = fit(problem, Structure(0, 0, True), [np.array([0.1])], budget=budget)
-    diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT))
+    diagnostics = ResidualDiagnostics(problem, lag, prepared.steps, (CREEP, DRIFT, LINEARITY))
     # If the decimated record shows none, all samples need not be tested.
     if diagnostics.thinned is not None and not _detected_drift(diagnostics.thinned):
         return []
