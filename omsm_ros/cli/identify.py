@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 from omsm_ros import __version__, quantities
@@ -30,6 +31,7 @@ from omsm_ros.cli.command import (
 )
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import Origin
+from omsm_ros.core.calibration.typed_json import from_json
 from omsm_ros.core.estimation.sampled_model import BAND_LIMITED, SampledModel
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.sampled_identification import HOLDS
@@ -41,6 +43,7 @@ from omsm_ros.io.model_file import load_model, save_model
 from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.pipelines.identify import (
     SampledRecord,
+    intended_use_of,
     model_of,
     motion_of_bag,
     record_of_motion,
@@ -92,6 +95,27 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
+    sub.add_argument(
+        "--for",
+        dest="scan",
+        type=Path,
+        metavar="SCAN",
+        help="the scan that will be corrected, a bag or a plan as CSV time_s,z_m, from which the "
+        "limits of the verdict follow; default: the paper's, 30 rpm over its mirror",
+    )
+    sub.add_argument(
+        "--accuracy",
+        type=number(quantities.UNCERTAINTY),
+        help="of a height of that scan, k = 2, asked for [m]",
+    )
+    sub.add_argument(
+        "--origin",
+        type=json_object,
+        default={},
+        metavar="JSON",
+        help="for the certificate: machine, probe, probe_serial_number, target, temperature_c, "
+        "operator, laboratory, method",
+    )
     add_trigger(sub)
     add_by_stamps(sub)
     sub.add_argument(
@@ -126,7 +150,12 @@ def _identify(args: argparse.Namespace) -> Facts:
         order=args.order,
         input=args.input,
         settings=settings_of_bag(bag, args.settings or {}),
-        origin=Origin(recorded_ns=recorded_ns_of_bag(bag), software=f"omsm_ros {__version__}"),
+        use=intended_use_of(args.scan, args.accuracy),
+        origin=replace(
+            from_json(Origin, args.origin, "origin"),
+            recorded_ns=recorded_ns_of_bag(bag),
+            software=f"omsm_ros {__version__}",
+        ),
     )
     facts = calibration_facts(identified.calibration)
     path = output_path_for(args.out, facts["verdict"])
@@ -189,6 +218,9 @@ def _check_for_bags(args: argparse.Namespace) -> None:
         "--counter-offset": args.counter_offset != 0,
         "--stamp-tolerance": args.stamp_tolerance != TWO_DRIVERS_S,
         "--settings": bool(args.settings),
+        "--for": args.scan is not None,
+        "--accuracy": args.accuracy is not None,
+        "--origin": bool(args.origin),
     }
     if passed_over := [name for name, given in stated.items() if given]:
         raise ConfigurationError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from omsm_ros import __version__
 from omsm_ros.core.calibration.calibration import settings_with
+from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
 from omsm_ros.core.estimation.sampled_model import FreeRun, SampledModel, free_run
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
@@ -21,12 +22,13 @@ from omsm_ros.core.streams.stamps import check_period
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import BagError, ConfigurationError, DataError, FileError
 from omsm_ros.io import bags
+from omsm_ros.io.descriptions import load_motion
 from omsm_ros.io.files import save_bytes
 from omsm_ros.io.folders import result_folder
 from omsm_ros.io.table_file import first_line, load_columns
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import read_blocks
+from omsm_ros.pipelines.recording import path_in, read_blocks
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import date_text, quantity
 from omsm_ros.report.certificate.markdown import picture_name, render_markdown
@@ -90,6 +92,20 @@ def _beginning(blocks: list[Block], duration: float) -> list[Block]:
         return blocks
     end = blocks[0].first_sample + duration / blocks[0].sample_period
     return [block for block in blocks if block.first_sample < end]
+
+
+def intended_use_of(scan: Path | None, accuracy: float | None) -> IntendedUse:
+    """Return the intended use: a scan, as a bag or as a plan CSV, and the accuracy asked for [m].
+
+    scan: None for the paper's.  Raises FileError, BagError or ConfigurationError.
+    """
+    if scan is None:
+        return replace(PAPER_USE, accuracy_m=accuracy)
+    if scan.suffix.lower() == ".csv":
+        z, period = load_motion(scan)
+        return use_of_motion(z, period, accuracy)
+    path = path_in(scan)
+    return use_of_motion(path.z, path.sample_period, accuracy)
 
 
 # A model between two columns of a table, or two channels of a bag; and its run over another.

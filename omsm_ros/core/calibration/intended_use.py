@@ -12,8 +12,14 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import FREQUENCY, UNCERTAINTY
 
-# Harmonics below this share of the motion's mean square are left out of a spectrum.
-_LEAST_SHARE = 1e-6
+# Fewer samples have no spectrum.
+_LEAST_SAMPLES = 16
+# Bands of a spectrum in an octave: errors of a response change little within one.
+_BANDS_PER_OCTAVE = 6
+# Bands with a smaller share of the mean square speed are noise of the encoder.
+_LEAST_SHARE = 1e-3
+# Share of the mean square speed below the highest content of a motion.
+_CONTENT = 0.999
 
 
 @dataclass(frozen=True)
@@ -74,9 +80,17 @@ class IntendedUse:
         return self.HARMLESS_SHARE * accuracy / self.speed_m_s
 
     @property
+    def highest_hz(self) -> float:
+        """Frequency [Hz] below which nearly all of the mean square speed lies."""
+        order = np.argsort(self.frequencies_hz)
+        speed = np.cumsum((self.frequencies_hz[order] * self.rms_m[order]) ** 2)
+        place = int(np.searchsorted(speed, _CONTENT * speed[-1]))
+        return float(self.frequencies_hz[order][place])
+
+    @property
     def least_valid_up_to_hz(self) -> float:
         """Frequency [Hz] up to which a response must be known to be of use."""
-        return self.BAND_OVER_CONTENT * float(np.max(self.frequencies_hz))
+        return self.BAND_OVER_CONTENT * self.highest_hz
 
 
 def use_of_motion(
@@ -84,18 +98,22 @@ def use_of_motion(
 ) -> IntendedUse:
     """Return the intended use of a scan that moves as ``z`` (n,) [m], sampled evenly [s].
 
-    The linear trend is taken out, and components that add nothing to the rms are left out.
-    Raises ConfigurationError for a motion without samples or without movement.
+    The linear trend is taken out, and neighbouring frequencies are joined to bands that keep rms
+    and speed. Raises ConfigurationError for a motion without samples or without movement.
     """
-    if len(z) < 4 or not np.all(np.isfinite(z)):
+    if len(z) < _LEAST_SAMPLES or not np.all(np.isfinite(z)):
         raise ConfigurationError("calibration.empty_spectrum")
     slope = np.linspace(-1.0, 1.0, len(z))
-    still = z - np.mean(z) - slope * float(slope @ z) / float(slope @ slope)
-    line = np.abs(np.fft.rfft(still)) ** 2
-    mean_square = 2 * line / len(z) ** 2
+    moved = z - np.mean(z) - slope * float(slope @ z) / float(slope @ slope)
+    window = np.hanning(len(z))
+    power = 2 * np.abs(np.fft.rfft(window * moved)) ** 2 / (len(z) * float(window @ window))
     frequency = np.fft.rfftfreq(len(z), sample_period)
-    kept = (frequency > 0) & (mean_square > _LEAST_SHARE * np.sum(mean_square))
-    pairs = zip(frequency[kept].tolist(), np.sqrt(mean_square[kept]).tolist(), strict=True)
+    power, frequency = power[1:], frequency[1:]
+    band = np.floor(_BANDS_PER_OCTAVE * np.log2(frequency / frequency[0])).astype(np.int64)
+    in_band, speed = np.bincount(band, power), np.bincount(band, power * frequency**2)
+    kept = speed > _LEAST_SHARE * np.sum(speed)
+    mean = np.sqrt(speed[kept] / in_band[kept])
+    pairs = zip(mean.tolist(), np.sqrt(in_band[kept]).tolist(), strict=True)
     return IntendedUse(tuple(pairs), accuracy_m)
 
 

@@ -245,7 +245,7 @@ def limit_table(certificate: Certificate) -> Table:
     ]
     rows.append(("motion taken from", certificate.origin.input or NOTHING))
     if use is not None:
-        highest = quantity(float(np.max(use.frequencies_hz)), "Hz")
+        highest = quantity(use.highest_hz, "Hz")
         rows.append(("intended scan", f"{quantity(use.speed_m_s, 'm/s')} rms, up to {highest}"))
         rows.append(("accuracy asked for, k = 2", quantity(use.accuracy_m, "m")))
     return Table("Limits of the verdict", (), known_rows(rows, 1))
