@@ -12,6 +12,8 @@ import omsm_ros
 
 PACKAGE = Path(omsm_ros.__file__).parent
 ROOT = PACKAGE.parent
+# Pages of the reference are generated from the code, whose texts are tested above.
+WRITTEN = [p for p in sorted((ROOT / "docs").rglob("*.md")) if p.parent.name != "reference"]
 GLOSSARY = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
 
 
@@ -22,7 +24,11 @@ def _rows(heading):
 
 
 FORBIDDEN = [word for row in _rows("## Words that are not used") for word in row[0].split(", ")]
-PATTERN = re.compile(r"\b(" + "|".join(map(re.escape, FORBIDDEN)) + r")\b", re.IGNORECASE)
+# A degree of freedom is a term; a freedom alone is not.
+PATTERN = re.compile(
+    r"(?<!degree of )(?<!degrees of )\b(" + "|".join(map(re.escape, FORBIDDEN)) + r")\b",
+    re.IGNORECASE,
+)
 
 
 def forbidden_words(source):
@@ -49,14 +55,12 @@ def test_a_module_uses_no_forbidden_word(path):
     assert not list(forbidden_words(path.read_text(encoding="utf-8")))
 
 
-@pytest.mark.parametrize(
-    "page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda p: p.name
-)
+@pytest.mark.parametrize("page", [ROOT / "README.md", *WRITTEN], ids=lambda p: p.name)
 def test_a_page_uses_no_forbidden_word(page):
     text = page.read_text(encoding="utf-8")
     if page.name == "glossary.md":
         text = text.split("## Words that are not used")[0]
-    assert not [match[1] for match in PATTERN.finditer(text)]
+    assert not [match[1] for match in PATTERN.finditer(" ".join(text.split()))]
 
 
 @pytest.mark.parametrize("word", FORBIDDEN)
