@@ -1,4 +1,4 @@
-"""How Sphinx makes the manual: ``make docs`` writes it to ``out/docs``."""
+"""Configuration of Sphinx: ``make docs`` writes the manual to ``out/docs``."""
 
 import re
 import sys
@@ -21,18 +21,18 @@ html_static_path: list[str] = []
 exclude_patterns = ["_*"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
-# Python lexers know neither our YAML comments nor G-code; a block that is no language is plain.
+# Pygments does not know our YAML comments and G-code; such a block is shown without colours.
 suppress_warnings = ["misc.highlighting_failure"]
 
 
 def outside_as_text(app, name, source):
-    """Links to folders and pages outside of docs/ serve in the repository; here they are text."""
+    """Replace links to files outside of docs/, which serve in the repository, by text."""
     source[0] = re.sub(
         r"\[([^\]]+)\]\((?:\.\./)+(?:README|CHANGELOG|config)[^)]*\)", r"\1", source[0]
     )
 
 
 def setup(app):
-    """Write the pages that come from the code before Sphinx reads any."""
+    """Write the generated pages before Sphinx reads any page."""
     generated.write(ROOT / "docs" / "reference")
     app.connect("source-read", outside_as_text)

@@ -1,4 +1,4 @@
-"""Pages of the reference that come from the code: commands, parameters, messages, quantities."""
+"""Pages of the reference, generated from the code: commands, parameters, messages, quantities."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def write(folder: Path) -> None:
-    """Write every generated page into ``folder``, leaving alone what did not change."""
+    """Write every generated page into ``folder``; unchanged files are not touched."""
     folder.mkdir(exist_ok=True)
     pages = {
         "commands": commands(),
@@ -34,7 +34,7 @@ def commands() -> str:
     """Return a section for each word after ``omsm``, with its arguments."""
     parser = parser_of(WORDS)
     (words,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    lines = ["# Commands", "", "Exit status: 0 done, 2 bad input, 70 a defect of ours.", ""]
+    lines = ["# Commands", "", "Exit status: 0 done, 2 bad input, 70 internal error.", ""]
     for name, sub in words.choices.items():
         lines += [f"## omsm {name}", "", (sub.description or "").strip().capitalize() + ".", ""]
         lines += ["```text", sub.format_usage().strip(), "```", ""]
@@ -76,7 +76,7 @@ def parameters() -> str:
 
 
 def messages() -> str:
-    """Return the messages and services of ``omsm_msgs``, as they are written."""
+    """Return the definitions of the messages and services of ``omsm_msgs``."""
     lines = ["# Messages and services"]
     for path in sorted((ROOT / "msg_defs").glob("*/*.*")):
         if path.suffix in (".msg", ".srv"):
@@ -93,13 +93,13 @@ def messages() -> str:
 
 
 def ranges() -> str:
-    """Return what may come from outside: each quantity with its unit and range."""
+    """Return the table of quantities from outside, each with its unit and range."""
     lines = [
         "# Quantities",
         "",
-        "What comes from outside (messages, files, arguments) is held against this table.",
+        "Values from outside (messages, files, arguments) are checked against this table.",
         "",
-        "| quantity | unit | plausible | where it is not |",
+        "| quantity | unit | plausible range | remedy |",
         "|---|---|---|---|",
     ]
     known = {q for q in vars(quantities).values() if isinstance(q, quantities.Quantity)}
