@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmarks.disturbance_catalogue import CATALOGUE
 from benchmarks.identification import record_once
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.identification.identify import identify
@@ -21,7 +22,6 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
-from omsm_ros.twin.catalogue import CATALOGUE
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant
 from omsm_ros.units import NANOMETRE_M

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import named_causes
+from benchmarks.disturbance_catalogue import CATALOGUE, SIZES, together
 from benchmarks.row import Row, at_most, shown
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import ACCEPTED, REJECTED
@@ -28,7 +29,6 @@ from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
-from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.units import NANOMETRE_M

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from written_disturbances import write_disturbances
 
+from benchmarks.disturbance_catalogue import CATALOGUE
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.pipelines.demonstrate import (
     Demonstration,
@@ -15,7 +16,6 @@ from omsm_ros.pipelines.demonstrate import (
     sample_rows,
     true_response,
 )
-from omsm_ros.twin.catalogue import CATALOGUE
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import step_test_of

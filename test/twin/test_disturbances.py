@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from benchmarks.disturbance_catalogue import CATALOGUE, SIZES, together
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral, StepTest
 from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.catalogue import CATALOGUE, SIZES, together
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.machine_errors import Drift, MachineErrors, PartPose

@@ -80,7 +80,9 @@ def test_every_so_many_of_the_points_are_portioned_and_each_once() -> None:
 def test_before_a_surface_is_known_nothing_is_said_of_what_needs_its_slope() -> None:
     model = ScanModel([spiral(), spiral()], 3)
     place = ScanPlacement(1e-4, np.array([0.0, 1e-5]))
-    for part in model.portions(place, 1):
+    parts = list(model.portions(place, 1))
+    assert parts
+    for part in parts:
         x, y = model.columns(part, place, None)
         assert not np.any(x[:, [3, *range(4, 7)]])
         assert np.all(y == 0.0)

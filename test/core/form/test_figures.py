@@ -117,6 +117,7 @@ def test_an_upper_bound_widens_but_is_not_subtracted(there):
     seen = figures(map_of(deviation))
     known = figures(map_of(deviation, effects=EFFECTS / 20))
     reported = figures(map_of(deviation, effects=effects, bounds=[len(EFFECTS)]))
+    assert set(reported) == set(TRUE)
     for name, figure in reported.items():
         assert figure.value == pytest.approx(seen[name].value, rel=0.05), name
         assert figure.value == pytest.approx(known[name].value, rel=0.02), name
@@ -129,7 +130,9 @@ def test_a_bound_beyond_the_map_leaves_the_figure_open():
     bound = 100e-9 * X / 1e-2
     rng = np.random.default_rng(4)
     reported = map_of(rng.normal(0.0, 1e-9, POINTS), 1e-9, bound[np.newaxis], bounds=[0])
-    for figure in figures(reported).values():
+    found = figures(reported)
+    assert set(found) == set(TRUE)
+    for figure in found.values():
         assert figure.value < 3e-9
         assert figure.uncertainty > 0.5 * np.sqrt(np.mean(bound**2))
 
@@ -162,7 +165,9 @@ def test_the_rms_is_by_area():
 def test_a_small_effect_is_propagated_through_the_figure():
     """1 % more of the form itself is 1 % more of every figure."""
     map_ = map_of(FORM, effects=0.01 * FORM[np.newaxis])
-    for name, figure in figures(map_).items():
+    found = figures(map_)
+    assert set(found) == set(TRUE)
+    for name, figure in found.items():
         assert figure.uncertainty == pytest.approx(0.01 * TRUE[name], rel=0.2), name
         assert figure.value == pytest.approx(TRUE[name], rel=5e-3)
 

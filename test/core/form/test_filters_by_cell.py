@@ -66,6 +66,7 @@ def test_texture_upside_down_and_turned_is_the_same_but_for_its_skewness():
     usual, down, turned = (
         texture(c, c, bands_of(c)) for c in map(cells_of, (values, -values, values.T))
     )
+    assert {"Sa", "Sq", "Sz", "Ssk", "Sku"} <= set(usual)
     for name, figure in usual.items():
         sign = -1 if name == "Ssk" else 1
         assert down[name].value == pytest.approx(sign * figure.value)
@@ -91,7 +92,9 @@ def test_a_single_cell_has_no_slope():
 def test_a_constant_effect_makes_no_texture_uncertain():
     values = RNG.normal(0, 1e-9, (40, 40))
     cells = cells_of(values, effects=[np.full((40, 40), 1e-6)])
-    for name, figure in texture(cells, cells, bands_of(cells)).items():
+    found = texture(cells, cells, bands_of(cells))
+    assert {"Sa", "Sq", "Sz"} <= set(found)
+    for name, figure in found.items():
         assert figure.uncertainty < 1e-6 * max(abs(figure.value), 1e-9), name
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.disturbance_catalogue import CATALOGUE, SIZES
 from benchmarks.named_causes import RIGHT, UNKNOWN, WRONG, judged
 from omsm_ros.core.calibration.finding import RESERVATION, Finding
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import OmsmError
-from omsm_ros.twin.catalogue import CATALOGUE, SIZES
 from omsm_ros.twin.cell import Cell, record
 
 # These move the part, which a step test on a mirror does not measure.

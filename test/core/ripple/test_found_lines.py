@@ -53,6 +53,7 @@ class TestBounds:
             assert line.possible == {TIME: line.frequency}
 
     def test_uncertainties_are_the_bounds_of_cramer_and_rao(self, found):
+        assert found[0].lines
         for line in found[0].lines:
             sigma = 1 * NM * np.sqrt(2 / COUNT)
             assert line.amplitude_uncertainty == pytest.approx(sigma, rel=0.15, abs=0)
@@ -60,6 +61,7 @@ class TestBounds:
             assert line.frequency_uncertainty == pytest.approx(bound, rel=0.15)
 
     def test_significance_is_that_of_the_power_over_the_noise_among_all_frequencies(self, found):
+        assert found[0].lines
         for line in found[0].lines:
             ratio = line.amplitude**2 / (2 * line.amplitude_uncertainty**2)
             expected = float(significance(np.array(ratio), COUNT / 2))
@@ -81,6 +83,7 @@ class TestBounds:
     def test_units_make_no_difference(self, found):
         spectrum, values = found
         other = find_lines(still(), 1e9 * values)
+        assert spectrum.lines
         for one, same in zip(spectrum.lines, other.lines, strict=True):
             assert same.frequency == pytest.approx(one.frequency, rel=1e-9)
             assert same.amplitude == pytest.approx(1e9 * one.amplitude, rel=1e-6)

@@ -104,6 +104,7 @@ class TestFit:
         rng = np.random.default_rng(5)
         values = rng.normal(0, NM, COUNT) + wave(SECONDS, 20.0, 5 * NM, 0.0)
         found = fitted(at_start([(TIME, 20.02), (TIME, 61.0)], values), COORDINATES, values)
+        assert len(found) == 2
         columns = waves_of(found, COORDINATES)(np.arange(COUNT))
         expected = np.linalg.lstsq(columns, values, rcond=None)[0].reshape(-1, 2)
         for one, (cosine, sine) in zip(found, expected, strict=True):

@@ -27,7 +27,8 @@ def test_rings_and_spindle_at_one_feed_a_turn_need_another_feed():
     ]
     for one in scans:
         one.lines = (seen_by(one, "c", 31, 4 * NM),)
-    for (row,) in name_lines(scans):
+    (first,), (second,) = name_lines(scans)
+    for row in (first, second):
         assert (row.kind, str(row.needs)) == (UNDECIDED, "needs a scan with another feed per turn")
 
 
@@ -38,5 +39,6 @@ def test_with_another_feed_the_spindle_is_known():
     ]
     for one in scans:
         one.lines = (seen_by(one, "c", 31, 4 * NM),)
-    for (row,) in name_lines(scans):
+    (first,), (second,) = name_lines(scans)
+    for row in (first, second):
         assert (row.kind, row.order, row.needs) == (SYNCHRONOUS, 31, None)
