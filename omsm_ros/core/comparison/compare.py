@@ -79,7 +79,7 @@ def verdict_of(
     differs = _differences(agreement)
     if differs:
         return ComparisonVerdict(DIFFER, differs, reservations)
-    doubts = _reservation_texts(matched, agreement)
+    doubts = _undecided(matched, agreement)
     if doubts:
         return ComparisonVerdict(CANNOT_TELL, doubts, reservations)
     largest = agreement.largest
@@ -140,7 +140,7 @@ def _differences(found: ComparisonAgreement) -> tuple[Notice, ...]:
     return tuple(reasons)
 
 
-def _reservation_texts(matched: Matched, found: ComparisonAgreement) -> tuple[Notice, ...]:
+def _undecided(matched: Matched, found: ComparisonAgreement) -> tuple[Notice, ...]:
     doubts = [
         Notice("comparison.term_undecided", term=(t.n, t.m), e_n=t.e_n)
         for t in found.terms

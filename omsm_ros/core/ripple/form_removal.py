@@ -44,9 +44,9 @@ _MOST_FITTED = 100_000
 # Samples at a time: 150 columns of them are 20 MB.
 _CHUNK = 16_384
 # An order that exceeds the sum of itself and the form by this factor is not determined.
-_AGAINST = 1.5
+_LARGEST_CANCELLATION = 1.5
 # Distance from a whole number of waves a turn, in resolutions, that counts as whole.
-_OWNED = 0.6
+_HARMONIC_WIDTH = 0.6
 # Radii within this share of the largest are one circle.
 _CIRCLE = 0.02
 # Eigenvalues below this share of the largest are not determined by the scan.
@@ -95,22 +95,22 @@ class FormFit:
         self._height = signal.height - np.mean(signal.height)
         every = max(len(signal) // _MOST_FITTED, 1)
         self._chosen = np.arange(0, len(signal), every)
-        self._degree = self._enough(self._height, _WORTH)
+        self._degree = self._sufficient_degree(self._height, _WORTH)
 
     @property
     def _basis(self) -> _Basis:
         return _Basis.of(self._signal).up_to(self._degree)
 
-    def _enough(self, values: FloatArray, worth: float) -> int:
+    def _sufficient_degree(self, values: FloatArray, worth: float) -> int:
         """Return the degree beyond which less than the share ``worth`` is removed."""
         for top in (_USUAL_DEGREE, max(_DEGREES)):
             basis = _Basis.of(self._signal).up_to(top)
             gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
             energy = float(np.sum(values[self._chosen] ** 2))
-            degree = _enough(basis, gram, moment, energy, worth)
+            degree = _sufficient_degree(basis, gram, moment, energy, worth)
             # The residual is fitted again, because rounding of millimetres would look like form.
             kept = basis.within(degree)
-            some = self._some()
+            some = self._selected()
             columns = basis.columns(self._signal, some)
             left = values[some] - columns[:, kept] @ _solved(gram, moment, kept)
             gram, moment = columns.T @ columns, columns.T @ left
@@ -119,7 +119,7 @@ class FormFit:
                 break
         return degree
 
-    def _some(self) -> np.ndarray:
+    def _selected(self) -> np.ndarray:
         """Return a random selection of samples, which has no aliases, to test a degree."""
         drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
         return np.asarray(self._chosen[np.sort(drawn)])
@@ -127,7 +127,7 @@ class FormFit:
     def refine(self, heights: FloatArray) -> None:
         """Choose the degree again with the ``heights`` of all lines (n,) [m] subtracted."""
         bare = self._height - heights
-        self._degree = max(self._degree, self._enough(bare, _WORTH_WITHOUT_LINES))
+        self._degree = max(self._degree, self._sufficient_degree(bare, _WORTH_WITHOUT_LINES))
 
     def without(self, waves: Waves | None = None) -> FormRemoved:
         """Remove form, drift and orders, fitted together with ``waves``, which are kept."""
@@ -154,7 +154,7 @@ class FormFit:
             on_circle=basis.on_circle,
         )
 
-    def owned(self) -> list[tuple[float, float]]:
+    def reserved_orders(self) -> list[tuple[float, float]]:
         """Return the waves a turn of form and orders, and the width of each in resolutions.
 
         A harmonic with q radial functions extends q/2 resolutions to either side.
@@ -163,7 +163,7 @@ class FormFit:
             return []
         radial = Counter(abs(m) for kind, _, m in self._basis.names if kind == "form" and m >= 0)
         highest = max([HIGHEST_ORDER, *radial])
-        return [(float(k), _OWNED + 0.5 * radial[k]) for k in range(1, highest + 1)]
+        return [(float(k), _HARMONIC_WIDTH + 0.5 * radial[k]) for k in range(1, highest + 1)]
 
 
 def without_form(signal: ScanSignal) -> FormRemoved:
@@ -272,7 +272,7 @@ def _waves_of(waves: Waves, signal: ScanSignal, solution: FloatArray) -> FloatAr
     return np.concatenate(parts)
 
 
-def _enough(
+def _sufficient_degree(
     basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
 ) -> int:
     """Return the degree after which the next one removes less than the share ``worth``."""
@@ -343,5 +343,5 @@ def _orders(
             alike = [i for i, (kind, _, m) in enumerate(basis.names) if abs(m) == k]
             part = solution[alike]
             together = float(part @ mean[np.ix_(alike, alike)] @ part)
-            if own.amplitude**2 / 2 <= _AGAINST**2 * together:
+            if own.amplitude**2 / 2 <= _LARGEST_CANCELLATION**2 * together:
                 yield own

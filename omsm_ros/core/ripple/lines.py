@@ -44,7 +44,7 @@ _APART_BINS = 8
 # Samples between the places at which the rings are evaluated.
 _STRIDE = 50
 # Share of power and distance in resolutions of the image of a line in another coordinate.
-_SHADOW, _SHADOW_BINS = 0.3, 30
+_IMAGE_SHARE, _IMAGE_BINS = 0.3, 30
 # Loss of log-likelihood (5 σ) and of power (more than jitter and encoders cause) from which a line
 # is excluded in another coordinate.
 _LOST_RATIO, _LOST_SHARE = 12.5, 0.05
@@ -74,17 +74,22 @@ def find_lines(
     signal: ScanSignal,
     values: FloatArray,
     known: Sequence[SpectralLine] = (),
-    owned: Sequence[tuple[float, float]] = (),
+    reserved_orders: Sequence[tuple[float, float]] = (),
 ) -> LineSpectrum:
     """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ.
 
     known: lines to start with
-    owned: waves a turn of form and orders, which are no lines, with their width in resolutions
+    reserved_orders: waves a turn of form and orders, which are no lines, and their width in
+        resolutions
     """
     coordinates = coordinates_of(signal)
     searched = [c for c in coordinates.values() if c.like == c.name]
-    reserved = _reserved(coordinates, owned)
-    lines = _free(fitted(list(known), coordinates, values), coordinates, reserved) if known else []
+    reserved = _reserved(coordinates, reserved_orders)
+    lines = (
+        _outside_reserved(fitted(list(known), coordinates, values), coordinates, reserved)
+        if known
+        else []
+    )
     residual = values - sum_of(lines, coordinates, len(values))
     taken = {name: list(places) for name, places in reserved.items()}
     for _ in range(MOST_LINES):
@@ -93,13 +98,13 @@ def find_lines(
             break
         for line in new:  # a line that moves in the fit must not be found again
             taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
-        new = [line for line in new if not _is_shadow(line, lines, coordinates)]
+        new = [line for line in new if not _is_image(line, lines, coordinates)]
         if not new:
             continue
         lines = fitted(lines + new, coordinates, values)
         residual = values - sum_of(lines, coordinates, len(values))
         lines = in_their_coordinates(lines, new, coordinates, residual)
-        lines = _free(lines, coordinates, reserved)
+        lines = _outside_reserved(lines, coordinates, reserved)
         residual = values - sum_of(lines, coordinates, len(values))
     return _judged(signal, lines, coordinates, residual)
 
@@ -133,13 +138,16 @@ def _strongest(
 
 
 def _reserved(
-    coordinates: dict[str, Coordinate], owned: Sequence[tuple[float, float]]
+    coordinates: dict[str, Coordinate], reserved_orders: Sequence[tuple[float, float]]
 ) -> dict[str, list[tuple[float, float]]]:
-    """Return the frequencies of ``owned`` waves a turn over turns, time and path."""
+    """Return the frequencies of ``reserved_orders`` waves a turn over turns, time and path."""
     turn, path = coordinates.get(TURN), coordinates.get(PATH)
     if turn is None:
         return {}
-    found = {TURN: list(owned), TIME: [(order * turn.pace, bins) for order, bins in owned]}
+    found = {
+        TURN: list(reserved_orders),
+        TIME: [(order * turn.pace, bins) for order, bins in reserved_orders],
+    }
     if path is not None:
         # Turns per metre of the innermost and the outermost ring.
         along = abs(np.diff(path.values[::_STRIDE]))
@@ -150,12 +158,12 @@ def _reserved(
                 order * (most + least) / 2,
                 bins + order * (most - least) / 2 / path.resolution,
             )
-            for order, bins in owned
+            for order, bins in reserved_orders
         ]
     return found
 
 
-def _is_shadow(
+def _is_image(
     new: SpectralLine, known: Sequence[SpectralLine], coordinates: dict[str, Coordinate]
 ) -> bool:
     """Return True for the image of a known line in another coordinate.
@@ -166,15 +174,15 @@ def _is_shadow(
     for line in known:
         other = coordinates[line.coordinate]
         apart = abs(line.frequency * other.pace - new.frequency * own.pace)
-        if other.name == own.name or apart > _SHADOW_BINS * own.resolution * own.pace:
+        if other.name == own.name or apart > _IMAGE_BINS * own.resolution * own.pace:
             continue
         share, frequency = same_line(other, line.frequency, own)
-        if share > _SHADOW and abs(frequency - new.frequency) < 2 * own.resolution:
+        if share > _IMAGE_SHARE and abs(frequency - new.frequency) < 2 * own.resolution:
             return True
     return False
 
 
-def _free(
+def _outside_reserved(
     lines: list[SpectralLine],
     coordinates: dict[str, Coordinate],
     reserved: Mapping[str, Sequence[tuple[float, float]]],

@@ -113,7 +113,7 @@ def analyse_scan(
     textures: frequencies along the path [1/m] that are known from other scans and too high to be
         searched, with their uncertainties
     """
-    formless, spectrum = _apart(signal, textures)
+    formless, spectrum = _separated(signal, textures)
     return StudiedScan(
         signal=signal,
         formless=formless,
@@ -134,13 +134,13 @@ def analyse_scans(
     studied = [analyse_scan(signal, acceleration_lines) for signal, acceleration_lines in scans]
     return [
         analyse_scan(one.signal, one.acceleration_lines, finer)
-        if (finer := _finer(one, studied))
+        if (finer := _finer_textures(one, studied))
         else one
         for one in studied
     ]
 
 
-def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float, float]]:
+def _finer_textures(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float, float]]:
     """Return textures beyond the resolution of ``one`` with their uncertainty, that rising."""
     path = one.coordinates.get(PATH)
     if path is None or path.proportional_to_time:
@@ -158,20 +158,20 @@ def _finer(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tuple[float
     return kept
 
 
-def _apart(
+def _separated(
     signal: ScanSignal, textures: Sequence[tuple[float, float]]
 ) -> tuple[FormRemoved, LineSpectrum]:
     """Return form and lines, fitted together because a line near an order leaks into it."""
     form = FormFit(signal)
     formless = form.without()
     known = [texture(signal, formless.residual, wave, spread) for wave, spread in textures]
-    spectrum = find_lines(signal, formless.residual, known, form.owned())
+    spectrum = find_lines(signal, formless.residual, known, form.reserved_orders())
     if not spectrum.lines:
         return formless, spectrum
     form.refine(sum_of(spectrum.lines, spectrum.coordinates, len(signal)))
     for _ in range(_TURNS_OF_FITTING):
         formless = form.without(waves_of(spectrum.lines, spectrum.coordinates))
-        spectrum = find_lines(signal, formless.residual, spectrum.lines, form.owned())
+        spectrum = find_lines(signal, formless.residual, spectrum.lines, form.reserved_orders())
         if not spectrum.lines:
             break
     return formless, spectrum
@@ -224,7 +224,7 @@ def name_lines(scans: Sequence[StudiedScan]) -> list[list[NamedLine]]:
 
 def _named(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
     scan, line = done.scans[key[0]], evidence.line
-    source = done.claim.get(key)
+    source = done.selected.get(key)
     own = None if source is None else _by_other_scans(done, key, source)
     also = done.also.get(key)
     if own is not None and source is not None and also is not None:

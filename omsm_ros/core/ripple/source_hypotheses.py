@@ -279,17 +279,17 @@ class LineEvidence:
 
     line: SpectralLine
     tested: tuple[TestedHypothesis, ...]
-    claims: tuple[SourceHypothesis, ...]
+    sources: tuple[SourceHypothesis, ...]
 
 
 def attribution_evidence(scans: Sequence[StudiedScan]) -> dict[Key, LineEvidence]:
     """Return the evidence for every line of every scan."""
     keys = [(own, k) for own, scan in enumerate(scans) for k in range(len(scan.lines))]
     tested = {key: tuple(_tests(scans, key)) for key in keys}
-    claims = {key: _claims(scans, tested[key]) for key in keys}
-    images = _images(scans, claims)
+    sources = {key: _sources(scans, tested[key]) for key in keys}
+    images = _images(scans, sources)
     return {
-        key: LineEvidence(_line(scans, key), tested[key], (*claims[key], *images.get(key, ())))
+        key: LineEvidence(_line(scans, key), tested[key], (*sources[key], *images.get(key, ())))
         for key in keys
     }
 
@@ -326,7 +326,7 @@ def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
     return bool(high - low >= -0.02 * max(a.max(), b.max()))
 
 
-def _claims(
+def _sources(
     scans: Sequence[StudiedScan], tested: Sequence[TestedHypothesis]
 ) -> tuple[SourceHypothesis, ...]:
     """Return the hypotheses that a scan separates from all other kinds and none contradicts."""
@@ -362,11 +362,11 @@ def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
 
 
 def _images(
-    scans: Sequence[StudiedScan], claims: dict[Key, tuple[SourceHypothesis, ...]]
+    scans: Sequence[StudiedScan], sources: dict[Key, tuple[SourceHypothesis, ...]]
 ) -> dict[Key, list[SourceHypothesis]]:
     """Return the sources of aliases of a texture that another scan resolves, by line."""
     found: dict[Key, list[SourceHypothesis]] = {}
-    for key, own in claims.items():
+    for key, own in sources.items():
         for texture in own:
             if texture.kind != PART or texture.hypothesis.coordinate != PATH:
                 continue
@@ -384,52 +384,52 @@ class Attribution:
 
     scans: Sequence[StudiedScan]
     evidence: dict[Key, LineEvidence]
-    claim: dict[Key, SourceHypothesis] = field(default_factory=dict)
+    selected: dict[Key, SourceHypothesis] = field(default_factory=dict)
     also: dict[Key, SourceHypothesis] = field(default_factory=dict)
 
-    def open_claims(self, key: Key) -> list[SourceHypothesis]:
+    def open_sources(self, key: Key) -> list[SourceHypothesis]:
         """Return the sources of a line with a partner that no other source explains, else all."""
-        every = self.evidence[key].claims
+        every = self.evidence[key].sources
         left = [c for c in every if any(self._may_be(p, c) for p in c.partners)]
         return left or list(every)
 
-    def _may_be(self, partner: Key, claim: SourceHypothesis) -> bool:
-        settled = self.claim.get(partner)
-        return settled is None or _family(settled.kind) == _family(claim.kind)
+    def _may_be(self, partner: Key, source: SourceHypothesis) -> bool:
+        chosen = self.selected.get(partner)
+        return chosen is None or _family(chosen.kind) == _family(source.kind)
 
-    def settle(self, key: Key, claim: SourceHypothesis) -> None:
+    def select(self, key: Key, source: SourceHypothesis) -> None:
         """Select a source for ``key``, and for its partners of similar amplitude."""
-        self.claim[key] = claim
+        self.selected[key] = source
         size = self.evidence[key].line.amplitude
-        for partner in claim.partners:
+        for partner in source.partners:
             ratio = self.evidence[partner].line.amplitude / size
-            theirs = self._adopt_partner_claim(partner, claim, key)
-            if partner in self.claim:
-                if _family(self.claim[partner].kind) != _family(claim.kind):
-                    self.also.setdefault(partner, theirs or claim)
+            theirs = self._adopt_partner_source(partner, source, key)
+            if partner in self.selected:
+                if _family(self.selected[partner].kind) != _family(source.kind):
+                    self.also.setdefault(partner, theirs or source)
             elif theirs is not None and _EXPLAINED[0] <= ratio <= _EXPLAINED[1]:
-                self.claim[partner] = theirs
+                self.selected[partner] = theirs
                 self._note_secondary_sources(partner, theirs)
 
-    def _note_secondary_sources(self, key: Key, claim: SourceHypothesis) -> None:
+    def _note_secondary_sources(self, key: Key, source: SourceHypothesis) -> None:
         """Record a second source of a line whose partners were selected before."""
-        for other in self.evidence[key].claims:
-            if _family(other.kind) != _family(claim.kind) and any(
-                partner in self.claim
-                and _family(self.claim[partner].kind) == _family(other.kind)
-                and key in self.claim[partner].partners
+        for other in self.evidence[key].sources:
+            if _family(other.kind) != _family(source.kind) and any(
+                partner in self.selected
+                and _family(self.selected[partner].kind) == _family(other.kind)
+                and key in self.selected[partner].partners
                 for partner in other.partners
             ):
                 self.also.setdefault(key, other)
 
-    def _adopt_partner_claim(
-        self, partner: Key, claim: SourceHypothesis, key: Key
+    def _adopt_partner_source(
+        self, partner: Key, source: SourceHypothesis, key: Key
     ) -> SourceHypothesis | None:
-        """Return the source of ``partner`` that is the same as ``claim`` and names ``key``."""
+        """Return the source of ``partner`` that is the same as ``source`` and names ``key``."""
         own = [
             c
-            for c in self.evidence[partner].claims
-            if _family(c.kind) == _family(claim.kind) and key in c.partners
+            for c in self.evidence[partner].sources
+            if _family(c.kind) == _family(source.kind) and key in c.partners
         ]
         return max(own, key=lambda c: c.kind == ARTEFACT, default=None)
 
@@ -439,30 +439,30 @@ def attribute_lines(scans: Sequence[StudiedScan], evidence: dict[Key, LineEviden
     done = Attribution(scans, evidence)
     while True:
         waiting = [
-            (_urgency(done, key, claims), key, claims)
+            (_urgency(done, key, sources), key, sources)
             for key, own in evidence.items()
-            if key not in done.claim and (claims := done.open_claims(key))
+            if key not in done.selected and (sources := done.open_sources(key))
         ]
         if not waiting:
             return done
-        _, key, claims = max(waiting, key=lambda entry: entry[0])
-        done.settle(key, _largest(done, key, claims))
+        _, key, sources = max(waiting, key=lambda entry: entry[0])
+        done.select(key, _largest(done, key, sources))
 
 
 def _urgency(
-    done: Attribution, key: Key, claims: Sequence[SourceHypothesis]
+    done: Attribution, key: Key, sources: Sequence[SourceHypothesis]
 ) -> tuple[bool, int, bool, float]:
-    kinds = {_family(c.kind) for c in claims}
-    most = max(claims, key=lambda c: len(c.partners))
+    kinds = {_family(c.kind) for c in sources}
+    most = max(sources, key=lambda c: len(c.partners))
     size = done.evidence[key].line.amplitude
     return len(kinds) == 1, len(most.partners), most.kind != VIBRATION, size
 
 
-def _largest(done: Attribution, key: Key, claims: Sequence[SourceHypothesis]) -> SourceHypothesis:
+def _largest(done: Attribution, key: Key, sources: Sequence[SourceHypothesis]) -> SourceHypothesis:
     """Return, of several sources at one frequency, the one with the strongest partners."""
     by_kind: dict[str, list[SourceHypothesis]] = {}
-    for claim in claims:
-        by_kind.setdefault(_family(claim.kind), []).append(claim)
+    for source in sources:
+        by_kind.setdefault(_family(source.kind), []).append(source)
     sizes = {kind: unexplained_partner_amplitude(done, own) for kind, own in by_kind.items()}
     order = sorted(by_kind, key=lambda kind: -sizes[kind])
     if len(order) > 1:
@@ -470,13 +470,13 @@ def _largest(done: Attribution, key: Key, claims: Sequence[SourceHypothesis]) ->
     return max(by_kind[order[0]], key=lambda c: (c.kind == ARTEFACT, len(c.partners)))
 
 
-def unexplained_partner_amplitude(done: Attribution, claims: Sequence[SourceHypothesis]) -> float:
+def unexplained_partner_amplitude(done: Attribution, sources: Sequence[SourceHypothesis]) -> float:
     """Return the largest amplitude of the partners that no other source explains [m]."""
     found = [
         done.evidence[p].line.amplitude
-        for c in claims
+        for c in sources
         for p in c.partners
-        if p not in done.claim or _family(done.claim[p].kind) == _family(c.kind)
+        if p not in done.selected or _family(done.selected[p].kind) == _family(c.kind)
     ]
     return max(found, default=0.0)
 

@@ -187,11 +187,11 @@ class TestFormNextToLines:
 
 class TestOwned:
     def test_each_order_owns_the_bandwidth_of_its_radial_functions(self):
-        owned = dict(FormFit(scan()).owned())
-        assert set(owned) == {float(k) for k in range(1, 13)}
+        reserved = dict(FormFit(scan()).reserved_orders())
+        assert set(reserved) == {float(k) for k in range(1, 13)}
         # Second degree: one radial function of one and of two waves, none of three.
-        assert owned[2.0] == pytest.approx(owned[12.0] + 0.5)
-        assert owned[3.0] == owned[12.0]
+        assert reserved[2.0] == pytest.approx(reserved[12.0] + 0.5)
+        assert reserved[3.0] == reserved[12.0]
 
     def test_without_turns_nothing_is_owned(self):
-        assert FormFit(scan(turns=1.0)).owned() == []
+        assert FormFit(scan(turns=1.0)).reserved_orders() == []

@@ -103,7 +103,7 @@ class TestWhatIsNone:
     def test_waves_a_turn_that_belong_to_the_form_are_no_lines(self):
         values = noise() + sine(6.0, 9 * NM) + sine(61.0, 4 * NM)
         # Leakage of a strong order beyond that width would be found as lines.
-        taken = find_lines(circle(), values, owned=[(3.0, 1.6)]).lines
+        taken = find_lines(circle(), values, reserved_orders=[(3.0, 1.6)]).lines
         assert [round(line.frequency) for line in taken] == [61]
         free = find_lines(circle(), values).lines
         assert sorted(round(line.frequency) for line in free) == [6, 61]
