@@ -48,7 +48,7 @@ RADIUS, NOISE = PAPER_MIRROR_RADIUS_M, 10 * NANOMETRE_M
 POINTS, PAPER_POINTS = 60_000, 254_000
 ASTIGMATISM, COMA = 50 * NANOMETRE_M, 15 * NANOMETRE_M
 DUST, DUST_SHARE = 5e-6, 1e-3
-DEGREES_OF_FREEDOM = ("x", "y", "piston", "tip", "tilt", "clocking")
+POSE_PARAMETERS = ("x", "y", "piston", "tip", "tilt", "clocking")
 SHIFT, TURN = 0.5 * MILLIMETRE_M, 0.5 * DEGREE_RAD
 MAPS = Path(__file__).parents[2] / "shared" / "data" / "surfaces"
 
@@ -97,7 +97,7 @@ def poses(seed: int) -> Iterator[Pose]:
     yield Pose(x=SHIFT * sign[0], y=SHIFT * sign[1])
     yield Pose(tip=TURN * sign[3], tilt=TURN * sign[4])
     sizes = np.repeat([SHIFT, TURN], 3) * sign
-    yield Pose(**dict(zip(DEGREES_OF_FREEDOM, map(float, sizes), strict=True)))
+    yield Pose(**dict(zip(POSE_PARAMETERS, map(float, sizes), strict=True)))
 
 
 def low_order_error(seed: int) -> ZernikeSurface:
@@ -125,7 +125,7 @@ def _poses(runs: int) -> list[Row]:
             portion = measured(PAPER_MIRROR, pose, seed, points=PAPER_POINTS)
             found = judged(PAPER_MIRROR, portion)
             registration = found.registration
-            for name in DEGREES_OF_FREEDOM:
+            for name in POSE_PARAMETERS:
                 spread = registration.uncertainty(name)
                 off = registration.placement.value(name) - getattr(pose, name)
                 held.append(spread is not None and abs(off) <= 2 * spread)

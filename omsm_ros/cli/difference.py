@@ -9,7 +9,7 @@ from omsm_ros import quantities
 from omsm_ros.cli.arguments import UNIT, number
 from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import dofs
-from omsm_ros.core.comparison.matching import DEGREES_OF_FREEDOM, SEATED, ordered_dofs
+from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, ordered_dofs
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import DIFFERENCE, REPORT
@@ -26,7 +26,7 @@ from omsm_ros.readable import count, figure, percent, plain, quantity
 def _dof_argument(text: str) -> tuple[str, ...]:
     """Return the argument type: freedoms of the second measurement against the first."""
     if text == "auto":
-        return tuple(name for name in DEGREES_OF_FREEDOM if name != "power")
+        return tuple(name for name in MATCHING_PARAMETERS if name != "power")
     try:
         return ordered_dofs(tuple(filter(None, text.split(","))))
     except ConfigurationError as err:
@@ -41,9 +41,9 @@ def _declare_difference(sub: argparse.ArgumentParser) -> None:
         "--fit",
         type=_dof_argument,
         default=SEATED,
-        metavar="FREEDOMS",
-        help=f"of {','.join(DEGREES_OF_FREEDOM)}; 'auto': all but power that the surface determines; "
-        f"default {','.join(SEATED)}",
+        metavar="PARAMETERS",
+        help=f"of {','.join(MATCHING_PARAMETERS)}; 'auto': all but power that the surface "
+        f"determines; default {','.join(SEATED)}",
     )
     sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="taken off both first")
     sub.add_argument(

@@ -7,8 +7,8 @@ import argparse
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import number
 from omsm_ros.cli.command import Facts
-from omsm_ros.core.registration.degrees_of_freedom import parse_dofs
 from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import count, measured
 from omsm_ros.report.measurement.page import correlated_moves, figure_rows, settled

@@ -10,7 +10,7 @@ from omsm_ros.cli.arguments import UNIT, add_bags, cell_of, number, refuse_cell
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.kinematics.limits import MachineLimits
-from omsm_ros.core.registration.degrees_of_freedom import AUTO
+from omsm_ros.core.registration.pose_parameters import AUTO
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_limits, load_surface
 from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT

@@ -14,15 +14,15 @@ from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import conformity
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.registration.degrees_of_freedom import MOVES, Registration
 from omsm_ros.core.registration.placement import (
-    DEGREES_OF_FREEDOM,
+    POSE_PARAMETERS,
     Aperture,
     Placed,
     PointBatch,
     PointBatches,
     placed,
 )
+from omsm_ros.core.registration.pose_parameters import MOVES, Registration
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.deviation import mismatch
@@ -189,7 +189,7 @@ def form_facts(
     return {
         "pose": {
             name: {"value": placement.value(name), "uncertainty": found.uncertainty(name)}
-            for name in DEGREES_OF_FREEDOM
+            for name in POSE_PARAMETERS
         },
         "deviation": {name: figure.entry() for name, figure in form.deviation.items()},
         "zernike": _terms(form),

@@ -147,9 +147,10 @@ class AzimuthalRipple:
 
     def __post_init__(self) -> None:
         for name in ("radius", "wavelength"):
-            if not getattr(self, name) > 0:
+            value = getattr(self, name)
+            if not value > 0:
                 raise ConfigurationError(
-                    f"spokes: {name} is {getattr(self, name)!r} m, expected a positive number"
+                    f"azimuthal ripple: {name} is {value!r} m, expected a positive number"
                 )
 
     @property

@@ -21,7 +21,7 @@ class ErrorFigures:
 
 
 def spread(error: FloatArray, weight: FloatArray | None = None) -> ErrorFigures:
-    """Return the departure of ``error`` (n,) [m]; rms weighted by ``weight`` (n,) if given."""
+    """Return the figures of ``error`` (n,) [m], the rms weighted by ``weight`` (n,) if given."""
     if not len(error):
         raise DataError("no points to compare with the truth")
     return ErrorFigures(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))

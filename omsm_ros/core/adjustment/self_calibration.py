@@ -212,7 +212,7 @@ class SelfCalibration:
     known: which of them the scans or the prior determine, (4,);  speeds: of the scans [rad/s]
     residual: rms [m];  agreement: of the scans with each other
     followed: rms standard uncertainty of the heights of this surface from the four parameters [m]
-    prior_conflict: χ² of lag and curvature against the prior, 2 degrees of freedom
+    prior_conflict: χ² of lag and curvature against the prior, χ²(2) without a conflict
     own, own_uncertainty: clocking [rad], shift [m] and tilt [rad] of each scan except the first
     amplitudes: rms over the part of each harmonic of the surface, from 1 [m]
     points: number of fitted points

@@ -259,7 +259,7 @@ def _terms(
 
 
 def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]:
-    """Return χ² of ``value`` (t,) with its ``correlation`` (t, t), and the degrees of freedom.
+    """Return χ² of ``value`` (t,) with its ``correlation`` (t, t), and its rank.
 
     Directions with a variance of rounding only are left out.
     """

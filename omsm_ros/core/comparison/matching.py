@@ -16,7 +16,7 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import ConfigurationError, DataError, Notice
 
-DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
+MATCHING_PARAMETERS = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
 """Pose parameters in this order, with the signs of a pose: tip raises the side of +y, tilt
 lowers the side of +x, clocking turns from x towards y."""
 
@@ -81,11 +81,11 @@ class Matched:
 def ordered_dofs(names: Sequence[str]) -> tuple[str, ...]:
     """Return the pose parameters in their order; raise ConfigurationError for other names."""
     for name in names:
-        if name not in DEGREES_OF_FREEDOM:
+        if name not in MATCHING_PARAMETERS:
             raise ConfigurationError(
-                "comparison.unknown_freedom", name=name, known=[*DEGREES_OF_FREEDOM]
+                "comparison.unknown_freedom", name=name, known=[*MATCHING_PARAMETERS]
             )
-    return tuple(name for name in DEGREES_OF_FREEDOM if name in names)
+    return tuple(name for name in MATCHING_PARAMETERS if name in names)
 
 
 def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence[str]) -> Matched:

@@ -39,8 +39,8 @@ from omsm_ros.core.form.texture import (
 from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.registration.degrees_of_freedom import Registration
 from omsm_ros.core.registration.placement import Aperture, Placed, PointBatch, PointBatches, placed
+from omsm_ros.core.registration.pose_parameters import Registration
 from omsm_ros.core.registration.register import CHUNK, register
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of

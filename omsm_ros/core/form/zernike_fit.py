@@ -214,7 +214,7 @@ def _scores(
         first = last
     scatter = np.diff(sums, differences, axis=1) / np.sqrt(comb(2 * differences, differences))
     count = max(scatter.shape[1], 2)
-    # The sum over all groups is zero, which takes one degree of freedom without differences.
+    # The sum over all groups is zero, so that without differences one group is not independent.
     free = count if differences else count - 1
     dof = max(1 - len(terms) / len(x), 1e-3)
     return scatter @ scatter.T * len(begins) / free / dof, single / dof

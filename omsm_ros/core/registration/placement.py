@@ -23,7 +23,7 @@ from omsm_ros.errors import DataError, SurfaceError
 LEAST_POINTS = 200
 # A cloud of a nanometre has a wrong unit.
 _LEAST_EXTENT_M = 1e-9
-DEGREES_OF_FREEDOM = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
+POSE_PARAMETERS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
 """Pose parameters of a fit: the six of a pose, and an additional curvature [1/m]."""
 
 _SHIFTS = {"x": 0, "y": 1, "piston": 2}

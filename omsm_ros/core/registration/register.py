@@ -15,19 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.registration.degrees_of_freedom import (
-    AUTO,
-    HELD,
-    DegreesOfFreedom,
-    OpenUncertainty,
-    Registration,
-    determined_dofs,
-    held_dof_effects,
-    root_of,
-    shares_of,
-    typical_range,
-    weakest_dof,
-)
 from omsm_ros.core.registration.form_model import (
     LEAST_LIMIT_M,
     NOT_SETTLED,
@@ -40,8 +27,8 @@ from omsm_ros.core.registration.form_model import (
     relaxation_factor,
 )
 from omsm_ros.core.registration.placement import (
-    DEGREES_OF_FREEDOM,
     LEAST_POINTS,
+    POSE_PARAMETERS,
     Aperture,
     Placement,
     PointBatch,
@@ -51,6 +38,19 @@ from omsm_ros.core.registration.placement import (
     inside_aperture,
     placed,
     selection,
+)
+from omsm_ros.core.registration.pose_parameters import (
+    AUTO,
+    HELD,
+    OpenUncertainty,
+    PoseParameters,
+    Registration,
+    determined_dofs,
+    held_dof_effects,
+    root_of,
+    shares_of,
+    typical_range,
+    weakest_dof,
 )
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray
@@ -154,7 +154,7 @@ def register(
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     except DataError:
         # On a tilted part an undetermined rotation may seem to be determined; seat it first.
-        seated = coarse_placement(surface, chosen, DEGREES_OF_FREEDOM[:3], aperture, start)
+        seated = coarse_placement(surface, chosen, POSE_PARAMETERS[:3], aperture, start)
         dofs = _determined(surface, chosen, asked, aperture, seated)
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     points = inside_aperture(placed(surface, at, chosen), aperture)
@@ -174,10 +174,10 @@ def _determined(
     asked: Sequence[str],
     aperture: Aperture | None,
     at: Placement,
-) -> DegreesOfFreedom:
+) -> PoseParameters:
     """Return which pose parameters the surface determines where the part is ``at``."""
     points = inside_aperture(placed(surface, at, chosen), aperture)
-    columns = dof_columns(at, points, DEGREES_OF_FREEDOM)
+    columns = dof_columns(at, points, POSE_PARAMETERS)
     return determined_dofs(asked, columns @ columns.T, len(points.x))
 
 
@@ -231,7 +231,7 @@ class _PoseFit:
     """Fixed inputs of the passes;  plain: the least-squares placement."""
 
     surface: Surface
-    dofs: DegreesOfFreedom
+    dofs: PoseParameters
     aperture: Aperture | None
     basis: FormBasis
     plain: Placement

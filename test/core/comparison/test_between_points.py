@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.comparison.matching import DEGREES_OF_FREEDOM, SEATED, match, ordered_dofs
+from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, match, ordered_dofs
 from omsm_ros.core.comparison.resampling import (
     TREND_DEGREE,
     LocalQuadratic,
@@ -232,7 +232,7 @@ def test_less_the_fit_nothing_is_left_of_its_columns_and_once_is_enough():
 
 
 def test_freedoms_come_in_one_order_and_each_once():
-    assert ordered_dofs(DEGREES_OF_FREEDOM[::-1]) == DEGREES_OF_FREEDOM
+    assert ordered_dofs(MATCHING_PARAMETERS[::-1]) == MATCHING_PARAMETERS
     assert ordered_dofs(("tilt", "piston", "tilt")) == ("piston", "tilt")
     assert ordered_dofs(()) == ()
     with pytest.raises(ConfigurationError, match=r"'roll' is unknown, expected one of \['piston'"):

@@ -6,13 +6,6 @@ import numpy as np
 import pytest
 from scipy import linalg
 
-from omsm_ros.core.registration.degrees_of_freedom import (
-    DegreesOfFreedom,
-    OpenUncertainty,
-    root_of,
-    shares_of,
-    typical_range,
-)
 from omsm_ros.core.registration.form_model import (
     GROUP,
     LEAST_LIMIT_M,
@@ -24,6 +17,13 @@ from omsm_ros.core.registration.form_model import (
     relaxation_factor,
 )
 from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.registration.pose_parameters import (
+    OpenUncertainty,
+    PoseParameters,
+    root_of,
+    shares_of,
+    typical_range,
+)
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 
@@ -313,7 +313,7 @@ def test_uncertainties_of_a_freedom_add_up_from_where_they_come():
     np.testing.assert_allclose(by_source["slide"], [np.sqrt(17) * 1e-9, 0.0])
     np.testing.assert_allclose(by_source["gain"], [0.0, 2e-6])
     np.testing.assert_allclose(by_source["clocking"], [5e-9, 0.0])
-    dofs = DegreesOfFreedom(("x", "tip"), {"clocking": "why"}, {"y": "why"})
+    dofs = PoseParameters(("x", "tip"), {"clocking": "why"}, {"y": "why"})
     spread = found.spread(dofs, by_source)
     assert spread["x"] == pytest.approx(np.sqrt(9 + 17 + 25) * 1e-9)
     assert spread["tip"] == pytest.approx(np.sqrt(20) * 1e-6)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.registration.degrees_of_freedom import parse_dofs
 from omsm_ros.core.registration.form_model import Estimate, _variance_upper_factor
-from omsm_ros.core.registration.placement import DEGREES_OF_FREEDOM, Aperture, PointBatch
+from omsm_ros.core.registration.placement import POSE_PARAMETERS, Aperture, PointBatch
+from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
@@ -56,5 +56,5 @@ def test_a_pose_that_goes_to_and_fro_within_its_uncertainty_stands():
     height = mounted_surface(part, sits).height(x, y) + rng.normal(0, 10e-9, len(x))
     portion = PointBatch(x, y, height, np.empty((0, len(x))))
     found = register(nominal, lambda: [portion], parse_dofs("auto"), aperture=Aperture(RADIUS))
-    for name in DEGREES_OF_FREEDOM[:6]:
+    for name in POSE_PARAMETERS[:6]:
         assert abs(found.placement.value(name) - pose[name]) < 3 * found.uncertainty(name)

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.registration.placement import (
-    DEGREES_OF_FREEDOM,
     LEAST_POINTS,
+    POSE_PARAMETERS,
     Aperture,
     Placed,
     Placement,
@@ -78,7 +78,7 @@ def test_power_is_a_bowl_that_the_nominal_does_not_have():
 def test_of_a_plane_moves_do_what_geometry_says():
     """Piston lowers the points beside it, a tip those of y, a tilt raises those of x."""
     flat = portion(np.stack([X, Y, 0 * X]))
-    columns = dof_columns(Placement(), placed(Flat(), Placement(), flat), DEGREES_OF_FREEDOM)
+    columns = dof_columns(Placement(), placed(Flat(), Placement(), flat), POSE_PARAMETERS)
     expected = [-np.ones(N), -Y, X, 0 * X, 0 * X, 0 * X, -(X**2 + Y**2) / 2]
     np.testing.assert_allclose(columns, expected, atol=1e-18)
 
@@ -86,9 +86,7 @@ def test_of_a_plane_moves_do_what_geometry_says():
 def test_of_a_sphere_a_shift_does_what_a_tilt_does_by_its_radius():
     on_it = portion(np.stack([X, Y, Sphere(0.05).height(X, Y)]))
     at = placed(Sphere(0.05), Placement(), on_it)
-    columns = dict(
-        zip(DEGREES_OF_FREEDOM, dof_columns(Placement(), at, DEGREES_OF_FREEDOM), strict=True)
-    )
+    columns = dict(zip(POSE_PARAMETERS, dof_columns(Placement(), at, POSE_PARAMETERS), strict=True))
     # Turned by an angle about the vertex, the centre, R above it, moves by R times the angle.
     np.testing.assert_allclose(columns["tilt"], 0.05 * columns["x"], atol=1e-16)
     np.testing.assert_allclose(columns["tip"], -0.05 * columns["y"], atol=1e-16)
@@ -98,7 +96,7 @@ def test_of_a_sphere_a_shift_does_what_a_tilt_does_by_its_radius():
 def test_columns_come_in_the_order_in_which_freedoms_are_named():
     at = placed(PAPER_MIRROR, Placement(POSE), portion(carried(POSE, adjacent(PAPER_MIRROR))))
     every = dict(
-        zip(DEGREES_OF_FREEDOM, dof_columns(Placement(POSE), at, DEGREES_OF_FREEDOM), strict=True)
+        zip(POSE_PARAMETERS, dof_columns(Placement(POSE), at, POSE_PARAMETERS), strict=True)
     )
     names = ("power", "x", "piston", "clocking")
     some = dof_columns(Placement(POSE), at, names)
@@ -113,7 +111,7 @@ def test_a_placement_moves_by_the_names_of_its_freedoms():
     found = Placement(Pose(x=1e-3, tip=0.1), 0.5).moved(
         ("tip", "power", "clocking"), np.array([0.05, -0.2, 0.3])
     )
-    values = [found.value(name) for name in DEGREES_OF_FREEDOM]
+    values = [found.value(name) for name in POSE_PARAMETERS]
     assert values == pytest.approx([0.0, 0.15, 0.0, 1e-3, 0.0, 0.3, 0.3])
     back = found.moved(("tip", "power", "clocking"), np.array([-0.05, 0.2, -0.3]))
     assert back.value("tip") == pytest.approx(0.1)

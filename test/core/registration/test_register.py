@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.registration import register as registering
-from omsm_ros.core.registration.degrees_of_freedom import parse_dofs
 from omsm_ros.core.registration.placement import (
-    DEGREES_OF_FREEDOM,
+    POSE_PARAMETERS,
     Aperture,
     Placement,
     PointBatch,
     dof_columns,
     placed,
 )
+from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import (
@@ -85,8 +85,8 @@ def test_derivatives_are_those_of_the_deviation():
     """Compare with differences in every pose parameter, at a pose far from zero."""
     at = Placement(Pose(x=1e-3, y=-2e-3, piston=1e-3, tip=0.02, tilt=-0.03, clocking=0.5), 0.01)
     portion = scan(FREEFORM, at.pose, noise=1e-7, points=300)
-    columns = dof_columns(at, placed(FREEFORM, at, portion), DEGREES_OF_FREEDOM)
-    for k, name in enumerate(DEGREES_OF_FREEDOM):
+    columns = dof_columns(at, placed(FREEFORM, at, portion), POSE_PARAMETERS)
+    for k, name in enumerate(POSE_PARAMETERS):
         step = 1e-7
         high, low = (
             placed(FREEFORM, at.moved([name], np.array([s])), portion).deviation
@@ -199,7 +199,7 @@ def test_what_is_not_determined_widens_what_follows_it():
     """Clocking of an off-axis paraboloid about its parent's axis, 50.8 mm away."""
     pose = Pose(clocking=5e-3)
     found = fitted(PAPER_MIRROR, scan(PAPER_MIRROR, pose))
-    for name in DEGREES_OF_FREEDOM[:6]:
+    for name in POSE_PARAMETERS[:6]:
         off = found.placement.value(name) - getattr(pose, name)
         assert abs(off) < 2 * found.uncertainty(name)
     assert found.uncertainty("y") > 5e-4

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omsm_ros.core.registration.degrees_of_freedom import (
+from omsm_ros.core.registration.placement import POSE_PARAMETERS
+from omsm_ros.core.registration.pose_parameters import (
     AUTO,
     RIGID,
-    DegreesOfFreedom,
+    PoseParameters,
     determined_dofs,
     parse_dofs,
     typical_range,
     weakest_dof,
 )
-from omsm_ros.core.registration.placement import DEGREES_OF_FREEDOM
 from omsm_ros.errors import ConfigurationError, DataError
 
 RNG = np.random.default_rng(3)
@@ -24,7 +24,7 @@ X, Y = RNG.uniform(-1e-2, 1e-2, (2, POINTS))
 
 def gram_of(**columns):
     """Return the products of the columns of all pose parameters, zero for those without one."""
-    rows = np.array([columns.get(name, np.zeros(POINTS)) for name in DEGREES_OF_FREEDOM])
+    rows = np.array([columns.get(name, np.zeros(POINTS)) for name in POSE_PARAMETERS])
     return rows @ rows.T
 
 
@@ -114,13 +114,13 @@ def test_other_names_are_reported_with_those_there_are(text, reported):
 
 
 def test_a_part_put_on_by_hand_is_off_by_a_millimetre_and_a_degree():
-    assert [typical_range(name) for name in DEGREES_OF_FREEDOM] == pytest.approx(
+    assert [typical_range(name) for name in POSE_PARAMETERS] == pytest.approx(
         [1e-3, np.radians(1), np.radians(1), 1e-3, 1e-3, np.radians(1), 1.0]
     )
 
 
 def test_a_freedom_that_is_held_is_no_longer_fitted():
-    found = DegreesOfFreedom(("piston", "x", "y"), {"clocking": "no"}, {"tip": "weak"}).without(
+    found = PoseParameters(("piston", "x", "y"), {"clocking": "no"}, {"tip": "weak"}).without(
         "x", "why"
     )
     assert found.fitted == ("piston", "y")

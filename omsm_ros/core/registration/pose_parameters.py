@@ -15,7 +15,7 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.form_model import FormBasis
 from omsm_ros.core.registration.placement import (
-    DEGREES_OF_FREEDOM,
+    POSE_PARAMETERS,
     Aperture,
     Placed,
     Placement,
@@ -28,9 +28,9 @@ from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
 AUTO = "auto"
-HELD = "freedoms held"
+HELD = "held pose parameters"
 """Name of the error source for pose parameters that are held at their nominal value."""
-RIGID = DEGREES_OF_FREEDOM[:6]
+RIGID = POSE_PARAMETERS[:6]
 MOVES = ("x", "y", "clocking")
 """Pose parameters that a chuck may hold at zero; piston, tip and tilt always vary."""
 # Odds from which a move of the part counts as strong evidence (Kass and Raftery, 1995).
@@ -49,7 +49,7 @@ def typical_range(dof: str) -> float:
     return MILLIMETRE_M if dof in ("x", "y", "piston") else DEGREE_RAD
 
 
-class DegreesOfFreedom(NamedTuple):
+class PoseParameters(NamedTuple):
     """Pose parameters that are fitted, in the order of their columns, and why others are not.
 
     refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest_dof`
@@ -59,10 +59,10 @@ class DegreesOfFreedom(NamedTuple):
     refused: dict[str, Notice]
     held: dict[str, Notice]
 
-    def without(self, name: str, reason: Notice) -> DegreesOfFreedom:
+    def without(self, name: str, reason: Notice) -> PoseParameters:
         """Return these with ``name`` held for a ``reason``."""
         left = tuple(n for n in self.fitted if n != name)
-        return DegreesOfFreedom(left, self.refused, {**self.held, name: reason})
+        return PoseParameters(left, self.refused, {**self.held, name: reason})
 
 
 def parse_dofs(text: str) -> tuple[str, ...]:
@@ -71,7 +71,7 @@ def parse_dofs(text: str) -> tuple[str, ...]:
     Raises ConfigurationError for an unknown or repeated name.
     """
     names = [name.strip() for name in text.split(",") if name.strip()]
-    known = [AUTO, *DEGREES_OF_FREEDOM]
+    known = [AUTO, *POSE_PARAMETERS]
     for name in names:
         if name not in known:
             raise ConfigurationError("registration.unknown_freedom", name=name, known=known)
@@ -82,7 +82,7 @@ def parse_dofs(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> DegreesOfFreedom:
+def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> PoseParameters:
     """Return which of the pose parameters ``asked`` for the surface determines.
 
     asked: names, or "auto" for all rigid ones that are determined, alone or with "power"
@@ -91,7 +91,7 @@ def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> Degr
     Raises DataError if one that was named is not determined.
     """
     automatic = AUTO in asked
-    wanted = [n for n in DEGREES_OF_FREEDOM if n in asked or (automatic and n in RIGID)]
+    wanted = [n for n in POSE_PARAMETERS if n in asked or (automatic and n in RIGID)]
     fitted: list[str] = []
     refused: dict[str, Notice] = {}
     for name in wanted:
@@ -102,7 +102,7 @@ def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> Degr
             refused[name] = reason
         else:
             raise DataError("registration.not_determined", name=name, reason=reason)
-    return DegreesOfFreedom(tuple(fitted), refused, {})
+    return PoseParameters(tuple(fitted), refused, {})
 
 
 def weakest_dof(
@@ -141,7 +141,7 @@ def weakest_dof(
 
 def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> Notice | None:
     """Return why ``name`` is not determined in a fit with those ``before`` it, None if it is."""
-    places, own = [DEGREES_OF_FREEDOM.index(n) for n in before], DEGREES_OF_FREEDOM.index(name)
+    places, own = [POSE_PARAMETERS.index(n) for n in before], POSE_PARAMETERS.index(name)
     alone = float(np.sqrt(gram[own, own]))
     if alone * typical_range(name) < _LEAST_FORM_M:
         return Notice("registration.surface_unchanged")
@@ -179,7 +179,7 @@ class Registration:
 
     surface: Surface
     placement: Placement
-    dofs: DegreesOfFreedom
+    dofs: PoseParameters
     from_source: dict[str, FloatArray]
     pose_effects: FloatArray
     taken: FloatArray
@@ -316,7 +316,7 @@ class OpenUncertainty(NamedTuple):
             found[name] = np.array([np.linalg.norm(correlated_moves[n]) for n in names])
         return found
 
-    def spread(self, dofs: DegreesOfFreedom, by_source: dict[str, FloatArray]) -> dict[str, float]:
+    def spread(self, dofs: PoseParameters, by_source: dict[str, FloatArray]) -> dict[str, float]:
         """Return the standard uncertainty of each pose parameter that was asked for."""
         held = np.sqrt(np.diag(self.held))
         fitted = np.sqrt(np.sum([s**2 for s in by_source.values()], axis=0))
