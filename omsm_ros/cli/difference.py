@@ -49,7 +49,7 @@ def _declare_difference(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--register",
         type=dofs,
-        metavar="FREEDOMS",
+        metavar="PARAMETERS",
         help="of each to the nominal surface first, as 'omsm form' has them: 'auto', or of "
         "piston,tip,tilt,x,y,clocking,power",
     )

@@ -46,7 +46,7 @@ def declare_fit(sub: argparse.ArgumentParser, default: tuple[str, ...] | None) -
         "--fit",
         type=dofs,
         default=default,
-        metavar="FREEDOMS",
+        metavar="PARAMETERS",
         help="'auto', or of piston,tip,tilt,x,y,clocking,power: what is taken out",
     )
     sub.add_argument(
