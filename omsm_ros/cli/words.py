@@ -69,6 +69,9 @@ TASKS: dict[str, dict[str, Word]] = {
             "align", "spindle centre and beam direction from a scan of a reference sphere"
         ),
         "correct": Word("correct", "correct a recorded scan: cloud, summary and report"),
+        "adjust": Word(
+            "adjust", "adjust two or more scans of one part together: form, sources, verdict"
+        ),
         "report": Word(
             "report", "the page of a finished correction once more, as after --no-report"
         ),

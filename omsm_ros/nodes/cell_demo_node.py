@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -146,6 +146,10 @@ class DemoNode(Node):
                 "level": str(status.level[0]),
             }
 
+    def forget(self, node: str) -> None:
+        """Drop what the diagnostics of ``node`` said, as before it is started again."""
+        self._status.pop(node, None)
+
     def value(self, node: str, key: str) -> int:
         """Return a count from a node's diagnostics; 0 before the first one."""
         return int(self._status.get(node, {}).get(key, 0))
@@ -231,7 +235,7 @@ def perform(
     steps = plan.step_test_samples
     with stage(f"step test: {steps} samples on a fixed mirror", steps) as progress:
         node.call(Trigger, "/omsm/cell_emulator/step_test", Trigger.Request())
-        _follow(node, "calibrator", ("axes_held", "distance_held"), steps, progress)
+        _follow(node, "calibrator", {"axes_held": 0, "distance_held": 0}, steps, progress)
     with stage("identifying the transfer function from encoder to probe"):
         answer = node.call(Identify, "/omsm/calibrator/identify", Identify.Request())
         node.wait_until(
@@ -239,21 +243,34 @@ def perform(
             lambda: node.text("corrector", "calibration") == answer.calibration.id,
         )
     with stage("starting the recorder"):
-        processes.start("recorder", path=str(plan.bag))
-        node.wait_until(
-            "the recorder to be heard",
-            lambda: (
-                node.value(_axes_of(plan), "axes_subscribers") >= 3
-                and node.value("confocal_driver", "confocal_subscribers") >= 3
-                and node.value("corrector", "points_subscribers") >= 1 + plan.view
-            ),
-        )
+        _record(node, processes, plan, plan.bag)
     with stage(f"scanning the mirror: {plan.scan_samples} points", plan.scan_samples) as progress:
-        _scan(node, plan, progress)
+        _scan(node, plan, "scan", plan.scan_samples, progress)
+    with stage("starting the recorder of the second scan"):
+        processes.end("recorder")
+        _record(node, processes, plan, plan.second_bag)
+    samples = plan.second_scan_samples
+    with stage(f"outward at twice the speed: {samples} points", samples) as progress:
+        _scan(node, plan, "verifying_scan", samples, progress)
     if plan.view:
         _until_seen()
     with stage("ending the nodes"):
         processes.end()
+
+
+def _record(node: DemoNode, processes: NodeProcesses, plan: Demonstration, bag: Path) -> None:
+    """Start a recorder, and wait until it is connected to all topics."""
+    node.forget("recorder")
+    processes.start("recorder", path=str(bag))
+    node.wait_until(
+        "the recorder to be heard",
+        lambda: (
+            node.value(_axes_of(plan), "axes_subscribers") >= 3
+            and node.value("confocal_driver", "confocal_subscribers") >= 3
+            and node.value("corrector", "points_subscribers") >= 1 + plan.view
+            and bool(node.text("recorder", "message"))
+        ),
+    )
 
 
 def _until_seen() -> None:
@@ -291,19 +308,27 @@ def _axes_of(plan: Demonstration) -> str:
     return "axis_driver" if companion and companion[0] == "axis_driver" else "confocal_driver"
 
 
-def _scan(node: DemoNode, plan: Demonstration, progress: Callable[[int], None]) -> None:
-    """Scan, and wait until all of it is corrected and recorded."""
-    samples = plan.scan_samples
+def _scan(
+    node: DemoNode,
+    plan: Demonstration,
+    motion: str,
+    samples: int,
+    progress: Callable[[int], None],
+) -> None:
+    """Scan by the emulator's service ``motion``, and wait until all is corrected and recorded."""
     drivers = {"/omsm/axes": _axes_of(plan), "/omsm/confocal": "confocal_driver"}
     earlier = {topic: node.value(driver, "blocks") for topic, driver in drivers.items()}
-    node.call(Trigger, "/omsm/cell_emulator/scan", Trigger.Request())
-    _follow(node, "corrector", ("axes_received", "distance_received"), samples, progress)
+    received = ("axes_received", "distance_received")
+    before = {name: node.value("corrector", name) for name in received}
+    clouds = node.value("corrector", "clouds_published")
+    node.call(Trigger, f"/omsm/cell_emulator/{motion}", Trigger.Request())
+    _follow(node, "corrector", before, samples, progress)
     node.wait_until(
         "the last clouds to be recorded",
         lambda: (
             node.value("corrector", "pairs_held") == 0
             and node.value("recorder", "/omsm/points")
-            == node.value("corrector", "clouds_published")
+            == node.value("corrector", "clouds_published") - clouds
             and all(
                 node.value("recorder", topic) == node.value(driver, "blocks") - earlier[topic]
                 for topic, driver in drivers.items()
@@ -313,10 +338,16 @@ def _scan(node: DemoNode, plan: Demonstration, progress: Callable[[int], None]) 
 
 
 def _follow(
-    node: DemoNode, who: str, counts: tuple[str, ...], total: int, progress: Callable[[int], None]
+    node: DemoNode,
+    who: str,
+    before: Mapping[str, int],
+    total: int,
+    progress: Callable[[int], None],
 ) -> None:
+    """Wait until each of the counts has grown by ``total`` from what it was ``before``."""
+
     def seen() -> int:
-        least = min(node.value(who, name) for name in counts)
+        least = min(node.value(who, name) - count for name, count in before.items())
         progress(least)
         return least
 

@@ -30,7 +30,7 @@ from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.quantities import Parameter
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, verifying_scan_of
 from omsm_ros.twin.sensors import ReferenceSensor
 
 _SCENARIO = (
@@ -67,8 +67,9 @@ class CellEmulatorNode(ManagedNode):
 
     An ``accelerometer`` among the disturbances is published on ``acceleration``.
 
-    Services: ``~/step_test``, ``~/scan`` (std_srvs/Trigger) answer as soon as the motion has
-    been worked out and starts; ``~/stop`` ends it.
+    Services: ``~/step_test``, ``~/scan``, ``~/verifying_scan`` (std_srvs/Trigger; the last one
+    scans the part outward at twice the speed) answer as soon as the motion starts; ``~/stop``
+    ends it.
     """
 
     def __init__(self) -> None:
@@ -101,7 +102,12 @@ class CellEmulatorNode(ManagedNode):
             values["seed"],
         )
         undo.callback(self._player.close)
-        for name, motion_of in (("step_test", planned_test_of), ("scan", scan_of)):
+        motions = {
+            "step_test": planned_test_of,
+            "scan": scan_of,
+            "verifying_scan": verifying_scan_of,
+        }
+        for name, motion_of in motions.items():
             serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
         self._messages = message_mapping.ros_messages()

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
@@ -37,16 +38,24 @@ from omsm_ros.io.files import (
 from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines import measure as measurement
 from omsm_ros.pipelines import publish as publication
+from omsm_ros.pipelines.adjust import (
+    ADJUSTED_CLOUD,
+    ADJUSTMENT,
+    adjust_bags,
+    adjustment_facts,
+    write_adjustment,
+)
 from omsm_ros.pipelines.correct import correct_bag
 from omsm_ros.pipelines.measure import Judgement, with_sources
 from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report import response_figures, style
+from omsm_ros.report.adjustment import headline
 from omsm_ros.report.measurement.figures import levelled, overview_figure, surface_figures
 from omsm_ros.report.measurement.surface_map import CloudView
 from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
-from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
 from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.twin.truth import TruthComparison, compare_with_truth
 from omsm_ros.units import PPM
@@ -60,8 +69,14 @@ _FIRST_PORT, _PORTS = 20_000, 10_000
 _LAPSE, _RADIUS_M = 20.0, 12.7e-3
 _SLOW_LAPSE, _SMALL_RADIUS_M = 3.0, 3e-3
 OVERVIEW = "overview.png"
+SCAN_REPORT = "scan_report.html"
+# Form deviation that a mirror of this kind may have, peak to valley.
+TOLERANCE_M = 250e-9
 _MARK = "made_by_omsm_demo.txt"
-_RESULTS = (CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, OVERVIEW)
+_RESULTS = (
+    CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, SCAN_REPORT, OVERVIEW,
+    ADJUSTMENT, ADJUSTED_CLOUD,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -117,6 +132,11 @@ class Demonstration:
         return self.out / "scan.mcap"
 
     @property
+    def second_bag(self) -> Path:
+        """The second scan: outward at twice the speed, written by the recorder node."""
+        return self.out / "scan_outward.mcap"
+
+    @property
     def link(self) -> str:
         """The emulated port."""
         if emulated(self.device).tcp:
@@ -139,6 +159,11 @@ class Demonstration:
     def scan_samples(self) -> int:
         """Samples of the scan."""
         return round(spiral_of(self.scenario).duration / self.sample_period)
+
+    @property
+    def second_scan_samples(self) -> int:
+        """Samples of the second scan."""
+        return round(spiral_of(verifying(self.scenario)).duration / self.sample_period)
 
     def emulator_parameters(self) -> dict[str, object]:
         """Return ROS parameters of the emulator."""
@@ -193,7 +218,12 @@ class Demonstration:
                 "empty or does not exist yet"
             )
         save_text(mark, "Whatever is in this folder, the next demonstration replaces.\n")
-        stale = (self.calibration_file, self.bag, *(self.out / name for name in _RESULTS))
+        stale = (
+            self.calibration_file,
+            self.bag,
+            self.second_bag,
+            *(self.out / name for name in _RESULTS),
+        )
         for path in stale:
             if path.is_dir():
                 raise OmsmError(f"{str(path)!r} is a folder and stands in the way; remove it")
@@ -215,7 +245,7 @@ _REGISTERING = measurement.RegistrationOptions(("piston", "tip", "tilt"))
 
 
 def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
-    """Correct the recorded bag offline, compare with the truth, write all results."""
+    """Correct the first scan offline, adjust both, compare with the truth, write all results."""
     calibration = load_calibration(plan.calibration_file)
     options = with_sources(CorrectionOptions(), calibration, NOTHING_STATED, PAPER_MIRROR)
     done = correct_bag(
@@ -230,7 +260,7 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     judgement = Judgement(options, out=plan.out, fitted=_REGISTERING.dofs)
     summary = measurement.summarise(plan.bag, done, calibration, judgement)
     measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
-    summary["files"] |= {"report": REPORT, "overview": OVERVIEW}
+    summary["files"] |= {"scan_report": SCAN_REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
     summary["response"] = response_errors(calibration, true_response(step_test))
@@ -246,10 +276,44 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     )
     figures |= calibration_figures(calibration, step_test)
     (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true_response(step_test)))
-    save_json(plan.out / SUMMARY, summary)
     surface = publication.map_of(view, PAPER_MIRROR, plan.out)
     publication.publish(plan.out, TITLE, summary, calibration, figures, surface)
+    (plan.out / REPORT).replace(plan.out / SCAN_REPORT)
+    summary["adjustment"] = _adjusted(plan, calibration)
+    summary["files"] |= {"report": REPORT, "adjustment": ADJUSTMENT, "adjusted": ADJUSTED_CLOUD}
+    save_json(plan.out / SUMMARY, summary)
     return summary
+
+
+def _adjusted(plan: Demonstration, calibration: Calibration) -> dict[str, Any]:
+    """Adjust both scans together, and add the true form of the part to their page."""
+    bags_of_part = [plan.bag, plan.second_bag]
+    found, scans = adjust_bags(
+        bags_of_part, calibration, nominal=PAPER_MIRROR, accuracy=TOLERANCE_M / 5
+    )
+    facts = adjustment_facts(found, scans, calibration, TOLERANCE_M)
+    facts["truth"] = _form_truth(plan, found)
+    write_adjustment(plan.out, facts, found, scans, TITLE)
+    return {name: facts[name] for name in ("verdict", "figures", "conformity", "truth")}
+
+
+def _form_truth(plan: Demonstration, found: Adjustment) -> dict[str, float]:
+    """Return the true PV and rms of the part, pose removed, and the error of the map (rms)."""
+    form = found.form
+    error = plan.scenario.part.error(form.x, form.y)
+    columns = np.stack([np.ones_like(form.x), form.x, form.y], axis=1)
+    weight = np.sqrt(form.area)[:, np.newaxis]
+
+    def levelled(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        pose = np.linalg.lstsq(columns * weight, values * weight[:, 0], rcond=None)[0]
+        return np.asarray(values - columns @ pose)
+
+    true, off = levelled(error), levelled(form.height - error)
+    return {
+        "peak_to_valley": float(np.ptp(true)),
+        "rms": float(np.sqrt(form.area @ true**2)),
+        "map_error_rms": float(np.sqrt(form.area @ off**2)),
+    }
 
 
 def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
@@ -352,6 +416,7 @@ def _live_text(summary: dict[str, Any]) -> str:
 
 def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
     before, after = summary["dynamic_error_before"], summary["dynamic_error_after"]
+    yield from adjustment_rows(summary["adjustment"])
     yield "dynamic error before", _spread(before)
     yield "  after correction", _spread(after)
     surface = summary["surface_deviation"]
@@ -366,6 +431,20 @@ def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
             f"{quantity(row['gain_error'] / PPM, 'ppm', signed=True)}, "
             f"{quantity(row['phase_error_deg'], '°', signed=True)}",
         )
+
+
+def adjustment_rows(adjusted: dict[str, Any]) -> Iterable[tuple[str, str]]:
+    """Yield names and texts of the verdict, beside the truth of the twin."""
+    yield "form of the part", headline(adjusted)
+    yield "  verdict", adjusted["verdict"]["text"]
+    for reason in adjusted["verdict"]["reasons"]:
+        yield "", reason["text"]
+    truth = adjusted["truth"]
+    yield (
+        "  truth of the twin",
+        f"PV {quantity(truth['peak_to_valley'], 'm')}; the map is off by "
+        f"{quantity(truth['map_error_rms'], 'm', 2)} rms",
+    )
 
 
 def _spread(spread: dict[str, float]) -> str:

@@ -28,6 +28,7 @@ class Scenario:
     seed: of all random numbers;  part_seed: of the figure error, None takes ``seed``
     spindle_speed: [rpm];  feed_per_turn, start_radius: [m];  step_rise, sample_period: [s]
     tool_marks: peak to valley of the marks of the turning tool [m]
+    outward: scan from the centre outward
     """
 
     seed: int = 1
@@ -38,6 +39,7 @@ class Scenario:
     sample_period: float = 1e-3
     part_seed: int | None = None
     tool_marks: float = 0.0
+    outward: bool = False
 
     @property
     def part(self) -> FigureError:
@@ -91,5 +93,25 @@ def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recordi
 def spiral_of(scenario: Scenario) -> Spiral:
     """Return the commanded motion of the scan over the nominal mirror."""
     return Spiral(
-        PAPER_MIRROR, scenario.start_radius, scenario.feed_per_turn, scenario.spindle_speed
+        PAPER_MIRROR,
+        scenario.start_radius,
+        scenario.feed_per_turn,
+        scenario.spindle_speed,
+        scenario.outward,
     )
+
+
+def verifying(scenario: Scenario) -> Scenario:
+    """Return the scan that verifies ``scenario``: the same part outward at twice the speed."""
+    return replace(
+        scenario,
+        seed=scenario.seed + 1,
+        part_seed=scenario.seed if scenario.part_seed is None else scenario.part_seed,
+        spindle_speed=2 * scenario.spindle_speed,
+        outward=not scenario.outward,
+    )
+
+
+def verifying_scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
+    """Return the scan of :func:`verifying`."""
+    return scan_of(verifying(scenario), disturbances)

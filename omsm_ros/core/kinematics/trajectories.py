@@ -105,6 +105,7 @@ class Spiral:
     """X feeds from ``start_radius`` to the centre while C turns and Z follows ``surface``.
 
     start_radius: [m];  feed_per_turn: [m];  spindle_speed: [rpm], negative reverses.
+    outward: from the centre to ``start_radius`` instead.
     Before its start the motion is a circle at the start radius.
     """
 
@@ -112,6 +113,7 @@ class Spiral:
     start_radius: float
     feed_per_turn: float
     spindle_speed: float
+    outward: bool = False
 
     def __post_init__(self) -> None:
         if self.start_radius <= 0 or self.feed_per_turn <= 0 or self.spindle_speed == 0:
@@ -128,13 +130,13 @@ class Spiral:
 
     @property
     def duration(self) -> float:
-        """Time until X reaches the centre [s]."""
+        """Time that the feed takes [s]."""
         return self.start_radius / (self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ)
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]."""
         feed = self.feed_per_turn * abs(self.spindle_speed) * RPM_HZ * np.maximum(time, 0.0)
-        x = self.start_radius - feed
+        x = feed if self.outward else self.start_radius - feed
         return _on_surface(self.surface, x, self.spindle_speed * RPM_RAD_S * time)
 
 

@@ -1,0 +1,95 @@
+"""Sentences about an adjustment of scans: its verdict, its reasons, and names of sources."""
+
+from __future__ import annotations
+
+TEMPLATES = {
+    "verdict.verified": "verified by {scans:count} scans",
+    "verdict.not_verified": "not verified",
+    "verdict.contradicted": "contradicted by the scans",
+    "verdict.too_uncertain": "uncertainty too large",
+    "verdict.refuted": (
+        "{names}: found {value:plain/2} standard deviations from the declared value; check the "
+        "declaration, or accept the found value with {opt.accept}"
+    ),
+    "verdict.undeclared_effect": (
+        "{names}: significant, and not declared; the found value is in the uncertainty. Look for "
+        "its cause, or accept it with {opt.accept}"
+    ),
+    "verdict.scans_disagree": (
+        "scan {names} differs from the others by E_n = {value:plain/2}, at most {limit:plain/1} is "
+        "expected; look for what changed between the scans"
+    ),
+    "verdict.wrong_sign": (
+        "scan {names}: the deviation follows the removed dynamic error ({value:plain/2} of it), "
+        "as with a wrong sign of the probe; check the polarity of step test and scan"
+    ),
+    "verdict.not_redundant": (
+        "one speed and direction cannot show an error of the dynamics, a lag or a drift"
+    ),
+    "verdict.uncertainty": (
+        "expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked for"
+    ),
+    "verdict.add_other_speed": "scan the part again at twice the speed, from the centre outward",
+    "verdict.add_other_direction": "scan the part again with the spindle reversed",
+    "verdict.add_reclocked": "turn the part on the chuck by 80°, and scan it again",
+    "verdict.add_repeated_track": "scan the part again in the same way",
+    "verdict.add_beyond_centre": "scan the part again to beyond the centre",
+    "verdict.add_other_stand_off": "scan the part again at another stand-off of the probe",
+    "verdict.add_reference_artefact": "measure a reference artefact",
+}
+
+SOURCE_NAMES = {
+    "lag_change": "change of the structural lag since the step test",
+    "lateral_lag": "latency of the probe",
+    "lag_asymmetry": "lag that differs between up and down",
+    "motion_error": "backlash",
+    "lag_speed": "lag that depends on the speed",
+    "lag_direction": "lag that depends on the spindle direction",
+    "lag_motion": "lag that depends on Z",
+    "lag_x": "lag that depends on X",
+    "lag_time": "lag that changes with time",
+    "lag_curvature": "change of the curvature of G",
+    "removed": "sign or size of the correction",
+    "centre_x": "spindle centre in x",
+    "centre_y": "spindle centre in y",
+    "parallelism": "parallelism of Z to the spindle",
+    "squareness": "squareness of X to the spindle",
+    "encoder_scale": "scale of the Z encoder",
+    "straightness_x": "straightness of X",
+    "straightness_z": "straightness of Z",
+    "pitch": "pitch of Z",
+    "static_gain": "scale of the probe",
+    "probe_square": "quadratic linearity error of the probe",
+    "probe_linearity": "cubic linearity error of the probe",
+    "probe_slope_square": "reading of the probe on slopes",
+    "beam": "direction of the beam",
+    "spindle_axial": "axial error motion of the spindle",
+    "spindle_tilt": "tilt error motion of the spindle",
+    "spindle_radial": "radial error motion of the spindle",
+    "c_error": "angular error of C",
+    "drift_rate": "steady drift",
+    "drift": "settling",
+    "drift_walk": "random drift",
+    "noise": "noise of the readings",
+    "tilt": "tilt of the part",
+    "decentre": "decentre of the part",
+    "clocking": "clocking of the part",
+    "expansion": "expansion of the part",
+    "scan_differs": "form that one scan alone shows",
+    "line": "vibration",
+    "height_step": "step of the height",
+    "angle_step": "jump of C",
+}
+
+
+def source_name(family: str) -> str:
+    """Return the name of a family for people: ``spindle_axial/2@1`` → "…, 2 per turn, scan 2"."""
+    name, _, scan = family.partition("@")
+    base, _, order = name.partition("/")
+    text = SOURCE_NAMES.get(base, base.replace("_", " "))
+    if order:
+        text += f", {order} per turn" if base in SPINDLE else f", {order} Hz"
+    return text + (f", scan {int(scan) + 1}" if scan.isdigit() else "")
+
+
+SPINDLE = ("spindle_axial", "spindle_tilt", "spindle_radial", "c_error")

@@ -1,0 +1,352 @@
+"""Adjust scans of one part together: from bags to form, sources and verdict in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.adjustment import Adjustment, ScanData, Source, SourceFinding, adjust
+from omsm_ros.core.adjustment.adjust import corrected_heights
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.correction.correct import CorrectionOptions
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.form.deviation_map import UncertainValue, conformity
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import Account, AxisBlock, FloatArray, IntArray
+from omsm_ros.errors import BagError, ConfigurationError
+from omsm_ros.io.files import REPORT, save_json, save_text
+from omsm_ros.io.results import PlyWriter
+from omsm_ros.io.topics import AnyBag
+from omsm_ros.messages import sentence
+from omsm_ros.messages.verdict import source_name
+from omsm_ros.pipelines.correct import Admission, CorrectedScan
+from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.readable import number
+from omsm_ros.units import RPM_RAD_S
+
+SCHEMA = "omsm-adjustment/1"
+ADJUSTMENT, ADJUSTED_CLOUD = "adjustment.json", "adjusted.ply"
+# Between two scans whose stamps do not say how far they lie apart, as the part is approached anew.
+_PAUSE_S = 20.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class AdjustedScan:
+    """One scan as it was read for the adjustment.
+
+    bag: where it is from;  data: for the adjustment;  points: as corrected
+    account: of every sample;  began_ns: ROS time of its first sample, None if it is not known
+    """
+
+    bag: str
+    data: ScanData
+    points: SurfacePoints
+    account: Account
+    began_ns: int | None
+
+
+def read_scan(
+    bag: AnyBag,
+    calibration: Calibration,
+    options: CorrectionOptions,
+    *,
+    clocking: float = 0.0,
+    clamping: int = 0,
+    admission: Admission | None = None,
+    progress: Progress = no_progress,
+) -> AdjustedScan:
+    """Correct a bag, and return its points with the motion of the axes, time from zero.
+
+    clocking: angle by which the part is turned on the chuck [rad];  clamping: its number
+    Raises BagError for a bag without a surface point.
+    """
+    axes: list[AxisBlock] = []
+    parts: list[SurfacePoints] = []
+    admission = admission or Admission()
+    with CorrectedScan(bag, calibration, options, admission=admission, progress=progress) as scan:
+        for block, points in scan.steps():
+            if isinstance(block, AxisBlock):
+                axes.append(block)
+            if points is not None and len(points):
+                parts.append(points)
+        account, period, began = scan.account, scan.sample_period, scan.recorded_ns
+    if not parts:
+        raise BagError(f"{str(bag)!r} gives no surface point; look at it with 'omsm inspect'")
+    made = join_points(parts)
+    z, c = _axes_at(axes, made.sample)
+    known = np.isfinite(z) & np.isfinite(c) & np.isfinite(made.height)
+    made, z, c = made.part(known), z[known], np.unwrap(c[known])
+    data = ScanData(
+        time=(made.sample - made.sample[0]) * period,
+        x=made.x,
+        y=made.y,
+        height=made.height,
+        distance=made.height - z + made.dynamic_error,
+        motion=z,
+        removed=made.dynamic_error,
+        c=c,
+        clocking=clocking,
+        clamping=clamping,
+    )
+    return AdjustedScan(bag=str(bag), data=data, points=made, account=account, began_ns=began)
+
+
+def _axes_at(blocks: Sequence[AxisBlock], samples: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return z [m] and c [rad] at the trigger counts ``samples``, NaN where there is none."""
+    counts = np.concatenate([b.first_sample + np.arange(len(b), dtype=np.int64) for b in blocks])
+    z, c = (np.concatenate([getattr(b, name) for b in blocks]) for name in "zc")
+    order = np.argsort(counts, kind="stable")
+    counts, z, c = counts[order], z[order], c[order]
+    place = np.minimum(np.searchsorted(counts, samples), len(counts) - 1)
+    there = counts[place] == samples
+    return np.where(there, z[place], np.nan), np.where(there, c[place], np.nan)
+
+
+def on_one_clock(scans: Sequence[AdjustedScan]) -> list[AdjustedScan]:
+    """Return ``scans`` in the order in which they were made, with times of one clock.
+
+    Their stamps are used where they leave room for each scan; a time lapse does not, then each
+    begins a pause after the one before, in the order of their stamps or as they were given.
+    """
+    began = [scan.began_ns for scan in scans]
+    order = list(range(len(scans)))
+    if all(stamp is not None for stamp in began):
+        order.sort(key=lambda k: began[k] or 0)
+    stamped = [((began[k] or 0) - (began[order[0]] or 0)) * 1e-9 for k in order]
+    durations = [scans[k].data.duration for k in order]
+    fits = all(
+        after - before > duration
+        for before, after, duration in zip(stamped, stamped[1:], durations, strict=False)
+    )
+    begin, found = 0.0, []
+    for k, stamp, duration in zip(order, stamped, durations, strict=True):
+        begin = stamp if fits else begin
+        data = replace(scans[k].data, time=scans[k].data.time + begin)
+        found.append(replace(scans[k], data=data))
+        begin += duration + _PAUSE_S
+    return found
+
+
+def priors_of(stated: MachineSources) -> tuple[Source, ...]:
+    """Return the declared sources as priors of the adjustment, those of single points left out."""
+    found: dict[str, Source] = {}
+    for source in stated.stated:
+        if (prior := _prior(source)) is not None:
+            before = found.get(prior.name)
+            size = (
+                prior.uncertainty
+                if before is None
+                else float(np.hypot(before.uncertainty, prior.uncertainty))
+            )
+            found[prior.name] = replace(prior, uncertainty=size)
+    return tuple(found.values())
+
+
+# Declared names that the adjustment calls otherwise, or has no family for.
+_RENAMED = {"probe_noise": "noise", "slope_square": "probe_slope_square",
+            "linearity": "probe_linearity", "static_gain": "static_gain"}  # fmt: skip
+_LEFT_OUT = ("reference_noise", "encoder_noise", "timing", "encoder_interpolation", "slope",
+             "linearity_periodic", "resolution", "lateral")  # fmt: skip
+
+
+def _prior(source: StatedSource) -> Source | None:
+    name = _RENAMED.get(source.source, source.source)
+    if name in _LEFT_OUT:
+        return None
+    order = source.parameters.get("per_turn")
+    if order is not None:
+        name = f"{name}/{order:.3g}"
+    return Source(name, source.standard_uncertainty, source.parameters.get("correlation_length"))
+
+
+def adjust_bags(
+    bags: Sequence[AnyBag],
+    calibration: Calibration,
+    *,
+    nominal: Surface | None = None,
+    options: CorrectionOptions | None = None,
+    stated: MachineSources = NOTHING_STATED,
+    clockings: Sequence[float] = (),
+    clampings: Sequence[int] = (),
+    accuracy: float | None = None,
+    accepted: Collection[str] = (),
+    admission: Admission | None = None,
+    progress: Progress = no_progress,
+) -> tuple[Adjustment, list[AdjustedScan]]:
+    """Return ``bags``, scans of one part, adjusted together, and the scans as they were read.
+
+    nominal: surface of the part in the frame of the workpiece; None: a polynomial
+    stated: declared sources, the priors;  accepted: found values that somebody has accepted
+    clockings: of the part on the chuck in each scan [rad];  clampings: their numbers
+    accuracy: asked for, k = 2 [m]
+
+    Raises ConfigurationError where ``clockings`` or ``clampings`` are not one for each scan.
+    """
+    for name, given in (("clocking", clockings), ("clamping", clampings)):
+        if given and len(given) != len(bags):
+            raise ConfigurationError(
+                f"{len(given)} values of {name} for {len(bags)} scans; give one for each scan"
+            )
+    scans = on_one_clock(
+        [
+            read_scan(
+                bag,
+                calibration,
+                options or CorrectionOptions(),
+                clocking=clockings[k] if clockings else 0.0,
+                clamping=clampings[k] if clampings else 0,
+                admission=admission,
+                progress=progress,
+            )
+            for k, bag in enumerate(bags)
+        ]
+    )
+    found = adjust(
+        [scan.data for scan in scans],
+        priors_of(stated),
+        nominal=nominal,
+        accuracy=accuracy,
+        accepted=accepted,
+    )
+    return found, scans
+
+
+def write_adjustment(
+    out: Path,
+    facts: dict[str, Any],
+    found: Adjustment,
+    scans: Sequence[AdjustedScan],
+    title: str = "Form of the part",
+    report: bool = True,
+) -> None:
+    """Write adjustment.json, the adjusted points of all scans, and report.html into ``out``."""
+    out.mkdir(parents=True, exist_ok=True)
+    _save_cloud(out / ADJUSTED_CLOUD, found, scans)
+    facts["files"] = {"adjustment": ADJUSTMENT, "cloud": ADJUSTED_CLOUD}
+    if report:
+        facts["files"]["report"] = REPORT
+    save_json(out / ADJUSTMENT, facts)
+    if report:
+        # Here, because drawing takes longer to load than scans to adjust.
+        from omsm_ros.report.adjustment import render
+
+        save_text(out / REPORT, render(title, facts, found))
+
+
+def _save_cloud(path: Path, found: Adjustment, scans: Sequence[AdjustedScan]) -> None:
+    """Write the points of all scans, heights less what the adjustment found of the machine."""
+    with PlyWriter(path) as cloud:
+        for index, scan in enumerate(scans):
+            height = corrected_heights(found, scan.data, index)
+            cloud.write(replace(scan.points, height=height))
+
+
+def adjustment_facts(
+    found: Adjustment,
+    scans: Sequence[AdjustedScan],
+    calibration: Calibration,
+    tolerance: float | None = None,
+) -> dict[str, Any]:
+    """Return what ``adjustment.json`` says; lengths in metres.
+
+    tolerance: of the peak to valley [m], None: conformity is not assessed
+    """
+    form = found.form
+    spread = np.sqrt(np.maximum(np.diag(form.term_covariance), 0.0))
+    facts: dict[str, Any] = {
+        "schema": SCHEMA,
+        "calibration": calibration.id,
+        "verdict": _verdict_entry(found, len(scans)),
+        "figures": {
+            "peak_to_valley": _figure(form.pv.value, form.pv.uncertainty),
+            "rms": _figure(form.rms.value, form.rms.uncertainty),
+            "removed": list(form.removed),
+            "terms": [
+                {"n": t.n, "m": t.m, **_figure(value, size)}
+                for t, value, size in zip(form.terms, form.coefficients, spread, strict=True)
+            ],
+        },
+        "scans": [_scan_entry(scan) for scan in scans],
+        "sources": [_source_entry(source) for source in found.sources],
+        "agreement": [
+            {"scan": a.scan, "peak_to_valley": a.pv, "rms": a.rms, "terms": a.terms.tolist()}
+            for a in found.agreement
+        ],
+        "noise": found.noise.tolist(),
+        "drift_walk": found.drift_walk,
+    }
+    if tolerance is not None:
+        judged = conformity(UncertainValue(form.pv.value, form.pv.uncertainty), tolerance)
+        facts["conformity"] = None if judged is None else asdict(judged)
+    return facts
+
+
+def _figure(value: float, uncertainty: float) -> dict[str, float]:
+    return {"value": float(value), "standard_uncertainty": float(uncertainty)}
+
+
+def _scan_entry(scan: AdjustedScan) -> dict[str, Any]:
+    return {
+        "bag": scan.bag,
+        "speed_rpm": scan.data.speed / RPM_RAD_S,
+        "outward": scan.data.outward,
+        "turns": scan.data.turns,
+        "duration": scan.data.duration,
+        "clocking": scan.data.clocking,
+        "points": len(scan.data),
+        "samples": scan.account.as_dict(),
+    }
+
+
+def _source_entry(source: SourceFinding) -> dict[str, Any]:
+    return {
+        "name": source.name,
+        "text": source_name(source.name),
+        "unit": source.unit,
+        "declared": source.declared,
+        "found": np.atleast_1d(source.found).tolist(),
+        "uncertainty": np.atleast_1d(source.uncertainty).tolist(),
+        "effect": number(source.effect),
+        "identifiable": source.shown,
+        "identified_by": source.shown_by,
+        "deviate": number(source.deviate),
+        "refuted": source.refuted,
+        "alike": list(source.alike),
+    }
+
+
+def _verdict_entry(found: Adjustment, scans: int) -> dict[str, Any]:
+    verdict = found.verdict
+    reasons = [
+        {
+            "code": reason.code,
+            "names": list(reason.names),
+            "value": number(reason.value),
+            "limit": number(reason.limit),
+            "text": sentence(f"verdict.{reason.code}", _values(reason)),
+        }
+        for reason in verdict.reasons
+    ]
+    entry: dict[str, Any] = {
+        "code": verdict.code,
+        "text": sentence(f"verdict.{verdict.code}", {"scans": scans}),
+        "reasons": reasons,
+    }
+    if verdict.add:
+        entry["add"] = {
+            "code": verdict.add,
+            "reached": number(verdict.reached),
+            "text": sentence(f"verdict.add_{verdict.add}", {}),
+        }
+    return entry
+
+
+def _values(reason: Any) -> Mapping[str, Any]:
+    scans = reason.code in ("scans_disagree", "wrong_sign")
+    names = [str(int(n) + 1) if scans else source_name(n) for n in reason.names]
+    return {"names": " or ".join(names), "value": reason.value, "limit": reason.limit}

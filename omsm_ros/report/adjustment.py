@@ -1,0 +1,266 @@
+"""The page of an adjustment: verdict and figures, the map, sources declared and found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from omsm_ros.core.adjustment import Adjustment
+from omsm_ros.readable import NOTHING, count, expanded, plain, quantity
+from omsm_ros.report import style
+from omsm_ros.report.page_parts import Section, StudyPage, fill_study
+from omsm_ros.report.tables import Table
+from omsm_ros.report.verdict import PageVerdict
+from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
+
+_LEVELS = {
+    "verified": "good",
+    "not_verified": "care",
+    "contradicted": "bad",
+    "too_uncertain": "bad",
+}
+_CONFORMITY = {"holds": "tolerance held", "fails": "tolerance exceeded"}
+_OPEN = "conformity open: the tolerance lies within the uncertainty"
+CAPTIONS = {
+    "map": "Form deviation from the nominal surface, pose removed; mean of each cell.",
+    "uncertainty": "Standard uncertainty (k = 1) of the map, all sources together.",
+    "profiles": "Sections through the map along x, y and 45°, with the band of k = 2.",
+    "agreement": "E_n of each scan against the others: beyond ±1 they disagree.",
+    "sources": "Effect on the heights (rms) of what was found; red: refuted declarations.",
+}
+
+
+def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
+    """Return the page as HTML.
+
+    facts: the content of ``adjustment.json``;  found: from which it was made
+    """
+    figures = {"map": form_map(found), "uncertainty": uncertainty_map(found),
+               "profiles": profiles(found), "sources": sources(facts)}  # fmt: skip
+    if found.agreement:
+        figures["agreement"] = agreement(found)
+    verdict = facts["verdict"]
+    return fill_study(
+        StudyPage(
+            title=f"{title}: {headline(facts)}",
+            subtitle="; ".join(_scan_text(scan) for scan in facts["scans"]),
+            verdict=PageVerdict(
+                _LEVELS[verdict["code"]],
+                verdict["text"][:1].upper() + verdict["text"][1:],
+                tuple(next_steps(facts)),
+            ),
+            sections=(
+                Section(
+                    "Form", ("map", "uncertainty", "profiles"), (_truth(facts), _figures(facts))
+                ),
+                Section(
+                    "Sources: declared and found",
+                    ("sources",),
+                    (source_table(facts),),
+                    tested_text(facts),
+                ),
+                Section("Agreement of the scans", ("agreement",), (_scans(facts),)),
+            ),
+            captions=CAPTIONS,
+            figures={name: style.png(made) for name, made in figures.items()},
+            footer=f"calibration {facts['calibration'][:12]}",
+        )
+    )
+
+
+def headline(facts: Mapping[str, Any]) -> str:
+    """Return the result in one line: "PV 175 nm ± 12 nm (k = 2), tolerance held"."""
+    pv = facts["figures"]["peak_to_valley"]
+    text = f"PV {expanded(pv['value'], pv['standard_uncertainty'], 'm')}"
+    if (judged := facts.get("conformity")) is not None:
+        text += f", {_CONFORMITY.get(judged['verdict'], _OPEN)}"
+    return text
+
+
+def next_steps(facts: Mapping[str, Any]) -> list[str]:
+    """Return the reasons against green and the scan that helps most; what agrees where green."""
+    verdict = facts["verdict"]
+    found = [reason["text"] for reason in verdict["reasons"]]
+    if (add := verdict.get("add")) is not None:
+        found.append(f"{add['text']}: then U = {quantity(add['reached'], 'm', 2)} (rms, k = 2)")
+    if verdict["code"] == "verified":
+        found.append("the scans agree, and no declared source is refuted")
+    return found
+
+
+def _scan_text(scan: Mapping[str, Any]) -> str:
+    way = "outward" if scan["outward"] else "inward"
+    return f"{plain(scan['speed_rpm'])} rpm {way}, {count(scan['points'])} points"
+
+
+def _truth(facts: Mapping[str, Any]) -> Table:
+    """Return what only the twin knows; a table without rows for a real part."""
+    truth = facts.get("truth")
+    names = (
+        ("true PV", "peak_to_valley"),
+        ("true rms", "rms"),
+        ("map off by, rms", "map_error_rms"),
+    )
+    rows = [] if truth is None else [(name, quantity(truth[key], "m")) for name, key in names]
+    return Table("Truth of the twin", ("figure", "value"), rows)
+
+
+def _figures(facts: Mapping[str, Any]) -> Table:
+    figures = facts["figures"]
+    rows = [
+        (name, expanded(figures[key]["value"], figures[key]["standard_uncertainty"], "m"))
+        for name, key in (("PV", "peak_to_valley"), ("rms", "rms"))
+    ]
+    rows += [
+        (
+            f"Z({term['n']}, {term['m']})",
+            expanded(term["value"], term["standard_uncertainty"], "m", signed=True),
+        )
+        for term in figures["terms"]
+    ]
+    return Table("Figures, pose removed", ("figure", "value and U (k = 2)"), rows)
+
+
+def source_table(facts: Mapping[str, Any]) -> Table:
+    """Return each source that was declared or is significant: declared against found."""
+    rows = []
+    for source in sorted(facts["sources"], key=lambda s: -(s["effect"] or 0.0)):
+        if source["declared"] is None and not source["refuted"]:
+            continue
+        rows.append(
+            (
+                source["text"],
+                declared_text(source),
+                found_text(source),
+                quantity(source["effect"], "m", 2) if source["identifiable"] else NOTHING,
+                _status(source),
+            )
+        )
+    heads = ("source", "declared (k = 1)", "found (k = 1)", "effect, rms", "")
+    return Table("", heads, rows)
+
+
+def tested_text(facts: Mapping[str, Any]) -> str:
+    """Return how many further effects were tested without a significant result."""
+    others = sum(s["declared"] is None and not s["refuted"] for s in facts["sources"])
+    return f"{count(others)} further effects were tested; none is significant"
+
+
+def declared_text(source: Mapping[str, Any]) -> str:
+    """Return the declared standard uncertainty, or that there is none."""
+    declared = source["declared"]
+    return "not declared" if declared is None else quantity(declared, source["unit"])
+
+
+def _status(source: Mapping[str, Any]) -> str:
+    if not source["refuted"]:
+        return ""
+    return "refuted" if source["declared"] is not None else "significant"
+
+
+def found_text(source: Mapping[str, Any]) -> str:
+    """Return the found value with its uncertainty, or which scan would show it."""
+    if not source["identifiable"]:
+        return f"not identifiable; {source['identified_by'].replace('_', ' ')} would show it"
+    size = float(np.linalg.norm(source["found"]))
+    spread = float(np.sqrt(np.mean(np.square(source["uncertainty"]))))
+    return f"{quantity(size, source['unit'])} ± {quantity(spread, source['unit'], 2)}"
+
+
+def _scans(facts: Mapping[str, Any]) -> Table:
+    rows = []
+    for k, scan in enumerate(facts["scans"]):
+        e_n = next((a for a in facts["agreement"] if a["scan"] == k), None)
+        largest = (
+            "–" if e_n is None else plain(max(e_n["peak_to_valley"], e_n["rms"], *e_n["terms"]), 2)
+        )
+        rows.append((str(k + 1), scan["bag"], _scan_text(scan), largest))
+    return Table("", ("scan", "recording", "motion", "largest E_n"), rows)
+
+
+def form_map(found: Adjustment) -> Figure:
+    """Draw the form deviation, colours symmetric about zero."""
+    values = found.form.height / NANOMETRE_M
+    largest = float(np.max(np.abs(values)))
+    return _map(found, values, "RdBu_r", (-largest, largest), "form deviation [nm]")
+
+
+def uncertainty_map(found: Adjustment) -> Figure:
+    """Draw the standard uncertainty of the form deviation."""
+    values = found.form.uncertainty / NANOMETRE_M
+    return _map(found, values, "viridis", (0.0, float(np.max(values))), "u (k = 1) [nm]")
+
+
+def _map(
+    found: Adjustment, values: Any, colours: str, limits: tuple[float, float], name: str
+) -> Figure:
+    made, axes = style.figure(6.1, 5.0)
+    ax = axes[0, 0]
+    drawn = ax.tripcolor(
+        found.form.x / MILLIMETRE_M, found.form.y / MILLIMETRE_M, values,
+        cmap=colours, vmin=limits[0], vmax=limits[1], shading="gouraud",
+    )  # fmt: skip
+    ax.set_aspect("equal")
+    made.colorbar(drawn, ax=ax, label=name)
+    style.label(ax, x="x [mm]", y="y [mm]", title=name.split(" [")[0])
+    return made
+
+
+def profiles(found: Adjustment) -> Figure:
+    """Draw sections along x, y and 45° with their band."""
+    form = found.form
+    made, axes = style.figure(9.2, 5.5, 3, 1, sharex=True)
+    radius = np.hypot(form.x, form.y)
+    width = 0.06 * float(np.max(radius))
+    for ax, (name, angle) in zip(
+        axes[:, 0], (("x", 0.0), ("y", np.pi / 2), ("45°", np.pi / 4)), strict=True
+    ):
+        along = form.x * np.cos(angle) + form.y * np.sin(angle)
+        across = form.y * np.cos(angle) - form.x * np.sin(angle)
+        near = np.abs(across) < width
+        order = np.argsort(along[near])
+        position = along[near][order] / MILLIMETRE_M
+        height = form.height[near][order] / NANOMETRE_M
+        band = 2 * form.uncertainty[near][order] / NANOMETRE_M
+        ax.fill_between(position, height - band, height + band, color=style.AFTER, alpha=0.2,
+                        linewidth=0)  # fmt: skip
+        ax.plot(position, height, ".-", color=style.AFTER, linewidth=0.9, markersize=3)
+        style.label(ax, y="nm", title=f"along {name}")
+    style.label(axes[-1, 0], x="position [mm]")
+    return made
+
+
+def agreement(found: Adjustment) -> Figure:
+    """Draw E_n of PV, rms and terms of each scan against the others."""
+    made, axes = style.figure(9.2, 3.4)
+    ax = axes[0, 0]
+    names = ["PV", "rms", *(f"Z({t.n},{t.m})" for t in found.form.terms)]
+    width = 0.8 / max(len(found.agreement), 1)
+    for k, one in enumerate(found.agreement):
+        values = np.array([one.pv, one.rms, *one.terms])
+        ax.bar(np.arange(len(values)) + k * width, values, width, label=f"scan {one.scan + 1}")
+    ax.axhline(1.0, color=style.TRUTH, linewidth=0.9, linestyle=(0, (4, 2.5)))
+    ax.set_xticks(np.arange(len(names)) + 0.4 - width / 2, names, rotation=60)
+    style.legend_above(ax)
+    style.label(ax, y="E_n")
+    return made
+
+
+def sources(facts: Mapping[str, Any]) -> Figure:
+    """Draw the effects of declared and of significant sources, the largest first."""
+    rows = sorted(
+        (s for s in facts["sources"] if s["declared"] is not None or s["refuted"]),
+        key=lambda s: -(s["effect"] or 0.0),
+    )[:12]
+    made, axes = style.figure(9.2, 0.9 + 0.32 * max(len(rows), 1))
+    ax = axes[0, 0]
+    colours = [style.BEFORE if row["refuted"] else style.AFTER for row in rows]
+    sizes = [(row["effect"] or 0.0) / NANOMETRE_M for row in rows]
+    ax.barh(np.arange(len(rows)), sizes, color=colours)
+    ax.set_yticks(np.arange(len(rows)), [row["text"] for row in rows])
+    ax.invert_yaxis()
+    style.label(ax, x="effect on the heights, rms [nm]")
+    return made
