@@ -132,36 +132,33 @@ def on_one_clock(scans: Sequence[AdjustedScan]) -> list[AdjustedScan]:
     return found
 
 
+# Declared names that the adjustment calls otherwise.
+_RENAMED = {"probe_noise": "noise"}
+# Declared sources that no scan adjusts: single readings, and periodic errors of unknown phase.
+NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "discretisation",
+                "vibration", "encoder_interpolation", "probe_periodic", "probe_slope")  # fmt: skip
+
+
 def priors_of(stated: MachineSources) -> tuple[Source, ...]:
-    """Return the declared sources as priors of the adjustment, those of single points left out."""
+    """Return the declared sources as priors of the adjustment, but those of ``NOT_ADJUSTED``."""
     found: dict[str, Source] = {}
     for source in stated.stated:
-        if (prior := _prior(source)) is not None:
-            before = found.get(prior.name)
-            size = (
-                prior.uncertainty
-                if before is None
-                else float(np.hypot(before.uncertainty, prior.uncertainty))
-            )
-            found[prior.name] = replace(prior, uncertainty=size)
+        if source.source in NOT_ADJUSTED:
+            continue
+        prior = _prior(source)
+        before = found.get(prior.name, replace(prior, uncertainty=0.0))
+        size = float(np.hypot(before.uncertainty, prior.uncertainty))
+        found[prior.name] = replace(prior, uncertainty=size)
     return tuple(found.values())
 
 
-# Declared names that the adjustment calls otherwise, or has no family for.
-_RENAMED = {"probe_noise": "noise", "slope_square": "probe_slope_square",
-            "linearity": "probe_linearity", "static_gain": "static_gain"}  # fmt: skip
-_LEFT_OUT = ("reference_noise", "encoder_noise", "timing", "encoder_interpolation", "slope",
-             "linearity_periodic", "resolution", "lateral")  # fmt: skip
-
-
-def _prior(source: StatedSource) -> Source | None:
-    name = _RENAMED.get(source.source, source.source)
-    if name in _LEFT_OUT:
-        return None
-    order = source.parameters.get("per_turn")
-    if order is not None:
-        name = f"{name}/{order:.3g}"
-    return Source(name, source.standard_uncertainty, source.parameters.get("correlation_length"))
+def _prior(source: StatedSource) -> Source:
+    name, size = _RENAMED.get(source.source, source.source), source.standard_uncertainty
+    if "per_turn" in source.parameters:
+        name = f"{name}/{source.parameters['per_turn']:.3g}"
+    if name == "pitch":
+        size *= source.parameters["arm"]
+    return Source(name, size, source.parameters.get("correlation_length"))
 
 
 def adjust_bags(

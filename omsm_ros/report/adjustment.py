@@ -38,8 +38,13 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
 
     facts: the content of ``adjustment.json``;  found: from which it was made
     """
-    figures = {"map": form_map(found), "uncertainty": uncertainty_map(found),
-               "profiles": profiles(found), "sources": sources(facts)}  # fmt: skip
+    figures = {
+        "map": form_map(found),
+        "uncertainty": uncertainty_map(found),
+        "profiles": profiles(found),
+    }
+    if source_table(facts).rows:
+        figures["sources"] = sources(facts)
     if found.agreement:
         figures["agreement"] = agreement(found)
     verdict = facts["verdict"]
@@ -105,7 +110,7 @@ def _truth(facts: Mapping[str, Any]) -> Table:
         ("map off by, rms", "map_error_rms"),
     )
     rows = [] if truth is None else [(name, quantity(truth[key], "m")) for name, key in names]
-    return Table("Truth of the twin", ("figure", "value"), rows)
+    return Table("Truth of the twin", ("value",), rows)
 
 
 def _figures(facts: Mapping[str, Any]) -> Table:
@@ -121,7 +126,7 @@ def _figures(facts: Mapping[str, Any]) -> Table:
         )
         for term in figures["terms"]
     ]
-    return Table("Figures, pose removed", ("figure", "value and U (k = 2)"), rows)
+    return Table("Figures, pose removed", ("value and U (k = 2)",), rows)
 
 
 def source_table(facts: Mapping[str, Any]) -> Table:
@@ -139,7 +144,7 @@ def source_table(facts: Mapping[str, Any]) -> Table:
                 _status(source),
             )
         )
-    heads = ("source", "declared (k = 1)", "found (k = 1)", "effect, rms", "")
+    heads = ("declared (k = 1)", "found (k = 1)", "effect, rms", "")
     return Table("", heads, rows)
 
 
@@ -177,8 +182,8 @@ def _scans(facts: Mapping[str, Any]) -> Table:
         largest = (
             "–" if e_n is None else plain(max(e_n["peak_to_valley"], e_n["rms"], *e_n["terms"]), 2)
         )
-        rows.append((str(k + 1), scan["bag"], _scan_text(scan), largest))
-    return Table("", ("scan", "recording", "motion", "largest E_n"), rows)
+        rows.append((f"scan {k + 1}", scan["bag"], _scan_text(scan), largest))
+    return Table("", ("recording", "motion", "largest E_n"), rows)
 
 
 def form_map(found: Adjustment) -> Figure:
