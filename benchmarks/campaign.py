@@ -68,7 +68,7 @@ def _timed(work: Callable[[], list[Entry]]) -> float:
     return took
 
 
-def _name_from_single_scan(folder: Path, half: str) -> float:
+def _rate_alone(folder: Path, half: str) -> float:
     """Correct half of the bags by one process after the other; return how long it took [s]."""
     places = folder / "bags" / half, folder / "cal.json", folder / "alone" / half
     return _timed(lambda: run_campaign(*places, _OPTIONS, jobs=1))
@@ -128,7 +128,7 @@ def rows(full: bool) -> Iterator[Row]:
             write_spiral(half / f"{number:03d}.mcap", POINTS, seed=number)
         # One process does half of the bags before the two workers and half after them: a host that
         # slows down meanwhile does not speak for either.
-        alone = _name_from_single_scan(folder, _HALVES[0])
+        alone = _rate_alone(folder, _HALVES[0])
         with _cluster() as cluster:
             shared = _timed(
                 lambda: run_campaign(
@@ -136,7 +136,7 @@ def rows(full: bool) -> Iterator[Row]:
                     scheduler=cluster.scheduler_address,
                 )
             )  # fmt: skip
-        alone += _name_from_single_scan(folder, _HALVES[1])
+        alone += _rate_alone(folder, _HALVES[1])
         expected = _clouds(folder / "alone")
         text = f"{bags} bags of {POINTS} points: "
         yield shown(f"{text}one process after the other", alone, "s")

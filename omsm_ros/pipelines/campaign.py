@@ -108,7 +108,7 @@ def run_campaign(
             "other recordings become bags by 'omsm import'"
         )
     sign = [load_calibration(calibration).id, *options, __version__]
-    with _name_from_single_scan(out):
+    with _run_alone(out):
         earlier = {entry.bag: entry for entry in load_campaign(out)}
         tasks = [_task(bag, folder, calibration, out, options, sign) for bag in found]
         entries = {t.bag: earlier[t.bag] for t in tasks if _is_done(earlier.get(t.bag), t, out)}
@@ -260,7 +260,7 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 
 
 @contextmanager
-def _name_from_single_scan(out: Path) -> Iterator[None]:
+def _run_alone(out: Path) -> Iterator[None]:
     """Hold the folder, so that two campaigns never write into it."""
     try:
         make_folder(out)
