@@ -1,0 +1,150 @@
+"""Plan the scans of a part: which set reaches an accuracy, and the programs to run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros.core.adjustment import PlannedSet, ScanDesign, plan_scans, usual_sets
+from omsm_ros.core.correction.machine_sources import MachineSources
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
+from omsm_ros.core.kinematics.scan_path import ScanPath
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.files import save_text
+from omsm_ros.pipelines.adjust import priors_of
+from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, RPM_RAD_S
+
+# Points of a program: a planner joins segments of 2° within 0.1 nm of this mirror's curvature.
+_SEGMENT_RAD = 2 * DEGREE_RAD
+# Samples a second at which limits of a path are judged, and turns that stand for all.
+_JUDGED_HZ, _JUDGED_TURNS = 1000.0, 20.0
+
+
+def scan_path(design: ScanDesign, nominal: Surface, time: FloatArray) -> tuple[FloatArray, ...]:
+    """Return x [m], z [m] and c [rad] of ``design`` at ``time`` [s], Z on the nominal surface."""
+    x = design.start + (design.end - design.start) * time / design.duration
+    c = design.rpm * RPM_RAD_S * time
+    place = x * np.exp(-1j * (c + design.clocking))
+    return x, nominal.height(place.real, place.imag), c
+
+
+def within_limits(
+    design: ScanDesign, nominal: Surface, limits: MachineLimits, accuracy: float
+) -> list[str]:
+    """Return the limits of the machine that ``design`` exceeds, none where it may be run.
+
+    accuracy: asked for, k = 2 [m], for what exposure and timing cost
+    """
+    turns = abs(design.end - design.start) / design.pitch
+    share = min(_JUDGED_TURNS / turns, 1.0)
+    time = np.arange(0.0, design.duration * share, 1 / _JUDGED_HZ)
+    # The steepest turns are the outer ones.
+    outer = (
+        design
+        if abs(design.start) >= abs(design.end)
+        else replace(design, start=design.end, end=design.start)
+    )
+    x, z, c = scan_path(outer, nominal, time)
+    path = ScanPath(z=z, sample_period=1 / _JUDGED_HZ, x=x, c=c)
+    found, _ = speed_limits(path, limits, _JUDGED_HZ / 2, accuracy)
+    return [limit.name for limit in found if limit.speed_factor < 1]
+
+
+def planned_sets(
+    first: ScanDesign,
+    nominal: Surface,
+    stated: MachineSources,
+    accuracy: float,
+    limits: MachineLimits,
+) -> tuple[tuple[str, PlannedSet], ...]:
+    """Return the sets of scans that the machine can make, the shortest that reaches first.
+
+    A single scan comes last: nothing verifies it.
+
+    first: a scan that the machine can make;  accuracy: asked for, k = 2 [m]
+
+    Raises ConfigurationError where the first scan exceeds a limit of the machine.
+    """
+    if exceeded := within_limits(first, nominal, limits, accuracy):
+        raise ConfigurationError(
+            f"a scan at {first.rpm:g} rpm exceeds {', '.join(exceeded)}; give a smaller --rpm"
+        )
+    sets = {
+        name: designs
+        for name, designs in usual_sets(first).items()
+        if not any(within_limits(design, nominal, limits, accuracy) for design in designs)
+    }
+    planned = plan_scans(list(sets.values()), priors_of(stated), nominal, accuracy)
+    names = {designs: name for name, designs in sets.items()}
+    redundant_first = sorted(planned, key=lambda one: len(one.designs) < 2)
+    return tuple((names[p.designs], p) for p in redundant_first)
+
+
+def plan_facts(
+    sets: Sequence[tuple[str, PlannedSet]], accuracy: float, out: Path, nominal: Surface
+) -> dict[str, Any]:
+    """Write the programs of the best set into ``out``, and return what was planned.
+
+    For each scan scan_N.csv (t_s, x_m, z_m, c_rad) and scan_N.nc (G-code).
+    """
+    name, best = sets[0]
+    files = {}
+    for k, design in enumerate(best.designs):
+        steps = np.arange(0.0, design.duration, _SEGMENT_RAD / abs(design.rpm * RPM_RAD_S))
+        x, z, c = scan_path(design, nominal, steps)
+        files[f"scan_{k + 1}.csv"] = _csv(steps, x, z, c)
+        files[f"scan_{k + 1}.nc"] = scan_gcode(steps, x, z, c, design)
+    for file, text in files.items():
+        save_text(out / file, text)
+    return {
+        "set": name,
+        "reaches": best.reaches,
+        "accuracy": accuracy,
+        "sets": [
+            {
+                "name": one,
+                "expanded_uncertainty": 2 * planned.uncertainty.form,
+                "duration": planned.uncertainty.duration,
+                "reaches": planned.reaches,
+                "scans": [asdict(design) for design in planned.designs],
+            }
+            for one, planned in sets
+        ],
+        "files": list(files),
+    }
+
+
+def _csv(t: FloatArray, x: FloatArray, z: FloatArray, c: FloatArray) -> str:
+    rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in zip(t, x, z, c, strict=True))
+    return "t_s,x_m,z_m,c_rad\n" + "\n".join(rows) + "\n"
+
+
+def scan_gcode(
+    t: FloatArray, x: FloatArray, z: FloatArray, c: FloatArray, design: ScanDesign
+) -> str:
+    """Return a scan as G-code: inverse-time segments, millimetres and degrees.
+
+    Each segment takes the same time, so C turns steadily whatever X and Z do.
+    """
+    rate = 60 / float(np.median(np.diff(t)))
+    lines = [
+        f"; scan at {design.rpm:g} rpm, {len(t)} segments of {np.degrees(_SEGMENT_RAD):g} degrees",
+        f"; part turned on the chuck by {np.degrees(design.clocking):g} degrees",
+        "G21 ; millimetres",
+        "G90 ; absolute",
+        "G64 P0.0001 ; path tolerance",
+        f"G0 X{x[0] / MILLIMETRE_M:.7f}",
+        f"G0 Z{z[0] / MILLIMETRE_M:.7f} C{np.degrees(c[0]):.5f}",
+        "G93 ; inverse time",
+    ]
+    lines += [
+        f"G1 X{a / MILLIMETRE_M:.7f} Z{b / MILLIMETRE_M:.7f} C{np.degrees(d):.5f} F{rate:.4f}"
+        for a, b, d in zip(x[1:], z[1:], c[1:], strict=True)
+    ]
+    return "\n".join([*lines, "G94", "M2"]) + "\n"
