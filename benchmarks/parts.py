@@ -16,7 +16,7 @@ from benchmarks.row import Row, failed
 # The long ones first: the processors are then busy to the end.
 RESULTS = (
     *("other_plants", "identification", "disturbed", "honesty", "selfcal", "budget"),
-    *("spectra", "comparison", "correction", "free_path"),
+    *("spectra", "comparison", "correction", "free_path", "adjustment"),
 )
 TIMES = ("speed", "form", "real_data", "offline", "live", "devices", "twin", "campaign", "viewer")
 PARTS = (*RESULTS, *TIMES)

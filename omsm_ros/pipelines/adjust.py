@@ -139,25 +139,28 @@ NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "disc
                 "vibration", "encoder_interpolation", "probe_periodic", "probe_slope")  # fmt: skip
 
 
-def priors_of(stated: MachineSources) -> tuple[Source, ...]:
-    """Return the declared sources as priors of the adjustment, but those of ``NOT_ADJUSTED``."""
+def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ...]:
+    """Return the declared sources as priors of the adjustment, but those of ``NOT_ADJUSTED``.
+
+    abbe_arm: over which pitch acts, unless it is stated with its own [m]
+    """
     found: dict[str, Source] = {}
     for source in stated.stated:
         if source.source in NOT_ADJUSTED:
             continue
-        prior = _prior(source)
+        prior = _prior(source, abbe_arm)
         before = found.get(prior.name, replace(prior, uncertainty=0.0))
         size = float(np.hypot(before.uncertainty, prior.uncertainty))
         found[prior.name] = replace(prior, uncertainty=size)
     return tuple(found.values())
 
 
-def _prior(source: StatedSource) -> Source:
+def _prior(source: StatedSource, abbe_arm: float) -> Source:
     name, size = _RENAMED.get(source.source, source.source), source.standard_uncertainty
     if "per_turn" in source.parameters:
         name = f"{name}/{source.parameters['per_turn']:.3g}"
     if name == "pitch":
-        size *= source.parameters["arm"]
+        size *= source.parameters.get("arm", abbe_arm)
     return Source(name, size, source.parameters.get("correlation_length"))
 
 
@@ -205,7 +208,7 @@ def adjust_bags(
     )
     found = adjust(
         [scan.data for scan in scans],
-        priors_of(stated),
+        priors_of(stated, options.geometry.abbe_arm if options else 0.0),
         nominal=nominal,
         accuracy=accuracy,
         accepted=accepted,
