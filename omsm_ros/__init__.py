@@ -1,4 +1,13 @@
-"""On-machine surface measurement with the dynamic error of the loop corrected."""
+"""On-machine surface measurement with the dynamic error of the loop corrected.
+
+The Python interface stands in :mod:`omsm_ros.api`; its names can be used from here, and are loaded
+when one of them is used first::
+
+    import omsm_ros as omsm
+
+    calibration = omsm.identify(omsm.read("steps.mcap"))
+    points = omsm.correct(omsm.read("scan.mcap"), calibration)
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,3 +25,35 @@ def _sentence(code: str, values: Mapping[str, Any]) -> str:
 
 
 errors.write_texts_with(_sentence)
+
+_PUBLIC = (
+    "Adjusted",
+    "Calibration",
+    "Form",
+    "Points",
+    "Recording",
+    "Spectrum",
+    "adjust",
+    "correct",
+    "form",
+    "identify",
+    "load",
+    "read",
+    "simulate",
+    "spectrum",
+    "surface",
+)
+
+
+def __getattr__(name: str) -> Any:
+    """Return a name of the Python interface, which is loaded now."""
+    if name in _PUBLIC:
+        from omsm_ros import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module 'omsm_ros' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Return the public names, those of the interface too."""
+    return sorted({*globals(), *_PUBLIC})

@@ -26,6 +26,14 @@ TEMPLATES = {
     "verdict.not_redundant": (
         "one speed and direction cannot show an error of the dynamics, a lag or a drift"
     ),
+    "verdict.not_evaluated": (
+        "not evaluated, and not shown by these scans: {names} (may change the heights by "
+        "{value:m/2}); {remedy}, or declare it with its evaluation"
+    ),
+    "verdict.declared_only": (
+        "declared without an evaluation, and not shown by these scans: {names} (may change the "
+        "heights by {value:m/2}); {remedy}, or evaluate it from a recording"
+    ),
     "verdict.uncertainty": (
         "expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked for"
     ),

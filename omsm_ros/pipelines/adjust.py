@@ -9,12 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.adjustment import Adjustment, ScanData, Source, SourceFinding, adjust
+from omsm_ros.core.adjustment import (
+    Adjustment,
+    Reason,
+    ScanData,
+    Source,
+    SourceFinding,
+    adjust,
+)
 from omsm_ros.core.adjustment.adjust import corrected_heights
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import Account, AxisBlock, FloatArray, IntArray
@@ -161,7 +169,7 @@ def _prior(source: StatedSource, abbe_arm: float) -> Source:
         name = f"{name}/{source.parameters['per_turn']:.3g}"
     if name == "pitch":
         size *= source.parameters.get("arm", abbe_arm)
-    return Source(name, size, source.parameters.get("correlation_length"))
+    return Source(name, size, source.parameters.get("correlation_length"), source.how == EVALUATED)
 
 
 def adjust_bags(
@@ -322,20 +330,19 @@ def _source_entry(source: SourceFinding) -> dict[str, Any]:
 
 def _verdict_entry(found: Adjustment, scans: int) -> dict[str, Any]:
     verdict = found.verdict
-    reasons = [
-        {
-            "code": reason.code,
-            "names": list(reason.names),
-            "value": number(reason.value),
-            "limit": number(reason.limit),
-            "text": sentence(f"verdict.{reason.code}", _values(reason)),
-        }
-        for reason in verdict.reasons
-    ]
     entry: dict[str, Any] = {
         "code": verdict.code,
         "text": sentence(f"verdict.{verdict.code}", {"scans": scans}),
-        "reasons": reasons,
+        "reasons": [
+            {
+                "code": reason.code,
+                "names": list(reason.names),
+                "value": number(reason.value),
+                "limit": number(reason.limit),
+                "text": sentence(f"verdict.{reason.code}", _values(reason)),
+            }
+            for reason in _grouped(verdict.reasons)
+        ],
     }
     if verdict.add:
         entry["add"] = {
@@ -346,7 +353,31 @@ def _verdict_entry(found: Adjustment, scans: int) -> dict[str, Any]:
     return entry
 
 
-def _values(reason: Any) -> Mapping[str, Any]:
+def _grouped(reasons: Sequence[Reason]) -> list[Reason]:
+    """Return the reasons, sources without evaluation that one scan would show as one."""
+    found: list[Reason] = []
+    open_ones: dict[tuple[str, str], list[Reason]] = {}
+    for reason in reasons:
+        if reason.code in _OPEN:
+            open_ones.setdefault((reason.code, reason.names[1]), []).append(reason)
+        else:
+            found.append(reason)
+    for (code, shown_by), group in open_ones.items():
+        names = (*dict.fromkeys(r.names[0] for r in group), shown_by)
+        largest = max(r.value for r in group)
+        found.append(Reason(code, names, largest, group[0].limit))
+    return found
+
+
+# Reasons whose last name is the scan that would show the sources named before it.
+_OPEN = ("not_evaluated", "declared_only")
+
+
+def _values(reason: Reason) -> Mapping[str, Any]:
     scans = reason.code in ("scans_disagree", "wrong_sign")
-    names = [str(int(n) + 1) if scans else source_name(n) for n in reason.names]
-    return {"names": " or ".join(names), "value": reason.value, "limit": reason.limit}
+    names, remedy = reason.names, ""
+    if reason.code in _OPEN:
+        names, remedy = names[:-1], sentence(f"verdict.add_{names[-1]}", {})
+    texts = [str(int(n) + 1) if scans else source_name(n) for n in names]
+    joined = (", " if reason.code in _OPEN else " or ").join(texts)
+    return {"names": joined, "value": reason.value, "limit": reason.limit, "remedy": remedy}

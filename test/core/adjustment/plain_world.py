@@ -41,6 +41,21 @@ def form(x, y):
     return low + 12e-9 * (u**3 - 3 * u * v**2) + 3e-9 * np.sin(2 * np.pi * x / 4e-3)
 
 
+def rings(x, y):
+    """Form of a turned part: astigmatism, trefoil, and rings of 8 nm and 1.6 mm [m]."""
+    u, v = x / RADIUS_M, y / RADIUS_M
+    low = 40e-9 * (u**2 - v**2) + 20e-9 * (u**3 - 3 * u * v**2)
+    return low + 4e-9 * np.cos(2 * np.pi * np.hypot(x, y) / 1.6e-3)
+
+
+def _fading(z, samples):
+    """Return the motion less its mean over the last ``samples``, fading."""
+    from scipy import signal
+
+    step = 1 / samples
+    return signal.lfilter([step], [1, step - 1], z, zi=[z[0] * (1 - step)])[0] - z
+
+
 class Machine:
     """One part on one machine; ``scan`` may be called again for further scans.
 
@@ -63,8 +78,11 @@ class Machine:
         return self.part(x, y)
 
     def scan(self, rpm=30.0, outward=False, clocking=0.0, start=RADIUS_M, end=0.0, clamping=0,
-             lag=None, **more):  # fmt: skip
-        """Return a spiral from ``start`` to ``end``, or back with ``outward``."""
+             lag=None, moved=(0.0, 0.0), turned=0.0, **more):  # fmt: skip
+        """Return a spiral from ``start`` to ``end``, or back with ``outward``.
+
+        moved, turned: of the part since it was last looked at [m], [rad], unknown to the scan
+        """
         wrong = {**self.errors, **more}
         lag = self.lag if lag is None else lag
         duration = abs(start - end) / self.pitch * 60 / abs(rpm)
@@ -80,10 +98,14 @@ class Machine:
             z = (r + dx + 1j * dy) * np.exp(-1j * (c + clocking))
             return z.real, z.imag
 
+        lift = MIRROR.height(*place(c, r)) / 0.6e-3
+        bow = wrong.get("bow_of_z", 0.0) * (np.cos(np.pi * lift) - 1)
         seen = place(
             c - self.latency * omega + wrong.get("c_lost", 0.0) * (t > 0.5 * duration),
-            r - self.latency * r_rate, wrong.get("centre_x", 0.0), wrong.get("centre_y", 0.0),
+            r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow, wrong.get("centre_y", 0.0),
         )  # fmt: skip
+        at = (seen[0] + 1j * seen[1]) * np.exp(-1j * turned) - complex(*moved)
+        seen = (at.real, at.imag)
         there = place(c, r)
         z = MIRROR.height(*there)
         step = 1e-4
@@ -94,7 +116,8 @@ class Machine:
         true = MIRROR.height(*seen) + self.part(*seen)
         height = true + lag * z_rate + self._of_machine(c, r, t, z, z_rate, duration, wrong)
         height = height + self.noise * self.random.standard_normal(len(t))
-        distance = 10e-6 * np.sin(2 * np.pi * t / 7.0) + (true - z)
+        stand_off = wrong.get("stand_off", 10e-6) * np.sin(2 * np.pi * t / 7.0)
+        distance = stand_off + (true - z)
         removed = wrong.get("removed_lag", 340e-6) * z_rate
         height = height + wrong.get("wrong_sign", 0.0) * removed
         # In the frame of the chuck the part's place is turned by the clocking.
@@ -112,10 +135,23 @@ class Machine:
         for n, cosine, sine in (*self.spindle, *wrong.get("more_spindle", ())):
             made = made + cosine * np.cos(n * c) + sine * np.sin(n * c)
         made = made + wrong.get("asymmetry", 0.0) * np.abs(z_rate)
+        span = (z - np.mean(z)) / np.max(np.abs(z - np.mean(z)))
+        absolute = (self.begin + t) / 400.0
+        lag = (
+            wrong.get("lag_by_x", 0.0) * r / RADIUS_M
+            + wrong.get("lag_by_z", 0.0) * span
+            + wrong.get("lag_by_time", 0.0) * absolute
+        )
+        made = made + lag * z_rate
+        made = made + wrong.get("warming", 0.0) * (1 - np.exp(-(self.begin + t) / 150.0))
+        made = made + wrong.get("creep", 0.0) * _fading(z, 2.0 * self.rate)
+        made = made + wrong.get("stretch", 0.0) * z
         made = made + wrong.get("backlash", 0.0) * np.sign(z_rate)
         made = made + wrong.get("settling", 0.0) * np.exp(-t / 15.0)
         made = made + wrong.get("knock", 0.0) * (t > 0.4 * duration)
         made = made + wrong.get("hum", 0.0) * np.sin(2 * np.pi * 50.0 * t + 1.0)
         made = made + wrong.get("floor", 0.0) * np.sin(2 * np.pi * 2.13 * t + 1.0)
+        if "straightness" in wrong:
+            made = made + np.interp(r, *wrong["straightness"])
         tilt = wrong.get("growth", 0.0)
         return made + tilt * r / RADIUS_M + wrong.get("bow", 0.0) * (r / RADIUS_M) ** 2

@@ -1,0 +1,313 @@
+"""Adjust scans of one part together: form, errors of the machine, and what is contradicted."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.adjustment.agreement import ScanAgreement, agreement_of
+from omsm_ros.core.adjustment.blocks import block_columns, blocks_of
+from omsm_ros.core.adjustment.disturbances import (
+    follows_removed,
+    line_family,
+    lines_of,
+    network_with,
+    step_family,
+    steps_of,
+)
+from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
+from omsm_ros.core.adjustment.families import (
+    Family,
+    Source,
+    base_name,
+    families_of,
+    prior_sizes,
+    ranges_of,
+)
+from omsm_ros.core.adjustment.figures import POSE, FormMap, form_map
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
+from omsm_ros.core.adjustment.part_terms import part_model
+from omsm_ros.core.adjustment.planning import best_addition
+from omsm_ros.core.adjustment.refutation import (
+    Refutation,
+    fit_and_refute,
+    settled,
+    start_scales,
+)
+from omsm_ros.core.adjustment.scan_data import (
+    ScanData,
+    ScanView,
+    fitted_surface,
+    view_of,
+)
+from omsm_ros.core.adjustment.verdict import (
+    Verdict,
+    not_evaluated,
+    reasons_of,
+    redundant,
+    rests_on,
+    verdict_of,
+)
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import DataError
+
+# Enough for lines and steps to stand out; they are tested after the scales have settled.
+_FIRST_STEPS = 2
+# Points at a time of corrected heights.
+_CHUNK = 16_384
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFinding:
+    """One family: declared against found.
+
+    name, unit: of the family;  declared: standard uncertainty [unit], None where nothing was
+    found, uncertainty: by the adjustment, each component (size,) [unit]; of a family that takes
+        no part, by its score test
+    effect: rms of what was found on the heights [m];  possible: of what is left open, k = 1 [m]
+    shown: True if the scans determine it, else ``shown_by`` would
+    deviate: of found from declared, in standard deviations
+    refuted: True if released;  alike: families that explain the same
+    """
+
+    name: str
+    unit: str
+    declared: float | None
+    found: FloatArray
+    uncertainty: FloatArray
+    effect: float
+    possible: float
+    shown: bool
+    shown_by: str
+    deviate: float
+    refuted: bool
+    alike: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """Scans of one part, adjusted together.
+
+    form: map of the form error, figures and covariance
+    sources: each family, declared against found;  refutations: in the order of their evidence
+    agreement: each scan against the others;  wrong_sign: scan, and the share that it follows
+    verdict: may the heights be relied on
+    scales: noise, drift and form below the terms, estimated;  noise: of a reading, each scan [m]
+    solution: parameters, covariance, residuals
+    begin: time of the first point of all [s]
+    """
+
+    form: FormMap
+    sources: tuple[SourceFinding, ...]
+    refutations: tuple[Refutation, ...]
+    agreement: tuple[ScanAgreement, ...]
+    wrong_sign: tuple[tuple[int, float], ...]
+    verdict: Verdict
+    scales: Scales
+    noise: FloatArray
+    solution: Solution
+    nominal: Surface
+    begin: float
+
+    def source(self, name: str) -> SourceFinding:
+        """Return the finding of family ``name``.
+
+        Raises KeyError for a family that the scans cannot have.
+        """
+        for finding in self.sources:
+            if finding.name == name:
+                return finding
+        raise KeyError(name)
+
+    @property
+    def drift_walk(self) -> float:
+        """Standard deviation of the drift after one second [m/√s]."""
+        return float(np.sqrt(self.scales.walk))
+
+
+def adjust(
+    scans: Sequence[ScanData],
+    priors: Sequence[Source] = (),
+    *,
+    nominal: Surface | None = None,
+    accuracy: float | None = None,
+    removed: Sequence[str] = POSE,
+    accepted: Collection[str] = (),
+) -> Adjustment:
+    """Return ``scans`` of one part, adjusted together by least squares with priors.
+
+    Parameters
+    ----------
+    scans
+        One or more. Redundancy, and with it a green verdict, needs two that differ in speed or
+        direction.
+    priors
+        Declared sources. Families without one take part by their default, or once they show.
+    nominal
+        Surface in the part frame; None: a polynomial of degree 8 through the first scan, of which
+        the form error then is the deviation.
+    accuracy
+        Asked for, k = 2 [m]; None: none.
+    removed
+        Pose that is taken from the form error: ``piston``, ``tip``, ``tilt``, ``x``, ``y``,
+        ``clocking``.
+    accepted
+        Names of families whose found value somebody has accepted: they refute no more.
+
+    Raises
+    ------
+    DataError
+        For no scan.
+    ConfigurationError
+        For a declared source that is no family of the adjustment.
+    """
+    if not scans:
+        raise DataError("no scan to adjust; give one or more scans of one part")
+    surface: Surface = fitted_surface(scans[0]) if nominal is None else nominal
+    return _adjusted(scans, priors, surface, accuracy, removed, accepted)
+
+
+def _adjusted(
+    scans: Sequence[ScanData],
+    priors: Sequence[Source],
+    surface: Surface,
+    accuracy: float | None,
+    removed: Sequence[str],
+    accepted: Collection[str],
+) -> Adjustment:
+    """Return the adjustment of ``scans`` to the nominal ``surface``."""
+    begin = float(min(s.time[0] for s in scans))
+    views = [view_of(s, k, begin, surface) for k, s in enumerate(scans)]
+    network, sizes = _network(scans, views, priors)
+    walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
+    solution, refutations = _fitted(network, views, sizes, walk)
+    form = form_map(solution, surface, removed)
+    agreement = agreement_of(solution, surface, removed)
+    wrong = _wrong_signs(views)
+    declared = {p.name for p in priors}
+    found_walk = float(np.sqrt(solution.scales.walk))
+    contradictions = reasons_of(
+        refutations, declared, agreement, wrong, (found_walk, walk), accepted
+    )
+    evidences = _evidences(solution, refutations)
+    enough = redundant(scans)
+    verdict = verdict_of(
+        contradictions,
+        not_evaluated(evidences, priors, accuracy),
+        rests_on(evidences, declared),
+        enough,
+        2 * form.pv.uncertainty,
+        accuracy,
+        None if enough else best_addition(scans[0], priors, surface)[:2],
+    )
+    return Adjustment(
+        form=form,
+        sources=_findings(solution, evidences, priors, refutations),
+        refutations=refutations,
+        agreement=agreement,
+        wrong_sign=wrong,
+        verdict=verdict,
+        scales=solution.scales,
+        noise=network.blocks.noise,
+        solution=solution,
+        nominal=surface,
+        begin=begin,
+    )
+
+
+def _network(
+    scans: Sequence[ScanData], views: Sequence[ScanView], priors: Sequence[Source]
+) -> tuple[Network, dict[str, float]]:
+    families = families_of(ranges_of(views, priors, [s.clamping for s in scans]), priors)
+    blocks = blocks_of(views, [s.weight for s in scans], families)
+    part = part_model(blocks, min(s.turns for s in scans))
+    return Network(blocks, families, part), prior_sizes(families, priors)
+
+
+def _fitted(
+    network: Network, views: Sequence[ScanView], sizes: Mapping[str, float], walk: float | None
+) -> tuple[Solution, tuple[Refutation, ...]]:
+    """Return the solution, lines and steps of the residuals among its families."""
+    y = network.blocks.deviation
+    first = settled(solve(network, y, start_scales(network, walk), sizes), _FIRST_STEPS)
+    extra: list[Family] = []
+    for view in views:
+        extra += map(line_family, lines_of(first, view))
+        extra += map(step_family, steps_of(first, view.index))
+    if extra:
+        network = network_with(network, extra, block_columns(views, extra))
+    return fit_and_refute(network, y, first.scales, sizes)
+
+
+def _wrong_signs(views: Sequence[ScanView]) -> tuple[tuple[int, float], ...]:
+    """Return scan and share of each, if all scans follow what was removed alike."""
+    shares = [follows_removed(view) for view in views]
+    found = [(v.index, s) for v, s in zip(views, shares, strict=True) if s is not None]
+    return tuple(found) if len(found) == len(views) else ()
+
+
+def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[Evidence, ...]:
+    """Return the evidence of each family; of a released one, what released it."""
+    released = {r.name: r.evidence for r in refutations}
+    return tuple(
+        released.get(f.name) or evidence_of(solution, f) for f in solution.network.families
+    )
+
+
+def _findings(
+    solution: Solution,
+    evidences: Sequence[Evidence],
+    priors: Sequence[Source],
+    refutations: Sequence[Refutation],
+) -> tuple[SourceFinding, ...]:
+    """Return every family, declared against found."""
+    stated = {p.name: p.uncertainty for p in priors}
+    alike = {r.name: r.alike for r in refutations}
+    found = []
+    for evidence in evidences:
+        family = evidence.family
+        takes_part = family.name in solution.sizes
+        here = solution.network.place[family.name]
+        found.append(
+            SourceFinding(
+                name=family.name,
+                unit=family.unit,
+                declared=stated.get(base_name(family.name)),
+                found=solution.values[here] if takes_part else evidence.values,
+                uncertainty=(
+                    solution.uncertainty(family.name) if takes_part else evidence.uncertainty
+                ),
+                effect=evidence.effect,
+                possible=evidence.possible,
+                shown=evidence.shown,
+                shown_by=family.shown_by,
+                deviate=evidence.deviate,
+                refuted=family.name in alike,
+                alike=alike.get(family.name, ()),
+            )
+        )
+    return tuple(found)
+
+
+def corrected_heights(adjustment: Adjustment, scan: ScanData, index: int) -> FloatArray:
+    """Return the heights of ``scan`` less all that the adjustment found of the machine, (n,) [m].
+
+    index: of the scan among those that were adjusted
+    """
+    solution = adjustment.solution
+    net = solution.network
+    view = view_of(scan, index, adjustment.begin, adjustment.nominal)
+    taking = [f for f in net.families if f.name in solution.sizes]
+    knots = solution.values[net.knots[index]]
+    drift = np.interp(view.since, np.arange(len(knots)) * net.steps[index], knots)
+    made = scan.height - drift
+    for first in range(0, len(view), _CHUNK):
+        part = slice(first, first + _CHUNK)
+        points = view.part(part)
+        for family in taking:
+            values = solution.values[net.place[family.name]]
+            made[part] -= values @ np.atleast_2d(family.columns(points))
+    return np.asarray(made)

@@ -1,0 +1,257 @@
+"""Lines in time, steps from turn to turn, and heights that follow what the correction removed.
+
+They are looked for in the residuals of a first fit. What is found becomes a family of columns, and
+is tested as every other one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from omsm_ros.core.adjustment.families import REPEATED_TRACK, Family, only
+from omsm_ros.core.adjustment.network import Network, Solution
+from omsm_ros.core.adjustment.scan_data import ScanView
+from omsm_ros.core.streams.blocks import FloatArray
+
+# Over its neighbours a bin of white noise is beyond 30 once in 10 000 scans of 250 000 points.
+_LINE_OVER_NOISE, _MOST_LINES = 30.0, 3
+# Of the larger amplitude of both halves of a scan.
+_LASTING = 0.5
+# The part's own waves: whole multiples of the turn, and what changes from turn to turn beside them.
+_PART_HARMONICS, _BESIDE = 30, 0.12
+# Neighbours of a line, whose median is the noise.
+_BINS = 400
+# Median absolute deviation to standard deviation of a normal distribution.
+_MAD = 1.4826
+# Of 1500 differences between turns of clean scans none is beyond 5.
+_STEP_LIMIT = 7.0
+# Share of the deviation that the removed error explains where its sign is wrong, and how near to
+# once or twice the removed error it then is.
+_FOLLOWS, _NEAR_WHOLE = 0.95, 0.1
+# Jumps of height and of angle as machines in need of repair make them.
+_KNOCK_M, _C_LOST_RAD = 1e-7, 1e-3
+
+
+@dataclass(frozen=True)
+class Line:
+    """A wave in time: frequency [Hz] and amplitude [m] in scan ``scan``."""
+
+    scan: int
+    frequency: float
+    amplitude: float
+
+
+def lines_of(solution: Solution, view: ScanView) -> list[Line]:
+    """Return waves in time that stand out of the noise of one scan."""
+    net = solution.network
+    mine = net.blocks.scan == view.index
+    fitted = (
+        net.fitted(solution.values)
+        + net.cells_of(solution.scales, solution.residual())[net.part.cell]
+    )
+    left = view.deviation - np.interp(view.since, net.blocks.since[mine], fitted[mine])
+    period = float(np.median(np.diff(view.since)))
+    series = np.zeros(round(float(view.since[-1]) / period) + 1)
+    series[np.round(view.since / period).astype(np.int64)] = left
+    frequency: FloatArray = np.asarray(np.fft.rfftfreq(len(series), period), np.float64)
+    part = _of_the_part(frequency, abs(view.speed) / (2 * np.pi))
+    found: list[Line] = []
+    while len(found) < _MOST_LINES:
+        power = np.abs(np.fft.rfft(series * np.hanning(len(series)))) ** 2
+        ratio = np.where(part, 0.0, power / np.maximum(_floor(power), 1e-300))
+        peak = _summit(power, int(np.argmax(ratio)))
+        if np.max(ratio) < _LINE_OVER_NOISE or part[peak] or not 0 < peak < len(power) - 1:
+            break
+        refined = _refined(power, peak, frequency)
+        if not _lasting(series, 2 * np.pi * refined * period):
+            break
+        wave, series = _without(series, 2 * np.pi * refined * period)
+        found.append(Line(view.index, refined, wave))
+    return found
+
+
+def _lasting(series: FloatArray, step: float) -> bool:
+    """Return whether a wave of ``step`` [rad] a sample is as large in both halves of ``series``.
+
+    A line lasts; what the texture of the part makes at one radius does not.
+    """
+    half = len(series) // 2
+    sizes = [_without(part, step)[0] for part in (series[:half], series[half:])]
+    return min(sizes) > _LASTING * max(sizes)
+
+
+def _summit(power: FloatArray, peak: int) -> int:
+    """Return the local maximum that ``peak`` lies on the flank of."""
+    while True:
+        low, high = max(peak - 1, 0), min(peak + 2, len(power))
+        top = low + int(np.argmax(power[low:high]))
+        if top == peak:
+            return peak
+        peak = top
+
+
+def _without(series: FloatArray, step: float) -> tuple[float, FloatArray]:
+    """Return the amplitude of a wave of ``step`` [rad] a sample, and ``series`` without it."""
+    angle = step * np.arange(len(series))
+    wave = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    size = np.linalg.lstsq(wave, series, rcond=None)[0]
+    return float(np.hypot(*size)), series - wave @ size
+
+
+def _floor(power: FloatArray) -> FloatArray:
+    """Return the mean power around each bin by medians of groups, as of white noise."""
+    groups = max(len(power) // _BINS, 1)
+    edges = np.linspace(0, len(power), groups + 1).astype(np.int64)
+    level = [float(np.median(power[a:b])) for a, b in pairwise(edges)]
+    middle = (edges[:-1] + edges[1:]) / 2
+    return np.asarray(np.interp(np.arange(len(power)), middle, level) / np.log(2.0))
+
+
+def _of_the_part(frequency: FloatArray, turning: float) -> FloatArray:
+    multiple = frequency / turning
+    nearest = np.round(multiple)
+    return np.asarray(
+        (np.abs(multiple - nearest) < _BESIDE) & (nearest <= _PART_HARMONICS) | (multiple < 0.9)
+    )
+
+
+def _refined(power: FloatArray, peak: int, frequency: FloatArray) -> float:
+    """Return the frequency of a peak by a parabola through the logarithms."""
+    here = np.log(power[peak - 1 : peak + 2])
+    bend = here[0] - 2 * here[1] + here[2]
+    shift = 0.5 * (here[0] - here[2]) / bend if bend < 0 else 0.0
+    return float(frequency[peak] + shift * frequency[1])
+
+
+def line_family(line: Line) -> Family:
+    """Return both phases of a line in time."""
+    turned = 2 * np.pi * line.frequency
+
+    def columns(v: ScanView) -> FloatArray:
+        return np.stack([np.cos(turned * v.since), np.sin(turned * v.since)])
+
+    name = f"vibration/{line.frequency:.4g}@{line.scan}"
+    return Family(name, "m", 2, only(line.scan, 2, columns), 1e-7, REPEATED_TRACK)
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change from one turn to the next at ``time`` in scan ``scan`` [s].
+
+    kind: "knock" of the height, or "c_lost" of the angle;  deviate: in standard deviations
+    """
+
+    scan: int
+    kind: str
+    time: float
+    deviate: float
+
+
+def steps_of(solution: Solution, scan: int) -> list[Step]:
+    """Return the largest step of the height and of the angle, where they stand out."""
+    found = [_height_step(solution, scan), _angle_step(solution, scan)]
+    return [step for step in found if step.deviate > _STEP_LIMIT]
+
+
+def _deviates(moves: FloatArray) -> FloatArray:
+    scale = _MAD * float(np.median(np.abs(moves - np.median(moves))))
+    return np.asarray(np.abs(moves) / max(scale, 1e-15))
+
+
+def _height_step(solution: Solution, scan: int) -> Step:
+    net = solution.network
+    here, width = net.knots[scan], net.steps[scan]
+    size = _deviates(np.diff(solution.values[here]))
+    knot = int(np.argmax(size))
+    mine = net.blocks.scan == scan
+    since = net.blocks.since[mine]
+    left = (solution.residual() + net.of_drift(solution.values))[mine]
+    window = (since > (knot - 1) * width) & (since < (knot + 2) * width)
+    return Step(scan, "knock", _break(since[window], left[window]), float(size[knot]))
+
+
+def _break(time: FloatArray, values: FloatArray) -> float:
+    """Return the time between the two parts of ``values`` whose means differ most."""
+    number = np.arange(1, len(values))
+    below = np.cumsum(values)[:-1]
+    above = float(np.sum(values)) - below
+    between = below**2 / number + above**2 / (len(values) - number)
+    best = int(np.argmax(between))
+    return float((time[best] + time[best + 1]) / 2)
+
+
+def _angle_step(solution: Solution, scan: int) -> Step:
+    net = solution.network
+    mine = net.blocks.scan == scan
+    turn, left = net.blocks.turn[mine], solution.residual()[mine]
+    column = net.blocks.turning[mine]
+    turns = int(turn[-1]) + 1
+
+    def mean(values: FloatArray) -> FloatArray:
+        count = np.maximum(np.bincount(turn, minlength=turns), 1)
+        return np.asarray(np.bincount(turn, values, turns) / count)
+
+    centred = column - mean(column)[turn]
+    power = np.bincount(turn, centred**2, turns)
+    angle = np.bincount(turn, centred * left, turns) / np.maximum(power, 1e-300)
+    # Weighted as they are known: near the axis an angle moves no height.
+    known = np.sqrt(np.minimum(power[1:], power[:-1]))
+    size = _deviates(np.diff(angle) * known)
+    best = int(np.argmax(size))
+    since = net.blocks.since[mine]
+    # Within the turn where it happens part of it is seen on either side.
+    begin = float(since[np.argmax(turn >= best)])
+    end = float(since[min(len(since) - 1, int(np.sum(turn <= best + 1)))])
+    time = _angle_break(since, left, centred, begin, end)
+    return Step(scan, "c_lost", time, float(size[best]))
+
+
+def _angle_break(
+    since: FloatArray, left: FloatArray, column: FloatArray, first: float, last: float
+) -> float:
+    """Return the time from which on ``column`` is found in ``left`` with another coefficient."""
+    window = (since >= first) & (since <= last)
+    return _break(since[window], left[window] * np.sign(column[window]))
+
+
+def step_family(step: Step) -> Family:
+    """Return what a step of height or angle does from its time on."""
+
+    def columns(v: ScanView) -> FloatArray:
+        after = (v.since > step.time).astype(np.float64)
+        shape = after if step.kind == "knock" else after * v.sideways(-v.y, v.x)
+        return np.asarray(shape[np.newaxis])
+
+    unit, wide = ("m", _KNOCK_M) if step.kind == "knock" else ("rad", _C_LOST_RAD)
+    name = f"{step.kind}@{step.scan}"
+    return Family(name, unit, 1, only(step.scan, 1, columns), wide, REPEATED_TRACK)
+
+
+def follows_removed(view: ScanView) -> float | None:
+    """Return the share of the removed error that the deviation follows; None where it does not.
+
+    Regression on piston, both tilts and what the correction removed: a correction of the wrong sign
+    leaves the removed error once or twice in the heights, of either sign.
+    """
+    columns = np.stack([np.ones(len(view)), view.x, view.y, view.removed], axis=1)
+    scale = np.maximum(np.max(np.abs(columns), axis=0), 1e-300)
+    if scale[3] <= 1e-12:
+        return None
+    pose = columns[:, :3] / scale[:3]
+    values = np.stack([view.removed, view.deviation], axis=1)
+    free = values - pose @ np.linalg.lstsq(pose, values, rcond=None)[0]
+    power, mixed, total = free[:, 0] @ free[:, 0], free[:, 0] @ free[:, 1], free[:, 1] @ free[:, 1]
+    if power <= 0 or total <= 0:
+        return None
+    share, explained = mixed / power, mixed**2 / (power * total)
+    whole = min(max(round(abs(share)), 1), 2)
+    wrong = explained > _FOLLOWS and abs(abs(share) - whole) < _NEAR_WHOLE
+    return float(share) if wrong else None
+
+
+def network_with(network: Network, extra: list[Family], columns: FloatArray) -> Network:
+    """Return ``network`` with further families, whose block means are ``columns`` (b, k)."""
+    return Network(network.blocks.with_columns(columns), (*network.families, *extra), network.part)

@@ -1,0 +1,397 @@
+"""Which errors of the machine can the adjustment find, and what does each do to the heights?
+
+One row of the table made by :func:`families_of` is one family: columns of the design matrix that
+have one cause and one declared size. Names are those of the declared sources
+(:mod:`omsm_ros.core.correction.source_kinds`); ``/n`` behind a name is the number per turn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from omsm_ros.core.adjustment.scan_data import ScanView
+from omsm_ros.core.correction.source_kinds import components, smooth
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
+from omsm_ros.errors import ConfigurationError
+
+# Scans that would show a family, codes for the messages.
+OTHER_SPEED, OTHER_DIRECTION, RECLOCKED = "other_speed", "other_direction", "reclocked"
+BEYOND_CENTRE, REPEATED_TRACK = "beyond_centre", "repeated_track"
+OTHER_STAND_OFF, REFERENCE = "other_stand_off", "reference_artefact"
+
+_Columns = Callable[[ScanView], FloatArray]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A declared source: the prior of one family.
+
+    name: of the family, such as ``"centre_x"`` or ``"spindle_axial/2"``
+    uncertainty: standard uncertainty of each of its components [unit of the family]
+    correlation_length: of an unknown curve over its axis [m]; None: half of the axis' range
+    evaluated: True if a recording on this machine gave the figure; what is only declared, and not
+        shown by the scans, cannot turn a verdict green
+
+    Raises ConfigurationError for an uncertainty that is no finite number of zero or more.
+    """
+
+    name: str
+    uncertainty: float
+    correlation_length: float | None = None
+    evaluated: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.uncertainty < np.inf:
+            raise ConfigurationError(
+                f"{self.name}: standard uncertainty {self.uncertainty!r}, expected zero or more"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """Columns with one cause.
+
+    name, unit: of the source;  size: number of columns
+    columns: change of the heights [m] per unit, (size, n)
+    wide: as large as a machine in need of repair has it: prior once it is refuted [unit]
+    default: prior where nothing is declared [unit]; None leaves the family out until it shows
+    shown_by: code of the scan that shows it best
+    named: False for columns that detect, but have no cause of their own
+    """
+
+    name: str
+    unit: str
+    size: int
+    columns: _Columns
+    wide: float
+    shown_by: str
+    default: float | None = None
+    named: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """What the columns are scaled by: the extent of all scans together.
+
+    speed: mean magnitude [rad/s];  duration: of all [s];  motion, distance, radius: half ranges [m]
+    slide, lift: least and greatest slide x and motion [m];  clampings: number of each scan's
+    """
+
+    speed: float
+    duration: float
+    motion: float
+    distance: float
+    radius: float
+    slide: tuple[float, float]
+    lift: tuple[float, float]
+    clampings: tuple[int, ...]
+    both_directions: bool
+    lengths: Mapping[str, float] = field(default_factory=dict)
+
+
+def ranges_of(
+    views: Sequence[ScanView], priors: Sequence[Source], clampings: Sequence[int]
+) -> Ranges:
+    """Return the extent of ``views``.
+
+    clampings: number of the clamping of each
+    """
+
+    def ends(name: str) -> tuple[float, float]:
+        values = [getattr(v, name) for v in views]
+        return float(min(map(np.min, values))), float(max(map(np.max, values)))
+
+    lift, distance = ends("motion"), ends("distance")
+    return Ranges(
+        speed=float(np.mean([abs(v.speed) for v in views])),
+        duration=ends("time")[1] or 1.0,
+        motion=(lift[1] - lift[0]) / 2 or 1.0,
+        distance=max(map(abs, distance)) or 1.0,
+        radius=float(max(np.max(np.hypot(v.x, v.y)) for v in views)),
+        slide=ends("slide_x"),
+        lift=lift,
+        clampings=tuple(clampings),
+        both_directions=len({float(np.sign(v.speed)) for v in views}) > 1,
+        lengths={p.name: p.correlation_length for p in priors if p.correlation_length is not None},
+    )
+
+
+# Harmonics of the spindle that are looked for; above them little is left of a rolling bearing's
+# synchronous motion, and a block of a turn's points begins to smooth.
+SPINDLE_HARMONICS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+# Rolling elements and belts come round every second or third turn (ISO 230-7, asynchronous).
+SUB_HARMONICS = (1 / 2, 3 / 2, 5 / 2, 1 / 3, 2 / 3, 4 / 3, 5 / 3)
+_TILT_HARMONICS, _RADIAL_HARMONICS, _C_HARMONICS = (2, 3, 4), (2, 3), (1, 2)
+
+
+# Declared sources without columns: scales of noise and drift, and what one scan alone cannot have.
+_ELSEWHERE = ("drift_walk", "noise", "tilt", "part_shift", "part_turn", "expansion")
+
+
+def base_name(family: str) -> str:
+    """Return the name of the declared source of ``family``, without the scan's number."""
+    return family.split("@")[0]
+
+
+def prior_sizes(families: Sequence[Family], priors: Sequence[Source]) -> dict[str, float]:
+    """Return the standard deviations of the families that take part: declared, or by default."""
+    stated = {p.name: p.uncertainty for p in priors}
+    sizes = {}
+    for family in families:
+        size = stated.get(base_name(family.name), family.default)
+        if size is not None:
+            sizes[family.name] = size
+    return sizes
+
+
+def order_name(name: str, per_turn: float) -> str:
+    """Return ``name/per_turn``, thirds as 0.333."""
+    return f"{name}/{per_turn:.3g}"
+
+
+def families_of(ranges: Ranges, priors: Sequence[Source]) -> tuple[Family, ...]:
+    """Return every family that scans within ``ranges`` may have, declared or not.
+
+    Raises ConfigurationError for a declared source that is no family.
+    """
+    found = [
+        *_dynamic(ranges),
+        *_geometric(ranges),
+        *_of_the_probe(ranges),
+        *_of_the_spindle(priors),
+        *_of_each_scan(ranges),
+    ]
+    names = {base_name(f.name) for f in found} | set(_ELSEWHERE)
+    for prior in priors:
+        if prior.name not in names:
+            raise ConfigurationError(
+                f"source {prior.name!r} has no family in the adjustment, expected one of "
+                f"{sorted(names)!r}"
+            )
+    return tuple(found)
+
+
+def _one(
+    name: str, unit: str, column: _Columns, wide: float, shown_by: str, default: float | None = None
+) -> Family:
+    return Family(name, unit, 1, lambda v: column(v)[np.newaxis], wide, shown_by, default)
+
+
+def _dynamic(r: Ranges) -> list[Family]:
+    """Lag since the step test and what may change it, latency, asymmetry and backlash."""
+    far = max(abs(r.slide[0]), abs(r.slide[1]))
+    middle = sum(r.lift) / 2
+    return [
+        # A step test leaves less than 0.1 ms of lag unknown; the default covers its change.
+        _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
+        _one("lateral_lag", "s", lambda v: v.sideways(v.x_rate, v.y_rate), 3e-4, OTHER_STAND_OFF),
+        _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, OTHER_SPEED),
+        _one("motion_error", "m", lambda v: np.sign(v.motion_rate), 1e-7, OTHER_DIRECTION),
+        _one("lag_speed", "s", lambda v: v.motion_rate * (abs(v.speed) / r.speed - 1), 1e-4,
+             OTHER_SPEED),
+        _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
+             OTHER_SPEED),
+        _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
+        _one("lag_time", "s", lambda v: v.motion_rate * (v.time / r.duration - 0.5), 1e-4,
+             OTHER_SPEED),
+        _one("lag_curvature", "s2", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
+        _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
+        _one("removed", "1", lambda v: v.removed, 2.0, OTHER_SPEED),
+        # With one direction it is the change of the lag.
+        *([_one("lag_direction", "s", lambda v: v.motion_rate * np.sign(v.speed), 1e-4,
+                OTHER_SPEED)] if r.both_directions else []),
+    ]  # fmt: skip
+
+
+def _geometric(r: Ranges) -> list[Family]:
+    """Centre, squareness, straightness, pitch and scale of the slides."""
+    return [
+        _one("centre_x", "m", lambda v: v.across(1.0, 0.0), 2e-5, BEYOND_CENTRE),
+        _one("centre_y", "m", lambda v: v.across(0.0, 1.0), 2e-5, BEYOND_CENTRE),
+        Family("parallelism", "rad", 2, lambda v: np.stack(
+            [v.across(v.motion, 0.0), v.across(0.0, v.motion)]), 1e-3, BEYOND_CENTRE),
+        _one("squareness", "rad", lambda v: v.slide_x, 3e-5, BEYOND_CENTRE),
+        _one("encoder_scale", "1", lambda v: v.motion, 1e-4, REFERENCE),
+        _curve("straightness_x", "m", r.slide, r, lambda v, w: w(v.slide_x), 3e-7, BEYOND_CENTRE),
+        _curve("straightness_z", "m", r.lift, r, lambda v, w: np.stack(
+            [v.across(bow, 0.0) for bow in w(v.motion)]), 1e-6, BEYOND_CENTRE),
+        _curve("pitch", "m", r.lift, r, lambda v, w: w(v.motion), 3e-7, REFERENCE),
+    ]  # fmt: skip
+
+
+def _curve(
+    name: str,
+    unit: str,
+    ends: tuple[float, float],
+    r: Ranges,
+    columns: Callable[[ScanView, Callable[[FloatArray], FloatArray]], FloatArray],
+    wide: float,
+    shown_by: str,
+) -> Family:
+    """Return a family of an unknown curve between ``ends``: components of unit variance."""
+    nodes = np.linspace(*ends, 129) if ends[1] > ends[0] else np.array([ends[0], ends[0] + 1.0])
+    length = r.lengths.get(name, (nodes[-1] - nodes[0]) / 2)
+    parts = components(smooth(length), nodes)
+
+    def over(position: FloatArray) -> FloatArray:
+        return np.stack([np.interp(position, nodes, part) for part in parts])
+
+    return Family(name, unit, len(parts), lambda v: columns(v, over), wide, shown_by)
+
+
+def _of_the_probe(r: Ranges) -> list[Family]:
+    """Scale, linearity and slope errors of the probe, and its beam."""
+    return [
+        _one("static_gain", "1", lambda v: -v.distance, 1e-2, OTHER_STAND_OFF),
+        _one("probe_square", "m", lambda v: (v.distance / r.distance) ** 2, 1e-7, OTHER_STAND_OFF),
+        _one("probe_linearity", "m", lambda v: (v.distance / r.distance) ** 3, 1e-7,
+             OTHER_STAND_OFF),
+        _one("probe_slope_square", "m", lambda v: v.slope_x**2 + v.slope_y**2, 1e-5, REFERENCE),
+        Family("beam", "1", 2, lambda v: np.stack(
+            [v.across(v.distance, 0.0), v.across(0.0, v.distance)]), 1e-2, OTHER_STAND_OFF),
+    ]  # fmt: skip
+
+
+def _waves(angle: FloatArray, per_turn: float) -> tuple[FloatArray, FloatArray]:
+    return np.cos(per_turn * angle), np.sin(per_turn * angle)
+
+
+def _axial(n: float) -> _Columns:
+    return lambda v: np.stack(_waves(v.c, n))
+
+
+def _tilting(n: float) -> _Columns:
+    return lambda v: v.slide_x * np.stack(_waves(v.c, n))
+
+
+def _radial(n: float) -> _Columns:
+    def columns(v: ScanView) -> FloatArray:
+        along, beside = _waves(v.c, n)
+        return np.stack([v.across(along, beside), v.across(-beside, along)])
+
+    return columns
+
+
+def _angular(n: float) -> _Columns:
+    def columns(v: ScanView) -> FloatArray:
+        # C in error by ε turns the reported place by −ε about the spindle.
+        return v.across(0.0, -v.slide_x) * np.stack(_waves(v.c, n))
+
+    return columns
+
+
+def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
+    """Axial, tilt and radial motion, and errors of C, by their number per turn."""
+    stated = {p.name for p in priors}
+
+    def orders(name: str, usual: Sequence[float]) -> list[float]:
+        more = [float(s.split("/")[1]) for s in stated if s.startswith(f"{name}/")]
+        known = {order_name(name, n) for n in usual}
+        return [*usual, *(n for n in more if order_name(name, n) not in known)]
+
+    table: tuple[tuple[str, str, Sequence[float], Callable[[float], _Columns], float], ...] = (
+        ("spindle_axial", "m", (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
+        ("spindle_tilt", "rad", _TILT_HARMONICS, _tilting, 1e-5),
+        ("spindle_radial", "m", _RADIAL_HARMONICS, _radial, 1e-6),
+        ("c_error", "rad", _C_HARMONICS, _angular, 3e-4),
+    )
+    return [
+        Family(order_name(name, n), unit, 2, columns(n), wide, RECLOCKED)
+        for name, unit, usual, columns, wide in table
+        for n in orders(name, usual)
+    ]
+
+
+# What a warming chuck moves a part that nobody touches by; as in verification.self_calibration.
+_SHIFT_M, _CLOCKING_RAD = 1e-6, 5e-7
+# A part clamped again by hand against a stop.
+_SHIFT_AGAIN_M, _CLOCKING_AGAIN_RAD = 3e-5, 1e-3
+# Where no drift is declared: 60 nm a minute.
+_RATE_M_S = 1e-9
+# Free: every scan shows its tilt against the others.
+_TILT_RAD = 1e-4
+# Terms of the form that a scan may show differently from the others.
+DIFFERENT_TERMS = terms_up_to(4, 2)
+
+
+def _of_each_scan(r: Ranges) -> list[Family]:
+    """Drift of all scans and of each, pose of the part, and what differs from scan to scan.
+
+    ``decentre`` and ``clocking`` are the pose of the part against its nominal surface, which looks
+    like form; ``part_shift`` and ``part_turn`` are the pose of a scan against the first.
+    The machine warms on from scan to scan: one rate over all of them, and what differs is a walk.
+    """
+    found = [
+        _drift(r),
+        _one("drift_rate", "m/s", lambda v: v.time, 1e-8, REPEATED_TRACK, _RATE_M_S),
+        Family("decentre", "m", 2, lambda v: np.stack(
+            [v.sideways(1.0, 0.0), v.sideways(0.0, 1.0)]), 3e-5, REFERENCE, named=False),
+        Family("clocking", "rad", 1, lambda v: v.sideways(-v.y, v.x)[np.newaxis], 1e-3, REFERENCE,
+               named=False),
+    ]  # fmt: skip
+    for k in range(len(r.clampings)):
+        if k:
+            again = r.clampings[k] != r.clampings[0]
+            shift, turn = (
+                (_SHIFT_AGAIN_M, _CLOCKING_AGAIN_RAD) if again else (_SHIFT_M, _CLOCKING_RAD)
+            )
+            found += [
+                _of_scan(k, "tilt", "rad", 2, lambda v: np.stack([-v.x, v.y]), 1e-3, _TILT_RAD),
+                _of_scan(k, "part_shift", "m", 2, lambda v: np.stack(
+                    [v.sideways(1.0, 0.0), v.sideways(0.0, 1.0)]), 3e-5, shift),
+                _of_scan(k, "part_turn", "rad", 1, lambda v: v.sideways(-v.y, v.x)[np.newaxis],
+                         1e-3, turn),
+                _of_scan(k, "expansion", "1", 1, lambda v: v.sideways(v.x, v.y)[np.newaxis], 3e-5),
+            ]  # fmt: skip
+        if len(r.clampings) > 1:
+            found.append(_different(k, r.radius))
+    return found
+
+
+def _of_scan(
+    k: int, name: str, unit: str, size: int, columns: _Columns, wide: float,
+    default: float | None = None,
+) -> Family:  # fmt: skip
+    return Family(f"{name}@{k}", unit, size, only(k, size, columns), wide, REPEATED_TRACK, default)
+
+
+def only(k: int, size: int, columns: _Columns) -> _Columns:
+    """Return ``columns`` of scan ``k``, zero in the others."""
+    return lambda v: columns(v) if v.index == k else np.zeros((size, len(v)))
+
+
+# Of the duration of all scans: a clamp relaxes within a few turns, a body warms within minutes.
+_FADING = (1 / 64, 1 / 16, 1 / 4)
+
+
+def _drift(r: Ranges) -> Family:
+    """Return drifts of each scan of its own: fading within parts of the measurement, and steady."""
+    times = r.duration * np.array(_FADING)[:, np.newaxis]
+    own = len(_FADING) + 1
+
+    def columns(v: ScanView) -> FloatArray:
+        made = np.zeros((own * len(r.clampings), len(v)))
+        here = made[own * v.index : own * (v.index + 1)]
+        here[:-1], here[-1] = np.exp(-v.since / times), v.since / r.duration
+        return made
+
+    return Family("drift", "m", own * len(r.clampings), columns, 1e-7, REPEATED_TRACK)
+
+
+DIFFERS = "scan_differs"
+"""Name of the family of one scan whose form differs from that of the others."""
+
+
+def _different(k: int, radius: float) -> Family:
+    """Return low orders of form that scan ``k`` alone has: detects, and names nothing."""
+
+    def columns(v: ScanView) -> FloatArray:
+        return zernike_values(v.x / radius, v.y / radius, DIFFERENT_TERMS)
+
+    size = len(DIFFERENT_TERMS)
+    return Family(f"{DIFFERS}@{k}", "m", size, only(k, size, columns), 1e-7, REPEATED_TRACK,
+                  named=False)  # fmt: skip

@@ -1,0 +1,257 @@
+"""Form of the part with its covariance: map, peak to valley, rms and Zernike terms.
+
+The map is what terms and cells make together, at the middle of each cell and around the rim; its
+pose is fitted and taken away, and its covariance goes through the same projection, so that no
+figure counts what the fit has absorbed. PV and rms are not linear: their uncertainty comes from
+draws of the map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import linalg, sparse
+
+from omsm_ros.core.adjustment.network import Solution
+from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
+from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
+
+POSE = ("piston", "tip", "tilt")
+"""What is fitted by default; ``x``, ``y`` and ``clocking`` may be too."""
+# Points around the rim, where a form of high order has its peaks.
+_RIM = 96
+# Draws: a standard deviation to 4 %.
+_DRAWS = 300
+# Terms that are reported, and those that are fitted beside them.
+REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of the form [m]: value and standard uncertainty (k = 1)."""
+
+    value: float
+    uncertainty: float
+
+
+@dataclass(frozen=True, eq=False)
+class FormMap:
+    """The form error over the part, its pose removed; cells, then the rim.
+
+    x, y: part frame [m], (n,);  height: form error [m], (n,);  area: share of each (n,), 0 at the
+        rim;  covariance: (n, n) [m²]
+    pv, rms: figures;  terms: of degree 2 to 4 on ``disc``, coefficients one at its rim [m], and
+        their covariance [m²]
+    removed: names of the pose, with their values ``pose`` [m], [1], [rad]
+    """
+
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    area: FloatArray
+    covariance: FloatArray
+    pv: Figure
+    rms: Figure
+    disc: Aperture
+    terms: tuple[ZernikeIndex, ...]
+    coefficients: FloatArray
+    term_covariance: FloatArray
+    removed: tuple[str, ...]
+    pose: FloatArray
+
+    @property
+    def uncertainty(self) -> FloatArray:
+        """Standard uncertainty of each height (n,) [m]."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance), 0.0)))
+
+    @property
+    def mean_uncertainty(self) -> float:
+        """Standard uncertainty of the heights, rms over the part [m]."""
+        return float(np.sqrt(self.area @ np.diag(self.covariance)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Where the map is made: x, y, span-free terms, cell of each place, and areas."""
+
+    x: FloatArray
+    y: FloatArray
+    cell: IntArray
+    area: FloatArray
+
+
+def form_map(
+    solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE, seed: int = 0
+) -> FormMap:
+    """Return the form error that ``solution`` found.
+
+    nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
+    seed: of the draws
+    """
+    made = _Drawn.of(solution, nominal, removed, seed)
+    places, rows = made.places, made.rows
+    spread = solution.factor.forward(rows.T)
+    raw = spread.T @ spread
+    of_cells = made.member @ sparse.diags_array(made.share) @ made.member.T
+    raw += of_cells.toarray()
+    covariance = made.free(made.free(raw).T)
+    terms, by_heights = _term_fit(solution, places)
+    return FormMap(
+        x=places.x,
+        y=places.y,
+        height=made.height,
+        area=places.area,
+        covariance=covariance,
+        pv=made.pv,
+        rms=made.rms,
+        disc=solution.network.part.disc,
+        terms=terms,
+        coefficients=by_heights @ made.height,
+        term_covariance=by_heights @ covariance @ by_heights.T,
+        removed=tuple(removed),
+        pose=made.pose,
+    )
+
+
+def pv_and_rms(
+    solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE, seed: int = 0
+) -> tuple[Figure, Figure]:
+    """Return PV and rms of the form that ``solution`` found, as :func:`form_map` does."""
+    made = _Drawn.of(solution, nominal, removed, seed)
+    return made.pv, made.rms
+
+
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """The map, what it depends on, and its PV and rms by draws.
+
+    rows: change of the map by the parameters that take part (n, a);  share: variance of cells
+    member: cell of each place (n, cells);  columns, fit: of the pose (n, k), (k, n)
+    """
+
+    places: _Places
+    height: FloatArray
+    pose: FloatArray
+    rows: FloatArray
+    share: FloatArray
+    member: sparse.csr_array
+    columns: FloatArray
+    fit: FloatArray
+    pv: Figure = field(init=False)
+    rms: Figure = field(init=False)
+
+    @classmethod
+    def of(
+        cls, solution: Solution, nominal: Surface | None, removed: Sequence[str], seed: int
+    ) -> _Drawn:
+        """Return the map of ``solution``."""
+        net, scales = solution.network, solution.scales
+        places = _places(solution)
+        share = net.cell_share(net.weights(scales), scales)
+        found = net.cells_of(scales, solution.residual())
+        values = net.part.values(places.x, places.y)
+        height = values @ solution.values[net.terms] + found[places.cell]
+        # The cells follow from the parameters: a − A β.
+        rows = -(net.cell_sums(scales)[places.cell] * share[places.cell, np.newaxis])
+        rows[:, net.terms] += values
+        columns, fit = _pose(places, nominal, removed)
+        number = len(height)
+        member = sparse.csr_array(
+            (np.ones(number), (np.arange(number), places.cell)), shape=(number, len(share))
+        )
+        made = cls(
+            places, height - columns @ (fit @ height), fit @ height,
+            rows[:, solution.active], share, member, columns, fit,
+        )  # fmt: skip
+        draws = made.free(made.errors(solution, seed))
+        object.__setattr__(made, "pv", _figure(made.height, draws, _pv))
+        object.__setattr__(made, "rms", _figure(made.height, draws, lambda h: _rms(places, h)))
+        return made
+
+    def free(self, heights: FloatArray) -> FloatArray:
+        """Return ``heights`` (n, …) without their pose."""
+        return np.asarray(heights - self.columns @ (self.fit @ heights))
+
+    def errors(self, solution: Solution, seed: int) -> FloatArray:
+        """Return errors of the map as they may be, (n, draws) [m]."""
+        random = np.random.default_rng(seed)
+        factor = solution.factor
+        normal = random.standard_normal((len(solution.active), _DRAWS))
+        moved = linalg.solve_triangular(factor.root, normal, lower=True, trans="T")
+        moved *= factor.scale[:, np.newaxis]
+        of_cells = np.sqrt(self.share)[:, np.newaxis] * random.standard_normal(
+            (len(self.share), _DRAWS)
+        )
+        return np.asarray(self.rows @ moved + self.member @ of_cells)
+
+
+def _pv(heights: FloatArray) -> FloatArray:
+    return np.asarray(np.ptp(heights, axis=0))
+
+
+def _rms(places: _Places, heights: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(places.area @ heights**2))
+
+
+def _places(solution: Solution) -> _Places:
+    """Return the centre of the blocks of every cell that was scanned, and points of the rim."""
+    net = solution.network
+    blocks, part = net.blocks, net.part
+    number = np.bincount(part.cell, minlength=part.cells)
+    seen = np.flatnonzero(number)
+    x, y = (np.bincount(part.cell, v, part.cells)[seen] / number[seen]
+            for v in (blocks.x, blocks.y))  # fmt: skip
+    angle = 2 * np.pi * np.arange(_RIM) / _RIM
+    # Just inside, where the outermost points are.
+    rim_x = part.disc.x + part.disc.radius * np.cos(angle) * (1 - 1e-3)
+    rim_y = part.disc.y + part.disc.radius * np.sin(angle) * (1 - 1e-3)
+    cell = part.cell_of(rim_x, rim_y)
+    kept = number[cell] > 0
+    area = np.append(np.ones(len(seen)), np.zeros(np.count_nonzero(kept)))
+    return _Places(
+        np.append(x, rim_x[kept]),
+        np.append(y, rim_y[kept]),
+        np.append(seen, cell[kept]),
+        area / len(seen),
+    )
+
+
+def _pose(
+    places: _Places, nominal: Surface | None, removed: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return columns of the pose (n, k), and what fits them by least squares (k, n)."""
+    x, y = places.x, places.y
+    columns = {"piston": np.ones(len(x)), "tip": y, "tilt": -x}
+    if nominal is not None:
+        slope_x, slope_y = slopes_by_differences(nominal, x, y)
+        columns |= {"x": -slope_x, "y": -slope_y, "clocking": slope_x * y - slope_y * x}
+    made = np.stack([columns[name] for name in removed], axis=1)
+    scale = np.sqrt(places.area @ made**2)
+    root = np.sqrt(places.area)[:, np.newaxis]
+    fit = np.linalg.pinv(made / scale * root, rcond=1e-9) * root.T / scale[:, np.newaxis]
+    return made, np.asarray(fit)
+
+
+def _figure(
+    height: FloatArray, draws: FloatArray, of: Callable[[FloatArray], FloatArray]
+) -> Figure:
+    """Return a figure of ``height``, its uncertainty by draws: their spread and their bias."""
+    value = float(of(height[:, np.newaxis])[0])
+    many = of(height[:, np.newaxis] + draws)
+    bias = float(np.mean(many)) - value
+    return Figure(value, float(np.hypot(np.std(many), bias)))
+
+
+def _term_fit(solution: Solution, places: _Places) -> tuple[tuple[ZernikeIndex, ...], FloatArray]:
+    """Return the terms of degree 2 to 4, and the matrix from heights to their coefficients."""
+    every = terms_up_to(_FITTED_DEGREE)
+    u, v = solution.network.part.disc.scaled(places.x, places.y)
+    values = zernike_values(u, v, every).T
+    root = np.sqrt(places.area)[:, np.newaxis]
+    fit = np.linalg.pinv(values * root, rcond=1e-6) * root.T
+    kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
+    return tuple(every[k] for k in kept), fit[kept]

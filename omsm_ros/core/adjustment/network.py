@@ -1,0 +1,412 @@
+"""Weighted least squares with priors: normal equations, and their solution.
+
+``y = F β + Z ζ + K δ + cell + noise``: F columns of the families, Z terms of the part, K hat
+functions of the drift of each scan. Cells are eliminated one by one: with Σw the weight that a
+cell has and s² its variance, ``N = XᵀWX − Σ c cᵀ / (Σw + 1/s²)``, c = Σ w x over the cell.
+The normal equations without y are the geometry alone: planning uses them too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import linalg, sparse
+
+from omsm_ros.core.adjustment.blocks import Blocks
+from omsm_ros.core.adjustment.families import Family
+from omsm_ros.core.adjustment.part_terms import PartModel
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+
+# A walk between two knots of a third of a turn stays below the noise of a block.
+_KNOTS_A_TURN, _MOST_KNOTS = 3, 400
+# Blocks at a time: 28 MB of rows.
+_PORTION = 4096
+# The level of a scan: no prior; drift begins at zero with the first, so that the part has its own.
+_LEVEL_M, _FIRST_LEVEL_M = 1e-5, 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Variances that are estimated from the data.
+
+    walk: of the drift after one second [m²/s];  bands: of the terms of each degree above the free
+        ones [m²];  cells: of a cell [m²];  noise: of a block's mean over its white noise, each scan
+    """
+
+    walk: float
+    bands: Mapping[int, float]
+    cells: float
+    noise: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """The design of all scans, and its normal equations.
+
+    place: columns of each family among the parameters;  knots: of each scan
+    steps: time between knots of each scan [s]
+    """
+
+    blocks: Blocks
+    families: tuple[Family, ...]
+    part: PartModel
+    place: Mapping[str, slice] = field(init=False)
+    knots: tuple[slice, ...] = field(init=False)
+    steps: tuple[float, ...] = field(init=False)
+    terms: slice = field(init=False)
+    _values: FloatArray = field(init=False)
+    _hats: sparse.csr_array = field(init=False)
+    _member: sparse.csr_array = field(init=False)
+    _sums: list[tuple[FloatArray, FloatArray]] = field(init=False, default_factory=list)
+
+    def __post_init__(self) -> None:
+        blocks, place, begin = self.blocks, {}, 0
+        for family in self.families:
+            place[family.name] = slice(begin, begin + family.size)
+            begin += family.size
+        values = self.part.values(blocks.x, blocks.y, blocks.span)
+        end = begin + values.shape[1]
+        hats, knots, steps = _hats_of(blocks, end)
+        number = len(blocks)
+        member = sparse.csr_array(
+            (np.ones(number), (self.part.cell, np.arange(number))),
+            shape=(self.part.cells, number),
+        )
+        for name, value in {
+            "place": place,
+            "terms": slice(begin, end),
+            "knots": knots,
+            "steps": steps,
+            "_values": values,
+            "_hats": hats,
+            "_member": member,
+        }.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return int(self.terms.stop + self._hats.shape[1])
+
+    def weights(self, scales: Scales) -> FloatArray:
+        """Return the inverse variance of each block [1/m²], (b,)."""
+        blocks = self.blocks
+        return np.asarray(1 / (blocks.variance * scales.noise[blocks.scan]))
+
+    def cell_share(self, weights: FloatArray, scales: Scales) -> FloatArray:
+        """Return the variance of each cell after its blocks, 1 / (Σw + 1/s²) [m²]."""
+        total = self._member @ weights
+        return np.asarray(1 / (total + 1 / max(scales.cells, _LEAST_VARIANCE)))
+
+    def _own(self, scan: int) -> IntArray:
+        """Return the parameters that blocks of ``scan`` depend on: all but others' knots."""
+        knots = self.knots[scan]
+        return np.append(np.arange(self.terms.stop), np.arange(knots.start, knots.stop))
+
+    def _by_scan(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Return XᵀWX and Σ w x over each cell of each scan by white noise alone.
+
+        Made once: with the noise of each scan they are summed anew, whatever it is.
+        """
+        if not self._sums:
+            self._sums.extend(self._sums_of(k) for k in range(self.blocks.scans))
+        return self._sums
+
+    def _sums_of(self, scan: int) -> tuple[FloatArray, FloatArray]:
+        mine = np.flatnonzero(self.blocks.scan == scan)
+        knots, split = self.knots[scan], self.terms.stop
+        size = split + knots.stop - knots.start
+        matrix, sums = np.zeros((size, size)), np.zeros((self.part.cells, size))
+        columns = slice(knots.start - split, knots.stop - split)
+        for first in range(0, len(mine), _PORTION):
+            part = mine[first : first + _PORTION]
+            rows = np.empty((len(part), size))
+            rows[:, : self.terms.start] = self.blocks.columns[part]
+            rows[:, self.terms] = self._values[part]
+            rows[:, split:] = self._hats[part][:, columns].toarray()
+            weighted = rows / self.blocks.variance[part, np.newaxis]
+            sums += self._member[:, part] @ weighted
+            matrix += rows.T @ weighted
+        return matrix, sums
+
+    def cell_sums(self, scales: Scales) -> FloatArray:
+        """Return Σ w x over each cell, (cells, size)."""
+        made = np.zeros((self.part.cells, self.size))
+        for k, (_, sums) in enumerate(self._by_scan()):
+            made[:, self._own(k)] += sums / scales.noise[k]
+        return made
+
+    def normal_matrix(self, scales: Scales) -> FloatArray:
+        """Return XᵀV⁻¹X with the cells eliminated, (size, size): of the geometry alone."""
+        share = self.cell_share(self.weights(scales), scales)
+        sums = self.cell_sums(scales)
+        sums *= np.sqrt(share)[:, np.newaxis]
+        made = -(sums.T @ sums)
+        for k, (matrix, _) in enumerate(self._by_scan()):
+            own = self._own(k)
+            made[np.ix_(own, own)] += matrix / scales.noise[k]
+        return made
+
+    def right_side(self, scales: Scales, y: FloatArray) -> FloatArray:
+        """Return XᵀV⁻¹y with the cells eliminated, (size,)."""
+        weights = self.weights(scales)
+        pulled = weights * (y - self.cells_of(scales, y)[self.part.cell])
+        return np.concatenate(
+            [self.blocks.columns.T @ pulled, self._values.T @ pulled, self._hats.T @ pulled]
+        )
+
+    def cells_of(self, scales: Scales, residual: FloatArray) -> FloatArray:
+        """Return the cells that go with ``residual`` (b,) [m], (cells,)."""
+        weights = self.weights(scales)
+        sums = self._member @ (weights * residual)
+        return np.asarray(self.cell_share(weights, scales) * sums)
+
+    def fitted(self, parameters: FloatArray) -> FloatArray:
+        """Return X β without the cells, (b,) [m]."""
+        families = self.blocks.columns @ parameters[: self.terms.start]
+        return np.asarray(
+            families + self._values @ parameters[self.terms] + self.of_drift(parameters)
+        )
+
+    def of_drift(self, parameters: FloatArray) -> FloatArray:
+        """Return the drift at the blocks, (b,) [m]."""
+        return np.asarray(self._hats @ parameters[self.terms.stop :])
+
+    def of_families(self, parameters: FloatArray, names: Sequence[str]) -> FloatArray:
+        """Return what families ``names`` add to the heights of the blocks, (b,) [m]."""
+        made = np.zeros(len(self.blocks))
+        for name in names:
+            here = self.place[name]
+            made += self.blocks.columns[:, here] @ parameters[here]
+        return made
+
+    def column(self, name: str) -> FloatArray:
+        """Return the columns of family ``name``, (b, size)."""
+        return np.asarray(self.blocks.columns[:, self.place[name]])
+
+    def active(self, sizes: Mapping[str, float]) -> BoolArray:
+        """Return which parameters take part where the families in ``sizes`` do, (size,)."""
+        made = np.ones(self.size, np.bool_)
+        for name, here in self.place.items():
+            made[here] = name in sizes
+        return made
+
+    def add_prior(
+        self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Mapping[str, float]
+    ) -> None:
+        """Add the precision before the scans to ``matrix`` (a, a) of the parameters ``active``.
+
+        sizes: standard deviations of the families that take part
+        """
+        diagonal = np.zeros(self.size)
+        for name, size in sizes.items():
+            diagonal[self.place[name]] = 1 / max(size, _LEAST_SIZE) ** 2
+        free, degrees = self.part.free, self.part.degrees
+        variance = np.array(
+            [f**2 if f else scales.bands[int(d)] for f, d in zip(free, degrees, strict=True)]
+        )
+        diagonal[self.terms] = 1 / np.maximum(variance, _LEAST_VARIANCE)
+        matrix[np.diag_indices(len(active))] += diagonal[active]
+        left_out = self.size - len(active)
+        for knots, step in zip(self.knots, self.steps, strict=True):
+            # Knots stand behind all others, and always take part.
+            here = slice(knots.start - left_out, knots.stop - left_out)
+            matrix[here, here] += walk_precision(knots.stop - knots.start) / (
+                max(scales.walk, _LEAST_VARIANCE) * step
+            )
+            level = _FIRST_LEVEL_M if knots is self.knots[0] else _LEVEL_M
+            matrix[here.start, here.start] += level**-2
+
+
+# Square of a picometre: keeps what is exactly known regular.
+_LEAST_VARIANCE, _LEAST_SIZE = 1e-24, 1e-15
+
+
+def walk_precision(number: int) -> FloatArray:
+    """Return DᵀD of first differences between ``number`` knots."""
+    difference = np.diff(np.eye(number), axis=0)
+    return np.asarray(difference.T @ difference)
+
+
+def _hats_of(
+    blocks: Blocks, begin: int
+) -> tuple[sparse.csr_array, tuple[slice, ...], tuple[float, ...]]:
+    """Return hat functions over the time of each scan, (b, knots)."""
+    rows: list[IntArray] = []
+    places: list[IntArray] = []
+    values: list[FloatArray] = []
+    knots, steps, first = [], [], 0
+    for k in range(blocks.scans):
+        mine = np.flatnonzero(blocks.scan == k)
+        intervals = int(np.clip(_KNOTS_A_TURN * (blocks.turn[mine[-1]] + 1), 4, _MOST_KNOTS))
+        since = blocks.since[mine]
+        step = float(since[-1]) / intervals
+        place = np.clip(since / step, 0, intervals * (1 - 1e-12))
+        left = place.astype(np.int64)
+        rows += [mine, mine]
+        places += [first + left, first + left + 1]
+        values += [1 - (place - left), place - left]
+        knots.append(slice(begin + first, begin + first + intervals + 1))
+        steps.append(step)
+        first += intervals + 1
+    joined = (np.concatenate(values), (np.concatenate(rows), np.concatenate(places)))
+    return sparse.csr_array(joined, shape=(len(blocks), first)), tuple(knots), tuple(steps)
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """Cholesky root L of a positive matrix whose rows have different units: A = D⁻¹ L Lᵀ D⁻¹.
+
+    No ridge: a free form of 100 nm beside an uncertainty of 0.03 nm would be pulled by 1e-13.
+    """
+
+    root: FloatArray
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, matrix: FloatArray) -> Factor:
+        """Return the factor of ``matrix`` (p, p), which is overwritten."""
+        scale = 1 / np.sqrt(np.diag(matrix))
+        matrix *= scale
+        matrix *= scale[:, np.newaxis]
+        return cls(linalg.cholesky(matrix, lower=True, overwrite_a=True), scale)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return A⁻¹ ``right`` (p,)."""
+        return np.asarray(self.scale * linalg.cho_solve((self.root, True), self.scale * right))
+
+    def forward(self, right: FloatArray) -> FloatArray:
+        """Return Z (p, k) with ZᵀZ = ``right``ᵀ A⁻¹ ``right`` (p, k)."""
+        scaled = self.scale[:, np.newaxis] * right
+        return np.asarray(linalg.solve_triangular(self.root, scaled, lower=True))
+
+    def inverse(self) -> FloatArray:
+        """Return A⁻¹ (p, p)."""
+        made, _ = linalg.lapack.dpotri(self.root, lower=1)
+        lower = np.tril(made)
+        lower += np.tril(made, -1).T
+        lower *= self.scale
+        lower *= self.scale[:, np.newaxis]
+        return np.asarray(lower)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Parameters that take part, and all that is known of the others.
+
+    values: of all parameters, 0 where they take no part
+    matrix, right: normal equations of all, without priors
+    sizes: prior standard deviations of the families that took part
+    active: parameters that take part (a,);  factor: of their normal matrix, priors included
+    covariance: of those, (a, a)
+    """
+
+    network: Network
+    y: FloatArray
+    scales: Scales
+    sizes: Mapping[str, float]
+    values: FloatArray
+    covariance: FloatArray
+    matrix: FloatArray
+    right: FloatArray
+    active: IntArray
+    factor: Factor
+
+    def residual(self) -> FloatArray:
+        """Return y less families, part terms and drift, cells still in it, (b,) [m]."""
+        return np.asarray(self.y - self.network.fitted(self.values))
+
+    def covariance_of(self, here: slice) -> FloatArray:
+        """Return the covariance of consecutive parameters that take part."""
+        first = int(np.searchsorted(self.active, here.start))
+        part = slice(first, first + here.stop - here.start)
+        return self.covariance[part, part]
+
+    def uncertainty(self, name: str) -> FloatArray:
+        """Return standard uncertainties of a family's parameters."""
+        here = self.network.place[name]
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance_of(here)), 0.0)))
+
+
+def solve(network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float]) -> Solution:
+    """Return the solution for given scales and prior sizes of the families that take part."""
+    matrix, right = network.normal_matrix(scales), network.right_side(scales, y)
+    active = np.flatnonzero(network.active(sizes))
+    inside = matrix[np.ix_(active, active)]
+    network.add_prior(inside, active, scales, sizes)
+    factor = Factor.of(inside)
+    values = np.zeros(network.size)
+    values[active] = factor.solve(right[active])
+    return Solution(
+        network, y, scales, sizes, values, factor.inverse(), matrix, right, active, factor
+    )
+
+
+def estimate_scales(solution: Solution) -> Scales:
+    """Return one step of the variance components (MacKay, Neural Comp. 4, 415).
+
+    Each variance is the sum of squares of its parameters over how many of them the data determine.
+    """
+    net, scales = solution.network, solution.scales
+    diagonal = np.diag(solution.covariance_of(net.terms))
+    terms, degrees = solution.values[net.terms], net.part.degrees
+    bands = {}
+    for degree, before in scales.bands.items():
+        mine = degrees == degree
+        determined = np.sum(1 - diagonal[mine] / before)
+        bands[degree] = _variance(float(np.sum(terms[mine] ** 2)), float(determined), before)
+    residual = solution.residual()
+    cells = net.cells_of(scales, residual)
+    share = net.cell_share(net.weights(scales), scales)
+    seen = np.unique(net.part.cell)
+    determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, _LEAST_VARIANCE)))
+    return replace(
+        scales,
+        walk=_walk(solution),
+        bands=bands,
+        cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells),
+        noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
+    )
+
+
+# A step of a variance; what has vanished may come back.
+_LARGEST_STEP, _VANISHED = 30.0, 1e-22
+
+
+def _variance(square: float, determined: float, before: float) -> float:
+    found = square / max(determined, 1e-3)
+    return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), _VANISHED))
+
+
+def _walk(solution: Solution) -> float:
+    net, square, determined = solution.network, 0.0, 0.0
+    before = solution.scales.walk
+    for here, step in zip(net.knots, net.steps, strict=True):
+        moves = np.diff(solution.values[here])
+        covariance = solution.covariance_of(here)
+        d = np.diag(covariance)
+        variance = d[1:] + d[:-1] - 2 * np.diag(covariance, 1)
+        square += float(np.sum(moves**2)) / step
+        determined += float(np.sum(1 - variance / (before * step)))
+    return _variance(square, determined, before)
+
+
+def _noise(solution: Solution, residual: FloatArray, determined_cells: float) -> FloatArray:
+    """Return the factors of the variance of blocks by the residuals of each scan."""
+    blocks = solution.network.blocks
+    weights = 1 / blocks.variance
+    own = solution.matrix[np.ix_(solution.active, solution.active)]
+    parameters = float(np.sum(solution.covariance * own))
+    share = (parameters + determined_cells) / len(blocks)
+    made = []
+    for k in range(blocks.scans):
+        mine = blocks.scan == k
+        free = max(np.count_nonzero(mine) * (1 - share), 1.0)
+        made.append(float(np.sum(weights[mine] * residual[mine] ** 2)) / free)
+    return np.maximum(made, _LEAST_NOISE)
+
+
+# A block cannot be better than half of what its white noise says.
+_LEAST_NOISE = 0.5

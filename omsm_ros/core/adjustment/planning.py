@@ -1,0 +1,262 @@
+"""Which scans reach a wanted uncertainty? The covariance of an adjustment, before any data.
+
+A design becomes a scan with few points a turn, each of which stands for many readings; the normal
+equations are those of the adjustment (:mod:`network`), without heights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from omsm_ros.core.adjustment.blocks import blocks_of
+from omsm_ros.core.adjustment.families import (
+    BEYOND_CENTRE,
+    OTHER_DIRECTION,
+    OTHER_SPEED,
+    RECLOCKED,
+    REPEATED_TRACK,
+    Source,
+    families_of,
+    prior_sizes,
+    ranges_of,
+)
+from omsm_ros.core.adjustment.figures import POSE, form_map
+from omsm_ros.core.adjustment.network import Network, Scales, solve
+from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, RINGS, part_model
+from omsm_ros.core.adjustment.scan_data import ScanData, view_of
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import FloatArray
+
+# Points and turns of a design: sets with more turns are planned with fewer, each counting for
+# more and the time running faster.
+_POINTS_A_TURN, _MOST_TURNS = 96, 24
+# Terms of a plan: what a form of finer detail adds is the same for all sets.
+_DEGREE = 12
+# Of a reading, a drift after a second, and a cell: where nothing is declared.
+_NOISE_M, _WALK_M, _CELLS_M, _BAND_M = 12e-9, 1e-9, 1e-9, 1e-9
+# Between two scans: the spindle is stopped, turned over, and the probe driven back.
+_PAUSE_S = 20.0
+# A third turn of the part would leave its third harmonics where they were.
+_RECLOCKED_RAD = np.deg2rad(80.0)
+# Share of the radius that a scan goes on beyond the axis.
+_BEYOND = 0.3
+_RANGE_M = 1e-5
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScanDesign:
+    """A spiral that could be scanned.
+
+    rpm: spindle speed, with its sign;  start, end: slide x [m], beyond the axis negative
+    pitch: feed a turn [m];  clocking: of the part [rad];  clamping: its number
+    rate: readings a second [Hz]
+    """
+
+    rpm: float
+    start: float
+    end: float
+    pitch: float
+    clocking: float = 0.0
+    clamping: int = 0
+    rate: float = 1000.0
+
+    @property
+    def turns(self) -> float:
+        """Turns of the spindle."""
+        return abs(self.end - self.start) / self.pitch
+
+    @property
+    def duration(self) -> float:
+        """Of the scan [s]."""
+        return self.turns * 60 / abs(self.rpm)
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedUncertainty:
+    """What an adjustment of a set of scans will reach.
+
+    form: standard uncertainty of the heights once the pose is removed, rms over the part [m]
+    sources: of each family that takes part, standard uncertainty after the scans [unit]
+    duration: of all scans and the pauses between them [s]
+    """
+
+    form: float
+    sources: Mapping[str, FloatArray]
+    duration: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSet:
+    """A set of scans with what it reaches;  reaches: True if that is the wanted accuracy."""
+
+    designs: tuple[ScanDesign, ...]
+    uncertainty: PlannedUncertainty
+    reaches: bool
+
+
+def posterior_uncertainty(
+    designs: Sequence[ScanDesign], priors: Sequence[Source], nominal: Surface
+) -> PlannedUncertainty:
+    """Return what ``designs``, adjusted together, will leave uncertain.
+
+    priors: declared sources, ``noise`` [m] and ``drift_walk`` [m/√s] among them
+    """
+    scans, begin = [], 0.0
+    shorter = max(1.0, max(d.turns for d in designs) / _MOST_TURNS)
+    for design in designs:
+        scans.append(design_scan(design, nominal, begin / shorter, design.turns / shorter))
+        begin += design.duration + _PAUSE_S
+    views = [view_of(s, k, 0.0, nominal) for k, s in enumerate(scans)]
+    ranges = ranges_of(views, priors, [s.clamping for s in scans])
+    families = families_of(ranges, priors)
+    sizes = prior_sizes(families, priors)
+    # All is over sooner by ``shorter``: what grows with time has to grow faster.
+    sizes["drift_rate"] *= shorter
+    kept = [f for f in families if f.name in sizes]
+    stated = {p.name: p.uncertainty for p in priors}
+    noise = stated.get("noise", _NOISE_M)
+    blocks = blocks_of(views, [s.weight for s in scans], kept, noise)
+    part = part_model(blocks, min(s.turns for s in scans), _DEGREE)
+    scales = Scales(
+        walk=stated.get("drift_walk", _WALK_M) ** 2 * shorter,
+        bands=dict.fromkeys((RINGS, *range(FREE_DEGREE + 1, _DEGREE + 1)), _BAND_M**2),
+        cells=_CELLS_M**2,
+        noise=np.ones(len(scans)),
+    )
+    network = Network(blocks, tuple(kept), part)
+    solution = solve(network, np.zeros(len(blocks)), scales, sizes)
+    return PlannedUncertainty(
+        form=form_map(solution, nominal, POSE).mean_uncertainty,
+        sources={f.name: solution.uncertainty(f.name) for f in kept},
+        duration=begin - _PAUSE_S,
+    )
+
+
+def plan_scans(
+    candidates: Sequence[Sequence[ScanDesign]],
+    priors: Sequence[Source],
+    nominal: Surface,
+    accuracy: float,
+) -> tuple[PlannedSet, ...]:
+    """Return the sets of scans, the shortest that reaches ``accuracy`` [m] (k = 2) first.
+
+    Those that do not reach it follow, the most accurate first.
+    """
+    found = []
+    for designs in candidates:
+        planned = posterior_uncertainty(designs, priors, nominal)
+        found.append(PlannedSet(tuple(designs), planned, 2 * planned.form <= accuracy))
+
+    def order(planned: PlannedSet) -> tuple[bool, float]:
+        one = planned.uncertainty
+        return (not planned.reaches, one.duration if planned.reaches else one.form)
+
+    return tuple(sorted(found, key=order))
+
+
+def usual_sets(first: ScanDesign) -> dict[str, tuple[ScanDesign, ...]]:
+    """Return the sets to choose from, by name: ``single``, ``quick`` of two, ``full`` with more.
+
+    first: a scan that the machine can make
+    """
+    other = additions(first)
+    quick = (first, other[OTHER_SPEED])
+    again = other[RECLOCKED]
+    third = replace(again, clocking=2.5 * _RECLOCKED_RAD + first.clocking)
+    return {
+        "single": (first,),
+        "quick": quick,
+        "quick_beyond": (first, other[BEYOND_CENTRE]),
+        "full": (*quick, again),
+        "full_4": (*quick, again, third),
+    }
+
+
+def additions(first: ScanDesign) -> dict[str, ScanDesign]:
+    """Return the scans that may be added to ``first``, by their codes.
+
+    All but ``other_direction`` run back over the part at twice the speed, so that time and drift
+    are told from radius as well.
+    """
+    back = replace(first, start=first.end, end=first.start)
+    fast = replace(back, rpm=2 * first.rpm)
+    outer = max(first.start, first.end, key=abs)
+    beyond = (-_BEYOND * outer, outer)
+    start, end = beyond if abs(first.start) > abs(first.end) else beyond[::-1]
+    return {
+        OTHER_SPEED: fast,
+        OTHER_DIRECTION: replace(back, rpm=-first.rpm),
+        RECLOCKED: replace(
+            fast, clocking=first.clocking + _RECLOCKED_RAD, clamping=first.clamping + 1
+        ),
+        BEYOND_CENTRE: replace(fast, start=start, end=end),
+        REPEATED_TRACK: back,
+    }
+
+
+def design_of(scan: ScanData) -> ScanDesign:
+    """Return the design that ``scan`` followed, as far as it is a spiral."""
+    radius = np.hypot(scan.x, scan.y)
+    edge = max(len(scan) // 200, 1)
+    start, end = float(np.max(radius[:edge])), float(np.min(radius[-edge:]))
+    if scan.outward:
+        start, end = float(np.min(radius[:edge])), float(np.max(radius[-edge:]))
+    return ScanDesign(
+        rpm=scan.speed * 30 / np.pi,
+        start=start,
+        end=end,
+        pitch=abs(end - start) / max(scan.turns, 1.0),
+        clocking=scan.clocking,
+        clamping=scan.clamping,
+        rate=(len(scan) - 1) / scan.duration,
+    )
+
+
+def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float) -> ScanData:
+    """Return ``design`` as a scan of the nominal surface with few points.
+
+    begin: when it begins [s];  shown: turns that stand for those of the design, at its speed
+    """
+    number = round(shown * _POINTS_A_TURN)
+    share = np.arange(number) / number
+    time = share * shown * 60 / abs(design.rpm)
+    slide = design.start + (design.end - design.start) * share
+    c = np.sign(design.rpm) * 2 * np.pi * shown * share
+    chuck = slide * np.exp(-1j * c)
+    part = chuck * np.exp(-1j * design.clocking)
+    motion = nominal.height(part.real, part.imag)
+    # The probe is driven through some of its range on the way, else its scale would not show.
+    distance = _RANGE_M * np.sin(2 * np.pi * 7 * share)
+    return ScanData(
+        time=begin + time,
+        x=chuck.real,
+        y=chuck.imag,
+        height=motion,
+        distance=distance,
+        motion=motion,
+        removed=np.zeros(number),
+        c=c,
+        clocking=design.clocking,
+        clamping=design.clamping,
+        weight=max(design.duration * design.rate / number, 1e-9),
+    )
+
+
+def best_addition(
+    scan: ScanData, priors: Sequence[Source], nominal: Surface
+) -> tuple[str, float, float]:
+    """Return the code of the scan to add to ``scan`` that helps most, and what form then is.
+
+    Also returned: standard uncertainty of the form of ``scan`` alone, planned likewise [m].
+    """
+    first = design_of(scan)
+    alone = posterior_uncertainty([first], priors, nominal).form
+    reached = {
+        code: posterior_uncertainty([first, added], priors, nominal).form
+        for code, added in additions(first).items()
+    }
+    best = min(reached, key=lambda code: reached[code])
+    return best, reached[best], alone

@@ -1,0 +1,258 @@
+"""Scans as the adjustment takes them: heights over the part, and how the machine moved.
+
+``part frame``: the chuck's x and y turned back by the clocking of the part, so that one place of
+the part has one x and y in all scans. Rates are local polynomials over the samples
+(Savitzky-Golay), taken from the axes alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import DataError
+
+# A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.
+LEAST_POINTS = 200
+# As in verification.scan_reader: at the 12th harmonic of a turn a second the rate is 1 % short.
+_HALF_WINDOW_S, _POLYNOMIAL = 12e-3, 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanData:
+    """One scan, arrays (n,) in the order of time; only points with a valid reading.
+
+    time: [s], of one clock for all scans
+    x, y: of the point in the frame of the chuck [m]
+    height: corrected height, H(z) plus distance [m]
+    distance: that the probe measured, growing with the height [m]
+    motion: z of the encoder [m]
+    removed: what the correction took from the height, z − H(z) [m]
+    c: spindle angle, unwrapped [rad]
+    clocking: angle by which the part is turned on the chuck, from x towards y [rad]
+    clamping: number of the clamping; scans of one number were made without touching the part
+    weight: readings that one point stands for; above 1 for designs only
+
+    Raises DataError for arrays of unlike length, for values that are not finite, and for times
+    that do not grow.
+    """
+
+    time: FloatArray
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    distance: FloatArray
+    motion: FloatArray
+    removed: FloatArray
+    c: FloatArray
+    clocking: float = 0.0
+    clamping: int = 0
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ARRAYS:
+            values = getattr(self, name)
+            if np.shape(values) != np.shape(self.time):
+                raise DataError(
+                    f"{name} has shape {np.shape(values)!r}, expected {np.shape(self.time)!r} as "
+                    "time has"
+                )
+            if not np.isfinite(values).all():
+                raise DataError(f"{name} holds values that are not finite; leave such points out")
+        if len(self.time) < LEAST_POINTS:
+            raise DataError(f"scan of {len(self.time)} points, expected {LEAST_POINTS} or more")
+        if not (np.diff(self.time) > 0).all():
+            raise DataError("time does not grow from point to point; sort the scan by time")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last point [s]."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def turns(self) -> float:
+        """Turns of the spindle, without sign."""
+        return float(abs(self.c[-1] - self.c[0]) / (2 * np.pi))
+
+    @property
+    def speed(self) -> float:
+        """Mean speed of the spindle, with its sign [rad/s]."""
+        return float((self.c[-1] - self.c[0]) / self.duration)
+
+    @property
+    def outward(self) -> bool:
+        """True if the scan ends further from the axis than it began."""
+        return bool(np.hypot(self.x[-1], self.y[-1]) > np.hypot(self.x[0], self.y[0]))
+
+
+ARRAYS = ("time", "x", "y", "height", "distance", "motion", "removed", "c")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScanView:
+    """Points of one scan with all that a term of the model looks at, arrays (n,).
+
+    time: since the first scan began [s];  since: since this scan began [s]
+    x, y: in the part frame [m];  slide_x, slide_y: from the spindle axis, machine frame [m]
+    turned: spindle angle plus clocking, from the machine frame to the part frame [rad]
+    x_rate, y_rate: of the path over the part [m/s];  slope_x, slope_y: of the surface, part frame
+    motion, motion_rate, motion_acceleration: of Z [m], [m/s], [m/s²]
+    motion_fading: mean of the motion over the last seconds less the motion: creep [m]
+    distance: that the probe would measure of a part without form error [m]
+    deviation: height less nominal height [m]
+    speed: of the spindle [rad/s];  index: of the scan
+    """
+
+    time: FloatArray
+    since: FloatArray
+    x: FloatArray
+    y: FloatArray
+    slide_x: FloatArray
+    slide_y: FloatArray
+    c: FloatArray
+    turned: FloatArray
+    x_rate: FloatArray
+    y_rate: FloatArray
+    slope_x: FloatArray
+    slope_y: FloatArray
+    motion: FloatArray
+    motion_rate: FloatArray
+    motion_acceleration: FloatArray
+    motion_fading: FloatArray
+    distance: FloatArray
+    removed: FloatArray
+    deviation: FloatArray
+    speed: float
+    index: int
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def part(self, points: slice) -> ScanView:
+        """Return the view of some of the points."""
+        arrays: dict[str, Any] = {
+            name: values[points]
+            for name, values in vars(self).items()
+            if isinstance(values, np.ndarray)
+        }
+        return replace(self, **arrays)
+
+    def sideways(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
+        """Return the height error of points reported off by ``x``, ``y`` [m] of the part frame."""
+        return np.asarray(-self.slope_x * x - self.slope_y * y, np.float64)
+
+    def across(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
+        """Return the height error of points reported off by ``x``, ``y`` [m] of the machine."""
+        one = np.ones(len(self))
+        return self.sideways(*workpiece_xy(x * one, y * one, self.turned))
+
+
+def view_of(scan: ScanData, index: int, begin: float, nominal: Surface) -> ScanView:
+    """Return ``scan`` with rates, slopes and deviation from ``nominal``.
+
+    index: of the scan;  begin: time at which the first scan began [s]
+    """
+    x, y = workpiece_xy(scan.x, scan.y, np.full(len(scan), scan.clocking))
+    slide_x, slide_y = workpiece_xy(scan.x, scan.y, -scan.c)
+    x_rate, y_rate = (_rate(scan.time, v) for v in (x, y))
+    slope_x, slope_y = slopes_by_differences(nominal, x, y)
+    deviation = scan.height - nominal.height(x, y)
+    return ScanView(
+        time=scan.time - begin,
+        since=scan.time - scan.time[0],
+        x=x,
+        y=y,
+        slide_x=slide_x,
+        slide_y=slide_y,
+        c=scan.c,
+        turned=scan.c + scan.clocking,
+        x_rate=x_rate,
+        y_rate=y_rate,
+        slope_x=slope_x,
+        slope_y=slope_y,
+        motion=scan.motion,
+        motion_rate=_rate(scan.time, scan.motion),
+        motion_acceleration=_rate(scan.time, scan.motion, 2),
+        motion_fading=_fading(scan.time, scan.motion),
+        # The measured distance holds the form itself, as a regressor it would take it away.
+        distance=scan.distance - deviation,
+        removed=scan.removed,
+        deviation=deviation,
+        speed=scan.speed,
+        index=index,
+    )
+
+
+def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
+    """Return the derivative of ``order`` by time, run by run between gaps."""
+    period = float(np.median(np.diff(time)))
+    edges = np.flatnonzero(np.diff(time) > 1.5 * period) + 1
+    made = np.empty(len(values))
+    for run in np.split(np.arange(len(time)), edges):
+        half = min(max(round(_HALF_WINDOW_S / period), 3), (len(run) - 1) // 2)
+        if 2 * half + 1 > _POLYNOMIAL:
+            made[run] = signal.savgol_filter(
+                values[run], 2 * half + 1, _POLYNOMIAL, deriv=order, delta=period
+            )
+        else:
+            made[run] = 0.0 if order == 2 else _slope(time[run], values[run])
+    return made
+
+
+# Creep of guides and mounts that a step test with plateaus of half a second does not show.
+_CREEP_S = 2.0
+
+
+def _fading(time: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return the mean of ``motion`` over the last two seconds, fading, less ``motion``."""
+    step = float(np.median(np.diff(time))) / _CREEP_S
+    start = [motion[0] * (1 - step)]
+    return np.asarray(signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)
+
+
+def _slope(time: FloatArray, values: FloatArray) -> float:
+    return float((values[-1] - values[0]) / (time[-1] - time[0])) if len(time) > 1 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class FittedSurface:
+    """A polynomial in x and y through the points, where no nominal surface is given.
+
+    powers: of x and y of each term (k, 2);  coefficients: (k,) [m];  scale: of x and y [m]
+    """
+
+    powers: tuple[tuple[int, int], ...]
+    coefficients: tuple[float, ...]
+    scale: float = field(default=1.0)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]."""
+        u, v = np.asarray(x) / self.scale, np.asarray(y) / self.scale
+        made = np.zeros(np.broadcast(u, v).shape)
+        for (i, j), value in zip(self.powers, self.coefficients, strict=True):
+            made += value * u**i * v**j
+        return made
+
+
+# Degree of the slopes' polynomial: on the paper's mirror the eighth is 4 pm.
+_DEGREE, _POINTS = 8, 20_000
+
+
+def fitted_surface(scan: ScanData) -> FittedSurface:
+    """Return a polynomial of degree 8 through ``scan``, in the part frame."""
+    every = max(len(scan) // _POINTS, 1)
+    x, y = workpiece_xy(scan.x[::every], scan.y[::every], np.full(len(scan.x[::every]),
+                                                                   scan.clocking))  # fmt: skip
+    scale = float(np.max(np.hypot(x, y)))
+    powers = tuple((i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i))
+    columns = np.stack([(x / scale) ** i * (y / scale) ** j for i, j in powers], axis=1)
+    found = np.linalg.lstsq(columns, scan.height[::every], rcond=1e-10)[0]
+    return FittedSurface(powers, tuple(found.tolist()), scale)

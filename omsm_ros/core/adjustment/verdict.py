@@ -1,0 +1,183 @@
+"""May these heights be relied on? Green is for redundant scans that agree, never for declarations.
+
+Codes and values only; sentences are made elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.adjustment.agreement import ScanAgreement
+from omsm_ros.core.adjustment.evidence import Evidence
+from omsm_ros.core.adjustment.families import Source, base_name
+from omsm_ros.core.adjustment.refutation import Refutation
+from omsm_ros.core.adjustment.scan_data import ScanData
+
+VERIFIED, NOT_VERIFIED = "verified", "not_verified"
+CONTRADICTED, TOO_UNCERTAIN = "contradicted", "too_uncertain"
+
+# Reasons.
+REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
+UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redundant", "uncertainty"
+NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
+
+# A hundred knots tell a walk to 7 %; a step inside a knot adds to it.
+_WALK_RATIO = 1.5
+# Speeds nearer to each other than a tenth leave a lag as open as one scan does.
+_OTHER_SPEED = 0.1
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One reason against green.
+
+    code: of this module;  names: families or scans it is about;  value, limit: its figures
+    """
+
+    code: str
+    names: tuple[str, ...] = ()
+    value: float = float("nan")
+    limit: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What may be said of the heights.
+
+    code: of this module;  reasons: against green, none where it is verified
+    rests_on: declared sources that these scans do not verify, name and standard uncertainty of
+        the heights by each [m], largest first
+    add: code of the one scan to add that helps most, "" where none is needed
+    reached: expanded uncertainty (k = 2) of the heights with that scan, rms over the part [m]
+    """
+
+    code: str
+    reasons: tuple[Reason, ...]
+    rests_on: tuple[tuple[str, float], ...] = ()
+    add: str = ""
+    reached: float = float("nan")
+
+
+def redundant(scans: Sequence[ScanData]) -> bool:
+    """Return whether two of the scans differ in speed or direction, and in time."""
+    speeds = [s.speed for s in scans]
+    for k, one in enumerate(scans):
+        for other, speed in zip(scans[k + 1 :], speeds[k + 1 :], strict=True):
+            apart = one.time[-1] < other.time[0] or other.time[-1] < one.time[0]
+            differ = abs(speed - one.speed) > _OTHER_SPEED * max(abs(speed), abs(one.speed))
+            if apart and differ:
+                return True
+    return False
+
+
+def reasons_of(
+    refutations: Sequence[Refutation],
+    declared: Collection[str],
+    agreement: Sequence[ScanAgreement],
+    wrong_sign: Sequence[tuple[int, float]],
+    walk: tuple[float, float | None],
+    accepted: Collection[str],
+) -> tuple[Reason, ...]:
+    """Return what contradicts the scans or their declarations.
+
+    declared: names of the declared sources;  wrong_sign: scan, and share that it follows
+    walk: of the drift after one second, found and declared [m]
+    accepted: names of families whose found value somebody has accepted
+    """
+    found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
+    if walk[1] is not None and walk[0] > _WALK_RATIO * walk[1] and "drift_walk" not in accepted:
+        found.append(Reason(REFUTED, ("drift_walk",), walk[0], walk[1]))
+    for refutation in refutations:
+        names = (refutation.name, *refutation.alike)
+        if refutation.name in accepted:
+            continue
+        known = base_name(refutation.name) in declared
+        code = REFUTED if known else UNDECLARED_EFFECT
+        found.append(Reason(code, names, refutation.evidence.deviate, 3.0))
+    for one in agreement:
+        if one.largest >= one.limit:
+            found.append(Reason(DISAGREE, (str(one.scan),), one.largest, one.limit))
+    return tuple(found)
+
+
+# Of the accuracy: what a source that is neither shown nor declared may do to the heights.
+_OPEN_SHARE = 0.5
+# Where no accuracy is asked for, what matters to a mirror for visible light [m].
+_OPEN_M = 20e-9
+
+
+def not_evaluated(
+    evidences: Sequence[Evidence], priors: Sequence[Source], accuracy: float | None
+) -> tuple[Reason, ...]:
+    """Return families that nobody evaluated, that these scans do not show, and that may matter.
+
+    What is declared only is taken as large as it plausibly is (``Family.wide``); families with a
+    default count with that or their declaration. The second name of a reason is the scan or
+    artefact that would show the family.
+    """
+    stated = {p.name: p for p in priors}
+    limit = _OPEN_M if accuracy is None else _OPEN_SHARE * accuracy
+    found = []
+    for one in evidences:
+        family = one.family
+        prior = stated.get(base_name(family.name))
+        if not (family.named and one.open) or family.default is not None:
+            continue
+        possible, code = one.possible, NOT_EVALUATED
+        if prior is not None:
+            possible *= 0.0 if prior.evaluated else family.wide / max(prior.uncertainty, 1e-15)
+            code = DECLARED_ONLY
+        if possible > limit:
+            found.append(Reason(code, (family.name, family.shown_by), possible, limit))
+    return tuple(found)
+
+
+def rests_on(
+    evidences: Sequence[Evidence], declared: Collection[str]
+) -> tuple[tuple[str, float], ...]:
+    """Return the declared sources that these scans leave as they were declared."""
+    found = [
+        (e.family.name, e.possible)
+        for e in evidences
+        if base_name(e.family.name) in declared and e.open
+    ]
+    return tuple(sorted(found, key=lambda pair: -pair[1]))
+
+
+def verdict_of(
+    contradictions: Sequence[Reason],
+    open_sources: Sequence[Reason],
+    resting: tuple[tuple[str, float], ...],
+    is_redundant: bool,
+    expanded: float,
+    accuracy: float | None,
+    addition: tuple[str, float] | None,
+) -> Verdict:
+    """Return the verdict.
+
+    open_sources: what is neither shown nor declared;  resting: what rests on declarations alone
+    expanded: uncertainty (k = 2) of PV [m];  accuracy: asked for [m], None: none
+    addition: code of the scan to add and the standard uncertainty that is reached [m]
+    """
+    add, reached = ("", float("nan")) if addition is None else (addition[0], 2 * addition[1])
+    reasons = [*contradictions, *open_sources]
+    if not is_redundant:
+        reasons.append(Reason(NOT_REDUNDANT))
+    too_large = accuracy is not None and not expanded <= accuracy
+    if too_large:
+        limit = float("nan") if accuracy is None else accuracy
+        reasons.append(Reason(UNCERTAINTY, (), expanded, limit))
+    if contradictions:
+        code = CONTRADICTED
+    elif not is_redundant:
+        code = NOT_VERIFIED
+    elif too_large or not np.isfinite(expanded):
+        code = TOO_UNCERTAIN
+    elif open_sources:
+        code = NOT_VERIFIED
+    else:
+        code = VERIFIED
+    return Verdict(code, tuple(reasons), resting, add, reached)

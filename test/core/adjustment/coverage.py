@@ -1,0 +1,125 @@
+"""Coverage and false alarms over many machines drawn from their own declarations.
+
+``python test/core/adjustment/coverage.py SEEDS SCANS [PITCH_MM]`` prints them; the tests run few.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+from plain_world import MIRROR, RADIUS_M, Machine
+
+from omsm_ros.core.adjustment import Source, adjust
+from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
+
+SPINDLE = {2: 12e-9, 3: 9e-9, 4: 5e-9}
+STRAIGHTNESS_M, STRETCH = 2e-9, 2e-6
+LAG_S, RAMP_M_S, DECENTRE_M, CLOCKING_RAD = 50e-6, 0.15e-9, 2e-8, 5e-7
+PRIORS = (
+    Source("lag_change", LAG_S),
+    Source("drift_rate", RAMP_M_S),
+    Source("drift_walk", 1.2e-9),
+    Source("part_shift", DECENTRE_M),
+    Source("part_turn", CLOCKING_RAD),
+    # What a spiral to the centre does not show.
+    Source("straightness_x", STRAIGHTNESS_M, evaluated=True),
+    Source("straightness_z", 3e-8, evaluated=True),
+    Source("pitch", 1e-9, evaluated=True),
+    Source("parallelism", 1e-5, evaluated=True),
+    Source("encoder_scale", STRETCH, evaluated=True),
+    Source("probe_slope_square", 1e-8, evaluated=True),
+    *(Source(f"spindle_axial/{n}", size) for n, size in SPINDLE.items()),
+)
+
+
+def drawn(seed, scans, pitch=0.4e-3, **errors):
+    """Return a machine whose errors are as large as declared, and scans by it."""
+    random = np.random.default_rng(1000 + seed)
+    spindle = [(n, *(size * random.standard_normal(2))) for n, size in SPINDLE.items()]
+    slide = np.linspace(0.0, RADIUS_M, 60)
+    kernel = np.exp(-0.5 * ((slide - slide[:, np.newaxis]) / (RADIUS_M / 2)) ** 2)
+    bow = STRAIGHTNESS_M * random.multivariate_normal(np.zeros(60), kernel, method="eigh")
+    stretch = STRETCH * random.standard_normal()
+    errors = {"straightness": (slide, bow), "stretch": stretch, **errors}
+    machine = Machine(
+        seed, lag=LAG_S * random.standard_normal(), ramp=RAMP_M_S * random.standard_normal(),
+        spindle=spindle, pitch=pitch, **errors,
+    )  # fmt: skip
+    plans = [
+        {"rpm": 30.0},
+        {"rpm": 60.0, "outward": True},
+        {"rpm": 30.0, "clocking": np.deg2rad(80)},
+        {"rpm": 60.0, "outward": True, "clocking": np.deg2rad(200)},
+    ][:scans]
+    made = [machine.scan(**plans[0])]
+    for plan in plans[1:]:
+        moved = DECENTRE_M * random.standard_normal(2)
+        turned = CLOCKING_RAD * random.standard_normal()
+        made.append(machine.scan(**plan, moved=moved, turned=turned))
+    return machine, made
+
+
+def true_form(machine, form):
+    """Return the true form at the places of ``form`` without piston, tip and tilt [m]."""
+    height = machine.truth(form.x, form.y)
+    pose = np.stack([np.ones(len(form.x)), form.x, form.y], axis=1)
+    root = np.sqrt(form.area)[:, np.newaxis]
+    return height - pose @ np.linalg.lstsq(pose * root, height * root[:, 0], rcond=None)[0]
+
+
+def true_terms(form, height):
+    """Return the coefficients of the reported terms of ``height`` by plain least squares [m]."""
+    every = terms_up_to(8)
+    values = zernike_values(*form.disc.scaled(form.x, form.y), every).T
+    root = np.sqrt(form.area)[:, np.newaxis]
+    found = np.linalg.lstsq(values * root, height * root[:, 0], rcond=None)[0]
+    return found[[every.index(t) for t in form.terms]]
+
+
+def normalised(machine, found):
+    """Return errors over standard uncertainties: PV, rms, lag, terms; and the form's rms error."""
+    form = found.form
+    truth = true_form(machine, form)
+    lag = found.source("lag_change")
+    terms = (form.coefficients - true_terms(form, truth)) / np.sqrt(np.diag(form.term_covariance))
+    pv = (form.pv.value - np.ptp(truth)) / form.pv.uncertainty
+    rms = (form.rms.value - np.sqrt(form.area @ truth**2)) / form.rms.uncertainty
+    error = np.sqrt(form.area @ (form.height - truth) ** 2)
+    return pv, rms, (lag.found[0] - machine.lag) / lag.uncertainty[0], terms, error
+
+
+def main(seeds, scans, pitch=0.4e-3):
+    rows, alarms, errors, stated, lag, expanded, verdicts = [], 0, [], [], [], [], {}
+    for seed in range(seeds):
+        machine, made = drawn(seed, scans, pitch)
+        found = adjust(made, PRIORS, nominal=MIRROR, accuracy=25e-9)
+        pv, rms, delay, terms, error = normalised(machine, found)
+        rows.append([pv, rms, delay, *terms])
+        errors.append(error)
+        expanded.append(found.form.pv.uncertainty)
+        stated.append(found.form.mean_uncertainty)
+        lag.append(found.source("lag_change").uncertainty[0])
+        alarms += bool(found.refutations)
+        verdicts[found.verdict.code] = verdicts.get(found.verdict.code, 0) + 1
+        if found.refutations or found.verdict.code not in ("verified", "not_verified"):
+            print(seed, [r.name for r in found.refutations], found.verdict.reasons, flush=True)
+    table = np.abs(rows)
+    print(f"{seeds} machines, {scans} scans: alarms {alarms}, verdicts {verdicts}")
+    print(
+        f"form error {1e9 * np.sqrt(np.mean(np.square(errors))):.2f} nm rms, stated "
+        f"{1e9 * np.sqrt(np.mean(np.square(stated))):.2f}; u(lag) {1e6 * np.mean(lag):.2f} µs"
+    )
+    print(f"U(PV) {2e9 * np.mean(expanded):.1f} nm, largest {2e9 * np.max(expanded):.1f}")
+    for name, part in (("PV", table[:, 0]), ("rms", table[:, 1]), ("lag", table[:, 2]),
+                       ("terms", table[:, 3:])):  # fmt: skip
+        inside = 100 * np.mean(part <= 2)
+        size = np.sqrt(np.mean(part**2))
+        print(f"{name}: {inside:.1f} % within k = 2, normalised rms {size:.2f}")
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]), *(1e-3 * float(a) for a in sys.argv[3:4]))

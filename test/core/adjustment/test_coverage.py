@@ -1,0 +1,68 @@
+"""Stated uncertainties hold, and clean machines raise no alarm: machines drawn as declared."""
+
+import numpy as np
+import pytest
+from coverage import PRIORS, drawn, normalised
+from plain_world import MIRROR
+
+from omsm_ros.core.adjustment import VERIFIED, adjust
+
+SEEDS, PITCH_M = 32, 0.8e-3
+
+
+@pytest.fixture(scope="module")
+def two_scans():
+    rows, found = [], []
+    for seed in range(SEEDS):
+        machine, scans = drawn(seed, 2, PITCH_M)
+        found.append(adjust(scans, PRIORS, nominal=MIRROR, accuracy=25e-9))
+        rows.append(normalised(machine, found[-1]))
+    return rows, found
+
+
+@pytest.mark.timeout(300)
+def test_figures_lie_within_their_uncertainty(two_scans):
+    """Of 32 PV, rms and lags at least 28 lie within k = 2 (P = 0.996 at 95 %)."""
+    rows, _ = two_scans
+    for place in range(3):
+        off = np.abs([row[place] for row in rows])
+        assert np.sum(off <= 2) >= 28
+        assert np.max(off) < 4
+
+
+@pytest.mark.timeout(300)
+def test_terms_lie_within_their_uncertainty(two_scans):
+    """Of 384 Zernike terms 93 to 98 % lie within k = 2."""
+    rows, _ = two_scans
+    off = np.abs([row[3] for row in rows])
+    assert 0.93 <= np.mean(off <= 2) <= 0.985
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.timeout(300)
+def test_form_errors_are_as_large_as_stated(two_scans):
+    rows, found = two_scans
+    error = np.sqrt(np.mean([row[4] ** 2 for row in rows]))
+    stated = np.sqrt(np.mean([f.form.mean_uncertainty**2 for f in found]))
+    assert 0.7 < error / stated < 1.15
+
+
+@pytest.mark.timeout(300)
+def test_clean_machines_are_verified(two_scans):
+    _, found = two_scans
+    assert sum(bool(f.refutations) for f in found) == 0
+    assert sum(f.verdict.code == VERIFIED for f in found) >= 31
+    assert max(2 * f.form.pv.uncertainty for f in found) < 25e-9
+
+
+@pytest.mark.timeout(300)
+def test_single_clean_scans_refute_nothing():
+    rows = []
+    for seed in range(100, 120):
+        machine, scans = drawn(seed, 1, PITCH_M)
+        found = adjust(scans, PRIORS, nominal=MIRROR, accuracy=25e-9)
+        assert not found.refutations
+        assert not found.wrong_sign
+        rows.append(normalised(machine, found))
+    off = np.abs([row[3] for row in rows])
+    assert 0.92 <= np.mean(off <= 2) <= 0.99

@@ -1,0 +1,144 @@
+"""The normal equations against dense generalised least squares, and the blocks against sums."""
+
+import numpy as np
+import pytest
+from coverage import PRIORS
+from plain_world import MIRROR, Machine
+
+from omsm_ros.core.adjustment.adjust import _network
+from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
+from omsm_ros.core.adjustment.evidence import evidence_of
+from omsm_ros.core.adjustment.network import Factor, solve
+from omsm_ros.core.adjustment.refutation import start_scales
+from omsm_ros.core.adjustment.scan_data import view_of
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Two short scans, their views and network."""
+    machine = Machine(1, lag=20e-6, pitch=1.6e-3)
+    scans = [machine.scan(60), machine.scan(-90, outward=True)]
+    views = [view_of(s, k, 0.0, MIRROR) for k, s in enumerate(scans)]
+    network, sizes = _network(scans, views, PRIORS)
+    return views, network, sizes
+
+
+def dense_rows(network):
+    """All rows, one parameter at a time: the fitted heights are linear in the parameters."""
+    return np.stack([network.fitted(row) for row in np.eye(network.size)], axis=1)
+
+
+def test_eliminated_cells_equal_generalised_least_squares(small):
+    """N = XᵀV⁻¹X with V = diag(noise) + s² for two blocks of one cell."""
+    _, network, _ = small
+    scales = start_scales(network, 1e-9)
+    rows = dense_rows(network)
+    cell = network.part.cell
+    v = np.diag(1 / network.weights(scales)) + scales.cells * (cell[:, np.newaxis] == cell)
+    expected = rows.T @ np.linalg.solve(v, rows)
+    scale = 1 / np.sqrt(np.diag(expected) + 1e-300)
+    got = network.normal_matrix(scales) * scale * scale[:, np.newaxis]
+    np.testing.assert_allclose(got, expected * scale * scale[:, np.newaxis], atol=1e-8)
+    y = network.blocks.deviation
+    right = rows.T @ np.linalg.solve(v, y) * scale
+    np.testing.assert_allclose(
+        network.right_side(scales, y) * scale, right, atol=1e-7 * np.max(np.abs(right))
+    )
+
+
+def test_blocks_are_means_of_points(small):
+    """Count, deviation and a column of each block, by a loop."""
+    views, network, _ = small
+    blocks, first = network.blocks, 0
+    for view in views:
+        edges = [*block_begins(view), len(view)]
+        for k in range(0, len(edges) - 1, 37):
+            part = slice(edges[k], edges[k + 1])
+            sector = np.floor(view.c[part] * SECTORS / (2 * np.pi))
+            assert np.ptp(sector) == 0
+            assert blocks.count[first + k] == edges[k + 1] - edges[k]
+            assert blocks.deviation[first + k] == pytest.approx(
+                np.mean(view.deviation[part]), abs=1e-15
+            )
+            assert network.column("lag_change")[first + k, 0] == pytest.approx(
+                np.mean(view.motion_rate[part]), rel=1e-9, abs=1e-12
+            )
+        first += len(edges) - 1
+    assert first == len(blocks)
+
+
+def test_terms_of_a_block_are_their_means_over_its_arc(small):
+    """The factor sin(mφ/2)/(mφ/2) against the mean of the points."""
+    views, network, _ = small
+    view = views[0]
+    begins = block_begins(view)
+    count = np.diff(np.append(begins, len(view)))
+    mean = np.add.reduceat(network.part.values(view.x, view.y), begins, axis=0)
+    mean = mean / count[:, np.newaxis]
+    blocks = network.blocks
+    mine = np.flatnonzero(blocks.scan == 0)
+    outer = mine[np.hypot(blocks.x, blocks.y)[mine] > 3e-3]
+    outer = outer[count[outer] > 8]
+    got = network.part.values(blocks.x[outer], blocks.y[outer], blocks.span[outer])
+    bare = network.part.values(blocks.x[outer], blocks.y[outer])
+    high = np.array([abs(t.m) >= 12 for t in network.part.terms])
+    error = np.sqrt(np.mean((got - mean[outer])[:, high] ** 2))
+    without = np.sqrt(np.mean((bare - mean[outer])[:, high] ** 2))
+    assert error < 0.25 * without
+
+
+def test_factor_inverts_rows_of_different_units():
+    random = np.random.default_rng(0)
+    rows = random.standard_normal((60, 8)) * 10.0 ** np.arange(-12, 12, 3)
+    matrix = rows.T @ rows
+    factor = Factor.of(matrix.copy())
+    unit = np.sqrt(np.diag(matrix))
+    expected = random.standard_normal(8) / unit
+    np.testing.assert_allclose(
+        factor.inverse() * unit * unit[:, np.newaxis],
+        np.linalg.inv(matrix / unit / unit[:, np.newaxis]),
+        rtol=1e-9,
+    )
+    np.testing.assert_allclose(factor.solve(matrix @ expected), expected, rtol=1e-9)
+    half = factor.forward(matrix)
+    np.testing.assert_allclose(half.T @ half / unit / unit[:, np.newaxis],
+                               matrix / unit / unit[:, np.newaxis], atol=1e-9)  # fmt: skip
+
+
+def test_score_of_a_family_equals_its_fit(small):
+    """χ² of a family that takes no part is the misfit that it takes away when it does, freely."""
+    _, network, sizes = small
+    scales = start_scales(network, 1e-9)
+    family = next(f for f in network.families if f.name == "spindle_axial/6")
+    y = network.blocks.deviation + network.column(family.name) @ np.array([4e-9, -3e-9])
+    without = solve(network, y, scales, sizes)
+    evidence = evidence_of(without, family)
+    free = solve(network, y, scales, {**sizes, family.name: 1e-3})
+    here = network.place[family.name]
+    np.testing.assert_allclose(evidence.values, free.values[here], rtol=1e-4)
+    np.testing.assert_allclose(evidence.uncertainty, free.uncertainty(family.name), rtol=1e-3)
+    estimate = free.values[here]
+    chi_square = estimate @ np.linalg.solve(free.covariance_of(here), estimate)
+    assert evidence.chi_square == pytest.approx(chi_square, rel=1e-3)
+    assert evidence.freedom == 2
+
+
+def test_white_noise_is_told_from_a_slow_form():
+    random = np.random.default_rng(3)
+    time = np.arange(20_000) / 1000
+    height = 1e-7 * np.sin(2 * np.pi * time) + 12e-9 * random.standard_normal(len(time))
+    assert white_noise(height) == pytest.approx(12e-9, rel=0.03)
+
+
+def test_cells_are_alike_in_area(small):
+    """Points spread evenly over the disc fall into all cells alike."""
+    _, network, _ = small
+    random = np.random.default_rng(0)
+    disc = network.part.disc
+    radius = disc.radius * np.sqrt(random.random(200_000))
+    angle = 2 * np.pi * random.random(200_000)
+    cell = network.part.cell_of(disc.x + radius * np.cos(angle), disc.y + radius * np.sin(angle))
+    count = np.bincount(cell, minlength=network.part.cells)
+    assert len(count) == network.part.cells
+    even = 200_000 / network.part.cells
+    assert np.all(np.abs(count - even) < 6 * np.sqrt(even))

@@ -1,0 +1,95 @@
+"""What a plan promises, an adjustment of such scans keeps."""
+
+import numpy as np
+import pytest
+from coverage import PRIORS, drawn
+from plain_world import MIRROR, RADIUS_M, Machine
+
+from omsm_ros.core.adjustment import (
+    ScanDesign,
+    adjust,
+    plan_scans,
+    posterior_uncertainty,
+    usual_sets,
+)
+from omsm_ros.core.adjustment.planning import additions, best_addition, design_of
+
+FIRST = ScanDesign(rpm=30.0, start=RADIUS_M, end=0.0, pitch=0.4e-3)
+
+
+@pytest.mark.parametrize(("scans", "name"), [(1, "single"), (2, "quick")])
+def test_a_plan_foretells_the_adjustment(scans, name):
+    designs = usual_sets(FIRST)[name]
+    planned = posterior_uncertainty(designs, PRIORS, MIRROR)
+    _, made = drawn(0, scans)
+    found = adjust(made, PRIORS, nominal=MIRROR)
+    assert planned.form == pytest.approx(found.form.mean_uncertainty, rel=0.35)
+    lag = found.source("lag_change").uncertainty[0]
+    assert planned.sources["lag_change"][0] == pytest.approx(lag, rel=0.35)
+
+
+def test_more_scans_leave_less_uncertain():
+    sets = usual_sets(FIRST)
+    single, quick, full, four = (
+        posterior_uncertainty(sets[name], PRIORS, MIRROR)
+        for name in ("single", "quick", "full", "full_4")
+    )
+    assert single.form > 4 * quick.form
+    assert quick.form > full.form > four.form
+    assert single.duration == pytest.approx(RADIUS_M / 0.4e-3 * 2.0)
+    assert quick.duration == pytest.approx(single.duration * 1.5 + 20.0)
+
+
+def test_the_shortest_set_that_reaches_the_accuracy_is_first():
+    sets = usual_sets(FIRST)
+    plans = plan_scans(list(sets.values()), PRIORS, MIRROR, 12e-9)
+    assert plans[0].designs == sets["quick"]
+    assert plans[0].reaches
+    assert not plans[-1].reaches
+    assert plans[-1].designs == sets["single"]
+    none = plan_scans(list(sets.values()), PRIORS, MIRROR, 1e-10)
+    assert not any(p.reaches for p in none)
+    forms = [p.uncertainty.form for p in none]
+    assert forms == sorted(forms)
+
+
+def test_a_repeated_track_does_not_show_a_lag():
+    first, more = FIRST, additions(FIRST)
+    again = posterior_uncertainty([first, more["repeated_track"]], PRIORS, MIRROR)
+    faster = posterior_uncertainty([first, more["other_speed"]], PRIORS, MIRROR)
+    reversed_ = posterior_uncertainty([first, more["other_direction"]], PRIORS, MIRROR)
+    assert again.sources["lag_change"][0] > 5e-6
+    assert max(faster.sources["lag_change"][0], reversed_.sources["lag_change"][0]) < 1e-6
+
+
+def test_beyond_the_centre_straightness_is_told_from_the_part():
+    """Odd parts of a bend look like no part that is scanned from both sides."""
+    bent = [p for p in PRIORS if p.name != "squareness"]
+    inside, beyond = (
+        posterior_uncertainty([FIRST, additions(FIRST)[code]], bent, MIRROR)
+        for code in ("other_speed", "beyond_centre")
+    )
+    odd = np.linalg.norm(beyond.sources["parallelism"])
+    assert odd < np.linalg.norm(inside.sources["parallelism"])
+
+
+def test_the_design_of_a_scan_is_read_from_it():
+    machine = Machine(1)
+    design = design_of(machine.scan(-60, outward=True, clocking=0.5))
+    assert design.rpm == pytest.approx(-60, rel=1e-3)
+    assert design.start == pytest.approx(0.0, abs=1e-4)
+    assert design.end == pytest.approx(RADIUS_M, rel=1e-2)
+    assert design.pitch == pytest.approx(0.4e-3, rel=0.02)
+    assert design.clocking == 0.5
+    assert design.rate == pytest.approx(1000.0, rel=1e-3)
+
+
+def test_the_best_addition_is_the_best_of_all():
+    machine = Machine(1)
+    scan = machine.scan(30)
+    code, reached, alone = best_addition(scan, PRIORS, MIRROR)
+    first = design_of(scan)
+    for added in additions(first).values():
+        assert reached <= posterior_uncertainty([first, added], PRIORS, MIRROR).form
+    assert reached < 0.3 * alone
+    assert code != "repeated_track"
