@@ -9,6 +9,7 @@ when one of them is used first::
     points = omsm.correct(omsm.read("scan.mcap"), calibration)
 """
 
+import importlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -48,9 +49,8 @@ _PUBLIC = (
 def __getattr__(name: str) -> Any:
     """Return a name of the Python interface, which is loaded now."""
     if name in _PUBLIC:
-        from omsm_ros import api
-
-        return getattr(api, name)
+        # By its name, so that the package itself depends on none of its rooms.
+        return getattr(importlib.import_module("omsm_ros.api"), name)
     raise AttributeError(f"module 'omsm_ros' has no attribute {name!r}")
 
 

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from omsm_ros.core.calibration.calibration import Calibration as _Calibration
-from omsm_ros.core.calibration.calibration import verdict_of
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
 from omsm_ros.core.lti.transfer_function import TransferFunction, to_control
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, Status
@@ -125,13 +124,13 @@ class Recording(_Result):
     @property
     def time(self) -> FloatArray:
         """Time since the first sample [s], (n,)."""
-        return np.arange(len(self)) * self.period
+        return np.arange(len(self), dtype=np.float64) * self.period
 
     def blocks(self) -> Iterator[tuple[AxisBlock, DistanceBlock]]:
         """Yield the samples as blocks of both streams."""
         for begin in range(0, len(self), _BLOCK):
             part = slice(begin, begin + _BLOCK)
-            head = {
+            head: dict[str, Any] = {
                 "stamp_ns": round(begin * self.period * 1e9),
                 "first_sample": begin,
                 "sample_period": self.period,
@@ -179,9 +178,7 @@ class Calibration(_Result):
         system: continuous, in rad/s, of gain one at zero frequency;  period, delay: [s]
         """
         numerator, denominator = (np.ravel(v[0][0])[::-1] for v in (system.num, system.den))
-        dynamics = TransferFunction(
-            tuple(numerator / denominator[0]), tuple(denominator / denominator[0]), delay
-        )
+        dynamics = TransferFunction(numerator / denominator[0], denominator / denominator[0], delay)
         size = len(numerator) + len(denominator)
         return cls(
             _Calibration(
@@ -206,7 +203,7 @@ class Calibration(_Result):
     @property
     def verdict(self) -> str:
         """Verdict of the certificate, empty without one."""
-        return verdict_of(self.core)[0]
+        return self.core.certificate.verdict or ""
 
     def response(self, frequency: ArrayLike) -> NDArray[np.complex128]:
         """Return G at ``frequency`` [Hz], of its shape."""
@@ -223,8 +220,8 @@ class Calibration(_Result):
         yield "lag", measured(self.lag, self.lag_uncertainty, "s")
         yield "static gain", plain(self.core.static_gain, 6)
         yield "valid up to", quantity(self.core.valid_up_to, "Hz")
-        for reason in verdict_of(self.core)[1][:5]:
-            yield "reason", reason
+        for reason in self.core.certificate.reasons[:5]:
+            yield "reason", str(reason)
 
     def plot(self) -> Figure:
         """Draw gain, phase and the error of a motion before and after the correction."""
@@ -413,12 +410,13 @@ def read(path: Path | str) -> Recording:
     Raises BagError for a path that is no bag, or holds no samples.
     """
     from omsm_ros.io import bags
+    from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
 
     axes: list[AxisBlock] = []
     distance: list[DistanceBlock] = []
     with bags.BagReader(path) as bag:
-        for _, _, block in bag.blocks(bags.AXES_TOPIC, bags.DISTANCE_TOPIC):
-            (axes if isinstance(block, AxisBlock) else distance).append(block)  # type: ignore[arg-type]
+        for _, _, block in bag.blocks(AXES_TOPIC, DISTANCE_TOPIC):
+            (axes if isinstance(block, AxisBlock) else distance).append(block)
     if not axes or not distance:
         raise DataError(f"{str(path)!r} has no samples of axes and probe; record both")
     first = min(b.first_sample for b in (*axes, *distance))
@@ -473,8 +471,8 @@ def _recording(
         return given
     if distance is None or period is None:
         raise ConfigurationError("arrays need distance and period; or give a Recording")
-    arrays = (np.asarray(v, np.float64) for v in (given, distance))
-    return Recording(*arrays, period=period)
+    z, reading = (np.asarray(v, np.float64) for v in (given, distance))
+    return Recording(z, reading, period)
 
 
 def correct(
