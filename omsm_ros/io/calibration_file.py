@@ -146,7 +146,7 @@ _ID_CHARACTERS = 12
 
 @dataclass(frozen=True, slots=True)
 class CalibrationFolder:
-    """``cal.json``, a link to the calibration in force, beside ``cal.TIME.ID.json``, one for each.
+    """``cal.json``, a link to the calibration in force, and ``cal.TIME.ID.json``, one for each.
 
     TIME: UTC, when it came into force;  ID: the first characters of the calibration's id
     """

@@ -46,7 +46,7 @@ TEMPLATES: dict[str, str] = {
         f"identification.{name}": (
             f"{words}; it is part of the response: {remedy}"
             if name in _IN_RESPONSE
-            else f"{words}; it is modelled beside the response: {remedy}"
+            else f"{words}; it is modelled in addition to the response: {remedy}"
         )
         for name, (words, remedy) in _NAMES.items()
         if name != "stiffening"

@@ -203,7 +203,7 @@ def _latency(found: SelfCalibration, lag: float) -> Latency:
         return Latency(
             delay_s=0.0,
             uncertainty_s=None,
-            beside_z_s=structural_uncertainty,
+            unshared_s=structural_uncertainty,
             share=None,
             source=source,
             reason=str(SCOPE),
@@ -213,7 +213,7 @@ def _latency(found: SelfCalibration, lag: float) -> Latency:
     return Latency(
         delay_s=delay,
         uncertainty_s=float(np.sqrt(found.covariance[LATENCY, LATENCY])),
-        beside_z_s=structural_uncertainty,
+        unshared_s=structural_uncertainty,
         share=latency_share_of(delay, lag),
         source=source,
         reason=str(Notice("adjustment.origin", scans=len(speeds), speeds=speeds)),

@@ -1,4 +1,4 @@
-"""A calibration: the identified dynamics, how well they are known, and the settings they hold for."""
+"""A calibration: identified dynamics with their uncertainty, and the settings they hold for."""
 
 from __future__ import annotations
 

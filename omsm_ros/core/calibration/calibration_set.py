@@ -176,7 +176,7 @@ def _latency(members: Sequence[Calibration]) -> Latency:
     return Latency(
         delay_s=mean,
         uncertainty_s=float(np.hypot(own, spread)),
-        beside_z_s=float(np.hypot(max(latency.beside_z_s for latency in each), spread)),
+        unshared_s=float(np.hypot(max(latency.unshared_s for latency in each), spread)),
         share=latency_share_of(mean, lag),
         source=each[0].source,
         reason="; ".join(dict.fromkeys(latency.reason for latency in each)),

@@ -65,7 +65,7 @@ class Origin:
 
 @dataclass(frozen=True, kw_only=True)
 class Validity:
-    """The band in which the response may be used, beside ``valid_up_to`` of the calibration.
+    """The band in which the response may be used, with ``valid_up_to`` of the calibration.
 
     from_hz: below it the response is taken as the static gain
     excited_up_to_hz: beyond it the motion would show no error of the response
@@ -141,7 +141,7 @@ class TwoMassModel:
 
     table_mass_kg: as stated; where None, ``model`` is per mass of the table
     model: masses [kg], stiffnesses [N/m], dampings [N·s/m] by name
-    relative_uncertainty: of those fitted [1];  misfit: root of χ² per degree of freedom
+    relative_uncertainty: of those fitted [1];  misfit: root of the reduced χ²
     collocated: whether the probe is on the driven mass
     """
 
@@ -214,8 +214,8 @@ class ModelError:
     uncertainty_m: float | None = None
 
     @property
-    def added_poles(self) -> bool:
-        """Whether it became poles of the response; else it was fitted beside the response."""
+    def in_response(self) -> bool:
+        """Whether it became poles of the response; else it is a nuisance term of the fit."""
         return self.size_m is None
 
 

@@ -22,7 +22,7 @@ class Latency:
     """The part of the lag by which X, Y, B and C are delayed.
 
     delay_s: of the probe against the slides;  uncertainty_s: of it, k = 1, None if unknown
-    beside_z_s: standard uncertainty of the delay that the lag of Z does not share; only this part
+    unshared_s: standard uncertainty of the delay that the lag of Z does not share; only this part
         changes a height where Z follows the surface
     share: of the whole lag [1], None where it is not known or there is no lag
     source: one of ``SOURCES``;  reason: where the figure comes from, required but for UNRESOLVED
@@ -32,14 +32,14 @@ class Latency:
 
     delay_s: float
     uncertainty_s: float | None = None
-    beside_z_s: float
+    unshared_s: float
     share: float | None = None
     source: str
     reason: str = ""
 
     def __post_init__(self) -> None:
         LAG.checked(self.delay_s, ConfigurationError, "latency")
-        TIME_UNCERTAINTY.checked(self.beside_z_s, ConfigurationError, "latency beside Z")
+        TIME_UNCERTAINTY.checked(self.unshared_s, ConfigurationError, "latency unshared with Z")
         if self.uncertainty_s is not None:
             TIME_UNCERTAINTY.checked(self.uncertainty_s, ConfigurationError, "latency")
         if self.share is not None:
@@ -70,7 +70,7 @@ def unresolved_latency(lag: float) -> Latency:
     uniformly between 0 and the lag: its rms from zero is lag/√3.
     """
     spread = abs(lag) / sqrt(3.0)
-    return Latency(delay_s=0.0, uncertainty_s=spread, beside_z_s=spread, source=UNRESOLVED)
+    return Latency(delay_s=0.0, uncertainty_s=spread, unshared_s=spread, source=UNRESOLVED)
 
 
 def declared_latency(lag: float, delay: float, uncertainty: float, reason: str) -> Latency:
@@ -81,7 +81,7 @@ def declared_latency(lag: float, delay: float, uncertainty: float, reason: str) 
     return Latency(
         delay_s=delay,
         uncertainty_s=uncertainty,
-        beside_z_s=uncertainty,
+        unshared_s=uncertainty,
         share=latency_share_of(delay, lag),
         source=DECLARED,
         reason=reason,

@@ -107,8 +107,8 @@ def common_lines(calibrations: Sequence[Calibration]) -> FloatArray:
 def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArray:
     """Return the covariance (2k, 2k) of relative gain, then phase [rad], at ``lines`` (k,) [Hz].
 
-    That of the noise: what could hide in a step test hides in each of one machine alike, and
-    does not distinguish two of them.
+    That of the noise: undetected model errors are the same in each test of one machine, and
+    do not distinguish two of them.
     """
     jacobian = relative_response_jacobian(calibration.dynamics, lines).reshape(2 * len(lines), -1)
     return np.asarray(jacobian @ calibration.noise_covariance @ jacobian.T)

@@ -50,6 +50,7 @@ _PLACES = {
 # The calibration itself has the gain, the structure has the order, and the terms that may be
 # undetected tell which is the largest.
 _REDUNDANT = {"static_gain", "order", "hidden_mostly"}
+_LATENCY_NAMES = {"beside_z_s": "unshared_s"}
 _LISTS = {"reasons": REJECTS, "reservations": RESERVATION, "warnings": WARNING}
 _READ_APART = {"verdict", "limits", "candidates", "static_gains", *_LISTS}
 
@@ -71,6 +72,9 @@ def certificate_of_version_1(entries: Mapping[str, Any]) -> Certificate:
     _add_candidates(content, entries.get("candidates"))
     for name, gain in (entries.get("static_gains") or {}).items():
         content.setdefault("static_gain", {})[name] = gain
+    latency = content.get("latency")
+    if isinstance(latency, Mapping):
+        content["latency"] = {_LATENCY_NAMES.get(k, k): v for k, v in latency.items()}
     for error in content.get("model_errors", {}).get("modelled", ()):
         error.pop("modelled", None)
     return from_json(Certificate, content, "certificate")

@@ -85,7 +85,7 @@ class ErrorSources:
             probe_noise=calibration.certificate.residual.noise_m or 0.0,
             static_gain=calibration.static_gain_uncertainty,
             motion_error=calibration.certificate.model_errors.motion_error_m or 0.0,
-            lateral_lag=calibration.latency.beside_z_s,
+            lateral_lag=calibration.latency.unshared_s,
         )
 
 

@@ -283,7 +283,7 @@ def poles_beyond_valid_range(
 
 
 CHECKS: tuple[Callable[[IdentificationEvidence], Findings], ...] = (
-    # A motion from which the gain cannot be told makes every other finding meaningless.
+    # A motion that does not determine the gain makes every other finding meaningless.
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
     lambda e: misfit(
         e.residual.chi_square, e.residual.noise, e.known.clearly_better, e.residual.axis_timing

@@ -105,7 +105,7 @@ def reference_lag(record: MotionRecord) -> ReferenceLag | None:
 
 
 def inter_sample_motion(prepared: Prepared, fit: Fit) -> FloatArray:
-    """Return the covariance (p, p) of motion that an edge may hide between two samples."""
+    """Return the covariance (p, p) of motion between the samples of an edge."""
     problem = prepared.problem
     bound = inter_sample_delay_bound(problem.input, prepared.steps, problem.period)
     return inter_sample_motion_covariance(fit.dynamics, bound, problem.period)

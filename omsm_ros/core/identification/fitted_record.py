@@ -1,4 +1,4 @@
-"""A recording beside the fit that was certified: what a certificate draws of it."""
+"""The recording with the certified fit, as a certificate draws it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FittedRecord:
 
 
 def fitted_record(identified: Identification) -> FittedRecord:
-    """Return the recording of ``identified`` beside its fit; nothing is fitted again."""
+    """Return the recording of ``identified`` with its fit; nothing is fitted again."""
     problem, fit = identified.prepared.problem, identified.fit
     modelled = problem.response(fit)
     residual = problem.on_grid(fit.residual, np.nan)

@@ -39,7 +39,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 # friction lag by their whole half widths together; drift and linearity are no errors of motion.
 _PER_SIZE = {PERIODIC: 0.5**0.5, VIBRATION: 0.5**0.5}
 _AT_REVERSALS = (BACKLASH, FRICTION)
-_BESIDE_CODES = {
+_NUISANCE_CODES = {
     BACKLASH: "identification.backlash",
     FRICTION: "identification.friction",
     LINEARITY: "identification.linearity",
@@ -71,7 +71,7 @@ _PARAMETERS = {
 
 @dataclass(frozen=True)
 class Size:
-    """Size of a term that was fitted beside the response and its standard uncertainty [m].
+    """Size of a term that was fitted as a nuisance and its standard uncertainty [m].
 
     significant: whether the final fit still shows it
     """
@@ -99,7 +99,7 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         slow = term.parameter * searched.diagnostics.plateau < 1
         if not (drifts and slow and term.family == VIBRATION):
             values = _values(term, size, period)
-            yield Finding(_BESIDE_CODES[term.family], RESERVATION, values)
+            yield Finding(_NUISANCE_CODES[term.family], RESERVATION, values)
     for term in searched.added_poles:
         values = _values(term, None, period)
         yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)
@@ -113,7 +113,7 @@ def model_errors_of(searched: SearchResult, duration: float) -> ModelErrors:
         _PER_SIZE.get(modelled.term.family, 0.0) * float(np.hypot(found.value, found.uncertainty))
         for modelled, found in pairs
     ]
-    beside = [
+    nuisance = [
         ModelError(
             family=modelled.term.family,
             parameter=modelled.term.parameter,
@@ -125,7 +125,7 @@ def model_errors_of(searched: SearchResult, duration: float) -> ModelErrors:
     added_poles = [ModelError(family=t.family, parameter=t.parameter) for t in searched.added_poles]
     backlash = [2 * found.value for m, found in pairs if m.term.family == BACKLASH]
     return ModelErrors(
-        modelled=(*beside, *added_poles),
+        modelled=(*nuisance, *added_poles),
         motion_error_m=float(np.sqrt(np.sum(np.square(costs)))),
         backlash_m=max(backlash, default=0.0),
         drift_m_s=2 * float(searched.model.chosen.fit.background[1]) / duration,
@@ -137,8 +137,8 @@ def accuracy_on(evidence: IdentificationEvidence) -> float:
     use, duration = evidence.use, len(evidence.record) * evidence.record.sample_period
     band = response_band(evidence.dynamics, evidence.known.covariance, use.frequencies_hz)
     errors = np.hypot(band.gain, band.phase) * use.rms_m
-    beside = model_errors_of(evidence.searched, duration).motion_error_m or 0.0
-    return float(np.hypot(np.linalg.norm(errors), beside))
+    motion = model_errors_of(evidence.searched, duration).motion_error_m or 0.0
+    return float(np.hypot(np.linalg.norm(errors), motion))
 
 
 def _values(term: ModelErrorTerm, size: float | None, period: float) -> dict[str, object]:
@@ -151,7 +151,7 @@ def _values(term: ModelErrorTerm, size: float | None, period: float) -> dict[str
 
 
 def _sizes(searched: SearchResult) -> tuple[Sequence[Size], float]:
-    """Return the size of each term beside the response, and what those at reversals cost [m].
+    """Return the size of each nuisance term, and what those at reversals cost [m].
 
     Backlash and friction look alike, and what one has too much the other has too little.
     """

@@ -37,7 +37,7 @@ class ResponseUncertainty:
     gain_variance: of the gain of the probe per travel at rest [1]
     excited_up_to: [Hz] beyond which the motion would show no error of the response
     valid_up_to: [Hz] up to which the response is trusted; 0 if nowhere
-    widened: factor on the uncertainties, and clearly_better: number of poles, see no_surer
+    widened: factor on the uncertainties, and clearly_better: number of poles, see inflate_to_free_choice
     """
 
     covariance: FloatArray
@@ -85,7 +85,7 @@ def inflate_to_free_choice(
     free: ChosenModel,
     limits: ResponseLimits,
 ) -> ResponseUncertainty:
-    """Return what is known of an order that was asked for, no surer than the ``free`` choice.
+    """Return ``known`` of a requested order, inflated to the uncertainty of the ``free`` choice.
 
     Too low an order has few parameters, so little noise in them, and a bias beyond what the
     motion excites, which no residual shows. The free choice says how much stays open.

@@ -241,7 +241,7 @@ def response_of(model: SampledModel, frequency: FloatArray) -> tuple[ComplexArra
 
 
 def record(model: SampledModel, input: FloatArray, output: FloatArray, run: FreeRun) -> Figure:
-    """Draw input, output beside the free run, and their difference over time."""
+    """Draw the input, the output with the free run, and their difference over time."""
     made, axes = style.figure(7.4, 6.2, rows=3, sharex=True)
     given, both, left = axes[:, 0]
     time = model.sample_period * np.arange(len(input))

@@ -1,4 +1,4 @@
-"""The certificate of a calibration in Markdown, its plots as PNG files beside it."""
+"""The certificate of a calibration in Markdown, with its plots as PNG files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SPECIAL = re.compile(r"([\\`*_{}\[\]#|~!$])")
 
 
 def picture_name(figure: str) -> str:
-    """Return the file that holds ``figure`` beside the Markdown."""
+    """Return the name of the file of ``figure``, in the folder of the Markdown."""
     return f"certificate_{figure}.png"
 
 

@@ -1,4 +1,4 @@
-"""The page of a model between any two sampled quantities, beside a record that it runs over."""
+"""The page of a model between any two sampled quantities, with a record that it is run over."""
 
 from __future__ import annotations
 

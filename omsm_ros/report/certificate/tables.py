@@ -145,7 +145,7 @@ def background_table(certificate: Certificate) -> Table:
         ("drift", quantity(errors.drift_m_s, "m/s")),
         ("backlash", _or_none(errors.backlash_m, "m")),
         (
-            "lag that motion between samples may hide, at most",
+            "greatest bias of the lag by motion between samples",
             _or_none(response.inter_sample_delay_bound_s, "s"),
         ),
         ("lag of the reference sensor", quantity(response.reference_lag_s, "s")),
@@ -166,13 +166,13 @@ def model_error_table(certificate: Certificate) -> Table:
             error.family,
             quantity(error.size_m, "m"),
             quantity(error.uncertainty_m, "m"),
-            "in the response" if error.added_poles else "beside it",
+            "in the response" if error.in_response else "as a nuisance term",
         )
         for error in found.modelled
     ]
     if rows:
         rows.append(("together, on a height", quantity(found.motion_error_m, "m"), "", ""))
-    return Table("Found beside a linear, steady response", ("size", "u", "modelled"), rows)
+    return Table("Found in addition to a linear, steady response", ("size", "u", "modelled"), rows)
 
 
 def consistency_table(certificate: Certificate) -> Table:

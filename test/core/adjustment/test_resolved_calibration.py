@@ -273,7 +273,7 @@ def test_latency_is_stated_with_its_speeds_and_its_share() -> None:
     # The part in common with the lag of Z must not count twice.
     two = [LAG, LATENCY]
     apart = [1, -1] @ COVARIANCE[np.ix_(two, two)] @ [1, -1] - COVARIANCE[LAG, LAG]
-    assert latency.beside_z_s == pytest.approx(np.sqrt(max(apart, 0.0)))
+    assert latency.unshared_s == pytest.approx(np.sqrt(max(apart, 0.0)))
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def test_the_worst_of_the_members_is_said_of_the_set(true_calibration: Calibrati
     ]
     latency = calibration_set("z", list(zip((0.0, 1e-3), known, strict=True))).latency
     assert latency.delay_s == pytest.approx(1.1e-4)
-    assert latency.beside_z_s == pytest.approx(np.hypot(1e-6, 0.2e-4 / np.sqrt(12)))
+    assert latency.unshared_s == pytest.approx(np.hypot(1e-6, 0.2e-4 / np.sqrt(12)))
 
 
 def test_members_that_do_not_belong_together_are_refused(true_calibration: Calibration) -> None:

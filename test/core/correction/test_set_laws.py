@@ -139,7 +139,7 @@ def test_an_open_latency_may_be_any_part_of_the_largest_lag(lags: tuple[float, f
     """A lead counts too: the distance of the probe from the slides matters."""
     latency = together(*map(member, lags)).latency
     assert not latency.resolved
-    assert latency.beside_z_s == pytest.approx(unresolved_latency(3e-4).beside_z_s)
+    assert latency.unshared_s == pytest.approx(unresolved_latency(3e-4).unshared_s)
 
 
 def test_one_open_latency_leaves_that_of_the_set_open() -> None:
@@ -159,7 +159,7 @@ def test_latencies_that_differ_are_uncertain_by_as_much() -> None:
     found = made.latency
     assert found.delay_s == pytest.approx(np.mean(delays))
     assert found.uncertainty_s == pytest.approx(np.hypot(4e-6, 0.3e-4 / np.sqrt(12)))
-    assert found.beside_z_s == found.uncertainty_s
+    assert found.unshared_s == found.uncertainty_s
     assert found.share == pytest.approx(np.mean(delays) / 3e-4)
     assert found.reason == "test 0; test 1"
 

@@ -232,7 +232,7 @@ def test_a_declared_latency_is_read_back_as_it_was_stated(
     found = with_latency(made(), stated).latency
     assert found == stated == from_json(Latency, json.loads(json.dumps(to_json(stated))), "latency")
     assert found.share == pytest.approx(share, rel=1e-6, abs=0)
-    assert found.beside_z_s == found.uncertainty_s == u
+    assert found.unshared_s == found.uncertainty_s == u
 
 
 def test_declaring_a_latency_leaves_all_else() -> None:
@@ -244,7 +244,7 @@ def test_declaring_a_latency_leaves_all_else() -> None:
 
 
 def test_a_lead_leaves_as_much_open_as_a_lag() -> None:
-    assert unresolved_latency(-3e-4).beside_z_s == unresolved_latency(3e-4).beside_z_s
+    assert unresolved_latency(-3e-4).unshared_s == unresolved_latency(3e-4).unshared_s
     assert declared_latency(0.0, 1e-4, 1e-6, "data sheet").share is None
 
 
@@ -264,7 +264,7 @@ ENTRY = to_json(declared_latency(3e-4, 1e-4, 1e-6, "data sheet"))
         (ENTRY | {"reason": 5}, "latency.reason is 5, expected a text"),
         (ENTRY | {"reason": " "}, "needs a reason"),
         (ENTRY | {"uncertainty_s": -1.0}, "latency is -1.0 s"),
-        (ENTRY | {"beside_z_s": None}, "latency.beside_z_s is None"),
+        (ENTRY | {"unshared_s": None}, "latency.unshared_s is None"),
     ],
 )
 def test_an_entry_that_is_no_latency_is_named(entry: object, said: str) -> None:
@@ -275,6 +275,6 @@ def test_an_entry_that_is_no_latency_is_named(entry: object, said: str) -> None:
 def test_a_latency_that_is_typed_is_the_callers_to_correct() -> None:
     with pytest.raises(ConfigurationError, match="share of the latency"):
         Latency(
-            delay_s=1e-4, uncertainty_s=None, beside_z_s=0.0, share=float("nan"),
+            delay_s=1e-4, uncertainty_s=None, unshared_s=0.0, share=float("nan"),
             source="declared", reason="typed",
         )  # fmt: skip

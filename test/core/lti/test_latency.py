@@ -34,11 +34,11 @@ def test_without_a_word_any_part_of_the_lag_may_be_latency() -> None:
     # The root of the mean square of a uniform distribution from 0 to the lag.
     anywhere = np.random.default_rng(1).uniform(0.0, LAG, 100_000)
     assert found.uncertainty_s == pytest.approx(np.sqrt(np.mean(anywhere**2)), rel=0.01)
-    assert ErrorSources.of(KNOWN).lateral_lag == found.beside_z_s
+    assert ErrorSources.of(KNOWN).lateral_lag == found.unshared_s
 
 
 def test_no_lag_leaves_nothing_open() -> None:
-    assert unresolved_latency(0.0).beside_z_s == 0.0
+    assert unresolved_latency(0.0).unshared_s == 0.0
 
 
 def test_what_is_declared_counts_with_its_uncertainty() -> None:
@@ -53,7 +53,7 @@ def test_what_is_declared_counts_with_its_uncertainty() -> None:
     ("delay", "uncertainty", "reason", "named"),
     [
         (-1e-6, 1e-6, "because", "latency is -1e-06 s"),
-        (1e-6, -1e-6, "because", "latency beside Z is -1e-06 s"),
+        (1e-6, -1e-6, "because", "latency unshared with Z is -1e-06 s"),
         (1e-6, 1e-6, "  ", "needs a reason"),
     ],
 )

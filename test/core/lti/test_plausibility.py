@@ -137,15 +137,15 @@ GOOD_LATENCY = to_json(unresolved_latency(1e-4)) | {"uncertainty_s": 1e-5}
     ("entry", "named"),
     [
         ("late", "latency is 'late', expected an object"),
-        ({"delay_s": 1e-4}, "latency.beside_z_s is missing"),
+        ({"delay_s": 1e-4}, "latency.source is missing"),
         (GOOD_LATENCY | {"delay_s": -1e-3}, "latency is -0.001 s"),
         (
             GOOD_LATENCY | {"uncertainty_s": "none"},
             "latency.uncertainty_s is 'none', expected a finite number",
         ),
         (
-            GOOD_LATENCY | {"beside_z_s": None},
-            "latency.beside_z_s is None, expected a finite number",
+            GOOD_LATENCY | {"unshared_s": None},
+            "latency.unshared_s is None, expected a finite number",
         ),
         (GOOD_LATENCY | {"source": "hearsay"}, "latency by 'hearsay'"),
         (GOOD_LATENCY | {"source": "declared", "reason": " "}, "needs a reason"),
