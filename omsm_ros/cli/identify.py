@@ -95,6 +95,16 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
     )
+    _declare_use(sub)
+    add_trigger(sub)
+    add_by_stamps(sub)
+    sub.add_argument(
+        "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
+    )
+    declare_catalogue(sub)
+
+
+def _declare_use(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--for",
         dest="scan",
@@ -116,12 +126,6 @@ def _declare(sub: argparse.ArgumentParser) -> None:
         help="for the certificate: machine, probe, probe_serial_number, target, temperature_c, "
         "operator, laboratory, method",
     )
-    add_trigger(sub)
-    add_by_stamps(sub)
-    sub.add_argument(
-        "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
-    )
-    declare_catalogue(sub)
 
 
 def _identify(args: argparse.Namespace) -> Facts:

@@ -37,7 +37,7 @@ from omsm_ros.core.identification.covariance_terms import (
 )
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_choice import ChosenModel, model_from_start
-from omsm_ros.core.identification.model_error_search import search_model_errors
+from omsm_ros.core.identification.model_error_search import SearchResult, search_model_errors
 from omsm_ros.core.identification.response_uncertainty import (
     inflate_to_free_choice,
     response_uncertainty,
@@ -121,7 +121,7 @@ def identify(
     did not measure it, ConfigurationError for an impossible input or mass. A model that cannot be
     trusted is returned with the verdict "rejected" in its certificate.
     """
-    mass, limits = table_mass(settings or {}), DEFAULT_LIMITS
+    mass = table_mass(settings or {})
     prepared = prepare(record, input)
     check_axis_steps(prepared)
     searched = search_model_errors(
@@ -129,13 +129,37 @@ def identify(
     )
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
+    best = model.chosen.fit
+    evidence = _evidence(record, searched, input, settings or {}, use)
+    findings = [finding for check in CHECKS for finding in check(evidence)]
+    calibration = Calibration(
+        dynamics=best.dynamics,
+        static_gain=abs(best.gain),
+        sample_period=record.sample_period,
+        valid_up_to=max(evidence.known.valid_up_to, _UNTRUSTED_HZ),
+        covariance=evidence.known.covariance,
+        settings=dict(settings or {}),
+        certificate=certificate_of(evidence, findings, replace(origin, input=input), mass),
+    )
+    return Identification(calibration, prepared, best)
+
+
+def _evidence(
+    record: MotionRecord,
+    searched: SearchResult,
+    input: str,
+    settings: Mapping[str, object],
+    use: IntendedUse,
+) -> IdentificationEvidence:
+    """Return what the checks use: the uncertainty of the response, and what it consists of."""
+    prepared, model, limits = searched.prepared, searched.model, DEFAULT_LIMITS
     drift = [
         nuisance_terms.columns
         for nuisance_terms in searched.nuisance_terms
         if nuisance_terms.term.family == DRIFT
     ]
     best, diagnostics = model.chosen.fit, searched.diagnostics
-    further, undetected = undetected_covariance(diagnostics, settings or {}, drift, use)
+    further, undetected = undetected_covariance(diagnostics, settings, drift, use)
     further += alternative_modes(searched.without, searched.added_poles, best)
     compared = contrasts(diagnostics)
     further.append(contrast_covariance(compared, best.dynamics))
@@ -145,20 +169,9 @@ def identify(
     known = response_uncertainty(prepared, model, limits, further)
     if model.free is not None:
         known = inflate_to_free_choice(known, prepared, model, model.free, limits)
-    evidence = IdentificationEvidence(
+    return IdentificationEvidence(
         record, prepared, model, known, limits, searched, undetected, compared, reference, use
     )
-    findings = [finding for check in CHECKS for finding in check(evidence)]
-    calibration = Calibration(
-        dynamics=best.dynamics,
-        static_gain=abs(best.gain),
-        sample_period=record.sample_period,
-        valid_up_to=max(known.valid_up_to, _UNTRUSTED_HZ),
-        covariance=known.covariance,
-        settings=dict(settings or {}),
-        certificate=certificate_of(evidence, findings, replace(origin, input=input), mass),
-    )
-    return Identification(calibration, prepared, best)
 
 
 def table_mass(settings: Mapping[str, object]) -> float | None:
