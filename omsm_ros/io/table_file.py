@@ -134,11 +134,11 @@ def _rows(
     marks = -1 if cells is None or mark is None else cells - 1
     for number, line in enumerate(lines, seen[0] + 1):
         seen[0], seen[1] = number, line
-        if line.count(mark or ",") == marks > 0:  # as nearly all are
+        if marks > 0 and line.count(mark) == marks:  # as nearly all are
             yield line
         elif line and not line.isspace():
             if cells is not None:
-                _check_cells(line, mark, cells, layout.get("comments", "#"))
+                _check_cells(line, mark, cells, layout.get("comments", "#") or ())
             yield line
 
 

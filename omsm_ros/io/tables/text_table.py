@@ -7,6 +7,7 @@ import csv
 import io
 import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import open_regular
+from omsm_ros.io.table_file import rows_in
 from omsm_ros.io.tables.table import ForeignTable, TableForm
 from omsm_ros.quantities import shown
 from omsm_ros.units import NANOSECONDS_PER_S, WORDS
@@ -293,7 +295,6 @@ class _Rows:
         """Return the columns, each (n,); ValueError for anything else than one a name."""
         if not lines:
             return [np.empty(0) for _ in self._places]
-        self._check_cells(lines)
         numbers = iter(self._read_numbers(lines).T if self._numeric else ())
         dates = iter(self.read_dates(lines))
         return [np.ascontiguousarray(next(dates if date else numbers)) for date in self._dates]
@@ -304,22 +305,25 @@ class _Rows:
         cells = [self._table.cells(line) for line in lines] if found else []
         return [seconds_since_1970([c[p] for c in cells], self._form.zone) for p in found]
 
-    def _check_cells(self, lines: list[str]) -> None:
-        mark, wanted = self._form.delimiter, len(self._table.names) - 1
-        if mark == " " or any(line.count(mark) != wanted for line in lines):
-            for line in lines:
-                self._table.cells(line)
-
     def _read_numbers(self, lines: list[str]) -> FloatArray:
         if self._form.decimal != ".":
             self._check_points(lines)
             lines = [line.replace(self._form.decimal, ".") for line in lines]
         mark = None if self._form.delimiter == " " else self._form.delimiter
-        how = {"delimiter": mark, "usecols": self._numeric, "ndmin": 2, "comments": None}
+        read = partial(
+            rows_in,
+            lines,
+            str(self._table),
+            "",
+            cells=len(self._table.names),
+            delimiter=mark,
+            usecols=self._numeric,
+            comments=None,
+        )
         try:
-            return np.loadtxt(lines, **how)
-        except ValueError:
-            return np.loadtxt(lines, converters=self._number, encoding="utf-8", **how)
+            return read()
+        except ValueError:  # quotes, empty cells, texts that mean "no reading"
+            return read(converters=self._number, encoding="utf-8")
 
     def _check_points(self, lines: list[str]) -> None:
         """Raise FileError for points among decimal commas: 1.234 is another number there."""
