@@ -1,4 +1,9 @@
-"""Runs of samples → blocks, stamped on the host's clock."""
+"""Cuts runs of samples into blocks, stamped by the host's clock.
+
+Host time is fitted as ``offset + (1 + drift) · device time`` over the arrivals of half a minute:
+robustly, since some arrivals are very late, and over a window, since crystals change with
+temperature.
+"""
 
 from __future__ import annotations
 
@@ -22,43 +27,37 @@ from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
 from omsm_ros.instruments.scaling import AXES, AxisScaling
 from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
-# Device time → host time, by a line through all arrivals of the last half minute.
-#
-# What arrives, arrives late and unevenly; what the device counts is even. So host time is
-# fitted as ``offset + (1 + drift) · device time``: robustly, since some arrivals are very late,
-# and over a window, since crystals change with temperature.
-
 # Long enough to average jitter out, short enough to follow a crystal that warms up [s].
 WINDOW_S = 30.0
 # Arrivals closer than this count as one, their mean: it bounds the fit to 1500 points [s].
 _BIN_S = 0.02
-# Crystals differ by some tens of ppm; it holds the drift until arrivals show it.
+# Crystals differ by some tens of ppm: the standard uncertainty of the drift before any arrival.
 _DRIFT_SIGMA = 100 * PPM
-# A drift beyond this, by five of its own uncertainties, is no crystal: a device that is played
-# faster than it was recorded, or set to another rate.
-_NO_CRYSTAL = 1000 * PPM
-# Arrivals off the line by more than this, all to one side, for so long: a clock was set [s].
+# A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
+# is played faster than it was recorded, or set to another rate.
+_LARGEST_CRYSTAL_DRIFT = 1000 * PPM
+# A clock was set if all arrivals are off the line by the first, to one side, during the second [s].
 _STEP_S, _STEP_AFTER_S = 0.02, 2.0
-# Nothing arrives before it was sent: what is earlier than the line by more than a busy host may
-# have held up its first arrivals is a sign of a clock that was set, at once [s].
+# A busy host delays its first arrivals by less than this, so an arrival that is earlier by more
+# shows at once that a clock was set [s].
 _EARLY_S = 1.0
-# And no sample is kept back for longer than this before it is sent [s].
+# No device holds a sample back for longer than this before it sends it [s].
 _OLDEST_S = 3600.0
-# A drift is told from so many seconds of arrivals on.
-_TELLING_S = 5.0
-# One of a tenth and more, another rate, shows sooner: arrivals uneven by 20 ms tell it to 0.01.
-_GROSS, _GROSS_TELLING_S = 0.1, 1.0
-# Huber's constant: 95 % efficient for normal jitter; uniform jitter is not clipped at all.
+# The drift is reported after this time of arrivals [s].
+_LEAST_SPAN_S = 5.0
+# A drift of a tenth or more is another rate; arrivals uneven by 20 ms determine it to 0.01 in 1 s.
+_GROSS, _GROSS_SPAN_S = 0.1, 1.0
+# Huber's constant for a Gaussian efficiency of 95 % is 1.345; at 1.5 uniform jitter is not clipped.
 _HUBER = 1.5
 _ITERATIONS = 5
 _LEAST_SCALE_S = 1e-6
 
 
 class DeviceClock:
-    """Stamps that neither jump nor bunch, and rise strictly whatever the arrivals do.
+    """Converts device time to host time; the stamps rise strictly and evenly.
 
-    A clock that was set, the device's or the host's, is followed after two seconds, and at once
-    if arrivals then come earlier than they can.
+    If the clock of the device or the host is set, the stamps follow after two seconds, or at once
+    if samples then arrive before they were taken.
     """
 
     def __init__(self) -> None:
@@ -66,26 +65,26 @@ class DeviceClock:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all arrivals: the device's clock started anew. Stamps still only rise."""
+        """Forget all arrivals, as after a restart of the device's clock; stamps still rise."""
         # Bins: sums of device time and of delay after the origin [s], and how many.
         self._bins: deque[tuple[float, float, int]] = deque()
         self._origin = self._newest = (0, 0)
         self._offset = self._slope = 0.0
         self._span = 0.0
         self._fitted_at = -np.inf
-        # To which side arrivals have been off, and since when [device, arrival; s].
+        # Whether arrivals have been late or early, and since when [device, arrival; s].
         self._astray: tuple[bool, float, float] | None = None
 
     @property
     def drift(self) -> float | None:
-        """Host seconds per device second, less one; None before it is known."""
-        patience = _GROSS_TELLING_S if abs(self._slope) > _GROSS else _TELLING_S
+        """Return host seconds per device second, less one; None before it is known."""
+        patience = _GROSS_SPAN_S if abs(self._slope) > _GROSS else _LEAST_SPAN_S
         return self._slope if self._span >= patience else None
 
     def observe(self, device_ns: int, arrival_ns: int) -> None:
-        """Note that a sample taken at ``device_ns`` was at the host at ``arrival_ns``.
+        """Enter the arrival at ``arrival_ns`` of a sample taken at ``device_ns``.
 
-        Of samples that arrive together, the last says most and is enough.
+        The last one of samples that arrive together is enough.
         """
         if not self._bins:
             self._origin = (device_ns, arrival_ns)
@@ -104,7 +103,7 @@ class DeviceClock:
     def to_host(self, device_ns: int) -> int:
         """Return the host time [ns] of ``device_ns``, later than every stamp given before.
 
-        A time that no sample can have which arrived with the newest is not believed.
+        A device time out of the possible range is replaced by that of the newest sample.
         """
         if not self._bins:
             raise ConfigurationError("DeviceClock.to_host before any arrival; call observe() first")
@@ -120,7 +119,7 @@ class DeviceClock:
         return stamp
 
     def _keep(self, device: float, late: float) -> None:
-        """Add to the last bin, or begin one; forget what the window has left behind."""
+        """Add to the last bin, or begin one; remove bins that are older than the window."""
         if self._bins:
             total, delay, count = self._bins[-1]
             if 0 <= device - total / count < _BIN_S:
@@ -146,15 +145,15 @@ class DeviceClock:
         return min(device - since, arrival - arrived) > _STEP_AFTER_S
 
     def _fit(self) -> None:
-        """Fit Huber's line through the bins, the drift held by what crystals do."""
+        """Fit Huber's line through the bins, with the prior of crystals for the drift."""
         bins = np.array(self._bins)
         count = bins[:, 2]
         device, late = bins[:, 0] / count, bins[:, 1] / count
         self._span = float(np.ptp(device))
-        # About the middle, offset and drift do not disturb each other.
+        # About the middle, the estimates of offset and drift do not correlate.
         middle = float(device.mean())
         free = _line(device - middle, late, count, np.inf)
-        beyond = abs(free[1]) - 5 * free[2] > _NO_CRYSTAL and len(count) > 5
+        beyond = abs(free[1]) - 5 * free[2] > _LARGEST_CRYSTAL_DRIFT and len(count) > 5
         offset, slope, _ = free if beyond else _line(device - middle, late, count, _DRIFT_SIGMA)
         self._slope = slope
         self._offset = offset - slope * middle
@@ -167,7 +166,7 @@ def _arrival(item: tuple[float, float, int]) -> float:
 def _line(
     x: FloatArray, y: FloatArray, count: FloatArray, sigma: float
 ) -> tuple[float, float, float]:
-    """Return offset, slope and its uncertainty of a robust line; sigma: of the slope beforehand."""
+    """Return offset, slope and its uncertainty of a robust line; sigma: of the slope's prior."""
     offset, slope = float(np.median(y)), 0.0
     weight, scale = count, _LEAST_SCALE_S
     uncertainty = np.inf
@@ -185,16 +184,16 @@ def _line(
     return offset, slope, float(uncertainty)
 
 
-# More than crystals differ by: beyond it the nominal period is wrong.
+# Crystals differ by less; beyond it the stated period is wrong.
 PERIOD_TOLERANCE = 100 * PPM
-# A device that runs freely at another rate than this is set to another rate.
+# A free-running device that deviates by more is set to another rate.
 RATE_TOLERANCE = 1000 * PPM
-# So is one that tells no time, if its samples arrive at another rate than this.
+# The same for a device without time stamps, by the arrivals of its samples.
 ARRIVAL_TOLERANCE = 5000 * PPM
 
 
 class BlockPair(NamedTuple):
-    """What one run of a device's samples becomes; None where it has no such channels."""
+    """Two blocks of the same samples; None where the device has no such channels."""
 
     axes: AxisBlock | None
     distance: DistanceBlock | None
@@ -202,10 +201,13 @@ class BlockPair(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlockSettings:
-    """sample_period: nominal [s];  block_size: samples;  pause: a partial block is handed over
-    when nothing came for so long [s];  renew: a connection that is silent for so long is made
-    anew, which costs a sample or two if it was well [s]; 0 = never;  free_running: the device
-    keeps the period itself, so a block at another rate is withheld.
+    """Settings of the blocks.
+
+    sample_period: nominal [s];  block_size: samples
+    pause: silence after which a partial block is handed over [s]
+    renew: silence after which the connection is made again, which may cost two samples [s];
+        0 = never
+    free_running: the device keeps the period itself, so a block at another rate is withheld
     """
 
     sample_period: float = 1e-3
@@ -226,8 +228,10 @@ class BlockSettings:
 
 
 class Channels(NamedTuple):
-    """What a device measures. distance: a probe;  axes: how its encoders count, in the order of
-    AXES, or None;  timed: its samples carry its own time.
+    """Channels of a device.
+
+    distance: it has a probe;  axes: scaling of its encoders in the order of AXES, or None
+    timed: its samples carry the time of its own clock
     """
 
     distance: bool = True
@@ -236,18 +240,18 @@ class Channels(NamedTuple):
 
 
 def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisScaling, ...] | None:
-    """Return the axes; their encoders wrap after ``counts`` where nothing else is said."""
+    """Return the axes, whose encoders wrap after ``counts`` if they state nothing else."""
     if axes is None:
         return None
     return tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)
 
 
 class BlockCutter:
-    """Runs → pairs of blocks of ``block_size`` samples; a gap or a restart closes one early.
+    """Cuts runs into blocks of ``block_size`` samples; a gap or restart ends a block early.
 
     delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
-    period_deviation: from nominal, relative: of the last full block's device time, or of the
-    arrivals of a device that reports no time
+    period_deviation: relative, from nominal: of the last full block's device time, or of the
+        arrivals of a device without time stamps [1]
     period_warnings: full blocks beyond PERIOD_TOLERANCE
     """
 
@@ -263,12 +267,12 @@ class BlockCutter:
 
     @property
     def pending(self) -> int:
-        """Samples that wait for their block to fill."""
+        """Return the number of samples that wait for their block to fill."""
         return len(self._pending)
 
     @property
     def wrong_rate(self) -> bool:
-        """Whether the device runs freely, but not at the rate it was set to."""
+        """Return whether the device runs freely at another rate than stated."""
         limit = RATE_TOLERANCE if self._channels.timed else ARRIVAL_TOLERANCE
         return self._settings.free_running and abs(self.period_deviation) > limit
 
@@ -285,7 +289,7 @@ class BlockCutter:
             yield from self._append(run)
 
     def _set_clock(self, runs: Sequence[CountedRun], arrival_ns: int, after_silence: bool) -> None:
-        """Tell the clock of the last sample that arrived before the device started anew."""
+        """Enter the arrival of the last sample before a restart of the device."""
         continuous = self._channels.timed or self._settings.free_running
         if runs[0].restarted or (after_silence and not continuous):
             self._clock.restart()
@@ -336,7 +340,7 @@ class BlockCutter:
             return
         periods = len(samples) - 1
         if periods < max(1, self._settings.block_size - 1):
-            return  # too short to tell a wrong period from jitter
+            return  # too short to distinguish a wrong period from jitter
         nominal = periods * self._settings.sample_period
         elapsed = (int(samples["time"][-1]) - int(samples["time"][0])) * NANOSECOND_S
         self.period_deviation = elapsed / nominal - 1

@@ -1,4 +1,4 @@
-"""Which sample is it? Wrapping device counters → one trigger counter that never wraps."""
+"""Converts device counters that wrap into one trigger count, and adds turns of encoders."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ SAMPLE = np.dtype(
     [
         ("counter", "<i8"),  # as the device sends it, wraps
         ("time", "<i8"),  # of the device [ns], does not wrap; 0 where it has none
-        ("distance", "<f8"),  # [m], NaN where there is none
-        ("intensity", "<f4"),  # 0-1, NaN where the device tells none
+        ("distance", "<f8"),  # [m], NaN = none
+        ("intensity", "<f4"),  # 0-1, NaN = not reported
         ("status", "u1"),  # Status
         ("counts", "<i8", (5,)),  # encoders X, Y, Z, B, C
     ]
 )
 Samples: TypeAlias = NDArray[np.void]
-"""Structured array of shape (n,), dtype ``SAMPLE``: what every device's driver makes first."""
+"""Structured array of shape (n,), dtype ``SAMPLE``: the common form of all devices' samples."""
 
-# A gap and the time that passed may differ by this much, since arrivals are not even [s].
+# Arrivals are uneven, so a gap and the time that passed may differ by this much [s].
 _SLACK_S = 0.5
 # Copies of samples that were sent before are recognised this far back.
 _RECENT_SAMPLES = 1024
@@ -35,7 +35,7 @@ _RECENT_SAMPLES = 1024
 class CountedRun:
     """Samples (n,) with consecutive trigger counts from ``first_sample``.
 
-    restarted: the device started anew just before
+    restarted: the device was restarted just before
     """
 
     samples: Samples
@@ -47,12 +47,12 @@ class CountedRun:
 class Counting:
     """How a device counts.
 
-    modulus: its counter starts again at zero there
-    timed: its samples carry its own time
-    checked: a checksum guards the counter; without, a counter that leaps and comes back with
-    the next sample is a spoilt telegram
-    period: of a device that runs freely [s]: its counter goes on in a silence, as far as time
-    does; 0 = triggered, its counter waits for the next trigger
+    modulus: after which its counter starts again at zero
+    timed: its samples carry the time of its own clock
+    checked: a checksum protects the counter; without one, a counter that jumps ahead and comes
+        back with the next sample marks a spoilt telegram
+    period: of a free-running device, whose counter advances with time in a silence [s];
+        0 = triggered: its counter waits for the next trigger
     """
 
     modulus: int
@@ -62,11 +62,11 @@ class Counting:
 
 
 class SequenceTracker:
-    """Samples in the order of arrival → runs, with everything that is missing or too much counted.
+    """Cuts samples in the order of arrival into runs, and counts missing and repeated ones.
 
-    The same sample again is a duplicate. A counter or a time that falls back is a restarted
-    device, and its own number counts from there; so is, after a silence, a counter at zero.
-    Anything else that is not the next number is a gap.
+    A repeated sample is a duplicate. A counter or time that falls back, or a counter at zero after
+    a silence, is a restart of the device; its own number counts from there. Any other number that
+    is not the next one is a gap.
     """
 
     def __init__(self, counting: Counting) -> None:
@@ -80,11 +80,11 @@ class SequenceTracker:
 
     @property
     def held(self) -> int:
-        """Samples that wait for their successor to show whether they are spoilt."""
+        """Return the number of samples that wait for their successor."""
         return len(self._held)
 
     def restart_count(self) -> None:
-        """Count from the device's next number, for it is known to have been restarted."""
+        """Count from the device's next number, as after a known restart."""
         self._anew = self._begun
 
     def split(
@@ -92,8 +92,8 @@ class SequenceTracker:
     ) -> Iterator[CountedRun]:
         """Yield the runs of ``samples`` (n,), in order.
 
-        elapsed: how long nothing had come before [s];  broken: that was a silence, or the line
-        was down
+        elapsed: silence before the samples [s]
+        broken: it was longer than the pause between samples, or the line was down
         """
         samples, self._held = np.concatenate([self._held, samples]), np.empty(0, SAMPLE)
         pause = _StreamBreak(elapsed, broken)
@@ -116,7 +116,7 @@ class SequenceTracker:
             yield from self._one(held, _StreamBreak())
 
     def _in_order(self, samples: Samples) -> int:
-        """Return how many samples at the beginning just go on."""
+        """Return how many samples at the beginning have consecutive counters."""
         if not self._begun:
             return 0
         steps = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
@@ -133,7 +133,7 @@ class SequenceTracker:
         return CountedRun(samples, first, restarted)
 
     def _must_wait(self, samples: Samples) -> bool:
-        """Return whether the only sample left leaps, so that the next one has to decide."""
+        """Return whether the only sample left jumps ahead, so that the next one must decide."""
         return len(samples) == 1 and self._counter_jumps(samples[0])
 
     def _counter_jumps(self, sample: np.void) -> bool:
@@ -142,7 +142,7 @@ class SequenceTracker:
         return self._step(int(sample["counter"])) > 1 and not self._is_repeated(sample)
 
     def _is_corrupted_counter(self, samples: Samples) -> bool:
-        """Return whether the counter leaps at the first sample and is back at the next."""
+        """Return whether the counter jumps ahead at the first sample and is back at the next."""
         if len(samples) < 2 or not self._counter_jumps(samples[0]):
             return False
         here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
@@ -152,7 +152,7 @@ class SequenceTracker:
         return (raw - self._raw) % self._counting.modulus
 
     def _one(self, samples: Samples, pause: _StreamBreak) -> Iterator[CountedRun]:
-        """Yield what becomes of the first of ``samples``, which does not just go on."""
+        """Classify the first of ``samples``, whose counter is not the next one."""
         sample, alone = samples[0], samples[:1]
         raw = int(sample["counter"])
         if not self._begun:
@@ -197,7 +197,7 @@ class SequenceTracker:
         return abs(pause.elapsed - whole * period) > _SLACK_S
 
     def _turns(self, step: int, pause: _StreamBreak) -> int:
-        """Return the whole turns of the counter that a silence hid."""
+        """Return the whole turns of the counter in a silence."""
         if not self._counting.period:
             return 0
         missing_samples = pause.elapsed / self._counting.period - step
@@ -206,40 +206,38 @@ class SequenceTracker:
 
 @dataclass(frozen=True, slots=True)
 class _StreamBreak:
-    """What lay before a sample."""
+    """The silence before a sample."""
 
     elapsed: float = 0.0
     broken: bool = False
 
 
-# Whole turns of encoders that wrap, also past telegrams that noise on the wire has garbled.
-
-# Of a turn: no axis changes its step by more from one sample to the next.
+# No axis changes its step by more than this from one sample to the next [turn].
 _LITTLE = 1 / 64
-# Steps in a row that differ by little: this is where the axis is, wherever it was before. Of
-# garbled counts so many do so by chance once in 10⁹.
+# After this many nearly equal steps the position is accepted; counts spoilt by noise give such a
+# row by chance once in 10⁹.
 _ALIKE = 6
 
 _Steps = TypeVar("_Steps", IntArray, int)
 
 
 class Turns:
-    """Continues the counts of an encoder that starts again at zero after ``wrap``; 0 = never.
+    """Adds the whole turns to counts that start again at zero after ``wrap``; 0 = never.
 
     The axis moves less than half a turn between two samples, so a step is the shorter way round.
-    Two steps to a garbled count and back may add up to a whole turn. So the count before a jump is
-    kept: what comes back to it, or goes on elsewhere, has the turns that bring it next to it.
+    Two steps to a count spoilt by noise and back may add up to a whole turn. So the count before a
+    jump is kept, and later counts get the turns that bring them next to it.
     """
 
     def __init__(self, wrap: int) -> None:
         self._wrap = wrap
         self._last = self._step = 0
-        self._seen = 0  # samples since the first, or since one whose first steps differed
+        self._seen = 0  # samples since the first one that was accepted
         self._kept: int | None = None  # the count before a jump
         self._since = self._alike = 0
 
     def continued(self, counts: IntArray) -> IntArray:
-        """Return the counts (n,) with their whole turns; the first of all are within one."""
+        """Return the counts (n,) with their whole turns, from the first count on."""
         if not self._wrap:
             return counts
         if self._seen > _ALIKE and self._kept is None:
@@ -257,9 +255,9 @@ class Turns:
         value = self._last + step
         differs = abs(step - self._step) > _LITTLE * self._wrap
         if self._kept is not None:
-            value, step = self._after_a_jump(value, step, differs)
+            value, step = self._follow_jump(value, step, differs)
         elif self._seen <= _ALIKE:
-            if self._seen == 0 or (self._seen > 1 and differs):  # the one before was garbled
+            if self._seen == 0 or (self._seen > 1 and differs):  # the one before was spoilt
                 value, step, self._seen = count, 0, 0
             self._seen += 1
         elif differs:
@@ -267,7 +265,7 @@ class Turns:
         self._last, self._step = value, step
         return value
 
-    def _after_a_jump(self, value: int, step: int, differs: bool) -> tuple[int, int]:
+    def _follow_jump(self, value: int, step: int, differs: bool) -> tuple[int, int]:
         assert self._kept is not None
         self._since += 1
         self._alike = 0 if differs else self._alike + 1
@@ -275,7 +273,7 @@ class Turns:
         if abs(off) <= _LITTLE * self._wrap:
             value, step, self._kept = self._kept + off, 0, None
         elif self._alike >= _ALIKE:
-            if self._alike < self._since - 1:  # else it went there at once: a gap
+            if self._alike < self._since - 1:  # else it moved there in a gap
                 value = self._kept + off
             self._kept = None
         return value, step

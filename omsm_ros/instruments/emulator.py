@@ -1,7 +1,7 @@
-"""What every emulated instrument has in common: a clock, a line, and faults on command.
+"""The base of all emulated instruments: a clock, a line, and faults on command.
 
-A model fills in how it answers and how it packs samples. The instrument measures whether
-anybody listens or not: what is not sent is lost, its counter goes on.
+A model implements its answers and the encoding of samples. The instrument measures whether a
+client is connected or not: samples that are not sent are lost, and its counter advances.
 
 Not imitated: latency of the link, baud rate and UART overrun, jitter of the trigger.
 """
@@ -29,7 +29,7 @@ from omsm_ros.units import NANOSECONDS_PER_S, PPM
 class Measured:
     """Consecutive samples, arrays of shape (n,).
 
-    distance: [m], NaN where there is none;  intensity: 0-1;  status: Status
+    distance: [m], NaN = none;  intensity: 0-1;  status: Status
     axes: x, y, z [m], b, c [rad] by name
     """
 
@@ -43,17 +43,17 @@ class Measured:
 
 
 class Source(Protocol):
-    """What there is to measure, sample by sample of a trigger."""
+    """Supplies the samples that an instrument measures, one for each trigger."""
 
     length: float
     period: float
 
     def take(self, first: int, count: int) -> Measured:
-        """Return samples ``first`` to ``first + count``; those beyond the length are left out."""
+        """Return samples ``first`` to ``first + count``, as far as the length reaches."""
 
 
 class RecordingSource:
-    """A motion of the twin, once."""
+    """Supplies a motion of the twin, once."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -74,9 +74,9 @@ class RecordingSource:
 
 
 class NumberedSource:
-    """Without end; sample k stands at x = k nm, so every sample shows which one it is.
+    """Supplies samples without end; sample k is at x = k nm, so it can be identified.
 
-    The other channels follow from k too: see ``NumberedSource.take``.
+    All channels follow from k: see ``NumberedSource.take``.
     """
 
     def __init__(self, period: float = 1e-3) -> None:
@@ -100,30 +100,30 @@ _LINEAR = AxisScaling(counts_per_unit=1e10, wrap=2**32)
 _ROTARY = AxisScaling(counts_per_unit=2**28 / (2 * np.pi), wrap=2**32)
 AXIS_SCALING = (_LINEAR, _LINEAR, _LINEAR, _ROTARY, _ROTARY)
 
-# Samples are written this often; shorter costs processor time, longer bunches arrivals.
+# Between two writes: shorter costs processor time, longer delays samples [s].
 WRITE_INTERVAL_S = 0.005
-# Bounds memory and the response to a stop, however fast the time lapse.
+# Bounds memory and the time to stop at any time lapse [samples].
 _MAX_SAMPLES = 2000
 _NOISE_BYTES = 20
 
 
 class InstrumentLink(Protocol):
-    """What carries the bytes: a ``Pty`` or a ``TcpServer``."""
+    """The instrument's end of a line: a ``Pty`` or a ``TcpServer``."""
 
     @property
     def has_reader(self) -> bool:
-        """Return whether anybody listens."""
+        """Return whether a client is connected."""
 
     @property
     def sessions(self) -> int:
-        """Return how many clients have come so far."""
+        """Return how many clients have connected so far."""
         ...
 
     def read(self) -> bytes:
-        """Return what the driver sent; b"" if nothing."""
+        """Return the bytes that the driver sent; b"" if none."""
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
-        """Send, and return how many bytes of ``data`` were taken."""
+        """Send ``data``; return how many bytes of it were taken."""
 
     def plug(self) -> None:
         """Offer the line."""
@@ -133,17 +133,17 @@ class InstrumentLink(Protocol):
 
 @dataclass(slots=True)
 class InstrumentFaults:
-    """Faults that are still to come: counts are used up, the others last until set back.
+    """Faults to come: counts are used up, the other values last until they are set back.
 
     lose, duplicate: samples not sent, sent twice
-    saturate, drop_out: samples the probe calls saturated, or sees no target in
-    noise: random bytes on the line before the next samples
-    cut: bytes missing in the middle of what is sent next
-    garbage_answers: commands answered with rubbish
-    slow_answers: how late commands are answered [s]
-    ignore_commands: commands not answered at all
-    merge: samples are kept and sent together this long after [s]
-    rate: how much faster than set it measures, without saying so [1]
+    saturate, drop_out: samples with status SATURATED, and NO_TARGET
+    noise: random bytes before the next samples
+    cut: bytes missing in the middle of the next ones sent
+    garbage_answers: commands answered with random bytes
+    slow_answers: delay of answers [s]
+    ignore_commands: commands without answer
+    merge: time for which samples are collected before they are sent [s]
+    rate: actual rate over the rate set [1]
     drift: of its clock [ppm]
     noise_rate, flip_rate, drop_rate: probability, for each sample, of random bytes before it, of
         one inverted bit in it, of its loss [1]
@@ -167,10 +167,10 @@ class InstrumentFaults:
 
 
 class Instrument:
-    """A device that is switched on when made; ``step`` lets it do what is due.
+    """A device that is switched on when made; ``step`` does what is due.
 
-    truth: numbers of the samples sent, in order, as ``(true number, device counter)``; the
-    true number counts triggers since the source began, and never falls back
+    truth: ``(true number, device counter)`` of each sample sent, in order; the true number counts
+        triggers since the source began
     """
 
     counter_range = 2**16
@@ -206,8 +206,6 @@ class Instrument:
         self._session = 0
         self.reset()
 
-    # What a model fills in.
-
     def reset(self) -> None:
         """Set everything as after switching on."""
 
@@ -220,22 +218,20 @@ class Instrument:
         return True
 
     def work(self) -> None:
-        """Do what else there is to do."""
+        """Serve other lines than that of the samples."""
 
     def greet(self) -> None:
-        """Do what is done for a new client."""
+        """Send the greeting to a new client."""
 
     def receive(self, data: bytes) -> None:
-        """Take commands, in any portions."""
+        """Take commands, in portions of any size."""
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
-        """Wire bytes of each sample, or of several in their first one's place."""
+        """Return the bytes of each sample, or of several in the place of their first one."""
         raise NotImplementedError
 
-    # Time.
-
     def step(self, stop: threading.Event | None = None) -> None:
-        """Do what is due now: come back, answer, measure, send."""
+        """Do what is due now: reconnect, answer, measure, send."""
         now = self._clock()
         if now < self._off_until:
             self._measure(now)
@@ -249,7 +245,7 @@ class Instrument:
         try:
             self._exchange(now, stop)
         except (DeviceError, OSError):
-            # The cable may be pulled, by another thread, while something is on its way.
+            # Another thread may unplug the line while it is in use.
             if self._clock() >= self._off_until:
                 raise
 
@@ -271,41 +267,39 @@ class Instrument:
             self.step(stop)
 
     def play(self, source: Source, time_lapse: float = 1.0) -> None:
-        """Begin a motion: its own trigger, the counter from zero."""
+        """Begin a motion; its trigger counts from zero."""
         self._source, self._lapse = source, time_lapse
         self._taken = self._counter = 0
         self._origin, self._due = self._clock(), 0.0
 
     @property
     def played(self) -> int:
-        """Samples of the motion measured so far."""
+        """Return the number of samples of the motion measured so far."""
         return self._taken
 
     @property
     def playing(self) -> bool:
-        """Whether a motion has samples left."""
+        """Return whether a motion has samples left."""
         return self._source is not None and self._taken < self._source.length
 
     def halt(self) -> None:
         """End the motion."""
         self._source = None
 
-    # Faults on command.
-
     def unplug(self, seconds: float) -> None:
-        """Take the cable out for a while; the device measures on."""
+        """Disconnect the line for ``seconds``; the device continues to measure."""
         self._off_until = self._clock() + seconds
         self._line.unplug()
         self._unplugged = True
 
     def power_cycle(self, seconds: float) -> None:
-        """Switch off for a while, then on as from the factory, counting from zero."""
+        """Switch off for ``seconds``, then on with factory settings and a counter at zero."""
         self.unplug(seconds)
         self.restart()
         self._started = self._off_until
 
     def restart(self) -> None:
-        """Set settings and counter as after switching on; the line stays up."""
+        """Set settings and counter as after switching on; the line stays connected."""
         self._counter = 0
         self._kept = b""
         self._later.clear()
@@ -313,7 +307,7 @@ class Instrument:
         self.reset()
 
     def stall(self, seconds: float) -> None:
-        """Stop sending and answering for a while; what was measured meanwhile is lost."""
+        """Stop sending and answering for ``seconds``; samples of that time are lost."""
         self._quiet_until = self._clock() + seconds
 
     def reset_counter(self) -> None:
@@ -321,13 +315,11 @@ class Instrument:
         self._counter = 0
 
     def step_clock(self, nanoseconds: int) -> None:
-        """Let the device's clock leap."""
+        """Set the device's clock ahead."""
         self._clock_offset += nanoseconds
 
-    # Measuring and sending.
-
     def _measure(self, now: float) -> list[bytes]:
-        """Return the samples that have become due, packed; empty while none are to be sent."""
+        """Return the bytes of the samples that are due; empty while none are to be sent."""
         elapsed = (now - self._origin) * self._lapse
         self._origin = now
         if self._source is None or now < self._started:
@@ -361,7 +353,7 @@ class Instrument:
         return np.rint(device).astype(np.int64) + self._clock_offset
 
     def _disturb(self, measured: Measured) -> Measured:
-        """Return the saturation and dropouts, at the beginning of the portion."""
+        """Return the samples, the first of them saturated or without target."""
         status, distance = measured.status.copy(), measured.distance.copy()
         intensity = measured.intensity.copy()
         saturated = _use(self.faults, "saturate", len(measured))
@@ -373,7 +365,7 @@ class Instrument:
         return replace(measured, status=status, distance=distance, intensity=intensity)
 
     def _spoil(self, packed: list[bytes], first: int, counters: np.ndarray) -> list[bytes]:
-        """Lose, double and damage what was packed."""
+        """Return the bytes, some of them lost, repeated or damaged."""
         pieces: list[bytes] = []
         dropped, noisy, flipped = (
             self._struck(rate, len(packed))
@@ -392,7 +384,7 @@ class Instrument:
         return pieces
 
     def _struck(self, rate: float, count: int) -> NDArray[np.bool_]:
-        # Nothing is drawn without a fault, so that each fault alone repeats with its seed.
+        # No random number is used without a fault, so each fault alone repeats with its seed.
         struck: NDArray[np.bool_] = np.zeros(count, np.bool_)
         return np.less(self._random.random(count), rate) if rate else struck
 
@@ -418,10 +410,8 @@ class Instrument:
         if wire:
             self._line.write(wire, stop)
 
-    # Answers.
-
     def say(self, wire: bytes) -> None:
-        """Queue an answer, as late and as wrong as the faults have it."""
+        """Queue an answer, delayed, replaced or dropped by the faults."""
         if _use(self.faults, "ignore_commands", 1):
             return
         if _use(self.faults, "garbage_answers", 1):
@@ -430,7 +420,7 @@ class Instrument:
 
     def _send_answers(self, now: float, stop: threading.Event | None) -> None:
         while self._later and self._later[0][0] <= now:
-            # What was measured before the answer goes first: a telegram is never cut in two.
+            # Samples measured before the answer are sent first, so that no telegram is split.
             if self._kept:
                 self._line.write(self._kept, stop)
                 self._kept = b""

@@ -24,7 +24,7 @@ from omsm_ros.twin.cell import Probe, Recording
 from omsm_ros.units import MICROMETRE_M, NANOSECONDS_PER_S
 
 _TCP = "tcp://127.0.0.1:"
-# What ``int`` reads at once, whatever the digits are.
+# Most digits of a port, since ``int`` refuses thousands of them.
 _PORT_DIGITS = 10
 _END_S = 5.0
 # The twin's probe measures about its middle, an emulated one from the beginning of its range.
@@ -120,7 +120,7 @@ class Player(Protocol):
 
 
 class InstrumentPlayer:
-    """An instrument that answers all the time, and measures while a motion triggers it."""
+    """Runs an instrument in a thread: it always answers, and measures while a motion is played."""
 
     def __init__(
         self,
@@ -157,7 +157,7 @@ class InstrumentPlayer:
 
 
 class PlayerGroup:
-    """Plays a motion on several devices of one trigger, on each what it measures of it."""
+    """Plays a motion on several devices of one trigger, on each its own part."""
 
     def __init__(self, *players: tuple[Player, Callable[[Recording], Recording]]) -> None:
         self._players = players
@@ -202,15 +202,15 @@ def player_for(
 
 
 class AccelerationFeed:
-    """Hands out a recording's acceleration as the motion goes on; one without has none."""
+    """Supplies the acceleration of a recording, if it has some, while its motion is played."""
 
     def __init__(self, recording: Recording, start_ns: int) -> None:
-        """start_ns: when the motion begins [ns]."""
+        """start_ns: begin of the motion [ns]."""
         self._whole, self._start_ns, self._nonempty_channels = recording.acceleration, start_ns, 0
         self._period = recording.axes.sample_period
 
     def due(self, played: int) -> AccelerationBlock | None:
-        """Return what has been felt until the trigger ``played``, and not been handed out yet."""
+        """Return the samples up to the trigger ``played`` that were not returned before."""
         whole = self._whole
         if whole is None:
             return None

@@ -1,4 +1,4 @@
-"""A TCP port without hardware: the device's end of a connection on this machine."""
+"""Ports for emulated instruments: a TCP port of this computer, and a pseudo-terminal."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from types import TracebackType
 from omsm_ros.errors import ConfigurationError, DeviceError
 
 _CHUNK_BYTES = 65_536
-# How long a write waits at a time before it looks at its stop event [s].
+# Between two looks of a waiting write at its stop event [s].
 _LOOK_S = 0.05
 
 
 class TcpServer:
-    """One client at a time on a loopback port, that stays the same over ``unplug``.
+    """Serves one client at a time on a loopback port, which stays the same over ``unplug``.
 
-    A second client is turned away at once, as by a device with one connection; with
-    ``newest_wins`` it takes the first one's place, as by others. Bytes written while nobody is
-    connected are lost. A client that does not read is waited for. ``sessions`` counts the
-    clients that were let in, ``turned_away`` the others.
+    A second client is refused at once, as by a device with one connection; with ``newest_wins``
+    it replaces the first one. Bytes written without a client are lost; a client that does not
+    read delays the writer. ``sessions`` counts the clients that were accepted, ``turned_away`` the
+    others.
 
     Not imitated: delay, loss and reordering of a network, keep-alive, several clients.
     """
@@ -52,7 +52,7 @@ class TcpServer:
 
     @property
     def path(self) -> str:
-        """What a driver opens."""
+        """Return the address that a driver opens."""
         return f"tcp://127.0.0.1:{self._port}"
 
     def plug(self) -> None:
@@ -73,12 +73,12 @@ class TcpServer:
 
     @property
     def has_reader(self) -> bool:
-        """Whether a client is connected."""
+        """Return whether a client is connected."""
         self._accept()
         return self._client is not None
 
     def read(self) -> bytes:
-        """Return what the client sent; b"" if nothing."""
+        """Return the bytes that the client sent; b"" if none."""
         self._accept()
         if (client := self._client) is None:
             return b""
@@ -93,7 +93,7 @@ class TcpServer:
         return data
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
-        """Return bytes of ``data`` a client can get: fewer without one, or when ``stop`` is set."""
+        """Send ``data``; return the bytes taken, fewer without a client or after ``stop``."""
         self._accept()
         remaining = memoryview(data)
         while remaining and (client := self._client) is not None and not (stop and stop.is_set()):
@@ -134,7 +134,7 @@ class TcpServer:
             return True
 
     def _drop(self) -> None:
-        # A fault on command comes from another thread than what serves.
+        # Faults on command come from another thread than the one that serves.
         client, self._client = self._client, None
         if client is not None:
             with contextlib.suppress(OSError):
@@ -142,19 +142,12 @@ class TcpServer:
             client.close()
 
 
-# A serial port without hardware: the device's end of a pseudo-terminal.
-
-# How often a wait looks at its stop event.
-
-
 class Pty:
-    """A pseudo-terminal in raw mode whose other end a driver opens like a serial port.
+    """A pseudo-terminal in raw mode, whose other end a driver opens like a serial port.
 
-    It outlives drivers that close and open again. Bytes written while nobody has the port
-    open are lost, as on a real line. While a driver has it open but does not read, ``write``
-    waits: nothing is lost, where a real UART would overrun.
-
-    Nothing shows when another driver opens it, so ``sessions`` stays 0.
+    It stays when drivers close and open it again. Bytes written while no driver has it open are
+    lost, as on a real line. While a driver does not read, ``write`` waits, where a real UART would
+    overrun. The system does not report that another driver opens it, so ``sessions`` stays 0.
 
     Not imitated: baud rate, parity, modem lines, breaks.
     """
@@ -162,7 +155,7 @@ class Pty:
     sessions = 0
 
     def __init__(self, link: str | Path | None = None) -> None:
-        """link: symbolic link to create, a name that stays the same; replaced if it exists."""
+        """link: symbolic link to create, or to replace."""
         self._link = None if link is None else Path(link)
         self._master: int | None = None
         self._slave_name = ""
@@ -172,13 +165,13 @@ class Pty:
         return self
 
     def plug(self) -> None:
-        """Offer the port, under the same link as before."""
+        """Create the port, with the same link as before."""
         self._master, slave = os.openpty()
         try:
             tty.setraw(slave)
             self._slave_name = os.ttyname(slave)
         finally:
-            # Kept open here, it would hide whether a driver is there.
+            # Kept open here, a driver that opens or closes it would not be noticed.
             os.close(slave)
         os.set_blocking(self._master, False)
         try:
@@ -209,21 +202,21 @@ class Pty:
             self._master = None
 
     def unplug(self) -> None:
-        """Take the port away, as a cable that is pulled."""
+        """Remove the port, as a cable is pulled."""
         self.close()
 
     @property
     def path(self) -> str:
-        """What a driver opens: the link if there is one, else the terminal's own name."""
+        """Return what a driver opens: the link, or the terminal's own name without one."""
         return str(self._link or self._slave_name)
 
     @property
     def has_reader(self) -> bool:
-        """Whether a driver has the port open."""
+        """Return whether a driver has the port open."""
         return not self._events(0.0) & select.POLLHUP
 
     def wait_for_reader(self, timeout: float, stop: threading.Event | None = None) -> bool:
-        """Wait until a driver opens the port; False after ``timeout`` [s] or ``stop``."""
+        """Wait until a driver opens the port; return False after ``timeout`` [s] or ``stop``."""
         stop = stop or threading.Event()
         deadline = time.monotonic() + timeout
         while not self.has_reader:
@@ -235,11 +228,11 @@ class Pty:
         """Return what the driver sent; b"" if nothing."""
         try:
             return os.read(self._descriptor(), _CHUNK_BYTES)
-        except OSError:  # nothing there, or no driver
+        except OSError:  # no bytes, or no driver
             return b""
 
     def write(self, data: bytes, stop: threading.Event | None = None) -> int:
-        """Return bytes of ``data`` a driver can get: fewer without one, or when ``stop`` is set."""
+        """Send ``data``; return the bytes taken, fewer without a driver or after ``stop``."""
         remaining = memoryview(data)
         while remaining and not (stop and stop.is_set()):
             events = self._events(_LOOK_S)
@@ -280,5 +273,5 @@ class Pty:
     def _points_here(self, link: Path) -> bool:
         try:
             return link.is_symlink() and os.readlink(link) == self._slave_name
-        except OSError:  # a name that can be none
+        except OSError:  # a name that no file can have
             return False

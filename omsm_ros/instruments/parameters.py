@@ -19,7 +19,7 @@ NowNs: TypeAlias = Callable[[], int]
 
 _SIGNS = (1, -1)
 _AS_IT_IS = "as the device has it"
-_PERIOD = "of the trigger, or of a device that runs freely [s]"
+_PERIOD = "period of the trigger, or of a free-running device [s]"
 STREAMS = ("six_channel", "six_channel_text")
 TRIGGERS = ("free_run", "each", "once", "window")
 FORMATS = ("binary", "ascii")
@@ -27,13 +27,13 @@ LATCHES = ("start", "end", "mean")
 COMMAND_PORT = Parameter(
     "command_port",
     0,
-    "TCP port for commands (confocalDT, capaNCDT: 23); 0 = leave it as it is set",
+    "TCP port for commands (confocalDT, capaNCDT: 23); 0 = keep its settings",
     quantities.TCP_PORT,
 )
 
 
 def _axis_parameters(axis: str, unit: str) -> tuple[Parameter, ...]:
-    # A scale that nobody stated would still give plausible positions, so there is none.
+    # A default scale would give plausible but wrong positions, so there is none.
     return (
         Parameter(
             f"{axis}.counts_per_unit",
@@ -49,7 +49,7 @@ def _axis_parameters(axis: str, unit: str) -> tuple[Parameter, ...]:
 
 
 def probe_parameters(full_scale: float) -> tuple[Parameter, ...]:
-    """Return range, sign and zero of a sensor of displacement."""
+    """Return the parameters of range, sign and zero of a displacement sensor."""
     return (
         Parameter("probe.full_scale", full_scale, "measuring range [m]", quantities.FULL_SCALE),
         Parameter("probe.polarity", 1, "+1: falls as z rises; -1: reversed", choices=_SIGNS),
@@ -73,7 +73,7 @@ DEVICE = Parameter(
 RENEW = Parameter(
     "renew",
     10.0,
-    "a stream over TCP that is silent for so long is connected anew [s]; 0 = never",
+    "silence after which a stream over TCP is connected again [s]; 0 = never",
     quantities.SILENCE,
 )
 _STREAM_PARAMETERS = (
@@ -82,15 +82,15 @@ _STREAM_PARAMETERS = (
     Parameter(
         "baud_rate",
         DEFAULT_BAUD_RATE,
-        "of a serial port that does not name its own",
+        "baud rate of a serial port whose address names none",
         quantities.BAUD_RATE,
     ),
     *BLOCK_PARAMETERS,
     *(p for axis in AXES for p in _axis_parameters(axis, "rad" if axis in "bc" else "m")),
 )
-# As ``six_channel.protocol`` encodes a line.
+# The columns of ``six_channel.protocol``.
 _USUAL_COLUMNS = "sequence device_time distance status x y z b c"
-_COLUMNS = "of a line of text, in order; - = one to pass over"
+_COLUMNS = "columns of a line of text, in order; - = ignored"
 
 PARAMETERS = (
     DEVICE,
@@ -120,7 +120,7 @@ PARAMETERS = (
     Parameter("sensor_head", -1, f"-1 = {_AS_IT_IS}", quantities.SENSOR_HEAD, unset=-1),
 )
 
-# Axes alone: the same streams, whose distance, if they have one, is left out.
+# For the axes alone the same streams are read, without their distance.
 AXIS_PARAMETERS = (
     replace(DEVICE, choices=STREAMS),
     *_STREAM_PARAMETERS,
@@ -164,7 +164,7 @@ def axes_of(values: Values, wired: Sequence[str] = AXES) -> dict[str, AxisScalin
     for axis in wired:
         if values[f"{axis}.counts_per_unit"] == 0:
             raise ConfigurationError(
-                f"parameter '{axis}.counts_per_unit' is not stated, and axis {axis} is read: give "
+                f"parameter '{axis}.counts_per_unit' is not stated, but axis {axis} is read; state "
                 "the encoder's counts per metre or radian (config/ has a YAML to copy)"
             )
     given = {

@@ -1,4 +1,4 @@
-"""Keeps a device read, whatever happens on its line."""
+"""Reads a device continuously and connects again after each fault of its line."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from typing import Protocol
 from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError, defect
 from omsm_ros.instruments.blocks import BlockPair
 
+# Requests of other threads wait for a read to end, so it is short [s].
 _READ_S = 0.05
 # The pause before connecting again doubles from the first to the second [s].
 BACK_OFF_S = (0.25, 5.0)
 
 
 class Readable(Protocol):
-    """What a reader reads."""
+    """A device that a reader can read."""
 
     @property
     def trouble(self) -> str:
@@ -35,7 +36,7 @@ class Readable(Protocol):
 
 
 class State(Enum):
-    """Of a reader."""
+    """State of a reader."""
 
     CONNECTING = "connecting"  # or setting the device up
     READING = "reading"
@@ -46,8 +47,8 @@ class State(Enum):
 class DeviceReader:
     """Connects, reads, hands blocks over, and connects again after growing pauses.
 
-    trouble: what keeps it from reading, one line; empty while all is well. That a device sends
-    nothing readable stays until samples come: connecting anew does not disprove it.
+    trouble: what keeps it from reading, one line; empty while it reads. The trouble that a device
+        sends nothing readable stays until samples come, since a new connection does not remove it
     connections: how often the device was connected and set up
     """
 
@@ -60,7 +61,7 @@ class DeviceReader:
         back_off: tuple[float, float] = BACK_OFF_S,
         connected: Callable[[], None] = lambda: None,
     ) -> None:
-        """complain, note: called once for each new trouble, and when it is over
+        """complain, note: called once for each new trouble, and once when it is over
         connected: called when the device was set up, before its samples are delivered
         """
         self.state = State.CONNECTING
@@ -79,7 +80,7 @@ class DeviceReader:
     def ask(self, request: Callable[[], None], patience: float) -> None:
         """Let the reading thread do ``request`` to the device between two reads, and wait for it.
 
-        Raises what ``request`` raises; DeviceError where the device is not being read, or after
+        Raises what ``request`` raises; DeviceError if the device is not being read, or after
         ``patience`` [s].
         """
         if self.state is not State.READING:
@@ -99,7 +100,7 @@ class DeviceReader:
                 continue
             try:
                 request()
-            except Exception as err:  # told to who asked
+            except Exception as err:  # raised where the request was made
                 done.set_exception(err)
             else:
                 done.set_result(None)
@@ -116,7 +117,7 @@ class DeviceReader:
         self.state = State.ENDED
 
     def _read_once(self, stop: threading.Event) -> bool:
-        """Read until the device is lost; whether any sample came."""
+        """Read until the device is lost; return whether any sample came."""
         self.state, any_came = State.CONNECTING, False
         try:
             self._device.open()
@@ -130,7 +131,7 @@ class DeviceReader:
             self._unproven = isinstance(err, NoSamplesError)
             self.state = State.LOST
             self._tell(str(err))
-        except Exception as err:  # a defect of ours must not end the reading for good
+        except Exception as err:  # an internal error must not end the reading
             self.state = State.LOST
             self._tell(defect(err))
         self._disconnect()
@@ -142,7 +143,7 @@ class DeviceReader:
             self._deliver_blocks(self._device.close())
         except (DeviceError, ConfigurationError) as err:
             self._tell(str(err))
-        except Exception as err:  # a defect of ours must not end the reading for good
+        except Exception as err:  # an internal error must not end the reading
             self._tell(defect(err))
 
     def _connected(self) -> None:

@@ -1,7 +1,7 @@
-"""What every device that sends samples has in common: from bytes to blocks, all accounted for.
+"""The base of all devices that send samples: bytes become blocks, and each sample is counted.
 
-``decoded = delivered + pending + held + duplicates + spoilt + withheld``; what never came is
-``lost``, what came broken is counted by the decoder of the protocol.
+``decoded = delivered + pending + held + duplicates + spoilt + withheld``; samples that
+never came are ``lost``; bytes that hold none are counted by the decoder of the protocol.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from omsm_ros.instruments.counting import SAMPLE, Counting, Samples, SequenceTra
 from omsm_ros.instruments.transport import Transport
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# Bytes without a sample for so long are another device's, or come at another baud rate.
+# Bytes that hold no sample for this long come from another device or at another baud rate [s].
 UNREADABLE_S = 2.0
+# Between two looks at the time-out of an answer [s].
 _ANSWER_S = 0.05
 
 
@@ -29,14 +30,14 @@ class StreamStatistics:
 
     decoded: samples that came whole
     delivered, pending: in blocks handed over, and waiting for their block to fill
-    held: waiting for their successor;  spoilt: whose counter leapt there and back
+    held: waiting for their successor;  spoilt: with a counter that jumped ahead and back
     duplicates: received twice
     withheld: kept back because the device runs at another rate than it was set to
     lost, gaps: trigger counts that never arrived, and in how many places
-    restarts: the device's counter or clock fell back
-    period_deviation: of the last full block's device time from nominal, relative
+    restarts: how often the device's counter or clock fell back
+    period_deviation: of the last full block's device time from nominal, relative [1]
     period_warnings: full blocks beyond PERIOD_TOLERANCE
-    renewals: connections made anew, because nothing came
+    renewals: connections made again because nothing came
     """
 
     decoded: int = 0
@@ -58,11 +59,11 @@ class StreamStatistics:
 class StreamDevice:
     """Reads a stream of samples and hands over blocks.
 
-    A model fills in ``_prepare`` (set it up), ``_decode`` and ``_rest`` (bytes → samples) and
-    ``_listen_in`` (is it still there?). The trigger count lives on over ``close`` and
-    ``open``, so what a lost connection cost shows up as a gap.
+    A model implements ``_prepare`` (set up), ``_decode`` and ``_rest`` (bytes → samples) and
+    ``_listen_in`` (check a silent device). The trigger count continues over ``close`` and ``open``,
+    so the samples lost with a connection appear as a gap.
 
-    described_by: the parameter that tells what the stream holds, where the device cannot
+    described_by: the parameter that states what the stream holds, if the device cannot report it
     """
 
     described_by = ""
@@ -86,10 +87,10 @@ class StreamDevice:
         self._cutter = BlockCutter(settings, channels)
         self._decoded = 0
         self._heard = self._opened = monotonic()
-        self._came_ns, self._came_at = 0, self._heard  # when the last bytes did
+        self._came_ns, self._came_at = 0, self._heard  # of the last bytes
         self._down = False
         self._renewals = 0
-        self._went_on = self._heard  # when a counter last went on
+        self._went_on = self._heard  # when a counter last advanced
 
     def open(self) -> None:
         """Connect, or connect again, and set the device up; raises DeviceError."""
@@ -121,7 +122,7 @@ class StreamDevice:
         silent = now - max(self._heard, self._opened)
         self._listen_in(silent)
         if 0 < self._settings.renew < silent:
-            # One that still says nothing may be at rest; one that is gone refuses.
+            # A device that waits for its trigger accepts it; one that is gone refuses it.
             self.open()
             self._renewals += 1
         return blocks
@@ -134,29 +135,29 @@ class StreamDevice:
 
     @property
     def identity(self) -> dict[str, str]:
-        """Make, model, version and settings as the device reported them; empty before it did."""
+        """Return make, model, version and settings as the device reported them; empty before."""
         return {}
 
     @property
     def settings(self) -> dict[str, object]:
-        """What a calibration belongs to: how the device measures, as far as it reported; JSON."""
+        """Return the settings that a calibration depends on, as far as reported; JSON values."""
         return {}
 
     @property
     def trouble(self) -> str:
-        """Why the samples cannot be used although the device sends them; empty if they can."""
+        """Return why the samples that come cannot be used; empty if they can."""
         if self._cutter.wrong_rate:
             period = self._settings.sample_period
             found = 1 / (period * (1 + self._cutter.period_deviation))
             return (
-                f"{self._transport.name} measures at {found:.6g} Hz, set is {1 / period:.6g} Hz; "
-                "its samples are withheld: set sample_period to what the device does"
+                f"{self._transport.name} measures at {found:.6g} Hz, sample_period states "
+                f"{1 / period:.6g} Hz; its samples are withheld: set sample_period to the device's"
             )
         return ""
 
     @property
     def statistics(self) -> StreamStatistics:
-        """What became of every sample."""
+        """Return the counts of all samples."""
         tracker, cutter = self._tracker, self._cutter
         return StreamStatistics(
             decoded=self._decoded,
@@ -179,8 +180,6 @@ class StreamDevice:
         """Return all statistics by name, those of the protocol included."""
         return asdict(self.statistics)
 
-    # What a model fills in.
-
     def _prepare(self) -> None:
         """Set the device up; raises DeviceError."""
 
@@ -193,13 +192,11 @@ class StreamDevice:
         return np.empty(0, SAMPLE)
 
     def _ahead(self) -> float:
-        """By how many samples that which has arrived is ahead of what was decoded."""
+        """Return how many of the samples that arrived are not decoded yet; may be a fraction."""
         return 0.0
 
     def _listen_in(self, silent: float) -> None:
         """Raise DeviceError if the device is gone, after ``silent`` [s] without a byte."""
-
-    # Common.
 
     def _check_understood(self, silent: float, unread: int) -> None:
         """Raise NoSamplesError if bytes keep coming, but for ``silent`` [s] no sample in them.
@@ -214,7 +211,7 @@ class StreamDevice:
             )
 
     def _read_answer(self, said: bytes, unanswered: Callable[[bytes], DeviceError]) -> bytes:
-        """Return what comes; where another service hangs up, raise what tells what it ``said``."""
+        """Return what arrives; if another service closes the line, raise ``unanswered(said)``."""
         try:
             return self._transport.read(_ANSWER_S)
         except DeviceError as err:
@@ -223,12 +220,12 @@ class StreamDevice:
             raise
 
     def _check_counter(self, now: float, counter: int) -> None:
-        """Raise NoSamplesError if samples keep coming, but only such as came before."""
+        """Raise NoSamplesError if all samples that come are repetitions."""
         if now - self._went_on > UNREADABLE_S:
             raise NoSamplesError(
-                f"{self._transport.name} repeats its sample counter, {counter!r} last, so every "
-                "sample counts as a duplicate; check that the driver's settings name the counter "
-                "in its place, and that it counts"
+                f"{self._transport.name} repeats its sample counter ({counter!r}), so every sample "
+                "is a duplicate; check that the settings name the place of the counter, and that "
+                "it counts"
             )
 
     def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
@@ -243,7 +240,7 @@ class StreamDevice:
         return list(self._cutter.add(runs, came_ns, after_silence=after_silence))
 
     def _end(self, arrival_ns: int) -> list[BlockPair]:
-        """Return everything that waited, now that nothing follows."""
+        """Return all samples that waited for the next ones."""
         rest, blocks = self._rest(), []
         if len(rest):
             silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at

@@ -1,6 +1,6 @@
-"""A trace of the wire: written while a device is read, and replayed as a test.
+"""Writes a trace of the bytes to and from a device, which a test can play back.
 
-One event a line: seconds since the trace began, a sign (``<`` from the device, ``>`` to it,
+Each line is an event: seconds since the trace began, a sign (``<`` from the device, ``>`` to it,
 ``!`` open or close), and the bytes in hexadecimal.
 """
 
@@ -19,7 +19,7 @@ READ, WRITTEN, OPENED, CLOSED = "<", ">", "open", "close"
 
 
 class TracedTransport:
-    """Another transport, all of whose traffic is written down; begun anew by each process."""
+    """Writes down all traffic of another transport; each process begins a new file."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class TracedTransport:
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
-        """Raise ConfigurationError, with the remedy, where the trace cannot be written."""
+        """Raise ConfigurationError if the trace cannot be written."""
         try:
             yield
         except (OSError, ValueError) as err:  # a full disk, no such folder; NUL in the path

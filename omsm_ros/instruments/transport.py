@@ -1,7 +1,6 @@
-"""Bytes to and from a device: serial port or TCP, the only module that opens either.
+"""Opens serial ports and TCP connections, and moves bytes to and from a device.
 
-Constructors touch nothing. A lost connection raises ``DeviceError``; ``open`` again connects
-anew.
+Constructors open nothing. A lost connection raises ``DeviceError``; ``open`` connects again.
 """
 
 from __future__ import annotations
@@ -19,11 +18,9 @@ from serial.tools import list_ports
 
 from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError
 
-# Addresses of devices as URLs: ``daq://Dev1/ai0?range=10``.
-
 
 def parts_of(address: str) -> SplitResult:
-    """Return scheme, host, path and query; ConfigurationError for a text that is no address."""
+    """Return the parts of an address such as ``daq://Dev1/ai0?range=10``; ConfigurationError."""
     try:
         return urlsplit(address)
     except ValueError as err:
@@ -31,13 +28,13 @@ def parts_of(address: str) -> SplitResult:
 
 
 DEFAULT_BAUD_RATE = 921_600
-# What waited while this process stood still comes in pieces: decoded at once, two seconds of it
-# left half a megabyte of holes in the memory of the process.
+# A backlog is read in pieces: two seconds of it decoded at once left half a megabyte of unused
+# holes in the memory of the process.
 _CHUNK_BYTES = 16_384
 ADS_SCHEME = "ads://"
 _TCP_SCHEME = "tcp://"
-# First probe after so many seconds, the next ones, and how many go unanswered before it is lost;
-# and what was sent is not waited for longer [ms].
+# Keep-alive: the first probe after 5 s, then each 2 s; the connection is lost after 3 without
+# answer, or if sent data is not acknowledged within 10 s.
 _KEEP_ALIVE = {
     socket.TCP_KEEPIDLE: 5,
     socket.TCP_KEEPINTVL: 2,
@@ -48,11 +45,11 @@ _SERIAL_SCHEME = "serial://"
 
 
 class Transport(Protocol):
-    """A byte stream with a name to put into messages."""
+    """A byte stream with a name for messages."""
 
     @property
     def name(self) -> str:
-        """Return what the stream is called in messages: a port, or a host and its port."""
+        """Return the name in messages: a port, or a host and its port."""
         ...
 
     def open(self) -> None:
@@ -160,8 +157,8 @@ class TcpTransport:
                 "check address, network and power"
             ) from err
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        # A device that lost its power says no farewell; its silence alone could be that of a
-        # triggered device at rest.
+        # A device that loses its power does not close the connection, and the silence of a
+        # triggered device is normal; only keep-alive distinguishes the two.
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEP_ALIVE.items():
             connection.setsockopt(socket.IPPROTO_TCP, option, value)
@@ -206,7 +203,7 @@ class TcpTransport:
 
 
 class CommandPort:
-    """Asks a device that ends every answer with a prompt; connected only while it is asked."""
+    """Sends commands to a device that ends each answer with a prompt; connected while in use."""
 
     def __init__(
         self,
@@ -215,14 +212,14 @@ class CommandPort:
         patience: float,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """prompt: a regular expression for what ends an answer;  patience: for an answer [s]."""
+        """prompt: regular expression of the end of an answer;  patience: for an answer [s]."""
         self._transport = transport
         self._prompt = re.compile(prompt)
         self._patience = patience
         self._monotonic = monotonic
 
     def __enter__(self) -> CommandPort:
-        """Connect, and let the device finish its greeting, which may end with a prompt, too."""
+        """Connect, and read the device's greeting, which may also end with a prompt."""
         self._transport.open()
         deadline = self._monotonic() + _GREETING_S
         while self._transport.read(_QUIET_S) and self._monotonic() < deadline:
@@ -235,8 +232,8 @@ class CommandPort:
     def ask(self, text: str, end: str, sign: bytes = b"") -> str:
         """Return the answer to ``text``, its echo and prompt included; DeviceTimeoutError if none.
 
-        sign: a regular expression for what every answer to it holds; a prompt before it is a
-        late one, of something else. Without it in all the time, the last prompt counts.
+        sign: regular expression that each answer to this command contains; a prompt before it
+            belongs to an earlier answer. If it never comes, the last prompt ends the answer.
         """
         self._transport.write((text + end).encode())
         said, deadline = b"", self._monotonic() + self._patience
@@ -246,7 +243,7 @@ class CommandPort:
                 if self._complete(said, b""):
                     break
                 raise DeviceTimeoutError(
-                    f"{self._transport.name} did not answer {text!r} (it said {said[-32:]!r}); "
+                    f"{self._transport.name} did not answer {text!r} (received {said[-32:]!r}); "
                     "check that the controller's command port is open and no other client uses it"
                 )
         return said.decode("latin-1")

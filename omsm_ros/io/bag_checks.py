@@ -1,7 +1,7 @@
-"""Is a bag what it claims to be, and can it be read in bounded memory?
+"""Checks bags from any source, and reads them in bounded memory.
 
-A bag comes from anywhere: its index may promise what is not there, its definitions may order the
-fields otherwise than ours, and a few bytes of it may unpack to gigabytes.
+The index of a bag may be wrong, its definitions of messages may differ from ours, and a few bytes
+may unpack to gigabytes.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ _MAX_METADATA_BYTES = 4 * 1024**2
 _LONGEST_QOS = 100_000
 # Chunks that overlap in time are held until their messages are in order; recorders overlap by one.
 _MAX_HELD_BYTES = 1024**3
-# What ROS 2 brings along are 100 lines a topic on the average; a second takes 25 000.
+# Messages of ROS 2 have 100 lines on average; 25 000 lines take a second to parse.
 _MOST_DEFINITION_LINES, _LONGEST_DEFINITION = 50_000, 50_000
 _ADDRESS_ERRORS = frozenset("%?#")
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
-# No recording is packed a hundred times; one that is, and is large, was made to fill a disk.
+# No recording has a compression ratio of 100; a large file with more was made to fill memory.
 _MOST_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 16 * 1024**2
 
 
@@ -57,9 +57,9 @@ DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or re
 
 @contextmanager
 def bag_errors(path: Path, remedy: str) -> Iterator[None]:
-    """Raise BagError for whatever the libraries say of a bag's bytes.
+    """Raise BagError for any exception that the libraries raise on a bag's bytes.
 
-    They raise what their parts raise: struct.error, ZstdError, RuntimeError, AssertionError, …
+    These are many: struct.error, ZstdError, RuntimeError, AssertionError, …
     """
     try:
         yield
@@ -77,7 +77,7 @@ _TABLES = (".csv", ".tsv", ".txt", ".npy", ".npz", ".mat", ".h5", ".hdf5", ".tdm
 
 
 def check_kind(path: Path) -> None:
-    """Raise BagError for a file that becomes a bag of ours by ``omsm import`` alone."""
+    """Raise BagError for a file that needs ``omsm import``."""
     with open_regular(path, BagError, "bag") as stream:
         of_ros_1 = stream.read(len(_ROS_1_MAGIC)) == _ROS_1_MAGIC
     if of_ros_1 or path.suffix.lower() in _TABLES:
@@ -89,12 +89,12 @@ def check_kind(path: Path) -> None:
 
 
 def check_files(path: Path) -> None:
-    """Raise BagError unless ``path`` is a regular file or a folder of such."""
+    """Raise BagError unless ``path`` is a regular file or a folder of regular files."""
     for part in sorted(path.iterdir()) if path.is_dir() else [path]:
         if not part.is_dir():
             open_regular(part, BagError, "bag").close()
         if part.suffix == ".db3" and set(str(part)) & _ADDRESS_ERRORS:
-            # rosbags makes an address of the path, and would read what lies elsewhere.
+            # rosbags makes a URI of the path, and would read another file.
             raise BagError(f"bag {str(part)!r} has one of '%?#' in its path; rename it")
     _check_metadata(path / "metadata.yaml")
 
@@ -126,7 +126,7 @@ def _plain_qos(described: Any) -> list[Qos]:
 
 
 def check_index(path: Path, reader: Reader) -> None:
-    """Raise BagError for an index whose chunks are too large, or the same one many times."""
+    """Raise BagError for an index whose chunks are too large, or repeated."""
     storage = reader.storage
     for part in getattr(storage, "storages", [storage]):
         chunks = getattr(part, "chunks", [])
@@ -156,7 +156,7 @@ def _held_together(chunks: Sequence[Any]) -> int:
 
 
 def check_checksums(path: Path) -> None:
-    """Raise BagError if the index of an MCAP file does not fit its checksum, where it has one."""
+    """Raise BagError if the index of an MCAP file does not match its checksum, if any."""
     for part in path.glob("*.mcap") if path.is_dir() else [path]:
         if part.suffix == ".mcap":
             with open_regular(part, BagError, "bag") as stream:
@@ -176,7 +176,7 @@ def _check_checksum(path: Path, stream: IO[bytes]) -> None:
 
 
 def check_unpacked(path: Path, packed: int, unpacked: int) -> None:
-    """Raise BagError if bytes that were ``packed`` unpack to more than those of any recording."""
+    """Raise BagError if ``packed`` bytes unpack to more than those of any recording."""
     if unpacked > _MOST_PACKED * packed + _ALWAYS_UNPACKED_BYTES:
         raise BagError(
             f"bag {str(path)!r} unpacks to {_MOST_PACKED} times its {packed} bytes and more, which "
@@ -185,7 +185,7 @@ def check_unpacked(path: Path, packed: int, unpacked: int) -> None:
 
 
 def check_length_of_definitions(path: Path) -> None:
-    """Raise BagError for a ROS 2 bag whose definitions of messages take long to take apart."""
+    """Raise BagError for a ROS 2 bag whose definitions of messages take long to parse."""
     with Reader(path) as reader:
         lines = sum(c.msgdef.data.count("\n") for c in reader.connections)
     if lines > _MOST_DEFINITION_LINES:
@@ -196,9 +196,9 @@ def check_length_of_definitions(path: Path) -> None:
 
 
 def check_definition(path: Path, connection: Connection, ours: Typestore) -> None:
-    """Raise BagError if the bag's definition of a message is not the one that we read it by."""
+    """Raise BagError if the bag's definition of a message is not ours."""
     expected = ours.hash_rihs01(connection.msgtype)
-    if len(connection.msgdef.data) > _LONGEST_DEFINITION:  # too long to take apart; ours are short
+    if len(connection.msgdef.data) > _LONGEST_DEFINITION:  # too long to parse; ours are short
         connection = connection._replace(msgdef=_NO_DEFINITION, digest="too long to be one")
     found = {connection.digest, _hash_of(connection.msgdef, connection.msgtype)} - {"", expected}
     if found:
@@ -211,7 +211,7 @@ def check_definition(path: Path, connection: Connection, ours: Typestore) -> Non
 
 @lru_cache(maxsize=64)
 def _hash_of(definition: MessageDefinition, name: str) -> str:
-    """Return RIHS01 of a definition that a bag carries; empty if it carries none."""
+    """Return the hash RIHS01 of a definition in a bag; empty without one."""
     if definition.format is MessageDefinitionFormat.NONE:
         return ""
     store = get_typestore(Stores.EMPTY)
@@ -223,12 +223,12 @@ def _hash_of(definition: MessageDefinition, name: str) -> str:
 
 
 def unpacked_message(data: bytes) -> bytes:
-    """Return a message that was compressed by itself; ReaderError if it is too long."""
+    """Return an unpacked message; ReaderError if it is too long."""
     return _zstd(data, MAX_MESSAGE_BYTES, exactly=False)
 
 
 def unpacked_chunk(data: bytes, compression: str, size: int, checksum: int) -> bytes:
-    """Return the records of a chunk; ReaderError if they are not ``size`` bytes, or changed."""
+    """Return the records of a chunk; ReaderError if size or checksum do not match."""
     return storage_mcap.decompress(data, compression, size, checksum)
 
 
@@ -253,7 +253,7 @@ def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: 
 
 
 class _Unpacked:
-    """A file of a folder that was compressed as a whole, read to a bound."""
+    """Reads a compressed file of a folder, up to a bound."""
 
     def __init__(self, packed: IO[bytes], mode: str) -> None:
         self._path, self._size = Path(packed.name), fstat(packed.fileno()).st_size
@@ -266,7 +266,7 @@ class _Unpacked:
         self._stream.close()
 
     def read(self, size: int) -> bytes:
-        """Return the next bytes; BagError where there are too many."""
+        """Return the next bytes; BagError if there are too many."""
         part: bytes = self._stream.read(size)
         self._read += len(part)
         check_unpacked(self._path, self._size, self._read)
@@ -274,7 +274,7 @@ class _Unpacked:
 
 
 def _check_tables(base: Any) -> None:
-    """Raise BagError for a database in which a few bytes are computed into as many as one likes."""
+    """Raise BagError for a database with computed columns, which can be of any size."""
     base.limit(storage_sqlite3.apsw.SQLITE_LIMIT_LENGTH, MAX_CHUNK_BYTES)
     computed = "SELECT m.name FROM sqlite_master m, pragma_table_xinfo(m.name) c WHERE c.hidden > 0"
     for (name,) in base.execute(computed):
@@ -282,25 +282,23 @@ def _check_tables(base: Any) -> None:
 
 
 storage_sqlite3.apsw.connection_hooks.append(_check_tables)
-# rosbags unpacks whatever comes out, and looks at its size afterwards.
+# rosbags checks sizes only after unpacking.
 storage_mcap.DECOMPRESSORS |= {"zstd": _zstd, "lz4": _lz4}
 bag_folder.zstd = SimpleNamespace(open=_Unpacked, decompress=unpacked_message)
-# Nested aliases of a few bytes unfold to gigabytes as soon as a message shows them.
+# A few bytes of nested aliases become gigabytes when an error message shows them.
 for _module in (bag_folder, storage_mcap, storage_sqlite3):
     _module.parse_qos = _plain_qos
 
 
-# Messages of an indexed MCAP file, a chunk at a time.
-#
-# rosbags makes two streams and reads five times for a message; of a long recording that took longer
-# than anything else that is done with its bytes. What is in a chunk is walked through here by the
-# lengths of its records (mcap.dev/spec, "Chunk (op=0x06)", "Message (op=0x05)").
+# rosbags makes two streams and five reads for each message, which took longer than all other work
+# on a long recording. Here a chunk is read by the lengths of its records (mcap.dev/spec,
+# "Chunk (op=0x06)", "Message (op=0x05)").
 
 _MESSAGE = 0x05
 _RECORD = Struct("<BQ")  # kind, length of what follows
 _MESSAGE_HEAD = Struct("<HIQQ")  # channel, sequence, when it was recorded, when published
 _CHUNK_HEAD = Struct("<BQQQQI")  # record, first and last time, length unpacked, checksum
-# Between that and what is packed: length of the compression's name, the name, and its own length.
+# Between the head and the data: length of the compression's name, the name, length of the data.
 _LENGTHS_BYTES = 4 + 8
 
 # When it was recorded, place of its chunk, connection, message.
@@ -310,7 +308,7 @@ _HANDED_ON = itemgetter(2, _TIME, 3)
 
 
 class ChunkReader(McapReader):  # type: ignore[misc]
-    """An MCAP file; one without index is read as rosbags does."""
+    """Reads an MCAP file chunk by chunk; one without index as rosbags does."""
 
     def messages(
         self,
@@ -318,9 +316,9 @@ class ChunkReader(McapReader):  # type: ignore[misc]
         start: int | None = None,
         stop: int | None = None,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield ``(connection, when recorded [ns], message)`` by that time, then by their place.
+        """Yield ``(connection, time of recording [ns], message)`` by time, then by place.
 
-        start, stop: the first instant, and the first that is left out [ns]
+        start, stop: the first instant, and the end, which is excluded [ns]
         """
         if not self.chunks:
             yield from super().messages(connections, start, stop)
@@ -337,14 +335,14 @@ class ChunkReader(McapReader):  # type: ignore[misc]
             before = bisect_left(waiting, begin, key=itemgetter(_TIME))
             yield from map(_HANDED_ON, waiting[:before])
             waiting[:before] = self._within(chunk, wanted, first, last)
-            # Stable: those of one chunk and time stay in their order.
+            # A stable sort keeps the order of messages of one chunk and time.
             waiting.sort(key=itemgetter(_TIME, _PLACE))
         yield from map(_HANDED_ON, waiting)
 
     def _within(
         self, chunk: Any, wanted: Mapping[int, Connection], first: int, last: int
     ) -> Iterator[_Waiting]:
-        """Yield what a chunk holds on the ``wanted`` channels from ``first`` to before ``last``."""
+        """Yield the messages of the ``wanted`` channels from ``first`` to before ``last``."""
         records, place, at = self._records(chunk), chunk.chunk_start_offset, 0
         while at < len(records):
             kind, length = _RECORD.unpack_from(records, at)
@@ -375,6 +373,6 @@ class _FolderReader(DirectoryReader):  # type: ignore[misc]
 
 
 class MessageReader(Reader):  # type: ignore[misc]
-    """rosbags' reader of files and folders, with the other reader of MCAP files."""
+    """Reads files and folders as rosbags does, but MCAP files by ``ChunkReader``."""
 
     STORAGE_PLUGINS = Reader.STORAGE_PLUGINS | {".mcap": ChunkReader, "dir": _FolderReader}

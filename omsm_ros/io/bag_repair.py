@@ -1,7 +1,7 @@
-"""What can be saved of a recording that was cut short or damaged?
+"""Copies the valid messages of a damaged or incomplete recording into a new bag.
 
-Every whole chunk whose checksum fits, copied message by message into a new bag with an index,
-without the messages that no command could read.
+Each complete chunk with a valid checksum is copied message by message; messages that no command
+can read are left out. The new bag has an index.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from omsm_ros.io.message_mapping import typestore
 from omsm_ros.io.topics import TOPIC_TYPES
 
 _HEAD_BYTES = 9
-# Besides its samples a chunk record has two times, sizes, a checksum and a name.
+# A chunk record adds two times, sizes, a checksum and a name.
 _MOST_BYTES = MAX_CHUNK_BYTES + 1000
 _MOST_NAMED = 20
-# Of a message that rosbag2 compressed by itself; a serialised message begins with a zero.
+# The beginning of a message that rosbag2 compressed; a serialised message begins with a zero.
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-# What rosbag2 keeps of a channel's type beside its definition.
+# The name under which rosbag2 stores the hash of a channel's type.
 _TYPE_HASH = "topic_type_hash"
 
 
 @dataclass
 class Repair:
-    """What was saved, and what was not.
+    """The result of a repair.
 
-    path: the new bag;  messages: saved, by topic;  lost: what could not be saved, and why, the
-    first twenty;  unnamed: how many others
+    path: of the new bag;  messages: copied, by topic;  lost: the first twenty losses and their
+    reasons;  unnamed: the number of further losses
     """
 
     path: Path
@@ -54,15 +54,15 @@ class Repair:
 
 
 def repair(path: Path) -> Repair:
-    """Copy what is whole of an MCAP bag, a file or a folder, to ``<its name>.repaired.mcap``.
+    """Copy the valid messages of an MCAP bag, a file or folder, to ``<its name>.repaired.mcap``.
 
-    Raises BagError if that exists, or ``path`` is no MCAP bag or has no whole message, and then
+    Raises BagError if that exists, or if ``path`` is no MCAP bag or has no valid message, and then
     leaves no file; ``path`` itself is only read.
     """
     parts = sorted(path.glob("*.mcap"), key=_number) if path.is_dir() else [path]
     if not parts:
         raise BagError(
-            f"{str(path)!r} holds no .mcap file; only MCAP is repaired here, "
+            f"{str(path)!r} holds no .mcap file; only MCAP is repaired, "
             "for sqlite3 use 'ros2 bag reindex'"
         )
     made = Repair(_sibling(path))
@@ -100,18 +100,18 @@ def _sibling(path: Path) -> Path:
 
 
 def _number(part: Path) -> tuple[int, str]:
-    """Return its place among the files of a rosbag2 folder, which end in _0, _1, … _10."""
+    """Return the number of a file of a rosbag2 folder, which ends in _0, _1, … _10."""
     number = part.stem.rpartition("_")[2]
     return (int(number) if number.isdecimal() else 0, part.name)
 
 
 def _check_magic(stream: IO[bytes], path: Path) -> None:
     if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-        raise BagError(f"{str(path)!r} is no MCAP file: it begins otherwise; check the path")
+        raise BagError(f"{str(path)!r} is no MCAP file: it has another beginning; check the path")
 
 
 class _Copy:
-    """Of one file into a bag; its channels and definitions get the numbers of that bag."""
+    """Copies one file into a bag; channels and definitions get the numbers of that bag."""
 
     def __init__(self, path: Path, writer: Writer, made: Repair) -> None:
         self._path, self._writer, self._made = path, writer, made
@@ -126,7 +126,7 @@ class _Copy:
                 try:
                     for record in self._within(kind, body):
                         self._add(record)
-                except Exception as err:  # the libraries raise what their parts raise
+                except Exception as err:  # the libraries raise many kinds
                     self._record_lost(f"{len(body)} bytes at {place}: {exception_text(err)}")
                 written()
 
@@ -177,23 +177,23 @@ class _Copy:
         elif isinstance(record, Channel) and record.id not in self._channels:
             schema, kind = self._schemas[record.schema_id]
             if record.metadata.get(_TYPE_HASH) not in (None, _hash_of(kind)):
-                kind = ""  # of another definition: nobody here can tell what is whole
+                kind = ""  # of another definition, so messages cannot be checked
             number = self._writer.register_channel(
                 record.topic, record.message_encoding, schema, record.metadata
             )
             self._channels[record.id] = number, record.topic, kind
         elif isinstance(record, Message):
             if record.channel_id not in self._channels:
-                raise ValueError(f"channel {record.channel_id} was declared in a part that is lost")
+                raise ValueError(f"channel {record.channel_id} was declared in a lost part")
             self._add_message(record, *self._channels[record.channel_id])
 
     def _add_message(self, record: Message, number: int, topic: str, kind: str) -> None:
         try:
             data = record.data
-            if data.startswith(_ZSTD_MAGIC):  # only metadata.yaml would say so, which is not copied
+            if data.startswith(_ZSTD_MAGIC):  # stated only in metadata.yaml, which is not copied
                 data = unpacked_message(data)
             check_message(topic, kind, data)
-        except Exception as err:  # the libraries raise what their parts raise
+        except Exception as err:  # the libraries raise many kinds
             self._record_lost(
                 f"a message of {topic!r} at {record.log_time} ns: {exception_text(err)}"
             )
@@ -211,12 +211,12 @@ class _Copy:
 
 
 def _hash_of(kind: str) -> str | None:
-    """Return the hash of a type as we know it; None if we do not."""
+    """Return the hash of one of our types; None for others."""
     return typestore().hash_rihs01(kind) if kind in TOPIC_TYPES.values() else None
 
 
 def _check_records(data: bytes) -> None:
-    """Raise ValueError for a chunk in which a record is of no kind: a run of zeros, most often."""
+    """Raise ValueError for a chunk with a record of kind 0: usually a run of zeros."""
     place = 0
     while place <= len(data) - _HEAD_BYTES:
         kind, length = unpack_from("<BQ", data, place)

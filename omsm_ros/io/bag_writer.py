@@ -1,4 +1,10 @@
-"""Writes bags: one bare ``.mcap`` file, which ``ros2 bag`` and Foxglove open as it is."""
+"""Writes bags: one ``.mcap`` file, which ``ros2 bag`` and Foxglove open.
+
+MCAP readers begin with the end of a file (mcap.dev/spec, "Footer (op=0x02)"). So an end without
+index is written behind each piece, and overwritten by the next piece: whenever the writer is
+stopped, the file is valid and readers scan it. Since the place of the end is taken first, a full
+disk leaves a valid file too.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +35,6 @@ from omsm_ros.io.topics import (
     TOPIC_TYPES,
 )
 
-# A recording that can be read at every moment at which it is not just being written to.
-#
-# MCAP readers look for the end of a file first (mcap.dev/spec, "Footer (op=0x02)"). So the end is
-# written behind every piece and overwritten by the next one. Whatever ends the writer between two
-# pieces leaves a whole file without an index, which readers scan; a full disk or a limit of size
-# leaves it too, for the place of the end was taken before.
-
 
 def _end_without_index() -> bytes:
     builder = RecordBuilder()
@@ -48,9 +47,9 @@ END = _end_without_index()
 
 
 class GrowingFile:
-    """What an ``mcap.writer.Writer`` writes to; nothing is on the disk before :meth:`flush`.
+    """The file of an ``mcap.writer.Writer``; nothing is on the disk before :meth:`flush`.
 
-    OSError if the file exists (as a link, too), or cannot be made.
+    Raises OSError if the file, or a link of its name, exists or cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -61,7 +60,7 @@ class GrowingFile:
 
     @property
     def waiting(self) -> int:
-        """Bytes that are not on the disk yet."""
+        """Return the number of bytes that are not on the disk yet."""
         return len(self._waiting)
 
     def write(self, data: bytes) -> None:
@@ -69,15 +68,15 @@ class GrowingFile:
         self._waiting += data
 
     def tell(self) -> int:
-        """Return the bytes taken so far."""
+        """Return the number of bytes taken so far."""
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """Write what waits, and an end; OSError if there is no room, and then none of it."""
+        """Write the waiting bytes and an end, or none of them: OSError without space."""
         self._append(END)
 
     def complete(self) -> None:
-        """Write what waits, which has an end of its own; OSError as :meth:`flush`."""
+        """Write the waiting bytes, which have their own end; OSError as :meth:`flush`."""
         self._append(b"")
 
     def _append(self, end: bytes) -> None:
@@ -100,18 +99,18 @@ class GrowingFile:
             rest, place = rest[count:], place + count
 
     def close(self) -> None:
-        """Close the file once it is on the medium itself."""
+        """Close the file after it is on the medium."""
         try:
             os.fsync(self._descriptor)
         finally:
             os.close(self._descriptor)
 
 
-# What a hard end costs is a chunk at most; smaller ones are slower to read.
+# A crash loses at most one chunk; smaller chunks are slower to read.
 CHUNK_BYTES = 1024 * 1024
 _INDEX_PIECE_BYTES = 32 * 1024
 
-# In the form and words of rosbag2 9; the times are its infinity.
+# The form of rosbag2 9; the times mean infinity.
 _FOREVER = "{{sec: 9223372036, nsec: 854775807}}"
 _OFFERED_QOS = f"""\
 - history: keep_last
@@ -127,12 +126,12 @@ _OFFERED_QOS = f"""\
 
 
 class BagWriter:
-    """Writes one ``.mcap`` file in place: what was flushed can be read, whatever happens then.
+    """Writes one ``.mcap`` file; all messages that were flushed stay readable.
 
-    Use it as a context manager; however it is left, the bag is readable.
+    It is a context manager; after any exit the bag is readable.
 
-    path: a file that does not exist yet; BagError if it does, or cannot be made
-    topics: of the contract;  names: what the bag calls them, where not by the contract's name
+    path: a file that does not exist yet; BagError if it does, or cannot be created
+    topics: of the contract;  names: in the bag, if they differ from the contract
     """
 
     def __init__(
@@ -177,10 +176,10 @@ class BagWriter:
     def write_raw(
         self, topic: str, stamp_ns: int, cdr: bytes | memoryview, published_ns: int | None = None
     ) -> None:
-        """Append one message as it came over the wire, received at ``stamp_ns``.
+        """Append one serialised message that was received at ``stamp_ns``.
 
-        BagError if there is no room for it, or for a stamp before 1970, which a bag cannot hold;
-        what was written before stays readable.
+        Raises BagError without space on the disk, or for a stamp before 1970, which a bag cannot
+        hold; messages written before stay readable.
         """
         if self._failed:
             return
@@ -196,7 +195,7 @@ class BagWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Put all messages so far on the disk, readable; BagError if there is no room for them."""
+        """Write all messages so far to the disk; BagError without space."""
         if self._failed:
             return
         with self._room():
@@ -211,12 +210,12 @@ class BagWriter:
             self._failed = True
             raise BagError(
                 f"recording ended, {str(self.path)!r} takes no more: {exception_text(err)}; it is "
-                f"readable and holds the first {self._kept} messages, the last {self._taken - self._kept} "
-                "are lost; make room and record anew"
+                f"readable and holds the first {self._kept} messages, the last "
+                f"{self._taken - self._kept} are lost; make room and record anew"
             ) from err
 
     def write(self, topic: str, stamp_ns: int, message: object) -> None:
-        """Append one message made of :func:`bag_messages`."""
+        """Append one message of a class of :func:`bag_messages`."""
         self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, TOPIC_TYPES[topic]))
 
     def write_axes(self, block: AxisBlock) -> None:
@@ -252,9 +251,9 @@ class BagWriter:
 
 @contextmanager
 def atomic_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
-    """Yield the writer of a bag that appears when all went well, and not at all otherwise.
+    """Yield the writer of a bag that appears only if no exception is raised.
 
-    BagError if there is such a file, or no room for it.
+    Raises BagError if the file exists, or without space on the disk.
     """
     if os.path.lexists(path):
         raise _exists(path)
@@ -273,7 +272,7 @@ def atomic_bag(path: Path, topics: Sequence[str]) -> Iterator[BagWriter]:
 
 
 def new_bag_file(path: Path) -> GrowingFile:
-    """Make a file for a bag; BagError if there is one, or none can be made."""
+    """Create the file of a bag; BagError if it exists or cannot be created."""
     try:
         make_folder(path.parent)
         return GrowingFile(path)
@@ -284,7 +283,7 @@ def new_bag_file(path: Path) -> GrowingFile:
 
 
 def next_free(path: Path) -> Path:
-    """Return ``path``, or the first of path.2, path.3, … before its suffix that is not there."""
+    """Return the first of ``path``, path.2, path.3, … (before the suffix) that does not exist."""
     tried, number = path, 1
     while os.path.lexists(tried):
         number += 1
@@ -306,26 +305,23 @@ def _not_writable(path: Path, err: Exception) -> BagError:
 
 
 def new_writer(file: GrowingFile) -> Writer:
-    """Begin an MCAP file of ROS 2, with checksums; samples of a probe do not compress."""
+    """Begin an MCAP file of ROS 2, with checksums and uncompressed: samples are noise."""
     writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)  # type: ignore[arg-type]
-    # It keeps an object of a kilobyte for each chunk: of two a second, 200 MB a day.
+    # Its list keeps a kilobyte for each chunk: at two chunks a second, 200 MB a day.
     writer._Writer__chunk_indices = _PackedIndex()  # type: ignore[attr-defined]
     writer.start(Profile.ROS2, "omsm_ros")
     return writer
 
 
 class _PackedIndex:
-    """The index of the chunks as the bytes that it will be, in place of a list of its records.
-
-    Compressed: a quarter of a megabyte an hour.
-    """
+    """The index of the chunks as compressed bytes: a quarter of a megabyte an hour."""
 
     def __init__(self) -> None:
         self._builder, self._recent = RecordBuilder(), bytearray()
         self._packed: list[bytes] = []
 
     def append(self, index: ChunkIndex) -> None:
-        """Take the record of one more chunk."""
+        """Add the record of a chunk."""
         index.write(self._builder)
         self._recent += self._builder.end()
         if len(self._recent) >= _INDEX_PIECE_BYTES:
@@ -343,6 +339,6 @@ class _PackedIndex:
 
 
 def finish(writer: Writer, file: GrowingFile) -> None:
-    """Write the index; OSError if there is no room for it, and the bag is readable without."""
+    """Write the index; OSError without space, and then the bag is readable without index."""
     writer.finish()
     file.complete()

@@ -1,6 +1,9 @@
-"""Bags: recordings of the contract's topics, read without ROS.
+"""Reads bags of the contract's topics without ROS: rosbag2 folders and ``.mcap`` files.
 
-Reads rosbag2 folders (sqlite3 and MCAP) and bare ``.mcap`` files.
+Drivers send a hundred samples in a message, and decoding one message takes longer than correcting
+its samples. Messages of one size have the same layout (plain CDR, little endian, OMG DDSI-RTPS
+2.3, 10), and many of them are read as one table: a row for each message, a column for each field.
+Consecutive rows make one block.
 """
 
 from __future__ import annotations
@@ -53,13 +56,6 @@ from omsm_ros.io.topics import (
 from omsm_ros.quantities import shown
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# How are many short messages read as a few long blocks?
-#
-# Drivers send a hundred samples at a time, and taking such a message apart costs more than
-# correcting its samples. Messages of one size are laid out alike (plain CDR, little endian, OMG
-# DDSI-RTPS 2.3, 10), so that many of them are one table: a row a message, a column a field.
-# Rows that continue each other make one block.
-
 CHANNELS: dict[type, tuple[tuple[str, type], ...]] = {
     AxisBlock: tuple((name, np.float64) for name in "xyzbc"),
     DistanceBlock: (("distance", np.float64), ("intensity", np.float32), ("status", np.uint8)),
@@ -67,12 +63,12 @@ CHANNELS: dict[type, tuple[tuple[str, type], ...]] = {
 """The sequences of each message that makes a block, in their order on the wire."""
 
 _LITTLE_ENDIAN = b"\x00\x01"
-_ENCAPSULATION_BYTES = 4  # before the first field; alignment counts from their end
+_ENCAPSULATION_BYTES = 4  # before the first field; alignment is relative to their end
 _MOST_PADDING = 3  # a writer may fill the last word
 
 
 class _Layout:
-    """Walks through one message and notes name, type and place of its fields."""
+    """Notes name, type and place of the fields of one message."""
 
     def __init__(self, message: bytes) -> None:
         self._message = message
@@ -106,8 +102,8 @@ class _Layout:
 def long_blocks(kind: type, messages: Sequence[bytes]) -> Iterator[Any] | None:
     """Yield blocks of ``kind`` with all samples of serialised ``messages`` of one size.
 
-    None if the messages are not laid out alike; then each is to be taken apart by itself.
-    Raises DataError as the block's class does.
+    None if the messages have different layouts, so that each must be decoded by itself. Raises
+    DataError as the block's class does.
     """
     layout = _Layout(messages[0])
     try:
@@ -122,14 +118,14 @@ def long_blocks(kind: type, messages: Sequence[bytes]) -> Iterator[Any] | None:
     except struct_error:
         return None
     alike = all((table[name] == table[name][0]).all() for name in layout.lengths)
-    # What stands before the intensity, which may be empty as the status may, is always there.
+    # Intensity and status may be empty; the sequences before them may not.
     needed = [name for name, channel in CHANNELS[kind] if channel is np.float64]
     alike &= messages[0][:2] == _LITTLE_ENDIAN and all(name in layout.fields for name in needed)
     return _runs(kind, table) if alike else None
 
 
 def _runs(kind: type, table: NDArray[np.void]) -> Iterator[Any]:
-    """Yield a block for each run of rows that continue each other in count, period and time."""
+    """Yield a block for each run of rows with consecutive counts and times and one period."""
     first, period = table["first_sample"], table["sample_period"]
     stamp = table["sec"].astype(np.int64) * NANOSECONDS_PER_S + table["nanosec"]
     present = [(name, c) for name, c in CHANNELS[kind] if name in (table.dtype.names or ())]
@@ -161,7 +157,7 @@ _TO_RECORD: dict[str, Callable[[Any], Any]] = {
     TEMPERATURE_TOPIC: message_mapping.temperature,
 }
 
-# Messages of other types are also those of other programs, who put into them what they like.
+# Other programs also use messages of other types, with any content.
 _OURS = "omsm_msgs/"
 
 _BLOCKS: dict[str, type] = {
@@ -173,13 +169,12 @@ _BLOCKS: dict[str, type] = {
 BLOCK_TOPICS = frozenset(_BLOCKS)
 """Topics that :meth:`BagReader.blocks` joins."""
 
-# Of messages that are joined: a block costs some 300 µs besides its samples, a fifth of the whole
-# at 1 MB; beyond 8 MB only memory grows (processor time of 5 million points: 3.3 s at 1 MB, 2.7 s
-# at 8 MB, 2.7 s at 16 MB).
+# Messages joined at once: a block costs some 300 µs besides its samples. Processor time of
+# 5 million points: 3.3 s at 1 MB, 2.7 s at 8 MB, 2.7 s at 16 MB.
 _JOINED_BYTES = 8_000_000
-# Made once: for each of a million messages it would take longer than the test itself.
+# Built once, since building it takes longer than the test, for each of a million messages.
 _BYTES = bytes | memoryview
-# The year 2000, before any ROS: earlier stamps count from the start of a computer or of the twin.
+# The year 2000: earlier stamps count from the start of a computer or of the twin.
 _CLOCK_SET_NS = 946_684_800 * 10**9
 
 Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
@@ -187,9 +182,9 @@ Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | An
 
 @dataclass(frozen=True, slots=True)
 class TopicSummary:
-    """What a bag holds on one topic.
+    """The messages of one topic in a bag.
 
-    topic: its name there;  role: the topic of the contract that it is, empty if none
+    topic: its name there;  role: the name in the contract, empty if it is another topic
     """
 
     topic: str
@@ -199,7 +194,7 @@ class TopicSummary:
 
 
 def check_message(topic: str, kind: str, raw: bytes) -> None:
-    """Raise an exception for a message of a cell that no reader would take."""
+    """Raise an exception for a message of a cell that no reader accepts."""
     for role, expected in TOPIC_TYPES.items():
         ours = kind.startswith(_OURS) or relative(topic) == relative(role)
         if kind == expected and ours:
@@ -208,9 +203,9 @@ def check_message(topic: str, kind: str, raw: bytes) -> None:
 
 
 class BagReader:
-    """A bag opened for reading; use it as a context manager.
+    """Opens a bag for reading; a context manager.
 
-    Topics are asked for by their names of the contract, whatever the bag calls them.
+    Topics are named as in the contract, whatever their names in the bag.
     Raises BagError if the path is missing, no bag, or cut short.
     """
 
@@ -237,7 +232,7 @@ class BagReader:
             self._stack = opening.pop_all()
         self._compressed = self._reader.compression_mode == "message"
         if self._compressed:
-            # Unpacked here, to a bound; rosbags would unpack whatever comes.
+            # Unpacked here up to a bound, which rosbags does not have.
             metadata = self._reader.storage.metadata
             self._reader.storage.metadata = metadata._replace(compression_mode=None)
         return self
@@ -251,7 +246,7 @@ class BagReader:
         self._stack.close()
 
     def topics(self) -> list[TopicSummary]:
-        """Return what is in the bag, by topic name; the channels of a topic count as one."""
+        """Return the topics of the bag by name; the channels of a topic are joined."""
         counts: Counter[tuple[str, str]] = Counter()
         for connection in self._reader.connections:
             counts[connection.topic, connection.msgtype] += connection.msgcount
@@ -262,24 +257,24 @@ class BagReader:
         ]
 
     def name_of(self, topic: str) -> str:
-        """Return what ``topic`` of the contract is called in this bag, or would be."""
+        """Return the name in this bag of ``topic`` of the contract."""
         return self._names[topic]
 
     @property
     def indexed(self) -> bool:
-        """Whether the recording was completed; an MCAP file that was not has no index."""
+        """Return whether the recording was completed; if not, an MCAP file has no index."""
         parts = getattr(self._reader.storage, "storages", [self._reader.storage])
         scanned = [p for p in parts if hasattr(p, "chunks") and not p.chunks]
         return not any(part.metadata.message_count for part in scanned)
 
     @property
     def start_ns(self) -> int:
-        """When the first message was recorded [ns, ROS time]."""
+        """Return the time of the first message [ns, ROS time]."""
         return int(self._reader.start_time)
 
     @property
     def recorded_ns(self) -> int | None:
-        """When the recording began [ns, ROS time], None where its clock was never set."""
+        """Return the begin of the recording [ns, ROS time], None if its clock was never set."""
         return self.start_ns if self.start_ns >= _CLOCK_SET_NS else None
 
     def count(self, topics: Sequence[str]) -> int:
@@ -289,9 +284,9 @@ class BagReader:
     def messages(
         self, topics: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
-        """Yield ``(topic, when it was recorded, serialised message)`` in that order [ns].
+        """Yield ``(topic, time of recording, serialised message)`` in the order of time [ns].
 
-        start_ns, stop_ns: the first instant, and the first that is left out
+        start_ns, stop_ns: the first instant, and the end, which is excluded
         """
         connections = [c for topic in topics for c in self._connections(topic)]
         roles = self._roles(topics)
@@ -310,7 +305,7 @@ class BagReader:
             yield topic, self._record(topic, raw)
 
     def probe_settings(self) -> list[dict[str, object]]:
-        """Return each state that the probe's driver reported; none where nobody recorded it."""
+        """Return each state of the settings that the probe's driver reported."""
         if not self.count([PROBE_TOPIC]):
             return []
         found: list[dict[str, object]] = []
@@ -320,13 +315,13 @@ class BagReader:
         return found
 
     def vibration(self) -> list[dict[str, Any]]:
-        """Return each state of the levels that the vibration monitor reported, in their order."""
+        """Return the levels that the vibration monitor reported, in their order."""
         if not self.count([VIBRATION_TOPIC]):
             return []
         return [stated_messages for _, stated_messages in self.records(VIBRATION_TOPIC)]
 
     def temperatures(self) -> FloatArray:
-        """Return the readings of the temperature (n,) [°C], in their order; NaN: cannot be."""
+        """Return the readings of the temperature (n,) [°C], in their order; NaN = invalid."""
         if not self.count([TEMPERATURE_TOPIC]):
             return np.empty(0)
         return np.array([value for _, value in self.records(TEMPERATURE_TOPIC)])
@@ -383,15 +378,15 @@ class BagReader:
         start_ns: int | None = None,
         stop_ns: int | None = None,
     ) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield the serialised messages; all of them must be as many as the bag promises."""
+        """Yield the serialised messages; their number must be that of the index."""
         promised = sum(connection.msgcount for connection in connections)
         with bag_errors(self.path, DAMAGED):
             if connections:
                 for connection, stamp, raw in self._reader.messages(connections, start_ns, stop_ns):
                     promised -= 1
-                    if not isinstance(raw, _BYTES):  # SQLite keeps any in any column
+                    if not isinstance(raw, _BYTES):  # SQLite keeps any type in any column
                         raise BagError(
-                            f"bag {str(self.path)!r}: a message is {shown(raw)}, no bytes: "
+                            f"bag {str(self.path)!r}: a message is {shown(raw)}, not bytes: "
                             f"{DAMAGED}"
                         )
                     yield connection, stamp, unpacked_message(raw) if self._compressed else raw

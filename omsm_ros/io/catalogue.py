@@ -1,7 +1,7 @@
-"""The catalogue: which calibrations and measurements there were, in a database.
+"""Keeps calibrations and measurements in a database, the catalogue.
 
-An SQLite file, or PostgreSQL where several cells share one. A row is added once, whatever how
-often it is given. SQLAlchemy is an optional package, loaded where a catalogue is asked for.
+It is an SQLite file, or PostgreSQL if several cells share it. A row is added only once. SQLAlchemy
+is an optional package.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.units import NANOSECONDS_PER_S
 
 WAIT_S = 3
-"""Longest time that a database may keep a measurement waiting [s]."""
+"""Longest time to wait for a database [s]."""
 
 MOST_ROWS = 10_000
 """Rows of a table that are read at once: years of one machine, a second's work."""
@@ -30,11 +30,12 @@ _KINDS = ("sqlite", "postgresql", "postgresql+psycopg")
 
 
 class Catalogue:
-    """A database of calibrations and measurements; use it as a context manager.
+    """A database of calibrations and measurements; a context manager.
 
-    address: of a database as SQLAlchemy has it (``postgresql://user@host/base``), or the path of
-    an SQLite file, which is made if it is not there. Opening raises FileError where the database
-    does not answer within three seconds, ConfigurationError where SQLAlchemy is missing.
+    address: of a database for SQLAlchemy (``postgresql://user@host/base``), or the path of an
+        SQLite file, which is created if needed
+    Raises FileError if the database does not answer within three seconds, ConfigurationError
+    without SQLAlchemy.
     """
 
     def __init__(self, address: str) -> None:
@@ -61,11 +62,11 @@ class Catalogue:
         if not sqlite:
             waiting["options"] = (
                 f"-c statement_timeout={1000 * WAIT_S} -c lock_timeout={1000 * WAIT_S} "  # type: ignore[assignment]
-                "-c client_encoding=UTF8"  # of a base that has none, all would be bytes
+                "-c client_encoding=UTF8"  # without it a base returns bytes
             )
         self._tables = _tables(sqlalchemy)
         with self._translated(), warnings.catch_warnings():
-            # A part of the address that is not understood is refused, not passed over.
+            # An unknown part of the address is an error.
             warnings.simplefilter("error", sqlalchemy.exc.SAWarning)
             # No pool: a command adds one row and ends.
             self._engine = sqlalchemy.create_engine(
@@ -83,7 +84,7 @@ class Catalogue:
         except self._sql.exc.DBAPIError as err:
             if "already exists" not in str(err):
                 raise
-            # Two who both find none make them at once; the slower one looks again.
+            # Another process created them at the same time, so look again.
             known.create_all(self._engine, checkfirst=True)
 
     def __exit__(self, *_: object) -> None:
@@ -106,7 +107,7 @@ class Catalogue:
     def rows(self, table: str, machine: str = "") -> list[dict[str, Any]]:
         """Return the newest ``MOST_ROWS`` of a table, the oldest first; of one machine, or all.
 
-        What was recorded at no known time stands where it was added.
+        Rows without a time of recording are ordered by the time of their addition.
         """
         source = self._tables[table]
         when = self._sql.func.coalesce(source.c.recorded_at, source.c.added_at)
@@ -137,7 +138,7 @@ class Catalogue:
             raise ConfigurationError(
                 f"catalogue: {exception_text(err)}; pip install psycopg[binary]"
             ) from err
-        except Exception as err:  # whatever a library says of a damaged file, or of an address
+        except Exception as err:  # the library raises many kinds
             raise FileError(
                 f"catalogue {self._shown_address()!r}: {self._reason(err)}; "
                 "check that it is there and may be written"
@@ -145,7 +146,7 @@ class Catalogue:
 
     @staticmethod
     def _reason(err: Exception) -> str:
-        """Return what the database said, without the statement and the link to a manual."""
+        """Return the text of the database, without the statement and the link to a manual."""
         text = str(err).partition("[SQL")[0].partition("(Background")[0]
         return " ".join(text.split())[:200]
 
@@ -154,7 +155,7 @@ class Catalogue:
         try:
             url = self._sql.engine.make_url(self.address)
         except (ValueError, self._sql.exc.ArgumentError):
-            return self.address.rpartition("@")[2]  # no address, and what may be a password
+            return self.address.rpartition("@")[2]  # invalid, and may contain a password
         return str(url.render_as_string(hide_password=True))
 
 
@@ -185,7 +186,7 @@ def _bounded(connection: Any, _: object) -> None:
 
 
 def time_of(stamp_ns: int | None) -> datetime | None:
-    """Return ROS time [ns] as UTC, or None for a time that nobody knows."""
+    """Return ROS time [ns] as UTC, or None for an unknown time."""
     if stamp_ns is None:
         return None
     return datetime.fromtimestamp(stamp_ns / NANOSECONDS_PER_S, tz=timezone.utc).replace(

@@ -1,4 +1,4 @@
-"""``GEOMETRY.yaml``, ``LIMITS.yaml``, ``PITCH.csv``: the probe's place, the machine's limits."""
+"""Reads descriptions of machine and part: geometry, limits, pitch, motion, sources, surface."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _T = TypeVar("_T")
 
 
 def load_geometry(path: Path | str) -> Geometry:
-    """Read ``GEOMETRY.yaml``: where the probe sits and looks, in metres and slopes."""
+    """Read ``GEOMETRY.yaml``: position and direction of the probe, in metres and slopes."""
     values = _read_mapping(path, "geometry")
     return _made(Geometry, values, f"geometry {str(path)!r}")
 
 
 def load_limits(path: Path | str) -> MachineLimits:
-    """Read ``LIMITS.yaml``: what servo, probe, spindle and axes can do, units in the names."""
+    """Read ``LIMITS.yaml``: limits of servo, probe, spindle and axes, units in the names."""
     values = _read_mapping(path, "limits")
     return _made(MachineLimits, values, f"limits {str(path)!r}")
 
@@ -76,13 +76,10 @@ def _read_mapping(path: Path | str, what: str) -> dict[str, Any]:
     return json_and_yaml.mapping_of(text, FileError, f"{what} {str(path)!r}")
 
 
-# A planned motion as CSV.
-
-
 def load_motion(path: Path | str) -> tuple[FloatArray, float]:
     """Read a planned motion, columns ``time_s`` and ``z_m`` of a CSV: z [m] and its period [s].
 
-    Raises FileError for a table without these columns, or times that are not even.
+    Raises FileError for a table without these columns, or uneven times.
     """
     time, z = load_columns(path, ("time_s", "z_m"))
     what = f"motion {str(path)!r}"
@@ -98,7 +95,7 @@ def load_motion(path: Path | str) -> tuple[FloatArray, float]:
     return z, period
 
 
-# ``SOURCES.yaml``: what is uncertain of the machine, one statement a source.
+# ``SOURCES.yaml`` states the sources of uncertainty of the machine:
 #
 # schema: omsm-sources/1
 # sources:
@@ -123,7 +120,7 @@ _FORM = form(
 
 
 def load_sources(path: Path | str) -> MachineSources:
-    """Read ``SOURCES.yaml``; FileError naming the source and what is wrong with it."""
+    """Read ``SOURCES.yaml``; FileError, which names the source and the error."""
     what = f"sources {str(path)!r}"
     content = json_and_yaml.mapping_of(
         read_text(path, MAX_BYTES, FileError, "sources"), FileError, what
@@ -145,14 +142,12 @@ def _stated(item: Mapping[str, Any]) -> StatedSource:
     return stated
 
 
-# ``SURFACE.yaml``: what a part should be.
-#
-# ``shape`` and the parameters of that shape under the names of its fields, in metres and radians; a
-# ``pose`` if the part does not sit at the origin of the machine. The schema is read off the fields
-# of the shape's record, so that a new shape has its own without a line here.
+# ``SURFACE.yaml`` has ``shape`` and the parameters of that shape under the names of its fields, in
+# metres and radians, and a ``pose`` if the part is not at the origin of the machine. The schema is
+# derived from the fields of the shape's record.
 
-# Every shape is evaluated at every point; what is in a turned frame, by Newton's method, some five
-# times for once, and so twenty-five times where its frame is turned in another one.
+# Each shape is evaluated at each point; in a turned frame by Newton's method, some five times, and
+# in two nested frames twenty-five times.
 MOST_SHAPES, MOST_FRAMES = 50, 3
 _GRID = "grid"
 _INTEGER: Mapping[str, Any] = {"type": "integer"}
@@ -174,7 +169,7 @@ def load_surface(path: Path | str) -> Surface:
 
 
 def _extent(content: Any) -> tuple[int, int]:
-    """Return how many shapes a description has, and how many frames are turned in one another."""
+    """Return the number of shapes in a description, and the depth of nested turned frames."""
     named = content if isinstance(content, dict) else {}
     inside = named.values() if named else content if isinstance(content, list) else ()
     known = [_extent(part) for part in inside]
@@ -184,9 +179,9 @@ def _extent(content: Any) -> tuple[int, int]:
 
 
 def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = None) -> Surface:
-    """Return the surface of a description, which messages call ``what``.
+    """Return the surface of a description, which error texts call ``what``.
 
-    folder: where the files that it names are sought; None: it may name none
+    folder: of the files that it names; None = it may name no files
     """
     values = dict(description)
     shape, pose = values.pop("shape", None), values.pop("pose", None)
@@ -204,7 +199,7 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
 
 def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
     """Return the surface of a map in a file of any known format."""
-    # Here, because readers of maps take longer to load than a scan to correct.
+    # Imported here, because readers of maps take longer to load than a scan takes to correct.
     from omsm_ros.io.maps.read_map import read_points
     from omsm_ros.units import units_of
 
@@ -238,7 +233,7 @@ def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None
 
 
 def _schema(hint: Any) -> Mapping[str, Any]:
-    """Return what JSON may stand for a value of this type."""
+    """Return the JSON schema of a value of this type."""
     if _choices(hint):
         return {"enum": list(_choices(hint))}
     if get_origin(hint) is tuple:
@@ -247,7 +242,7 @@ def _schema(hint: Any) -> Mapping[str, Any]:
 
 
 def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
-    """Return the foreign ``value`` as one of the type ``hint``."""
+    """Return ``value`` of a description as one of the type ``hint``."""
     if value is None and _present(hint) is not hint:
         return None
     kind = _present(hint)

@@ -1,7 +1,7 @@
-"""``DISTURBANCES.yaml``: what is wrong with the machine that the twin plays.
+"""Reads ``DISTURBANCES.yaml``: the errors of the simulated machine.
 
 Its names are those of :class:`~omsm_ros.twin.disturbances.Disturbances` and of the records in it,
-and so is its schema; a record that is left out is switched off.
+and its schema is derived from them; a record that is left out is switched off.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.twin.disturbances import Disturbances
 
 MAX_BYTES = 100_000
-# No machine has more lines or harmonics; each costs time at every sample.
+# More than the lines or harmonics of any machine; each costs time at each sample.
 _MOST_ITEMS = 100
 
 
 def load_disturbances(path: Path | str) -> Disturbances:
-    """Read ``DISTURBANCES.yaml``; FileError naming what is unknown, of the wrong kind or size."""
+    """Read ``DISTURBANCES.yaml``; FileError for unknown names and invalid values."""
     what = f"disturbances {str(path)!r}"
     content = json_and_yaml.mapping_of(
         read_text(path, MAX_BYTES, FileError, "disturbances"), FileError, what
@@ -70,7 +70,7 @@ def _names(kind: Any) -> Mapping[str, None]:
 
 
 def _without_none(kind: Any) -> Any:
-    """Return the type of a field that may also be None, which a file says by leaving it out."""
+    """Return the type of a field that may also be None, by leaving it out of the file."""
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         (kind,) = (k for k in typing.get_args(kind) if k is not types.NoneType)
     return kind

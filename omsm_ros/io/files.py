@@ -1,4 +1,4 @@
-"""Regular files, read up to a bound; files that appear only when they are whole."""
+"""Reads regular files up to a bound, and writes files that appear only when they are complete."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ FORM, CURVES, DEVIATION = "form.json", "curves.json", "deviation.ply"
 """The files of a measurement."""
 SPECTRUM, DIFFERENCE, EXPERIMENT = "spectrum.json", "difference.json", "experiment.json"
 
-# What says what is in the way of a file has room for it, and for the words around it.
+# Longest name in an error text [characters].
 _LONGEST_NAME = 120
 
 
-# What libraries raise of files that they take for whole; the words are those of their own code.
+# Exceptions of libraries that did not expect a damaged file; their texts do not help a user.
 _LIBRARY_ERRORS = (LookupError, TypeError, AttributeError, RecursionError, AssertionError)
 
 
@@ -35,7 +35,7 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
     try:
         with open_regular(path, error, what) as stream:
             raw = stream.read(limit + 1)
-        if raw is None:  # of the kernel's own files, some give lines as they come
+        if raw is None:  # some files of the kernel have no data yet
             raise BlockingIOError("there is nothing to read now")
         if len(raw) <= limit:
             return raw.decode("utf-8")
@@ -51,9 +51,9 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
 
 
 def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[bytes]:
-    """Open a regular file for reading; ``error`` for a folder, a device, a pipe, or none at all."""
+    """Open a regular file for reading; raise ``error`` for a folder, device, pipe, or none."""
     try:
-        # Without O_NONBLOCK the opening of a pipe waits for a writer that may never come.
+        # Without O_NONBLOCK, opening a pipe waits for a writer.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as err:
         raise error(f"no {what} at {str(path)!r}; check the path") from err
@@ -91,21 +91,21 @@ def resolved_within(path: Path, folders: str, error: type[OmsmError], what: str)
 
 
 def exception_text(err: Exception) -> str:
-    """Return what an exception says, on one line, without the path that a message names."""
+    """Return the text of an exception on one line, without the path."""
     if isinstance(err, MemoryError):
-        return "it asks for more memory than there is"
+        return "it needs more memory than there is"
     if isinstance(err, _LIBRARY_ERRORS):
-        return "what it holds does not fit together"
+        return "its content is inconsistent"
     text = err.strerror if isinstance(err, OSError) and err.strerror else str(err)
     return " ".join(text.split())[:200] or type(err).__name__
 
 
 @contextmanager
 def atomic_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open ``path`` for writing under a temporary name; rename it when all went well.
+    """Open ``path`` for writing under a temporary name; rename it if no exception is raised.
 
-    The temporary name cannot be foreseen, and nothing that exists is opened: neither a second
-    writer's file nor a link that somebody laid. FileError if it cannot be written there.
+    The temporary name is random, and no existing file or link is opened. Raises FileError if it
+    cannot be written.
     """
     target = Path(path)
     part: Path | None = None
@@ -130,7 +130,7 @@ def atomic_file(path: Path | str, mode: str = "wb") -> Iterator[IO[Any]]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it; NotADirectoryError names the file that is in the way."""
+    """Make a folder and its parents; NotADirectoryError names a file in their place."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as err:
@@ -142,8 +142,8 @@ def make_folder(path: Path) -> None:
 
 
 def temporary_sibling(target: Path) -> Path:
-    """Return a name that nobody can foresee, in the folder of ``target``."""
-    # Not made from the target's name, which may have all the characters that a name can have.
+    """Return a random name in the folder of ``target``."""
+    # Not derived from the target's name, which may already have the greatest length.
     return target.with_name(f".{secrets.token_hex(8)}.part")
 
 
@@ -163,5 +163,5 @@ def save_text(path: Path | str, text: str) -> None:
 
 
 def save_json(path: Path | str, content: Mapping[str, object]) -> None:
-    """Write a JSON object for people and programs; ValueError for what JSON cannot say."""
+    """Write an indented JSON object; ValueError for NaN and infinity."""
     save_text(path, json_and_yaml.text_of(content, indent=1) + "\n")

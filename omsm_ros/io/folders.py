@@ -1,4 +1,4 @@
-"""A folder of results: put in place together, all of one run or none of it; and read again."""
+"""Writes and reads folders of results, and keeps private folders and exclusive files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FORM_FILES = (DEVIATION, CURVES, REPORT, FORM)
 MEASUREMENT_FILES = (CLOUD, SYSTEMATIC, *FORM_FILES, SUMMARY)
 EXPERIMENT_FILES = (*MEASUREMENT_FILES, EXPERIMENT)
 
-# Results that have a name in common. An experiment may hold a measurement, that its form.
+# Results with a common file name. An experiment may contain a measurement, and that a form.
 _RESULTS = {
     EXPERIMENT: EXPERIMENT_FILES,
     SUMMARY: MEASUREMENT_FILES,
@@ -42,21 +42,21 @@ _RESULTS = {
     SPECTRUM: (REPORT, SPECTRUM),
     DIFFERENCE: (REPORT, DIFFERENCE),
 }
-# A summary of ours has tens of kilobytes.
+# Our summaries have tens of kilobytes.
 MAX_RESULT_BYTES = 10_000_000
 
 
 @contextmanager
 def result_folder(path: Path | str, names: Sequence[str]) -> Iterator[Path]:
-    """Yield an empty private folder; put its files into ``path`` at once when all went well.
+    """Yield an empty private folder; move its files into ``path`` if no exception is raised.
 
-    names: of the files that make a result; those of an earlier run go. The last of them says
-        that the result is whole: it is taken away first and comes last, so that nobody ever
-        sees it beside files of another run. Other files in ``path`` stay; one that this run
-        makes beside its result replaces only that of an earlier run.
+    names: of the files of a result; those of an earlier run are removed. The last of them marks a
+        complete result: it is removed first and written last, so it is never together with files
+        of another run. Other files in ``path`` stay; one that this run adds replaces only that of
+        an earlier run.
 
-    FileError if it cannot be written there, or where the result of another command is that has
-    files of these names; then, as after any exception, ``path`` is unchanged.
+    Raises FileError if ``path`` cannot be written, or has the result of another command with files
+    of these names; then, as after any exception, ``path`` is unchanged.
     """
     target = Path(os.path.abspath(path))
     staged: Path | None = None
@@ -98,7 +98,7 @@ def _move_into_place(staged: Path, target: Path, names: Sequence[str]) -> None:
                 raise
         else:
             return
-        # Another writer came first: what follows replaces its files.
+        # Another writer was first: its files are replaced.
     again = (target / names[-1]).is_file()
     for part in staged.iterdir():
         if (target / part.name).is_dir():
@@ -109,7 +109,7 @@ def _move_into_place(staged: Path, target: Path, names: Sequence[str]) -> None:
             )
     lock = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # one writer after the other
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one writer at a time
         _refuse_foreign(target, names)
         for name in reversed(names):
             (target / name).unlink(missing_ok=True)
@@ -120,7 +120,7 @@ def _move_into_place(staged: Path, target: Path, names: Sequence[str]) -> None:
 
 
 def _refuse_foreign(target: Path, names: Sequence[str]) -> None:
-    """Raise FileError where the folder holds another command's result with files of these names."""
+    """Raise FileError if the folder has another command's result with files of these names."""
     found = next((mark for mark in _RESULTS if (target / mark).is_file()), names[-1])
     if found != names[-1] and not set(names).isdisjoint(_RESULTS[found]):
         raise FileError(
@@ -132,23 +132,22 @@ def _refuse_foreign(target: Path, names: Sequence[str]) -> None:
 def read_result(path: Path, what: str) -> dict[str, Any]:
     """Return the object in a JSON file of results, such as ``summary.json``, called ``what``.
 
-    FileError where it is not there, too large, or no JSON object.
+    Raises FileError if it is missing, too large, or no JSON object.
     """
     text = read_text(path, MAX_RESULT_BYTES, FileError, what)
     return json_and_yaml.object_of(text, FileError, f"{what} {str(path)!r}")
 
 
-# A folder of the user's own for what lives as long as a process: links to emulated ports.
-
 _MODE = 0o700
 
 
 def runtime_folder(namespace: str = "") -> Path:
-    """Return a private folder, made if need be: ``$XDG_RUNTIME_DIR/omsm_ros`` and below.
+    """Return a private folder, such as for links to emulated ports; it is created if needed.
 
-    namespace: of the cell, a folder of its own for each
-    Without that variable it lies in the system's temporary folder and carries the user's number.
-    Raises FileError if somebody else's folder, or a link, stands there.
+    It is ``$XDG_RUNTIME_DIR/omsm_ros``, or in /tmp with the user's number without that variable.
+
+    namespace: of the cell, which has its own folder below
+    Raises FileError if a link or the folder of another user is there.
     """
     base = os.environ.get("XDG_RUNTIME_DIR", "")
     folder = (
@@ -177,15 +176,12 @@ def _make_own(folder: Path) -> None:
         )
 
 
-# Two emulators do not offer one port, two calibrators keep no one file: the second is refused.
-
-
 @contextmanager
 def exclusive_lock(path: Path) -> Iterator[None]:
-    """Hold ``path``, which need not exist, for this process alone.
+    """Lock ``path``, which need not exist, for this process.
 
-    The system lets go of it however the process ends. Raises ConfigurationError if another one
-    holds it or it names no file, FileError if its folder cannot be written.
+    The lock ends with the process. Raises ConfigurationError if another process holds it or the
+    path names no file, FileError if its folder cannot be written.
     """
     if path.name in ("", ".."):
         raise ConfigurationError(f"{str(path)!r} names no file; give a name in a folder")
@@ -213,7 +209,7 @@ def _locked(lock: Path) -> int:
         held = os.open(lock, flags, 0o600)
         try:
             fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Who ended meanwhile took the file's name away.
+            # A process that ended in between has removed the file.
             if lock.exists() and os.path.samestat(os.fstat(held), os.stat(lock)):
                 return held
         except BlockingIOError:

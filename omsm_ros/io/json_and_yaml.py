@@ -1,6 +1,9 @@
-"""JSON as RFC 8259 has it, and not more: no NaN, no Infinity, no number beyond a float's range.
+"""Reads JSON and YAML strictly, and checks objects by JSON schema.
 
-Python's own reader takes all of these, nests without end, and lets the last of two equal names win.
+JSON follows RFC 8259: no NaN, no infinity, no number beyond a float's range, no repeated name, and
+bounded nesting; Python's reader accepts all of these. YAML has plain values only: null, bool, int,
+float, str, list and map. Aliases, which unfold to gigabytes, tags, dates, and ``no`` as a truth
+value are refused.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ if TYPE_CHECKING:
     import jsonschema
 
 MAX_DEPTH = 32
-# An integer within 64 bits is an integer to every reader.
+# Each reader of JSON can represent integers of 64 bits.
 _INTEGERS = range(-(2**63), 2**64)
 
 _T = TypeVar("_T")
@@ -53,12 +56,12 @@ def object_of(text: str, error: type[OmsmError], what: str) -> dict[str, Any]:
 
 
 def text_of(content: object, indent: int | None = None) -> str:
-    """Return ``content`` as JSON; ValueError for a number that JSON cannot say."""
+    """Return ``content`` as JSON; ValueError for NaN and infinity."""
     return json.dumps(content, indent=indent, allow_nan=False)
 
 
 def unknown_as_null(content: _T) -> _T | None:
-    """Return ``content`` with null for each NaN and infinity: a number that nobody knows."""
+    """Return ``content`` with null for each NaN and infinity: an unknown number."""
     if isinstance(content, Mapping):
         return {key: unknown_as_null(value) for key, value in content.items()}  # type: ignore[return-value]
     if isinstance(content, list | tuple):
@@ -97,16 +100,11 @@ def _check_depth(value: object, left: int) -> None:
     if left < 0:
         raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels")
     if isinstance(value, str):
-        value.encode()  # half a character cannot be written again
+        value.encode()  # a lone surrogate cannot be written again
     elif isinstance(value, dict | list):
         for part in (*value, *value.values()) if isinstance(value, dict) else value:
             _check_depth(part, left - 1)
 
-
-# YAML of plain values only: null, bool, int, float, str, list and map.
-#
-# YAML has much that no description of a surface needs and that a reader should not meet: aliases
-# that unfold to gigabytes, tags that name Python objects, dates, and ``no`` as a truth value.
 
 MAX_DEPTH_STRICT_YAML = 8
 _LINES = "write 'name: value' lines, and quotes around a text with any of [ ] { } , : #"
@@ -114,7 +112,7 @@ _Number = TypeVar("_Number")
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Knows the scalars of JSON; refuses aliases, anchors, tags and names that stand twice."""
+    """Reads the scalars of JSON; refuses aliases, anchors, tags and repeated names."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012 - replaces that of its base
     _depth = 0
@@ -162,7 +160,7 @@ def _tag(kind: str) -> str:
     return f"tag:yaml.org,2002:{kind}"
 
 
-# The core schema of YAML 1.2, less octal and hexadecimal integers, infinity and not-a-number.
+# The core schema of YAML 1.2 without octal and hexadecimal integers, infinity and NaN.
 for _kind, _pattern, _first in (
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -196,7 +194,7 @@ def has_aliases(text: bytes) -> bool:
     """Return whether a YAML text has aliases or anchors; one that is no YAML has none."""
     if b"&" not in text and b"*" not in text:
         return False
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # fifty times as fast, where it is
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # much faster, if available
     try:
         return any(getattr(event, "anchor", None) is not None for event in yaml.parse(text, loader))
     except (yaml.YAMLError, ValueError):
@@ -204,7 +202,7 @@ def has_aliases(text: bytes) -> bool:
 
 
 def begins_as_mapping(text: bytes) -> bool:
-    """Whether a YAML text of any kind begins with a name and its value; the rest is not read."""
+    """Return whether a YAML text begins with a name and its value; the rest is not read."""
     begin = yaml.StreamStartEvent, yaml.DocumentStartEvent
     try:
         events = yaml.parse(text, yaml.SafeLoader)
@@ -220,11 +218,8 @@ def _said(err: Exception) -> str:
     return place + " ".join(str(getattr(err, "problem", None) or err).split())[:200]
 
 
-# The form of a foreign object: its names and types, by JSON schema.
-#
-# Ranges are in the one table of quantities: the record that is made of the object holds each
-# against
-# it, or, where none is made, the schema itself does (:func:`ranged`).
+# Ranges are in the table of quantities: the record made of an object checks them, or, without a
+# record, the schema (:func:`ranged`).
 
 NUMBER: Mapping[str, Any] = {"type": "number"}
 TEXT: Mapping[str, Any] = {"type": "string"}
@@ -253,7 +248,7 @@ def ranged(quantity: Quantity) -> dict[str, Any]:
 
 
 def group(needed: Mapping[str, Any], **others: Any) -> dict[str, Any]:
-    """Return the schema of an object; it may hold more, which nobody reads."""
+    """Return the schema of an object, which may have further names."""
     return {"type": "object", "properties": {**needed, **others}, "required": list(needed)}
 
 
@@ -263,11 +258,11 @@ def rows(needed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def or_none(schema: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the schema of what may also be null."""
+    """Return the schema of a value that may also be null."""
     return {**schema, "type": [schema["type"], "null"]}
 
 
-# What nobody could know is written as null.
+# An unknown figure is null.
 NUMBER_OR_NULL = or_none(ranged(SIGNAL))
 FIGURE = group({"value": NUMBER_OR_NULL, "uncertainty": NUMBER_OR_NULL})
 """A figure with its standard uncertainty."""
@@ -281,7 +276,7 @@ def check_form(
     content: Mapping[str, Any], schema: Mapping[str, Any], error: type[OmsmError], what: str
 ) -> None:
     """Raise ``error``, which calls the content ``what``, unless it follows ``schema``."""
-    # A tenth of a second to load, which a node that reads no file has no use for.
+    # It takes a tenth of a second to load, and a node that reads no file does not need it.
     import jsonschema
 
     found = next(jsonschema.Draft202012Validator(schema).iter_errors(content), None)
@@ -296,7 +291,7 @@ _KINDS = {
 
 
 def as_number(value: object) -> str:
-    """Return how to write a number in the place of ``value``, if that is a text; else nothing."""
+    """Return the remedy for a text ``value`` in the place of a number; empty for others."""
     text = isinstance(value, str)
     return "; write digits with a decimal point, without unit and quotes" if text else ""
 

@@ -1,8 +1,8 @@
-"""The one mapping between messages on the wire and records of the core.
+"""Converts messages to records of the core, and records to messages.
 
-The same field names hold for messages of rclpy and for those that ``rosbags``
-deserialises without ROS, so one function reads both. To *make* a message one needs its
-class: :class:`Messages` carries the classes of one world, and how that world wants its arrays.
+Messages of rclpy and those that ``rosbags`` deserialises without ROS have the same field names, so
+one function reads both. To create messages, :class:`Messages` has the classes of either, and the
+function that makes their arrays.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SET = "calibration_set"
 
 _AXES = ("x", "y", "z", "b", "c")
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
-# Of each field of a point: name, offset [bytes], type, count.
+# Name, offset [bytes], type and count of each field of a point.
 _POINT_LAYOUT = [
     (name, (POINT_DTYPE.fields or {})[name][1], _POINT_FIELD_TYPES[kind], 1)
     for name, kind in CLOUD_FIELDS
@@ -72,7 +72,7 @@ def ros_messages() -> Messages:
 def _ros_sequence(values: ArrayLike, dtype: DTypeLike) -> array.array[Any]:
     contiguous = np.ascontiguousarray(values, dtype)
     result: array.array[Any] = array.array(contiguous.dtype.char)
-    # Filling from the buffer is thousands of times faster than from an iterable.
+    # From a buffer this is thousands of times faster than from an iterable.
     result.frombytes(contiguous.view(np.uint8).data)
     return result
 
@@ -116,7 +116,7 @@ def acceleration_block(message: Any) -> AccelerationBlock:
 def calibration(message: Any) -> Calibration:
     """Return the record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
 
-    The certificate of a set carries the whole set; the other fields are then its middle member's.
+    The certificate of a set contains the whole set; the other fields are of its middle member.
     """
     certificate = _json_object("certificate", message.certificate)
     if isinstance(content := certificate.get(_SET), dict):
@@ -144,12 +144,12 @@ def calibration(message: Any) -> Calibration:
 
 
 def probe_settings(message: Any) -> dict[str, object]:
-    """Return what a probe's driver reported, a JSON object in a ``std_msgs/String``."""
+    """Return the settings of a probe, a JSON object in a ``std_msgs/String``."""
     return _json_object("probe_settings", message.data)
 
 
 def temperature(message: Any) -> float:
-    """Return a reading of a ``sensor_msgs/Temperature`` [°C], NaN for one that cannot be."""
+    """Return the reading of a ``sensor_msgs/Temperature`` [°C], NaN if it is out of range."""
     return float(TEMPERATURE.nan_if_implausible(np.array([message.temperature]))[0])
 
 
@@ -249,7 +249,7 @@ def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) 
 
 
 def _all_finite(packed: NDArray[np.void]) -> bool:
-    # A device that reports no intensity leaves NaN there, and PCL must know.
+    # Without reported intensity the field is NaN, which PCL must know.
     return all(bool(np.isfinite(packed[name]).all()) for name, kind in CLOUD_FIELDS if "f" in kind)
 
 
@@ -275,8 +275,6 @@ def cloud_message(
     )
 
 
-# Levels of vibration in a message: a JSON object in a ``std_msgs/String``.
-
 MAX_CHARACTERS = 100_000
 _MOST_BANDS = 100
 _LEVEL: Mapping[str, Any] = {"type": "number", "minimum": 0}
@@ -298,14 +296,14 @@ _SHAPE = {
 _LINE_OF_HEIGHT = form(
     dict.fromkeys(("frequency", "amplitude"), _LEVEL), ("frequency", "amplitude")
 )
-# Older recordings do not say what moves the height most.
+# Older recordings lack ``height_line``.
 _SCHEMA = form({**_SHAPE, "height_line": _LINE_OF_HEIGHT}, tuple(_SHAPE))
 
 
 def vibration_levels(message: Any) -> dict[str, Any]:
-    """Return what the vibration monitor told, see ``VibrationLevels.entry``; alarm and limit, too.
+    """Return the levels of the vibration monitor, see ``VibrationLevels.entry``, alarm and limit.
 
-    BagError for a text that says something else.
+    Raises BagError for a text with another content.
     """
     text = message.data
     if len(text) > MAX_CHARACTERS:
@@ -325,11 +323,9 @@ def vibration_levels(message: Any) -> dict[str, Any]:
     return found
 
 
-# The messages that bags are read and written with, where ROS is not installed.
-#
-# Ours come from the ``.msg`` texts that ROS builds from. The few of ROS itself are stated here as
-# Jazzy has them (std_msgs, sensor_msgs, builtin_interfaces): to load all that ROS 2 knows takes as
-# long as to correct a scan.
+# Definitions for bags without ROS. Ours are the ``.msg`` files that ROS uses; the few of ROS itself
+# are copied from Jazzy (std_msgs, sensor_msgs, builtin_interfaces), since loading all of them takes
+# as long as correcting a scan.
 
 _OF_ROS = {
     "builtin_interfaces/msg/Time": "int32 sec\nuint32 nanosec\n",
@@ -359,7 +355,7 @@ _MESSAGES = (
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """Return the types of omsm_msgs and those of ROS 2 Jazzy that they and our clouds hold."""
+    """Return the types of omsm_msgs, and those of ROS 2 Jazzy that they and our clouds need."""
     store = get_typestore(Stores.EMPTY)
     types: dict[str, Any] = {}
     ours = {
@@ -372,9 +368,9 @@ def typestore() -> Typestore:
 
 
 def message_folder() -> Path:
-    """Return the folder of our ``.msg`` texts."""
+    """Return the folder of our ``.msg`` files."""
     package = Path(__file__).resolve().parents[1]
-    # Installed beside the code, or in a source checkout next to the package.
+    # Installed within the package, or next to it in a source checkout.
     installed = package / "interfaces" / "msg"
     return installed if installed.is_dir() else package.parent / "msg_defs" / "msg"
 

@@ -1,7 +1,6 @@
-"""Is an HDF5 file read to its end, and from itself alone?
+"""Loads optional libraries, and checks an HDF5 file in a process of its own.
 
-A damaged one may keep its library in a loop for ever. Nothing in this process could interrupt that
-loop, so another one goes first.
+On a damaged file the HDF5 library may loop for ever, which this process could not interrupt.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from typing import Any
 from omsm_ros.errors import FileError
 from omsm_ros.quantities import MAP_POINTS, shown
 
-# Of a processor: to load the library, and to unpack slowly. A loop takes that much on an idle
-# computer as on a busy one; what only waits, for a disk, has ten times as long.
+# Processor time to load the library [s], rate of slow unpacking [bytes/s], and elapsed time over
+# processor time for a slow disk.
 LIMIT_S, SLOWEST_BYTES_S, _WAITING = 2.0, 50e6, 10.0
 _LINK_TYPES = 3
 
 
 def walk_in_subprocess(path: Path, what: str) -> None:
-    """Raise FileError if reading all of ``path`` does not end, ends its process, or leaves it."""
+    """Raise FileError if reading ``path`` does not end, crashes, or needs other files."""
     limit = math.ceil(LIMIT_S + path.stat().st_size / SLOWEST_BYTES_S)
     command = [sys.executable, "-m", __name__, str(path.absolute()), str(limit)]
     endless = f"{what} is not read in {limit} s: damaged; write it again"
@@ -63,9 +62,9 @@ def _walk(path: str, limit: int) -> None:
 
 
 def _keep_within(h5py: Any, name: str, item: Any) -> None:
-    """End this process if an array or a link of a group stands in a file of its own.
+    """Exit if an array or a link of a group is in another file.
 
-    Whoever made the file would choose which one of the reader's is opened, a pipe among them.
+    The author of the file would choose which file of the user is opened.
     """
     if isinstance(item, h5py.Group):
         links = {child: item.get(child, getlink=True) for child in item}
@@ -83,9 +82,6 @@ def _keep_within(h5py: Any, name: str, item: Any) -> None:
 
 if __name__ == "__main__":
     _walk(sys.argv[1], int(sys.argv[2]))
-
-
-# Libraries for some formats only: loaded when such a file comes, named when they are missing.
 
 
 def import_optional(name: str, what: str) -> ModuleType:

@@ -1,4 +1,4 @@
-"""``cloud.ply``: the corrected points, written as they come and read in portions."""
+"""Writes and reads the files of a measurement: clouds, summaries, forms and systematic errors."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ _PLY_DTYPE = np.dtype(list(CLOUD_FIELDS))
 
 
 class PlyWriter:
-    """Streams points into a binary ``cloud.ply`` of the contract's fields.
+    """Writes points into a binary ``cloud.ply`` with the fields of the contract.
 
-    Memory does not depend on the number of points: the header is written last, into the
-    room kept for it. Leaving by an exception leaves no file.
+    Memory does not depend on the number of points: the header is written last, into its reserved
+    space. An exception leaves no file.
     """
 
     def __init__(self, path: Path | str, comment: str = "") -> None:
         self._file = atomic_file(path)
-        # A line break in a comment would end it and forge header lines.
+        # A line break in the comment would add header lines.
         self._comment = " ".join(comment.split())[:200]
         self.points = 0
 
@@ -82,16 +82,16 @@ class PlyWriter:
 
 
 def _header_lines(points: int) -> list[bytes]:
-    """Return what the header of every cloud of ours says, but for comments."""
+    """Return the header of our clouds without comments."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {points}"]
     lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
     return [line.encode("ascii") for line in lines]
 
 
 class CloudFile:
-    """Our own ``cloud.ply``, read in portions: memory does not depend on its length.
+    """Reads our ``cloud.ply`` in portions; memory does not depend on its length.
 
-    points: how many it holds. Raises FileError if it is no cloud of ours, or was cut short.
+    points: their number. Raises FileError if it is no cloud of ours or is incomplete.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -100,7 +100,7 @@ class CloudFile:
             head = stream.read(_PLY_HEADER_BYTES)
             try:
                 held = stream.seek(0, io.SEEK_END) - _PLY_HEADER_BYTES
-            except OSError as err:  # what the kernel writes as it is read, as in /proc
+            except OSError as err:  # files of the kernel, as in /proc
                 raise FileError(f"{str(path)!r} has no length; give a file on a disk") from err
         self.points = max(held, 0) // _PLY_DTYPE.itemsize
         lines = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
@@ -115,7 +115,7 @@ class CloudFile:
     def portions(self, size: int = 500_000) -> Iterator[NDArray[np.void]]:
         """Yield all points in order, ``size`` at a time, as structured arrays of the contract.
 
-        Raises FileError for coordinates that are no numbers, or further off than any machine goes.
+        Raises FileError for coordinates that are not finite, or beyond the size of any machine.
         """
         with self._opened() as stream:
             stream.seek(_PLY_HEADER_BYTES)
@@ -127,7 +127,7 @@ class CloudFile:
                 yield rows
 
     def read(self, most: int | None = None) -> NDArray[np.void]:
-        """Return all points, or evenly every k-th so that there are no more than ``most``."""
+        """Return all points, or each k-th so that there are at most ``most``."""
         every = 1 if most is None else max(-(-self.points // most), 1)
         parts = [part[::every].copy() for part in self.portions(every * 100_000)]
         return np.concatenate([np.empty(0, _PLY_DTYPE), *parts])
@@ -136,9 +136,9 @@ class CloudFile:
 def with_added_variance(
     path: Path, variance: Callable[[int, int], FloatArray], size: int = 500_000
 ) -> Iterator[NDArray[np.void]]:
-    """Add a variance to the uncertainty of each point of our cloud; yield the points as they are.
+    """Add a variance to the uncertainty of each point of our cloud, and yield the points.
 
-    variance: [m²] of so many points from the one with that number on, (n,)
+    variance: returns that of ``(first, count)`` points, (n,) [m²]
     """
     first = 0
     with path.open("r+b") as stream:
@@ -152,7 +152,7 @@ def with_added_variance(
             yield rows
 
 
-# ``summary.json`` of a measurement, read again: its kinds, where a page or a table uses them.
+# The parts of ``summary.json`` that pages and tables use.
 
 _ANY = {"type": "object"}
 _COUNT, _NUMBER = ranged(COUNTER), ranged(SIGNAL)
@@ -223,17 +223,17 @@ _FORM = group(
 def read_summary(path: Path) -> dict[str, Any]:
     """Return the content of ``summary.json``: lengths [m], times [s], stamps [ns].
 
-    FileError where it is not there, too large, no JSON, or where something that is read from it
-    is of another kind than ``omsm correct`` writes.
+    Raises FileError if it is missing, too large, no JSON, or has values of other types than
+    ``omsm correct`` writes.
     """
     summary = read_result(path, "summary")
     check_form(summary, _FORM, FileError, f"summary {str(path)!r}")
     return summary
 
 
-# ``form.json`` and ``curves.json`` of a registered part, read again: what a page uses of them.
+# The parts of ``form.json`` and ``curves.json`` that pages use.
 
-_NUMBER_FORM_FILE = ranged(SIGNAL)
+_SIGNAL_NUMBER = ranged(SIGNAL)
 _SQUARE = {"type": "number", "minimum": 0, "maximum": SIGNAL.high}
 _ARRAY = {"type": "array"}
 _REPEATED = "register the part again"
@@ -245,10 +245,10 @@ _REMOVED = group(
     not_evaluated=TEXTS,
     held=each(TEXT),
     not_determined=each(TEXT),
-    pose_uncertainty=each(each(_NUMBER_FORM_FILE)),
+    pose_uncertainty=each(each(_SIGNAL_NUMBER)),
 )
 _TERM = {"n": {"type": "integer"}, "m": {"type": "integer"}, **FIGURE["properties"]}
-_FORM_FORM_FILE = group(
+_FORM_SCHEMA = group(
     {"zernike": rows(_TERM)},
     deviation=each(FIGURE),
     pose=each(FIGURE),
@@ -263,7 +263,7 @@ _DENSITY = group(
         "azimuthal": _CURVE,
         "mean_square": _SQUARE,
         "mean_square_in_band": _SQUARE,
-        "band": {"type": "array", "items": _NUMBER_FORM_FILE, "minItems": 2, "maxItems": 2},
+        "band": {"type": "array", "items": _SIGNAL_NUMBER, "minItems": 2, "maxItems": 2},
     },
     areal=group(dict.fromkeys(("x", "y", "value"), _ARRAY)),
 )
@@ -273,11 +273,11 @@ _CURVES = group({}, profiles=each(_CURVE), psd=or_none(_DENSITY))
 def read_form(path: Path) -> dict[str, Any]:
     """Return the content of ``form.json``: lengths [m], angles [rad].
 
-    FileError where it is not there, too large, no JSON, or where something that is read from it
-    is of another kind than a registration writes.
+    Raises FileError if it is missing, too large, no JSON, or has values of other types than a
+    registration writes.
     """
     form, what = read_result(path, "form"), f"form {str(path)!r}"
-    check_form(form, _FORM_FORM_FILE, FileError, what)
+    check_form(form, _FORM_SCHEMA, FileError, what)
     removed = form.get("removed", {})
     for source, shares in removed.get("pose_uncertainty", {}).items():
         for name in removed.get("fitted", ()):
@@ -291,7 +291,7 @@ def read_form(path: Path) -> dict[str, Any]:
 def read_curves(path: Path) -> dict[str, Any]:
     """Return the content of ``curves.json``: profiles [m], densities [m⁴].
 
-    FileError as :func:`read_form`, and for columns of a curve that do not fit each other.
+    Raises FileError as :func:`read_form`, and for columns of a curve with different lengths.
     """
     curves, what = read_result(path, "curves"), f"curves {str(path)!r}"
     check_form(curves, _CURVES, FileError, what)
@@ -322,7 +322,7 @@ def _numbers(values: object, what: str, axes: int) -> FloatArray:
     return found
 
 
-# ``systematic.npz``: what the systematic errors of a scan do to its points.
+# ``systematic.npz`` has the effect of the systematic errors of a scan on its points.
 
 # A hundred fields of ten thousand points are four megabytes.
 MAX_BYTES = 100_000_000
@@ -351,10 +351,10 @@ def load_fields(path: Path | str) -> ScanFields:
     if len(raw) > MAX_BYTES:
         raise FileError(f"{what} have more than {MAX_BYTES} bytes; correct the scan again")
     try:
-        # No pickles, by default; a NaN that signals is refused below.
+        # numpy refuses pickles by default; a signalling NaN is refused below.
         with np.load(io.BytesIO(raw)) as content, np.errstate(invalid="ignore"):
             names, fields, every = (np.asarray(content[name]) for name in _NAMES)
-            # Where nobody says which are upper bounds, each may be one.
+            # Without a statement, each field may be an upper bound.
             bounds = content["bounds"] if "bounds" in content else np.unique(names)
             aligned = content.get("aligned", ())
             if np.iscomplexobj(fields) or every.ndim:
@@ -367,7 +367,7 @@ def load_fields(path: Path | str) -> ScanFields:
             tuple(map(str, bounds)),
             tuple(map(str, aligned)),
         )
-    except Exception as err:  # whatever numpy says of a damaged archive
+    except Exception as err:  # numpy raises many kinds
         raise FileError(
             f"{what} are damaged: {exception_text(err)}; correct the scan again"
         ) from err
@@ -375,5 +375,5 @@ def load_fields(path: Path | str) -> ScanFields:
     if len(shape) != 2 or shape[0] != len(names) or found.every < 1:
         raise FileError(f"{what} have shape {shape!r} for {len(names)} names; correct it again")
     if not np.all(np.isfinite(found.fields)):
-        raise FileError(f"{what} hold what is no number; correct the scan again")
+        raise FileError(f"{what} hold values that are not finite; correct the scan again")
     return found

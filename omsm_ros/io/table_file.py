@@ -1,4 +1,4 @@
-"""A plain table: CSV with a line of names, then numbers."""
+"""Reads CSV with a line of names, and rows of numbers of any text."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from omsm_ros.errors import FileError
 from omsm_ros.io.files import read_text
 from omsm_ros.quantities import SIGNAL, shown
 
-# Two hours of two columns at 1 kHz, in three hundred megabytes of memory.
+# Two hours of two columns at 1 kHz; they take 300 MB of memory.
 MAX_TABLE_BYTES = 200_000_000
-# With which Windows begins texts in UTF-8.
+# The byte order mark, with which Windows begins texts in UTF-8.
 _MARK = "\ufeff"
-# Among which the line of names is looked for, where the first is none.
+# Lines among which a misplaced line of names is searched.
 _HEAD_LINES = 100
 _ROWS = (
     "below the names stand numbers with decimal points, between commas, as many as there are "
@@ -30,7 +30,7 @@ _ROWS = (
 def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
     """Read the columns ``names`` of a CSV file, each (n,) in the units of the file.
 
-    Raises FileError for a file without such columns, or with anything but plausible numbers.
+    Raises FileError for a file without these columns, or with invalid numbers.
     """
     text = read_text(path, MAX_TABLE_BYTES, FileError, "table").removeprefix(_MARK)
     if "\r" in text:  # Windows' line ends, or old Macs'
@@ -73,7 +73,7 @@ def _cells(line: str, mark: str) -> list[str]:
 
 
 def _where(text: str, names: tuple[str, ...]) -> str:
-    """Return what to do about a first line that does not name each of ``names`` once."""
+    """Return the remedy for a first line that does not name each of ``names`` once."""
     for number, line in enumerate(text.split("\n", _HEAD_LINES)[:_HEAD_LINES], 1):
         for mark in (",", ";", "\t"):
             cells = _cells(line, mark)
@@ -86,7 +86,7 @@ def _where(text: str, names: tuple[str, ...]) -> str:
 
 
 def _lines_of(text: str) -> Iterator[str]:
-    """Yield the lines of a text one by one: all at once take four times its memory."""
+    """Yield the lines of a text one by one: a list of them takes four times its memory."""
     start = 0
     while (end := text.find("\n", start)) >= 0:
         yield text[start:end]
@@ -105,19 +105,19 @@ def rows_in(
 ) -> FloatArray:
     """Return the numbers of lines of text, (lines, columns); (0, …) of none.
 
-    above: how many lines of the file stand above these, cells: in each line, None if unknown
-    layout: delimiter, comments, usecols, max_rows as numpy.loadtxt takes them
+    above: number of lines of the file above these;  cells: in each line, None if unknown
+    layout: delimiter, comments, usecols, max_rows, converters of numpy.loadtxt
 
-    Raises FileError, which calls the text ``what`` and names the ``remedy``, for the first line
-    that is something else.
+    Raises FileError, which calls the text ``what`` and names the ``remedy``, for the first other
+    line.
     """
     seen = [above, ""]
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that it is empty; the caller says so
+            warnings.simplefilter("ignore", UserWarning)  # of an empty text; the caller reports it
             return np.loadtxt(_rows(lines, seen, cells, layout), ndmin=2, **layout)
     except (ValueError, OSError) as err:
-        # numpy takes one line at a time: what it could not read is in the last one.
+        # numpy takes one line at a time, so the error is in the last one.
         line = shown(str(seen[1]).strip())
         raise FileError(f"{what}, line {seen[0]}: {line} is no row of numbers; {remedy}") from err
 
@@ -125,10 +125,10 @@ def rows_in(
 def _rows(
     lines: Iterable[str], seen: list[Any], cells: int | None, layout: Mapping[str, Any]
 ) -> Iterator[str]:
-    """Yield lines that are not blank, and note in ``seen`` the number and text of the last.
+    """Yield lines that are not blank, and note in ``seen`` number and text of the last one.
 
-    Raises ValueError for a line with another count of ``cells``: numpy passes over a cell too
-    many, and the comma of 1,5 makes one.
+    Raises ValueError for a line with another number of ``cells``: numpy ignores additional cells,
+    and a decimal comma makes one.
     """
     mark = layout.get("delimiter")
     marks = -1 if cells is None or mark is None else cells - 1

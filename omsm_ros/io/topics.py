@@ -1,6 +1,6 @@
-"""The topics of a cell: their names, types, and whether they are latched.
+"""Names and types of the topics of a cell.
 
-Several cells may be on one network, and in one bag: each has a namespace of its own.
+Several cells may be on one network and in one bag; each has its own namespace.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ TOPIC_TYPES = {
 }
 
 LATCHED_TOPICS = frozenset({CALIBRATION_TOPIC, PROBE_TOPIC})
-"""Who comes later gets the last message too."""
+"""Topics whose last message is also sent to later subscribers."""
 
 SAMPLES_DEPTH, LATCHED_DEPTH = 2000, 1
-"""Messages that a publisher keeps: seconds of blocks; the last one."""
+"""Messages that a publisher keeps: blocks of several seconds; the last one."""
 
 
 @dataclass(frozen=True)
 class CellBag:
-    """A bag, and which topics of it are the cell's.
+    """A bag, and the names of a cell's topics in it.
 
-    namespace: of the cell, as "/cell2"; empty finds it where there is only one
-    topics: what a topic of the contract is called there, for those that are called otherwise
+    namespace: of the cell, such as "/cell2"; empty = the only one
+    topics: contract's name → name in the bag, where they differ
     """
 
     path: Path
@@ -56,14 +56,14 @@ class CellBag:
 
     @property
     def name(self) -> str:
-        """Of the file or folder."""
+        """Return the name of the file or folder."""
         return self.path.name
 
     def names(self, held: Mapping[str, str]) -> dict[str, str]:
-        """Return topic of the contract → its name in a bag that holds names → types ``held``.
+        """Return contract's name → name in a bag with topics ``held`` (name → type).
 
-        Where nothing is stated, the contract's name goes first, and then the only topic of that
-        type which ends alike.
+        Without a statement, the contract's name is preferred, then the only topic of that type
+        with the same last part.
         """
         return {topic: self._name(topic, held) for topic in TOPIC_TYPES}
 

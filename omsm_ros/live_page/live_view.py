@@ -1,4 +1,4 @@
-"""What a browser is shown of a running scan: map, error over time, states, calibration."""
+"""Collects what a browser shows of a running scan: map, errors, states, calibration."""
 
 from __future__ import annotations
 
@@ -23,21 +23,19 @@ from omsm_ros.quantities import LENGTH
 from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import NANOMETRE_M
 
-# Which map do the points of a scan make while it grows, in bounded memory?
-
-# Smaller than any aperture: the first points may all lie in one place.
+# Smaller than any aperture, since the first points may coincide [m].
 _LEAST_SPAN_M = 1e-5
-# While so few have come, the grid is laid out anew around all of them: ten turns of a spiral, whose
-# first one tells how wide it is. After that it doubles.
+# Up to this number of points the grid is laid out again around all of them, since the first turns
+# of a spiral do not show its size; later it doubles.
 _EARLY_POINTS = 20_000
 _MARGIN = 1.05
 
 
 @dataclass(frozen=True, slots=True)
 class MapGrid:
-    """Where the cells lie: ``cells`` by ``cells`` of ``pitch`` [m] from ``left``, ``bottom`` [m].
+    """A grid of ``cells`` by ``cells`` cells of ``pitch`` [m] from ``left``, ``bottom`` [m].
 
-    generation: another one whenever the cells before mean nothing any more
+    generation: changes whenever the cells are laid out again
     """
 
     left: float
@@ -48,14 +46,14 @@ class MapGrid:
 
 
 class RunningMap:
-    """Mean of some values in each cell of a square grid that doubles its pitch as points demand.
+    """Means of values in the cells of a square grid, whose pitch doubles for points beyond it.
 
-    Memory is that of the cells, whatever the number of points; what was taken in stays in. Every
-    change of a cell has a version, so that any number of readers can ask what is new to them.
+    Memory does not depend on the number of points. Each change of a cell has a version, so that
+    readers can get the changes since their last version.
     """
 
     def __init__(self, values: int, cells: int = 400) -> None:
-        """values: of each point;  cells: along a side, even."""
+        """values: number for each point;  cells: along a side, even."""
         self._values, self._cells = values, cells
         self._grid: MapGrid | None = None
         self._version = self._next_generation = 0
@@ -70,21 +68,21 @@ class RunningMap:
 
     @property
     def grid(self) -> MapGrid | None:
-        """Where the cells lie now; None before the first point."""
+        """Return the present grid; None before the first point."""
         return self._grid
 
     @property
     def version(self) -> int:
-        """Of the newest change."""
+        """Return the version of the newest change."""
         return self._version
 
     @property
     def points(self) -> int:
-        """Points taken in."""
+        """Return the number of points."""
         return int(np.sum(self._count))
 
     def restart(self) -> None:
-        """Forget all points: another part, or another scan of it."""
+        """Remove all points, as before another scan."""
         generation = 0 if self._grid is None else self._grid.generation + 1
         self._clear()
         self._version += 1
@@ -92,9 +90,9 @@ class RunningMap:
         self._next_generation = generation
 
     def add(self, x: FloatArray, y: FloatArray, values: FloatArray) -> int:
-        """Take in points at ``x``, ``y`` (n,) [m] with ``values`` (n, k); return how many.
+        """Add points at ``x``, ``y`` (n,) [m] with ``values`` (n, k); return their number.
 
-        A point with anything that is no finite number is left out.
+        Points with values that are not finite are left out.
         """
         good = np.isfinite(x) & np.isfinite(y) & np.all(np.isfinite(values), axis=1)
         x, y, values = x[good], y[good], values[good]
@@ -152,7 +150,7 @@ class RunningMap:
         )
 
     def _double(self, x: FloatArray, y: FloatArray) -> None:
-        """Merge cells by fours into one quarter of the grid: the one that leaves room for these."""
+        """Merge groups of four cells into one quarter of the grid, so that the new points fit."""
         old = self._grid
         assert old is not None
         half, size = self._cells // 2, old.pitch * self._cells
@@ -177,7 +175,7 @@ class RunningMap:
     def since(self, version: int) -> tuple[IntArray, NDArray[np.float32]]:
         """Return the cells that changed after ``version``: place (m,), row by row; means (m, k).
 
-        After another generation of the grid ask with 0.
+        With another generation of the grid, ``version`` must be 0.
         """
         place = np.flatnonzero(self._changed.ravel() > version)
         count = self._count.ravel()[place]
@@ -186,17 +184,17 @@ class RunningMap:
 
 
 LAYERS = ("height", "dynamic_error", "uncertainty")
-"""Of each cell, in this order; ``height`` is the deviation where a nominal surface is known."""
+"""Values of a cell, in this order; ``height`` is the deviation from a nominal surface, if any."""
 
-# One entry a second: half an hour.
+# Half an hour, with one entry a second.
 _SERIES_ENTRIES = 1800
 _SERIES_STEP_S = 1.0
 _SPECTRUM_SAMPLES = 4096
 _SPECTRUM_LINES = 512
 _SEVERITY = ("OK", "WARN", "STALE", "ERROR")
-# A node that says nothing for so long is gone.
+# A node without a message for this time is gone [s].
 _STALE_S = 10.0
-# What one cell has, and others may say of it; a stranger on /diagnostics can have any number.
+# Limits for the states of a cell's nodes, since any program may publish on /diagnostics.
 _MOST_NODES = 64
 _MOST_NAME, _MOST_MESSAGE, _MOST_VALUE = 200, 500, 5000
 # Header of the binary part: cells along a side, generation, changed cells, version.
@@ -204,12 +202,12 @@ _HEADER = struct.Struct("<IIIQ")
 
 
 class LiveView:
-    """Takes in what nodes publish, hands out what is new to a browser; safe to share by threads."""
+    """Collects messages of nodes, and returns the changes since a browser's last; thread-safe."""
 
     def __init__(
         self, nominal: Surface | None = None, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        """nominal: what heights are compared with; None shows the heights themselves."""
+        """nominal: surface from which deviations are shown; None shows heights."""
         self._nominal, self._monotonic = nominal, monotonic
         self._lock = threading.Lock()
         self._map = RunningMap(len(LAYERS))
@@ -223,12 +221,12 @@ class LiveView:
         self._acceleration_period = 0.0
 
     def add_points(self, cloud: NDArray[np.void]) -> None:
-        """Take in points (n,) of the contract's fields."""
+        """Add points (n,) with the fields of the contract."""
         if not len(cloud):
             return
         x, y = (np.asarray(cloud[name], np.float64) for name in "xy")
         height = np.asarray(cloud["height"], np.float64)
-        # What lies on no machine would stretch the map until the part is one cell of it.
+        # A point beyond any machine would enlarge the map until the part is one cell.
         x, y, height = (LENGTH.nan_if_implausible(column) for column in (x, y, height))
         if self._nominal is not None:
             height = height - self._nominal.height(x, y)
@@ -256,9 +254,9 @@ class LiveView:
         self._bin, self._bin_start = [], now
 
     def add_state(self, name: str, level: str, message: str, values: Mapping[str, str]) -> None:
-        """Take in what a node says of itself; level "OK", "WARN", "STALE" or "ERROR".
+        """Enter the state of a node; level "OK", "WARN", "STALE" or "ERROR".
 
-        Raises DataError for one node more than a cell has.
+        Raises DataError for more nodes than a cell has.
         """
         name = name[:_MOST_NAME]
         kept = {key[:_MOST_NAME]: value[:_MOST_VALUE] for key, value in values.items()}
@@ -268,12 +266,12 @@ class LiveView:
             if name not in self._nodes and len(self._nodes) >= _MOST_NODES:
                 raise DataError(
                     f"states of more than {_MOST_NODES} nodes, all of this cell: {name!r} is not "
-                    "shown; end who else says such on /diagnostics, and start the viewer again"
+                    "shown; end the other publisher of /diagnostics, and start the viewer again"
                 )
             self._nodes[name] = (self._monotonic(), state)
 
     def set_calibration(self, calibration: Calibration) -> None:
-        """Take in the calibration in force; another one begins another map."""
+        """Enter the calibration in force; a new one begins a new map."""
         with self._lock:
             if self._calibration and self._calibration["id"] != calibration.id:
                 self._restart()
@@ -286,7 +284,7 @@ class LiveView:
             }
 
     def add_acceleration(self, block: AccelerationBlock) -> None:
-        """Take in a block of the accelerometer, for its spectrum."""
+        """Add a block of the accelerometer to the spectrum."""
         rows = np.column_stack([block.x, block.y, block.z])
         with self._lock:
             if block.sample_period != self._acceleration_period:
@@ -296,7 +294,7 @@ class LiveView:
             self._acceleration = kept[-_SPECTRUM_SAMPLES:]
 
     def restart(self) -> None:
-        """Begin another map."""
+        """Begin a new map."""
         with self._lock:
             self._restart()
 
@@ -306,10 +304,10 @@ class LiveView:
         self._points = self._left_out = 0
 
     def news(self, generation: int, version: int) -> tuple[bytes, int, int] | None:
-        """Return what changed on the map since a browser's generation and version; None if nothing.
+        """Return the changes of the map since a browser's generation and version; None without any.
 
-        A binary message: header, places (m) as uint32, then each layer (m) as float32 in nm; and
-        the generation and version that the browser then knows.
+        They are a binary message: header, places (m) as uint32, then each layer (m) as float32 in
+        nm; and the generation and version of the browser after it.
         """
         with self._lock:
             grid = self._map.grid
@@ -326,7 +324,7 @@ class LiveView:
         return packed, grid.generation, newest
 
     def state(self) -> dict[str, Any]:
-        """Return everything but the map, as JSON values."""
+        """Return all but the map, as JSON values."""
         with self._lock:
             now = self._monotonic()
             nodes = [
@@ -351,10 +349,10 @@ class LiveView:
             return None
         try:
             found = [density(column - column.mean(), period) for column in rows.T]
-        except DataError:  # too few as yet
+        except DataError:  # too few samples
             return None
         total = np.sqrt(np.sum([one.density for one in found], axis=0))
-        # The greatest of neighbours, so that no line is lost.
+        # The greatest of neighbouring values, so that no line is lost.
         cuts = np.unique(np.linspace(0, len(total), _SPECTRUM_LINES, endpoint=False).astype(int))
         peaks = np.maximum.reduceat(total, cuts)
         return {"frequency": found[0].frequency[cuts].tolist(), "amplitude": peaks.tolist()}
@@ -375,14 +373,14 @@ def _traffic_light_entry(
 ) -> dict[str, Any]:
     """Return the worst of: states of nodes, calibration, and what the corrector measures.
 
-    Green only if every node is well, the calibration was accepted without reservation, and the
-    light of the measurement, which a corrector reports, is green too.
+    Green only if each node is OK, the calibration was accepted without reservation, and the verdict
+    on the measurement, which a corrector reports, is green.
     """
     reasons = [f"{n['name']}: {n['message']}" for n in nodes if n["level"] != "OK"]
-    reasons += [f"{n['name']}: says nothing any more" for n in nodes if n["silent"]]
+    reasons += [f"{n['name']}: no message for {_STALE_S:.0f} s" for n in nodes if n["silent"]]
     worst = max((n["level"] for n in nodes), key=_SEVERITY.index, default="STALE")
     if not nodes:
-        reasons.append("no node has said anything yet")
+        reasons.append("no message of any node yet")
     against = _against(calibration)
     reasons += [against] * bool(against)
     measured = [n["values"] for n in nodes if n["values"].get("light") in ("amber", "red")]
@@ -400,7 +398,7 @@ def _is_rejected(calibration: Mapping[str, Any]) -> bool:
 
 
 def _against(calibration: Mapping[str, Any]) -> str:
-    """Return what speaks against the calibration in force; empty if nothing does."""
+    """Return the objection to the calibration in force; empty without one."""
     if not calibration:
         return "no calibration yet"
     verdict = str(calibration["verdict"])

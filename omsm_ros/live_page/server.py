@@ -1,4 +1,4 @@
-"""One port for the page and its socket: shows, and takes no orders."""
+"""Serves the live page and its socket on one port, read-only."""
 
 from __future__ import annotations
 
@@ -27,9 +27,8 @@ from omsm_ros.report import style
 from omsm_ros.report.measurement.surface_map import policy_of, script
 from omsm_ros.report.page_parts import fill
 
-# How many may knock at one port: so many at a time, and the port outlives a flood of them.
-
-# So that closing the port is noticed; and how long to wait where the process has no file left.
+# Time-out of ``accept``, so that closing the port is noticed, and the pause if the process may
+# open no more files [s].
 _LOOK_S = 0.2
 _REFUSAL = (
     f"HTTP/1.1 {http.HTTPStatus.SERVICE_UNAVAILABLE.value} Service Unavailable\r\n"
@@ -39,14 +38,14 @@ _REFUSAL = (
 
 
 class ConnectionLimit(socket.socket):
-    """A listening socket whose ``accept`` keeps to ``most`` connections, and refuses the others.
+    """A listening socket that accepts at most ``most`` connections, and refuses the others.
 
-    A server that stops at the first error of ``accept`` ends only when this is closed: not where a
-    peer has gone meanwhile, and not where the process may open no more files.
+    Its ``accept`` raises an error only after it is closed: not if a peer has gone, and not if the
+    process may open no more files. So a server that stops at the first error continues.
     """
 
     def __init__(self, host: str, port: int, most: int) -> None:
-        """Listen on ``host``; OSError if the port is taken, UnicodeError if it can be no name."""
+        """Listen on ``host``; OSError if the port is in use, UnicodeError for an invalid name."""
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listening = socket.create_server(address[:2], family=family)
         super().__init__(listening.family, listening.type, listening.proto, listening.detach())
@@ -54,7 +53,7 @@ class ConnectionLimit(socket.socket):
         self._places = threading.Semaphore(most)
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Return the next connection that has a place; OSError once this is closed."""
+        """Return the next connection within the limit; OSError once the socket is closed."""
         while True:
             try:
                 connection, peer = super().accept()
@@ -73,7 +72,7 @@ class ConnectionLimit(socket.socket):
     def releasing_slot(
         self, handler: Callable[[socket.socket, Any], None]
     ) -> Callable[[socket.socket, Any], None]:
-        """Return ``handler`` of a connection and its peer, after which their place is free."""
+        """Return ``handler`` of a connection and its peer, which frees their place at its end."""
 
         def handle(connection: socket.socket, peer: Any) -> None:
             try:
@@ -88,30 +87,32 @@ def _refuse(connection: socket.socket) -> None:
     with contextlib.suppress(OSError), connection:
         connection.setblocking(False)
         with contextlib.suppress(BlockingIOError):
-            connection.recv(4096)  # what was asked: closing over it would take the answer back
+            connection.recv(
+                4096
+            )  # the request: without reading it, closing would discard the answer
         connection.send(_REFUSAL)
         connection.shutdown(socket.SHUT_WR)
 
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _MOST_BROWSERS = 16
-# Those of the browsers, pages on their way, and some that only knock: each is two files, a thread.
+# Connections of browsers, pages being loaded, and others; each takes two files and a thread.
 _MOST_CONNECTIONS = 64
 _PERIOD_S = 0.25
 _STATES_EVERY = 2
 _LONGEST_TOKEN = 200
-# A browser has nothing to say.
+# Browsers send no messages.
 _MOST_BYTES_RECEIVED = 1024
 
 
 class LiveServer:
-    """Serves ``page`` at ``/`` and what is new at ``/live``; each browser has a thread.
+    """Serves ``page`` at ``/`` and its updates at ``/live``; each browser has a thread.
 
-    A slow browser is updated less often; nothing waits for it, and nothing queues up.
+    A slow browser gets fewer updates; nothing waits for it, and no queue grows.
     """
 
     def __init__(self, view: LiveView, page: str, host: str, port: int, token: str = "") -> None:
-        """port: 0 takes any that is free;  token: must stand behind ``?token=`` in the address.
+        """port: 0 = any free one;  token: required as ``?token=`` in the address; empty = none.
 
         Raises ConfigurationError for a host beyond this computer without a token.
         """
@@ -140,7 +141,7 @@ class LiveServer:
         return f"http://{host}:{port}/"
 
     def start(self) -> None:
-        """Listen; ConfigurationError if the port is taken."""
+        """Listen; ConfigurationError if the port is in use."""
         try:
             listening = ConnectionLimit(self._host, self._wanted, _MOST_CONNECTIONS)
         except (OSError, UnicodeError) as err:
@@ -185,10 +186,10 @@ class LiveServer:
         return _text(http.HTTPStatus.NOT_FOUND, "there is only /\n")
 
     def _from_here(self, request: Request) -> bool:
-        """Return whether no page of another origin asks, and the name is one of this computer's.
+        """Return whether the request is not of a page of another origin, nor to a foreign name.
 
-        A browser sends the page's origin with a socket's request; a foreign name that points here
-        (DNS rebinding) stands in Host.
+        A browser sends the page's origin with the request of a socket; a foreign name that resolves
+        to this computer (DNS rebinding) is in Host.
         """
         hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
         if len(hosts) != 1 or len(origins) > 1:
@@ -223,13 +224,13 @@ class LiveServer:
                 connection.send(content)
             turn += 1
             try:
-                connection.recv(timeout=_PERIOD_S)  # says nothing of use, but tells a closed line
+                connection.recv(timeout=_PERIOD_S)  # raises ConnectionClosed on a closed line
             except TimeoutError:
                 continue
 
 
 def _split(address: str) -> SplitResult | None:
-    """Return the parts of an address, None where it is none (``//[::1``)."""
+    """Return the parts of an address, None for an invalid one (``//[::1``)."""
     try:
         return urlsplit(address)
     except ValueError:
@@ -261,22 +262,20 @@ def _response(status: http.HTTPStatus, headers: Headers, text: str) -> Response:
 
 
 def _serve(server: Server) -> None:
-    """Serve until the server is shut down, which waits for the end, however this ends."""
+    """Serve until the server is shut down, which waits for the end of this function."""
     try:
         server.serve_forever()
     finally:
-        # Where it ends before it has begun, websockets does neither.
+        # websockets does neither if it ends before it has begun.
         server.socket_closed.set()
         server.shutdown_watcher.close()
 
-
-# The page of a running scan: one file, nothing fetched, drawn by the script of the maps.
 
 _COLOURS = 128
 
 
 def render(title: str) -> str:
-    """Return the page as HTML; it opens a socket to where it came from."""
+    """Return the page as HTML in one file; it opens a socket to its own origin."""
     colours = matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, _COLOURS))[:, :3]
     palette = "".join(f"{round(255 * part):02x}" for row in colours for part in row)
     folder = resources.files("omsm_ros.report") / "templates"

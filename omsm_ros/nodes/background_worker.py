@@ -1,4 +1,4 @@
-"""Work that takes seconds, done beside the samples, which go on being taken meanwhile."""
+"""Does work that takes seconds in a thread, while the node continues to take samples."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from omsm_ros.nodes.topics import REQUESTS_QOS
 
 T = TypeVar("T")
 
-# So many may wait; whoever comes then is told at once to ask again later.
+# Requests that may wait; a further one is refused at once.
 _MOST_WAITING = 8
-# Without work, until its memory is given back.
+# Idle time after which free memory is returned to the system [s].
 _IDLE_S = 1.0
 
 
 class BackgroundWorker:
-    """One thread that works for a node, and services that wait for it without stopping the node."""
+    """A thread for the work of a node, and services that await it without stopping the node."""
 
     def __init__(self, node: Node, undo: ExitStack) -> None:
         self._node = node
@@ -38,7 +38,7 @@ class BackgroundWorker:
     async def do(self, work: Callable[[], T]) -> T:
         """Return what ``work`` returns, or raise what it raises.
 
-        Raises OmsmError if too many wait already.
+        Raises OmsmError if too many requests wait.
         """
         if self.waiting >= _MOST_WAITING:
             raise OmsmError(f"busy: {self.waiting} requests are being worked on; ask again later")
@@ -57,7 +57,7 @@ class BackgroundWorker:
         name: str,
         answer: Callable[[Any, Any], Awaitable[None]],
     ) -> None:
-        """Offer the service ``name``; as ``running.serve``, for an ``answer`` that awaits."""
+        """Offer the service ``name``, as ``running.serve``, with an asynchronous ``answer``."""
 
         async def callback(request: Any, response: Any) -> Any:
             try:
@@ -80,22 +80,21 @@ class BackgroundWorker:
             try:
                 task = self._work.get(timeout=patience)
             except queue.Empty:
-                # Or a node has for good the memory of its largest request; the traceback of one
-                # that failed holds all of it.
+                # Else the node keeps the memory of its largest request.
                 return_free_memory()
                 patience = None
                 continue
             if task is None:
                 return
             self._do(*task)
-            del task  # with what it has found
+            del task  # with its result
             patience = _IDLE_S
 
     def _do(self, work: Callable[[], Any], done: Future) -> None:
         try:
             done.set_result(work())
-        except Exception as err:  # raised where it is awaited
+        except Exception as err:  # raised by ``do``
             done.set_exception(err)
-        # The executor looks at who waits only when something else wakes it.
+        # Without waking it, the executor continues the waiting service only at its next event.
         if (executor := self._node.executor) is not None:
             executor.wake()

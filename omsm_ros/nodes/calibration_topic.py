@@ -1,8 +1,8 @@
-"""The topic ``calibration``: it carries the one in force, in whatever order nodes start again.
+"""Publishes and receives the calibration in force on the topic ``calibration``.
 
-Its stamp is the time since when it is in force. Every node that deals with calibrations listens,
-and whoever hears a newer one says it again: so all that is latched is the newest, and one of the
-nodes may be restarted without it being forgotten.
+Its stamp is the time since which it is in force. Each node that uses calibrations subscribes, and
+publishes a newer one again: so all latched messages hold the newest one, and any node may be
+restarted without its loss.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from omsm_ros.nodes import topics
 
 TOPIC = "calibration"
 _COMPLAINT_PERIOD_S = 5.0
-# Two nodes that refuse each other's calibration do not fill the network with it.
+# Bounds the messages of two nodes that refuse each other's calibration.
 _REPEAT_NS = 5 * 10**9
-# Clocks of a cell's computers agree to much less.
+# The clocks of a cell's computers agree to much less.
 _AHEAD_NS = 10 * 10**9
 
 
 class CalibrationTopic:
-    """Publishes what its node puts in force, and hands it what others do.
+    """Publishes the calibrations of its node, and passes those of other nodes to it.
 
-    calibration, since_ns: in force, and since when [ns]; None before there is one
-    refused: why the last one heard was not taken; empty if it was
+    calibration, since_ns: in force, and since when [ns]; None before the first one
+    refused: why the last one received was refused; empty if it was accepted
     """
 
     def __init__(
         self, node: Node, undo: ExitStack, take: Callable[[Calibration, int], None], listens: bool
     ) -> None:
-        """take: called with each newer calibration that is heard; raises OmsmError to refuse."""
+        """take: called with each newer calibration received; raises OmsmError to refuse it."""
         self.calibration: Calibration | None = None
         self.since_ns = 0
         self.refused = ""
@@ -45,7 +45,7 @@ class CalibrationTopic:
         self._repeated_ns = 0
         self._published: tuple[str, int] | None = None  # id and stamp of the last message
         self._messages = message_mapping.ros_messages()
-        # Both are made without a check for rivals: here more than one may speak.
+        # Several nodes may publish here, so no check of the number of publishers is made.
         self._publisher = topics.publish_on(
             node, undo, CalibrationMessage, TOPIC, topics.LATCHED_QOS
         )
@@ -55,14 +55,14 @@ class CalibrationTopic:
             )
 
     def decided(self) -> int:
-        """Return the stamp of what is put in force now: later than all that was before [ns]."""
+        """Return the stamp of a calibration put in force now: later than all before [ns]."""
         return max(self._now_ns(), self.since_ns + 1)
 
     def announce(self, calibration: Calibration, since_ns: int) -> None:
         """Publish that ``calibration`` is in force since ``since_ns`` [ns].
 
         A stamp ahead of this node's clock, as of a file dated tomorrow or under simulated time,
-        is published as now: the other nodes would count it as now too, and answer for ever.
+        is replaced by now, as other nodes do; else all would answer each other without end.
         """
         since_ns = self._plausible(since_ns)
         self.calibration, self.since_ns, self.refused = calibration, since_ns, ""
@@ -94,7 +94,7 @@ class CalibrationTopic:
         self.announce(heard, since_ns)
 
     def _republish(self) -> None:
-        """Say again, as the newest, what stays in force."""
+        """Publish the calibration in force again, as the newest one."""
         now = self.decided()
         if self.calibration is not None and now - self._repeated_ns > _REPEAT_NS:
             self._repeated_ns, refused = now, self.refused
@@ -102,7 +102,7 @@ class CalibrationTopic:
             self.refused = refused
 
     def _plausible(self, stamp_ns: int) -> int:
-        """Return the stamp; now, of a message without one, or from a clock that is ahead."""
+        """Return the stamp; now for a message without one, or with one ahead of this clock."""
         now = self._now_ns()
         return stamp_ns if 0 < stamp_ns < now + _AHEAD_NS else max(now, self.since_ns + 1)
 

@@ -1,4 +1,4 @@
-"""``calibrator``: keeps the last motion and identifies the loop's dynamics on request."""
+"""``calibrator``: keeps the recent motion and identifies the dynamics of the loop on request."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.quantities import Parameter
 from omsm_ros.report.verdict import verdict_text
 
-# What identifies takes seconds to load on a small computer, and samples are kept without it: each
-# piece of work loads its own, beside them.
+# Identification takes seconds to load on a small computer, so it is imported in the thread that
+# does the work, while samples are kept.
 if TYPE_CHECKING:
     from omsm_ros.core.identification.identify import Identification
 
@@ -45,7 +45,7 @@ PARAMETERS = (
         "output", "calibration.json", "link to the calibration in force; each has a file beside it"
     ),
     Parameter("report", "", "folder for the certificate of each identification; empty = none"),
-    Parameter("settings", "", "JSON object of what the calibration belongs to"),
+    Parameter("settings", "", "JSON object of the cell's settings, stored in the calibration"),
     Parameter("catalogue", "", "file or URL of the database to write it down in; empty = none"),
     BAG_FOLDERS,
     *TRIGGER,
@@ -61,7 +61,7 @@ class CalibratorNode(ManagedNode):
         self._messages = message_mapping.ros_messages()
 
     def configure(self, undo: ExitStack) -> None:
-        """Take up what was in force, and answer requests."""
+        """Load the calibration that was in force, and answer requests."""
         self._settings = settings_of(self.values["settings"])
         self._trigger = trigger_of(self.values)
         self._folder = CalibrationFolder(Path(self.values["output"]))
@@ -102,22 +102,22 @@ class CalibratorNode(ManagedNode):
             return
         if self._probe and reported != self._probe:
             self.get_logger().warning(
-                "the probe's settings changed: the motion before is forgotten; make it anew"
+                "the probe's settings changed: the motion before is dropped; repeat the step test"
             )
             for buffer in self._buffers.values():
                 buffer.forget()
         self._probe = reported
 
     def _claim(self, undo: ExitStack) -> None:
-        """Keep a second cell from taking this one's calibrations for its own."""
+        """Lock the calibrations of this cell against a second calibrator."""
         try:
             undo.enter_context(exclusive_lock(self._folder.link))
-        except FileError as err:  # what cannot be kept is published all the same
+        except FileError as err:  # it is published nevertheless
             self._trouble = str(err)
             self.get_logger().error(self._trouble)
 
     def _publish_stored(self) -> None:
-        """Publish what was in force before this start."""
+        """Publish the calibration that was in force before this start."""
         try:
             known = self._folder.in_force()
         except OmsmError as err:
@@ -129,7 +129,7 @@ class CalibratorNode(ManagedNode):
             self._last = f"{known[0].id[:12]} in force, as before the start"
 
     def _adopt(self, calibration: Calibration, since_ns: int) -> None:
-        """Keep what another node put in force; it is published even if it cannot be kept."""
+        """Keep a calibration of another node; it is published even if it cannot be kept."""
         certificate = calibration.certificate
         if certificate.verdict == REJECTED:
             raise ConfigurationError(f"rejected: {'; '.join(map(str, certificate.reasons))}")
@@ -171,7 +171,7 @@ class CalibratorNode(ManagedNode):
     def _judge(self, calibration: Calibration, since_ns: int) -> tuple[bool, str]:
         certificate = calibration.certificate
         if certificate.verdict == REJECTED:
-            # An earlier, good calibration stays in its file and in use.
+            # An earlier calibration stays in use.
             return False, f"rejected: {'; '.join(map(str, certificate.reasons))}"
         kept = self._keep_file(calibration, since_ns)
         self._topic.announce(calibration, since_ns)
@@ -184,8 +184,8 @@ class CalibratorNode(ManagedNode):
         return resolved_within(Path(given), self.values["bag_folders"], BagError, "bag")
 
     def _noted(self, bag: Path | None, calibration: Calibration) -> str:
-        """Write it into the catalogue and say so; a database that fails undoes no calibration."""
-        # The database's library is an optional package.
+        """Add it to the catalogue and return a note; an error of the database is only a note."""
+        # SQLAlchemy is an optional package.
         from omsm_ros.pipelines.history import keep_calibration
 
         warnings = record_in_catalogue(
@@ -195,8 +195,8 @@ class CalibratorNode(ManagedNode):
         return f"; {'; '.join(warnings)}" if warnings else "; written into the catalogue"
 
     def _certified(self, bag: Path | None, identified: Identification) -> str:
-        """Write the certificate and say so; a full disk does not undo a calibration."""
-        # Drawing takes a second to import; most calibrators do without.
+        """Write the certificate and return a note; an error of the disk is only a note."""
+        # matplotlib takes a second to import, and most calibrators do not need it.
         from omsm_ros.pipelines.identify import write_certificate
 
         folder = Path(self.values["report"])
@@ -208,7 +208,7 @@ class CalibratorNode(ManagedNode):
         return f"; certificate in {page}"
 
     def _work(self, request: Identify.Request, bag: Path | None):  # type: ignore[no-untyped-def]
-        """Return what is to be done beside the samples; what it needs of them is taken now."""
+        """Return the work of a request; the samples that it needs are taken now."""
         duration = quantities.DURATION.checked(request.duration)
         order = quantities.ORDER.checked(request.order)
         if bag:
@@ -234,7 +234,7 @@ class CalibratorNode(ManagedNode):
 
     def _live_motion(self, *streams: list[Any]) -> MotionRecord:
         faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
-        if faster == 1.0:  # a time lapse is as even as the computer that plays it
+        if faster == 1.0:  # the stamps of a time lapse depend on the computer that plays it
             for name, blocks in zip(_STREAMS, streams, strict=True):
                 check_period(name, blocks)
         return assemble(*streams, trigger=self._trigger)
@@ -244,7 +244,7 @@ class CalibratorNode(ManagedNode):
         return self._settings.get("time_lapse", 1.0)
 
     def report(self) -> Report:
-        """Return what is held, in force, and refused."""
+        """Return the samples held, the calibration in force, and the blocks refused."""
         in_force = self._topic.calibration
         values: dict[str, object] = {
             "calibration": in_force.id if in_force else "",

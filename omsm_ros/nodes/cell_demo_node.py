@@ -1,8 +1,8 @@
 """``cell_demo``: calibrate and measure a whole (emulated) cell with the real nodes.
 
-Starts emulator, driver, calibrator, corrector and recorder as processes, has the step test
-run and identified, scans the paper's mirror, corrects the recorded bag once more offline and
-compares everything with the truth of the twin.
+It starts emulator, driver, calibrator, corrector and recorder as processes, runs the step test,
+identifies and scans the paper's mirror. Then it corrects the recorded bag offline and compares
+all results with the truth of the twin.
 """
 
 from __future__ import annotations
@@ -40,15 +40,13 @@ from omsm_ros.instruments.emulator_factory import EMULATED
 from omsm_ros.pipelines.demonstrate import Demonstration, finish_demonstration, table_of
 from omsm_ros.pipelines.progress import refresh_in_thread, tick
 
-# Nodes as processes of their own: started together, ended together, their output kept.
-
 _END_TIMEOUT_S = 15.0
 
 
 class NodeProcesses:
-    """Starts nodes of this package; a context manager that leaves none behind.
+    """Starts nodes of this package as processes; a context manager that ends all of them.
 
-    Each node's output goes to ``<folder>/<node>.log``.
+    The output of a node goes to ``<folder>/<node>.log``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -80,7 +78,7 @@ class NodeProcesses:
         return self._running[node].pid
 
     def check(self) -> None:
-        """Raise OmsmError with the last words of a node that ended by itself."""
+        """Raise OmsmError with the last line of a node that ended by itself."""
         for name, process in self._running.items():
             if process.poll() is not None:
                 lines = (self._folder / f"{name}.log").read_text(errors="replace").split("\n")
@@ -88,7 +86,7 @@ class NodeProcesses:
                 raise OmsmError(f"{name} ended with exit code {process.returncode}: {said}")
 
     def end(self, *nodes: str, how: signal.Signals = signal.SIGINT) -> None:
-        """End ``nodes`` (all of them if none is named) and wait; OmsmError if one had failed."""
+        """End ``nodes``, or all, and wait; OmsmError if one had failed."""
         names = nodes or tuple(self._running)
         for name in names:
             self._running[name].send_signal(how)
@@ -119,7 +117,7 @@ class NodeProcesses:
 
 
 def _parameter_text(value: object) -> str:
-    # Parsed as YAML, of which JSON is a part; a float keeps its point there.
+    # ROS parses it as YAML, which includes JSON; a float keeps its point.
     return json.dumps(value)
 
 
@@ -130,7 +128,7 @@ _PREFIX = "/omsm/"
 
 
 class DemoNode(Node):
-    """The operator: looks at diagnostics, presses the buttons, waits for what must come."""
+    """Reads diagnostics, calls services, and waits for their effects."""
 
     def __init__(self, processes: NodeProcesses) -> None:
         super().__init__("cell_demo", namespace="omsm")
@@ -161,7 +159,7 @@ class DemoNode(Node):
     def wait_until(
         self, what: str, done: Callable[[], bool], watch: Callable[[], object] = lambda: None
     ) -> None:
-        """Spin until ``done``; DeviceTimeoutError if ``watch`` stands still for long."""
+        """Spin until ``done``; DeviceTimeoutError if ``watch`` does not change for long."""
         last, deadline = watch(), time.monotonic() + _STALL_TIMEOUT_S
         while not done():
             rclpy.spin_once(self, timeout_sec=0.1)
@@ -170,7 +168,7 @@ class DemoNode(Node):
                 last, deadline = now, time.monotonic() + _STALL_TIMEOUT_S
             if time.monotonic() > deadline:
                 raise DeviceTimeoutError(
-                    f"waited in vain for {what}; see the logs beside the results"
+                    f"{what} did not happen in time; see the logs in the folder of the results"
                 )
 
     def ask(self, kind: Any, name: str, request: Any, patience: float = _SERVICE_TIMEOUT_S) -> Any:
@@ -179,7 +177,7 @@ class DemoNode(Node):
         try:
             if not client.wait_for_service(patience):
                 raise DeviceTimeoutError(f"service {name!r} did not appear; see the logs")
-            # The server may see the request before it sees who wants the answer, and then drops it.
+            # A server that has not discovered the client yet drops its answer.
             rclpy.spin_once(self, timeout_sec=_DISCOVERY_S)
             time.sleep(_DISCOVERY_S)
             future = client.call_async(request)
@@ -199,7 +197,7 @@ class DemoNode(Node):
 
 
 class DemoStage:
-    """One line of progress a stage: a bar on a terminal, a plain line elsewhere."""
+    """Shows the progress of a stage: a bar on a terminal, a line elsewhere."""
 
     def __init__(self, quiet: bool) -> None:
         self._skip_unremarkable = quiet
@@ -274,7 +272,7 @@ def _record(node: DemoNode, processes: NodeProcesses, plan: Demonstration, bag: 
 
 
 def _until_seen() -> None:
-    """Keep the live page up until whoever looks at it goes on; where nobody can, not at all."""
+    """Keep the live page until Enter is pressed; do not wait without a terminal."""
     if sys.stdin.isatty() and sys.stderr.isatty():
         print("the live page stays until you press Enter ", end="", file=sys.stderr, flush=True)
         sys.stdin.readline()
@@ -361,17 +359,17 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--device", choices=sorted(EMULATED), default="six_channel")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start-radius", type=float, help="[m]")
-    parser.add_argument("--disturbances", type=Path, help="what is wrong with the machine")
+    parser.add_argument("--disturbances", type=Path, help="errors of the simulated machine")
     parser.add_argument("--view", action="store_true", help="show the scan in a browser")
     parser.add_argument("--json", action="store_true")
-    # What follows --ros-args is for rclpy, when started by `ros2 run`.
+    # With `ros2 run`, the arguments after --ros-args are for rclpy.
     return parser.parse_args(rclpy.utilities.remove_ros_args(sys.argv)[1:])
 
 
 def main() -> None:
     """Run ``ros2 run omsm_ros cell_demo``."""
     args = _arguments()
-    # A demonstration talks to its own nodes only, whatever else runs on the network.
+    # A demonstration is isolated from other nodes on the network.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     plan = Demonstration(

@@ -1,4 +1,4 @@
-"""``cell_emulator``: the cell's probe and encoders on an emulated port, fed by the twin."""
+"""``cell_emulator``: emulates probe and encoders of a cell on a port, with data of the twin."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _FAULTS = (
 )
 PARAMETERS = (
     Parameter(
-        "device", "six_channel", "what to imitate, as in the driver", choices=tuple(EMULATED)
+        "device", "six_channel", "the device to emulate, as in the driver", choices=tuple(EMULATED)
     ),
     Parameter(
         "link", "", "serial port to offer, or tcp://127.0.0.1:PORT; empty = in a private folder"
@@ -57,13 +57,13 @@ PARAMETERS = (
     Parameter("link_beside", "", "of the second device, where the cell has one; as `link`"),
     Parameter("time_lapse", 1.0, "how much faster than real time to play", quantities.TIME_LAPSE),
     *_SCENARIO,
-    Parameter("disturbances", "", "file of what is wrong with the machine"),
+    Parameter("disturbances", "", "file of the errors of the simulated machine"),
     *_FAULTS,
 )
 
 
 class CellEmulatorNode(ManagedNode):
-    """Plays a motion on request; each motion starts the trigger counter anew.
+    """Plays a motion on request; each motion resets the trigger counter.
 
     An ``accelerometer`` among the disturbances is published on ``acceleration``.
 
@@ -129,7 +129,7 @@ class CellEmulatorNode(ManagedNode):
         return undo.enter_context(line_for(link))
 
     def activate(self, undo: ExitStack) -> None:
-        """Let motions be played."""
+        """Accept requests for motions."""
         undo.callback(self._player.halt)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = self.create_timer(_ACCELERATION_PERIOD_S, self._publish_acceleration, clock=steady)

@@ -1,4 +1,4 @@
-"""What can be set on the corrector, and the options that it makes."""
+"""The parameters of the corrector, and the options of the correction made of them."""
 
 from __future__ import annotations
 
@@ -44,21 +44,21 @@ TRIGGER = (
 BAG_FOLDERS = Parameter(
     "bag_folders",
     "~:.:/tmp",
-    "what a service may read bags from, separated by ':'; ~ = home, . = where the node was "
-    "started; empty = any folder",
+    "folders from which a service may read bags, separated by ':'; ~ = home, . = where the node "
+    "was started; empty = any folder",
 )
 PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
     Parameter(
         "calibration_folders",
         "~:.:/tmp",
-        "what load_calibration may read from, separated by ':'; ~ = home, . = where the node was "
-        "started; empty = any folder",
+        "folders from which load_calibration may read, separated by ':'; ~ = home, . = where the "
+        "node was started; empty = any folder",
     ),
     BAG_FOLDERS,
-    Parameter("follow_calibrator", True, "take what appears on the topic calibration"),
-    Parameter("settings", "", "JSON object of how the cell is set now; empty = not compared"),
-    Parameter("override", False, "use a calibration that does not belong; every cloud says so"),
+    Parameter("follow_calibrator", True, "use calibrations from the topic calibration"),
+    Parameter("settings", "", "JSON object of the cell's settings; empty = not compared"),
+    Parameter("override", False, "ignore a mismatch of settings (shown in each cloud's frame)"),
     Parameter("polarity", 1, "+1: distance falls as z rises; -1: reversed", choices=(1, -1)),
     Parameter(
         "lateral_lag",
@@ -83,14 +83,12 @@ PARAMETERS = (
     Parameter(
         "accuracy",
         _NOT_REQUESTED,
-        "asked for, k = 2 [m]: what the light is held against; -1 = the stated uncertainty",
+        "accuracy required by the user, k = 2 [m]: limit of the verdict; -1 = not stated",
         quantities.BUDGET,
         unset=_NOT_REQUESTED,
     ),
-    Parameter(
-        "nominal", "", "SURFACE.yaml, for what lateral errors cost; '' = slopes are not known"
-    ),
-    Parameter("sources_file", "", "SOURCES.yaml: what is uncertain of the machine; '' = nothing"),
+    Parameter("nominal", "", "SURFACE.yaml, for the effect of lateral errors; '' = slopes unknown"),
+    Parameter("sources_file", "", "SOURCES.yaml: uncertainties of the machine; '' = none stated"),
     *(
         Parameter(
             f"sources.{field.name}",
@@ -104,7 +102,7 @@ PARAMETERS = (
 
 
 def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
-    """Return how to correct."""
+    """Return the options of the correction."""
     lag = values["lateral_lag"]
     return CorrectionOptions(
         polarity=values["polarity"],
@@ -116,14 +114,14 @@ def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
 
 
 def trigger_of(values: Mapping[str, Any]) -> CommonTrigger:
-    """Return what is stated of the trigger that probe and axes count."""
+    """Return the settings of the trigger that probe and axes count."""
     return CommonTrigger(
         counter_offset=values["counter_offset"], stamp_tolerance=values["stamp_tolerance"]
     )
 
 
 def sources_of(values: Mapping[str, Any]) -> MachineSources:
-    """Return what is uncertain of the machine: by parameters, else by the file."""
+    """Return the uncertainties of the machine, from the parameters, else from the file."""
     sizes = {f.name: values[f"sources.{f.name}"] for f in fields(ErrorSources)}
     by_parameter = declared_sources({name: size for name, size in sizes.items() if size})
     path = values["sources_file"]
@@ -133,6 +131,6 @@ def sources_of(values: Mapping[str, Any]) -> MachineSources:
 
 
 def accuracy_of(values: Mapping[str, Any]) -> float | None:
-    """Return the accuracy asked for, k = 2 [m], None where nobody asked."""
+    """Return the accuracy required, k = 2 [m], or None."""
     asked: float = values["accuracy"]
     return None if asked == _NOT_REQUESTED else asked

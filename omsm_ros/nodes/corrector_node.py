@@ -1,4 +1,4 @@
-"""``corrector``: turns axes and distance into corrected surface points, as they come."""
+"""``corrector``: computes corrected surface points from axes and distance, continuously."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
 from omsm_ros.pipelines.measure import live_traffic_light, with_sources
 
-# Without a block for so long, and for as long as several last, the motion has paused [s].
+# A motion has paused after this time without a block, or the duration of three blocks [s].
 PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
 _STREAMS_CORRECTION_STATE = ("axes", "distance")
-# Longer than the pauses within a step test; five samples of a slow device.
+# Silence before a report: longer than the pauses of a step test, or five samples [s].
 _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
-# Of the two seconds of small blocks that wait at most, half.
+# Half of the two seconds for which small blocks can wait [ms].
 _DELAYED_MS = 1000.0
-# Reasons that are a sign of something lost on the way, unlike a probe that looks past its target.
+# Reasons that mean a loss of data, unlike a probe without a target.
 _LOSSES = ("unmatched", "late", "overdue")
 
 
 def light_values(light: TrafficLight) -> dict[str, object]:
-    """Return the light as values of a report: no fault of the node's, so no level of it."""
+    """Return the verdict as values of a report; it does not change the level of the node."""
     return {
         "light": light.level,
         "light_word": str(light.word),
@@ -65,7 +65,7 @@ def light_values(light: TrafficLight) -> dict[str, object]:
 
 
 class CorrectionState:
-    """Counts what the core never sees, and weighs both."""
+    """Counts samples that are not corrected, and reports on all of them."""
 
     def __init__(self) -> None:
         self.uncalibrated = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
@@ -91,22 +91,22 @@ class CorrectionState:
         return _sum_of(self._ended, corrector.account)
 
     def heard(self, stream: str, first: int, samples: int, period: float, now: float) -> None:
-        """Note a block, whatever becomes of it; first: its trigger number;  now: [s]."""
+        """Count a block; first: its trigger number;  now: [s]."""
         self._resumes = now + max(PAUSE_S, _PAUSE_BLOCKS * samples * period)
         self.begins_at.setdefault(stream, first)
         self._heard[stream] += samples
         self._period[stream] = period
 
     def has_paused(self, now: float) -> bool:
-        """Return whether no block came for as long as none does only where the motion ended [s]."""
+        """Return whether no block came for longer than within a motion; now: [s]."""
         return now > self._resumes
 
     def arrived(self, stamp_ns: int) -> None:
-        """Note that a message arrived at ``stamp_ns`` [ns], of those now taken."""
+        """Note the arrival of one of the messages that are now taken [ns]."""
         self._oldest_ns = min(self._oldest_ns or stamp_ns, stamp_ns)
 
     def done(self, now_ns: int) -> None:
-        """Note that all that arrived has been dealt with [ns]."""
+        """Note that all messages that arrived are processed [ns]."""
         if self._oldest_ns:
             self.load.block(self._oldest_ns, now_ns)
         self._oldest_ns = 0
@@ -118,9 +118,9 @@ class CorrectionState:
         cpu: float,
         motion: LiveOffset | None = None,
     ) -> Report:
-        """Weigh the state; ``corrector`` is None without a calibration.
+        """Return the report; ``corrector`` is None without a calibration.
 
-        motion: what it says of the counters of two devices
+        motion: estimate of the offset of two devices' counters
         """
         report = Report("correcting", {"clouds_published": self.published})
         for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
@@ -149,7 +149,7 @@ class CorrectionState:
         return report
 
     def _account(self, report: Report, corrector: Corrector) -> dict[str, float]:
-        """Enter every count of the account; return those that may mean trouble."""
+        """Enter all counts into ``report``; return those that may mean a loss."""
         watched: dict[str, float] = {}
         for stream, account in self.account(corrector).as_dict().items():
             counts: dict[str, int] = {**account}  # type: ignore[dict-item]
@@ -209,7 +209,7 @@ def _sum_of_stream(one: StreamAccount, other: StreamAccount) -> StreamAccount:
 
 
 def _add_motion(report: Report, slip: TriggerSlip, motion: LiveOffset) -> None:
-    """Enter what a motion before a fixed target said of the counts, and hold the stamps to it."""
+    """Enter the counter offset estimated from a motion, and compare it with the stamps."""
     offset = motion.established
     report.values["motion_offset_samples"] = None if offset is None else offset.samples
     if offset is None:
@@ -217,12 +217,12 @@ def _add_motion(report: Report, slip: TriggerSlip, motion: LiveOffset) -> None:
     if offset.samples:
         report.add(
             ERROR,
-            f"the motion says that the counts are {offset.samples} samples apart (± "
+            f"the motion shows that the counts are {offset.samples} samples apart (± "
             f"{offset.uncertainty:.2g}), so heights are wrong by what Z moves meanwhile: state "
             f"counter_offset {motion.in_use + offset.samples}, or identify anew if the lag changed",
         )
     elif slip.samples:
-        report.add(ERROR, "but the motion says that equal counts are one trigger: a link is late")
+        report.add(ERROR, "but the motion shows that equal counts are one trigger: a link is late")
 
 
 def publish_frames(
@@ -262,14 +262,14 @@ _OVERRIDDEN = "_overridden"
 
 
 class CorrectorNode(ManagedNode):
-    """Publishes nothing until it has a calibration; a new one begins a new correction."""
+    """Publishes points as soon as it has a calibration; a new one begins a new correction."""
 
     def __init__(self) -> None:
         super().__init__("corrector", PARAMETERS)
         self._messages = message_mapping.ros_messages()
 
     def configure(self, undo: ExitStack) -> None:
-        """Take up the calibration to start with, and answer requests."""
+        """Load the initial calibration, and answer requests."""
         self._settings = settings_of(self.values["settings"])
         self._options, self._sources = options_of(self.values), sources_of(self.values)
         nominal = self.values["nominal"]
@@ -326,9 +326,9 @@ class CorrectorNode(ManagedNode):
         corrector = Corrector(
             calibration, with_sources(self._options, calibration, self._sources, self._nominal)
         )
-        # Nothing is refused from here on: the new calibration is in force as a whole.
+        # No error can occur from here on, so the new calibration is either wholly in force or not.
         self._end_correction()
-        # A viewer that waits for the usual frame shows nothing until somebody has seen why.
+        # With another frame, a viewer of the usual frame shows nothing until the user has noticed.
         self._frame = self.values["workpiece_frame"] + (_OVERRIDDEN if reasons else "")
         for reason in reasons:
             self.get_logger().warning(f"overridden: {reason}")
@@ -337,7 +337,7 @@ class CorrectorNode(ManagedNode):
         self.get_logger().info(f"calibration {calibration.id[:12]} in use")
 
     def _on_probe(self, message: String, _: MessageInfo) -> None:
-        """Stop correcting where the calibration belongs to a probe set otherwise; else begin."""
+        """Stop the correction if the calibration is for other settings of the probe; else begin."""
         try:
             reported = message_mapping.probe_settings(message)
         except OmsmError as err:
@@ -387,7 +387,7 @@ class CorrectorNode(ManagedNode):
     async def _on_predict(
         self, request: PredictError.Request, response: PredictError.Response
     ) -> None:
-        # What cannot be predicted is no error of zero.
+        # Without a prediction the error is not zero but unknown.
         response.peak_to_valley = response.rms = response.outside_band_fraction = float("nan")
         bag = request.bag
         if bag:
@@ -410,8 +410,7 @@ class CorrectorNode(ManagedNode):
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples
             self._warn(
-                self._foreign
-                or "samples come, but there is no calibration: call identify or load one"
+                self._foreign or "samples arrive without a calibration: call identify or load one"
             )
             return
         convert = message_mapping.axis_block if stream == "axes" else message_mapping.distance_block
@@ -424,7 +423,7 @@ class CorrectorNode(ManagedNode):
             self._refuse(stream, samples, err)
 
     def _push(self, stream: str) -> None:
-        """Correct what was taken; the more waited, the less a sample costs."""
+        """Correct the waiting blocks together, which takes less time per sample."""
         blocks, self._waiting[stream] = self._waiting[stream], []
         if self._corrector is None:
             return
@@ -434,12 +433,12 @@ class CorrectorNode(ManagedNode):
                 push(*together)
             except OmsmError as err:
                 self._refuse(stream, sum(map(len, together)), err)
-            # One after the other: the middleware keeps room for its longest message many times.
+            # One cloud for each run, since the middleware reserves memory for its longest message.
             self._publish(self._corrector.take())
         self._state.done(time.time_ns())
 
     def _settle(self) -> None:
-        """Publish what waits for stamps, where none come: the motion has ended."""
+        """Publish the samples that wait for stamps once the motion has ended."""
         if self._corrector and self._corrector.held and self._state.has_paused(time.monotonic()):
             self._corrector.settle()
             self._publish(self._corrector.take())
@@ -462,13 +461,13 @@ class CorrectorNode(ManagedNode):
         self.get_logger().warning(text, throttle_duration_sec=_COMPLAINT_PERIOD_S)
 
     def report(self) -> Report:
-        """Return the account, and what is wrong with it now."""
+        """Return the account, and the present faults."""
         if self._motion and self._corrector and not self._corrector.slips.same_stamps:
             self._motion.judge()
         now, cpu = time.monotonic(), time.process_time()
         report = self._state.report(self._corrector, now, cpu, self._motion)
         report.values["calibration"] = self._in_force_id()
-        # Before there is a point, all that is uncertain would make nothing.
+        # Without a point there is nothing to assess.
         if self._state.published and self._corrector and self._topic.calibration is not None:
             light = live_traffic_light(
                 self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
@@ -477,7 +476,9 @@ class CorrectorNode(ManagedNode):
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._aside.waiting
         if self._frame != self.values["workpiece_frame"]:
-            report.add(WARN, "correcting with a calibration that does not belong (overridden)")
+            report.add(
+                WARN, "correcting although the settings do not match the calibration (overridden)"
+            )
         if self._foreign:
             report.add(ERROR, self._foreign)
         if self._topic.refused:
@@ -486,7 +487,7 @@ class CorrectorNode(ManagedNode):
 
 
 def _prediction(*motion: Any) -> Prediction:
-    # What reads bags takes as long to load as all else; most correctors are never asked.
+    # Readers of bags take long to load, and most correctors do not need them.
     from omsm_ros.pipelines.verify_calibration import predict_from
 
     return predict_from(*motion)

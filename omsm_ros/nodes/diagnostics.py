@@ -1,7 +1,7 @@
-"""What a node says of itself once a second: its state now as a level, its history as numbers.
+"""Publishes the state of a node once a second: its present state as a level, counts as values.
 
-OK: it does what it was asked to.  WARN: it does, but somebody should look.  STALE: it would, but
-nothing comes.  ERROR: it cannot. What went wrong longer than WINDOW_S ago is a number only.
+OK: it works.  WARN: it works, but should be checked.  STALE: no input arrives.  ERROR: it cannot
+work. Faults that are over are only counted.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ STALE = DiagnosticStatus.STALE
 
 _SEVERITY = (OK, WARN, STALE, ERROR)
 _COMPLAINT_PERIOD_S = 5.0
-# By node: how many, and the line of the last one.
+# Number of internal errors of a node, and the line of the last one.
 _defects: dict[str, tuple[int, str]] = {}
 
 
 @dataclass
 class Report:
-    """message: said when nothing is found;  values: history and figures, by name."""
+    """The state of a node.  message: without findings;  values: counts and figures, by name."""
 
     message: str
     values: dict[str, object] = field(default_factory=dict)
     findings: list[tuple[bytes, str]] = field(default_factory=list)
 
     def add(self, level: bytes, text: str) -> None:
-        """Enter something that is so now."""
+        """Add a present finding."""
         self.findings.append((level, text))
 
     @property
     def level(self) -> bytes:
-        """The gravest."""
+        """Return the most severe level."""
         return max((level for level, _ in self.findings), key=_SEVERITY.index, default=OK)
 
     @property
     def text(self) -> str:
-        """Every finding, the gravest first; the message if there is none."""
+        """Return all findings, the most severe first; the message without any."""
         ordered = sorted(self.findings, key=lambda found: -_SEVERITY.index(found[0]))
         return "; ".join(text for _, text in ordered) or self.message
 
@@ -59,7 +59,7 @@ class Diagnostics:
         """report, hardware_id: called from the node's executor."""
         self._node, self._report, self._hardware_id = node, report, hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # Simulated time may stand still; a state that nobody hears of is none.
+        # A steady clock, since simulated time may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(PERIOD_S, self.publish, clock=steady)
 
@@ -86,11 +86,11 @@ class Diagnostics:
 def _add_clock(node: Node, report: Report) -> None:
     clock = node.get_clock()
     if clock.ros_time_is_active and clock.now().nanoseconds == 0:
-        report.add(WARN, "use_sim_time is set, but nobody publishes /clock: stamps are 0")
+        report.add(WARN, "use_sim_time is set, but no node publishes /clock: stamps are 0")
 
 
 def log_internal_error(node: Node, err: Exception) -> str:
-    """Count and log a defect of ours; return the line that says what to report."""
+    """Count and log an internal error; return the line to report."""
     if os.environ.get(DEBUG):
         raise err
     name, line = node.get_fully_qualified_name(), defect(err)

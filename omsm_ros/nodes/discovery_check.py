@@ -1,4 +1,4 @@
-"""Do two ROS contexts of this computer find each other and pass a message? For ``omsm doctor``."""
+"""Checks that two ROS contexts of this computer exchange a message; for ``omsm doctor``."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ TIMEOUT_S = 10.0
 
 
 def main() -> int:
-    """Send a number from one participant to another; exit status 1 if it does not arrive."""
+    """Send a number from one participant to another; return 1 if it does not arrive."""
     contexts = [Context(), Context()]
     for context in contexts:
         rclpy.init(context=context)
-    # A name of its own, so that two checks at a time do not answer each other.
+    # A unique name, so that two simultaneous checks do not receive each other's message.
     topic = f"omsm_doctor_{time.monotonic_ns()}"
     received: list[int] = []
     sender = Node("omsm_doctor_sender", context=contexts[0])

@@ -44,7 +44,7 @@ from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
 _FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown")
-# Shorter pauses are those between two motions of a step test.
+# The pauses between two motions of a step test are shorter [s].
 _SILENCE_S = 2.0
 _SILENCE_SAMPLES = 5
 _END_S = 5.0
@@ -54,7 +54,7 @@ _ACCELERATION = "acceleration"
 
 
 class DriverNode(ManagedNode):
-    """Publishes a device's blocks; whatever happens on the wire, the node stays."""
+    """Reads a device and publishes its blocks."""
 
     def __init__(
         self,
@@ -66,10 +66,7 @@ class DriverNode(ManagedNode):
         distance: str | None = None,
         settings: str | None = None,
     ) -> None:
-        """axes, distance: topics of the blocks;  settings: of what a calibration belongs to.
-
-        None = it has none.
-        """
+        """axes, distance, settings: topics of blocks and of the probe's settings; None = none."""
         frames = [Parameter("machine_frame", "machine", "frame of the axes")] if axes else []
         if distance:
             frames.append(Parameter("probe_frame", "probe", "frame of the distance"))
@@ -87,7 +84,7 @@ class DriverNode(ManagedNode):
         return str(self.values.get("port", ""))
 
     def configure(self, undo: ExitStack) -> None:
-        """Make the device, which nobody touches yet."""
+        """Make the device, not yet connected."""
         self._device = self._make(self.values, lambda: self.get_clock().now().nanoseconds)
         self._reader = DeviceReader(
             self._device,
@@ -128,7 +125,7 @@ class DriverNode(ManagedNode):
                 )
 
     def _publish_settings(self) -> None:
-        """Tell them before the first samples that were taken with them, and who comes later."""
+        """Publish changed settings, before the first samples that were taken with them."""
         if self._settings is None:
             return
         named = {"device": self.values["device"], **self._device.settings}
@@ -138,7 +135,7 @@ class DriverNode(ManagedNode):
             self._settings.publish(String(data=json_and_yaml.text_of(reported)))
 
     def report(self) -> Report:
-        """Return what became of every sample, and what is wrong now."""
+        """Return the counts of all samples, and the present faults."""
         counts, now = self._device.counts(), time.monotonic()
         self._flow.update(int(counts["decoded"]), now)
         values: dict[str, object] = {**self._device.identity, "state": self._reader.state.value}
@@ -188,7 +185,7 @@ class ConfocalDriverNode(DriverNode):
         )
 
     def configure(self, undo: ExitStack) -> None:
-        """Make the device, which nobody touches yet, and answer requests."""
+        """Make the device, not yet connected, and answer requests."""
         super().configure(undo)
         self._aside = BackgroundWorker(self, undo)
         self._aside.serve(undo, Trigger, "~/dark_reference", self._on_dark_reference)
@@ -232,7 +229,7 @@ class AccelerometerDriverNode(DriverNode):
         self._acceleration: Publisher | None = None
 
     def configure(self, undo: ExitStack) -> None:
-        """Make the device, which nobody touches yet, and the topic."""
+        """Make the device, not yet connected, and the topic."""
         super().configure(undo)
         self._acceleration = self.publish_on(undo, AccelerationBlock, _ACCELERATION)
 

@@ -1,12 +1,12 @@
-"""What every node of this package is: managed, set by its parameters, honest about its state.
+"""The base of all nodes: lifecycle, checked parameters and diagnostics.
 
-``ros2 lifecycle`` takes it from unconfigured (parameters may be set) over inactive (they are in
-force) to active (it works) and back; unless ``autostart`` is false it goes there by itself. A
-node says what each of the two steps makes, and on the stack that it is handed, how it is undone:
+``ros2 lifecycle`` takes a node from unconfigured (parameters may be set) over inactive (they are in
+force) to active (it works) and back; unless ``autostart`` is false it becomes active by itself. A
+node implements the steps, and puts on the stack ``undo`` how each is undone:
 
-    configure(undo): what the parameters describe
-    activate(undo):  what takes and gives data
-    report():        its state while it is configured
+    configure(undo): make the objects that the parameters describe
+    activate(undo):  begin to receive and publish data
+    report():        return its state while it is configured
 """
 
 from __future__ import annotations
@@ -43,18 +43,16 @@ from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, log_int
 from omsm_ros.nodes.memory import RETURN_PERIOD_S, return_free_memory
 from omsm_ros.quantities import Parameter
 
-# A node's parameters as ROS sees them: declared once, checked at each door, no others.
-
 _QOS_PREFIX = "qos_overrides."
-# Of a name that is none, in an answer.
+# Longest unknown name in an answer.
 _MOST_CHARACTERS = 80
 _TYPES = range(ParameterType.PARAMETER_NOT_SET, ParameterType.PARAMETER_STRING_ARRAY + 1)
 
 
 class DeclaredParameters:
-    """Declares ``parameters`` on ``node``; one that is wrong keeps the node from being configured.
+    """Declares ``parameters`` on ``node``; an invalid one prevents its configuration.
 
-    refusal: why no parameter may be set now; empty if they may
+    refusal: returns why no parameter may be set now; empty if they may
     """
 
     def __init__(
@@ -63,7 +61,7 @@ class DeclaredParameters:
         self._node, self._refusal = node, refusal
         self._parameters = {parameter.name: parameter for parameter in parameters}
         self._wrong: dict[str, ConfigurationError] = {}
-        # rclpy ignores what is given but never declared; here it is an error.
+        # rclpy ignores parameters that are not declared; here they are errors.
         self._nonempty_channels = dict(node._parameter_overrides)
         for parameter in parameters:
             self._declare(parameter)
@@ -84,10 +82,7 @@ class DeclaredParameters:
         )
 
     def values(self) -> dict[str, Any]:
-        """Return every parameter by name.
-
-        Raises ConfigurationError for one that is wrong, missing, or known to nobody.
-        """
+        """Return all parameters by name; ConfigurationError for one that is invalid or unknown."""
         try:
             for err in self._wrong.values():
                 raise err
@@ -106,7 +101,7 @@ class DeclaredParameters:
         self.check_known([name for name in self._nonempty_channels if name.startswith(_QOS_PREFIX)])
 
     def check_known(self, names: Sequence[str]) -> None:
-        """Raise ConfigurationError for one that the node does not have, with the nearest one."""
+        """Raise ConfigurationError for an unknown parameter, with the nearest name."""
         for name in names:
             if not self._node.has_parameter(name):
                 name = shortened(name, _MOST_CHARACTERS)
@@ -133,7 +128,7 @@ class DeclaredParameters:
 def _rejecting_untyped(
     set_them: Callable[[Any, Any], Any],
 ) -> Callable[[Any, Any], Any]:
-    """Return a callback that refuses a value of no type, which rclpy would leave unanswered."""
+    """Return a callback that refuses a value of unknown type, which rclpy does not answer."""
 
     def answer(request: Any, response: Any) -> Any:
         for given in request.parameters:
@@ -167,14 +162,14 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 
 NAMESPACE = "omsm"
-# A publisher that is destroyed takes along what who listens has not fetched yet; the middleware
-# itself would tell so only every three seconds. In steps, as a busy machine counts time.
+# A destroyed publisher drops the messages that subscribers have not fetched yet, so wait before. In
+# short steps, since a busy computer may skip the time of a long one.
 _STEPS, _STEP_S = 20, 0.01
 AUTOSTART = Parameter("autostart", True, "configure and activate at the start", fixed=True)
 
 
 class LifecycleStage(Enum):
-    """How far a node has been brought."""
+    """State of the lifecycle of a node."""
 
     UNCONFIGURED = "unconfigured"
     INACTIVE = "inactive"
@@ -183,16 +178,18 @@ class LifecycleStage(Enum):
 
 
 class ManagedNode(LifecycleNode):  # type: ignore[misc]
-    """A node that is configured, activated, deactivated and cleaned up from outside.
+    """A node with a lifecycle.
 
     values: its parameters, once it is configured
-    fatal: what ends the node for good, once set; exit code 2
+    fatal: an error that ends the node, with exit code 2
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         try:
             super().__init__(name, namespace=NAMESPACE)
-        except InvalidParameterTypeException as err:  # of one that rclpy itself has: use_sim_time
+        except (
+            InvalidParameterTypeException
+        ) as err:  # of a parameter of rclpy, such as use_sim_time
             raise ConfigurationError(f"{name}: {err}") from err
         except rclpy_implementation.RCLError as err:
             if "invalid" not in str(err):
@@ -213,31 +210,27 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             RETURN_PERIOD_S, return_free_memory, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
 
-    # What a node fills in.
-
     def configure(self, undo: ExitStack) -> None:
-        """Make what ``self.values`` describe; raises OmsmError."""
+        """Make the objects that ``self.values`` describe; raises OmsmError."""
 
     def activate(self, undo: ExitStack) -> None:
-        """Begin to take and give data; raises OmsmError."""
+        """Begin to receive and publish data; raises OmsmError."""
 
     def report(self) -> Report:
         """Return the state of a node that is configured."""
         return Report("")
 
     def hardware_id(self) -> str:
-        """Return what the node's device is called; empty without one."""
+        """Return the name of the node's device; empty without one."""
         return ""
-
-    # For a node to use.
 
     @property
     def active(self) -> bool:
-        """Whether it works."""
+        """Return whether the node is active."""
         return self.stage is LifecycleStage.ACTIVE
 
     def start(self) -> None:
-        """Configure and activate, unless it is to be left alone; raises what kept it from it."""
+        """Configure and activate if ``autostart``; raise what prevented it."""
         if not self.get_parameter(AUTOSTART.name).value:
             return
         for step in (self.trigger_configure, self.trigger_activate):
@@ -246,30 +239,26 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
                 raise self._failure
 
     def close(self) -> None:
-        """Undo everything, in the order in which it is undone by hand."""
+        """Undo all steps, in reverse order."""
         if self.stage is not LifecycleStage.FINALIZED:
             self.trigger_shutdown()
 
     def publish_on(
         self, undo: ExitStack, kind: Any, topic: str, qos: QoSProfile = topics.SAMPLES_QOS
     ) -> Publisher:
-        """Return a publisher of the node's own results, of which there should be one only."""
+        """Return a publisher of a topic that no other node should publish."""
         made = topics.publish_on(self, undo, kind, topic, qos)
         self._outputs.append(made)
         undo.callback(self._outputs.remove, made)
         return made
 
-    # Parameters.
-
     def set_parameters_atomically(self, parameter_list: list[Any]) -> SetParametersResult:
-        """Set all or none; rclpy itself does not say which one it does not know."""
+        """Set all or none; unlike rclpy, name an unknown one."""
         try:
             self._declared.check_known([parameter.name for parameter in parameter_list])
         except ConfigurationError as err:
             return SetParametersResult(successful=False, reason=str(err))
         return super().set_parameters_atomically(parameter_list)
-
-    # Transitions.
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Configure; called by ``ros2 lifecycle``, as those below."""
@@ -288,7 +277,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         return self._end(LifecycleStage.UNCONFIGURED)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Undo everything, for good."""
+        """Undo all steps finally."""
         return self._end(LifecycleStage.FINALIZED)
 
     def _configure(self) -> None:
@@ -328,7 +317,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def _undo(self, stack: ExitStack) -> None:
         try:
             stack.close()
-        except Exception as err:  # the rest has been undone all the same
+        except Exception as err:  # the rest is undone nevertheless
             log_internal_error(self, err)
 
     def _wait_for_last_messages(self) -> None:
@@ -337,7 +326,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
                 time.sleep(_STEP_S)
 
     def _answer_impossible_transitions(self) -> None:
-        """Let a request for a transition that is none be answered, as refused, not raised."""
+        """Let a request for an impossible transition be answered, where rcl raises an exception."""
         (service,) = (made for made in self.services if made.srv_type is ChangeState)
         change = service.callback
 
@@ -362,8 +351,6 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             "`ros2 lifecycle set` it to deactivate and cleanup, set, then configure and activate"
         )
 
-    # State.
-
     def _report(self) -> Report:
         if self.stage is LifecycleStage.UNCONFIGURED:
             report = Report("")
@@ -378,7 +365,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
                 report.add(
                     WARN,
                     f"{count} nodes publish {publisher.topic_name}: end all but one "
-                    "(one that was killed is forgotten within 20 s)",
+                    "(a killed one disappears within 20 s)",
                 )
         report.values["lifecycle"] = self.stage.value
         return report

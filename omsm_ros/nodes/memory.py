@@ -1,6 +1,6 @@
-"""How a node's process deals with the memory that the middleware takes and frees.
+"""Limits the memory of a node's process.
 
-Nothing is imported here that takes time: it is needed before the rest loads.
+The module has no slow imports, since it is needed before the others load.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Collection
 from contextlib import suppress
 
 RETURN_PERIOD_S = 10.0
-"""Between two times at which a node gives back what it does not need."""
+"""Time between two returns of free memory to the system [s]."""
 
 _M_ARENA_MAX = -8  # of <malloc.h>
 _LIBC = ctypes.CDLL(None)
@@ -22,12 +22,12 @@ _SETTINGS, _KEPT_BY_THREADS = "GLIBC_TUNABLES", "glibc.malloc.tcache_count"
 
 
 def use_single_malloc_arena(held_back: Collection[signal.Signals] = ()) -> None:
-    """Let all threads share one pool of memory; each of the middleware's would keep its own.
+    """Let all threads share one malloc arena, without caches of their own.
 
-    A thread would also keep small pieces that were freed, seven of each size: what it needed once,
-    in a burst, lies scattered behind that burst for as long as the thread lives, and no page in
-    between goes back. glibc hears of that only where a process begins, so this one begins again,
-    under its number, unless that was set before. Signals ``held_back`` wait until then.
+    Each thread of the middleware would keep an arena, and a cache of seven freed pieces of each
+    size, which keep the pages around them from being returned. glibc reads that setting only at the
+    start of a process, so this process executes itself again, unless it is set. Signals
+    ``held_back`` are blocked until then.
     """
     mallopt = getattr(_LIBC, "mallopt", None)  # glibc has it
     if mallopt is None:
@@ -37,31 +37,30 @@ def use_single_malloc_arena(held_back: Collection[signal.Signals] = ()) -> None:
     if _KEPT_BY_THREADS not in before:
         os.environ[_SETTINGS] = f"{before}:{_KEPT_BY_THREADS}=0".lstrip(":")
         signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
-        with suppress(OSError):  # then it goes on as it is
+        with suppress(OSError):  # then it continues without
             os.execv(sys.executable, sys.orig_argv)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, held_back)
 
 
 def freeze_garbage_collector() -> None:
-    """Let Python look no more through what there is by now: a node needs it to its end.
+    """Exclude the present objects from garbage collection: a node needs them to its end.
 
-    Its modules are more than 80 000 objects. Without them a look at all that came since takes less
-    than a millisecond, so that ``return_free_memory`` can ask for one while samples come in.
+    Its modules have more than 80 000 objects. Without them a collection takes less than a
+    millisecond, so ``return_free_memory`` can do one while samples arrive.
     """
     gc.collect()
     gc.freeze()
 
 
 def return_free_memory() -> None:
-    """Return to the system what was freed in between, not at the end alone.
+    """Collect garbage, and return free memory within the heap to the system.
 
-    What a listener has not taken is kept for it. When it is sent and freed, small pieces lie
-    behind it that are not, so the pool would stay as large as the largest backlog that ever was,
-    and grow with each that finds no room in what earlier ones left.
+    Messages that a subscriber has not taken are kept. When they are freed, small pieces behind them
+    are still in use, so without trimming the heap stays as large as the largest backlog, and grows
+    with fragmentation.
 
-    Python itself looks at all of its objects only when a quarter of them is new. Until then it
-    keeps cycles that nothing refers to, and up to 2000 empty tuples of each length: a node would
-    grow for hours.
+    Python's own full collections come only when a quarter of all objects is new; until then unused
+    cycles, and up to 2000 empty tuples of each length, let a node grow for hours.
     """
     gc.collect()
     trim = getattr(_LIBC, "malloc_trim", None)  # glibc has it

@@ -1,4 +1,10 @@
-"""``replay``: plays a bag to the nodes of a cell, as it was or as fast as they can take it."""
+"""``replay``: plays a bag to the nodes of a cell, in its own time or as fast as they process it.
+
+Reliable delivery ends in a subscriber's queue, where the newest message silently replaces the
+oldest, and messages that the middleware sends again may arrive seconds late. So the player asks the
+subscribers how many messages they have processed (``~/taken``, a service of all nodes of this
+package), and never sends more than a small part of a queue.
+"""
 
 from __future__ import annotations
 
@@ -35,21 +41,13 @@ from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, publish_o
 from omsm_ros.quantities import Parameter
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# Who listens to what this node publishes, and how much of it have they taken?
-#
-# Reliable delivery ends in the listener's queue, where the oldest gives way to the newest
-# unnoticed,
-# and what the middleware has to send again may come seconds late. So the listeners themselves are
-# asked (``~/taken``, which every node of this package serves), again and again, and nobody is ever
-# sent more than fits into a small part of its queue.
-
-# A tenth of a queue; half of the shared memory that Fast DDS passes messages through by default,
-# beyond which it drops them, and sends them again three seconds later.
+# A tenth of a queue; half of the default shared memory of Fast DDS, beyond which it drops messages
+# and sends them again three seconds later.
 _MOST_OPEN, _MOST_OPEN_BYTES = 200, 256 * 1024
-# A service that has just been found may drop a request; a node may be computing.
+# A service just discovered may drop a request, or its node is busy [s].
 _RETRY_S = 2.0
-# Who has not been asked with success for so long is not waited for; nor is what has not been
-# taken for so long: the middleware sends again after three.
+# A subscriber without an answer, and messages not processed, for this time are not waited for; the
+# middleware sends again after three seconds.
 _PATIENCE_S = 10.0
 _DISCOVERY_S = 3.0  # of the service of a node whose subscription is known
 _PRESENCE_PERIOD_S = 0.2
@@ -57,7 +55,10 @@ _PRESENCE_PERIOD_S = 0.2
 
 @dataclass
 class _Listener:
-    """before: what it had taken of each topic when it was met, less what had been published."""
+    """A subscribed node.
+
+    before: messages of each topic it had processed when it was discovered, less those published
+    """
 
     client: Client
     topics: set[str]
@@ -69,9 +70,9 @@ class _Listener:
 
 
 class Listeners:
-    """Keeps account of the messages that were published, and not yet taken by all who listen.
+    """Counts the messages that were published and are not yet processed by all subscribers.
 
-    lost: messages that a listener never took, by its name;  deaf: who cannot be asked
+    lost: messages that a node never processed, by its name;  deaf: nodes without the service
     """
 
     def __init__(self, node: Node, publishers: Sequence[Publisher], undo: ExitStack) -> None:
@@ -88,15 +89,15 @@ class Listeners:
         undo.callback(self._forget_all)
 
     def published(self, topic: str, size: int) -> None:
-        """Enter one more message of ``size`` bytes."""
+        """Count a message of ``size`` bytes."""
         self._published[topic] += 1
         self._bytes[topic] += size
 
     @property
     def known(self) -> bool:
-        """Whether all who listen were met, or cannot be.
+        """Return whether all subscribers have answered or cannot answer.
 
-        The middleware may know of one before the graph says who it is.
+        The middleware may know a subscriber before the graph has its name.
         """
         unseen = any(
             p.get_subscription_count() > self._seen[p.topic_name] for p in self._publishers
@@ -105,21 +106,21 @@ class Listeners:
 
     @property
     def seconds_since_change(self) -> float:
-        """For how many seconds nobody has come or gone."""
+        """Return the time since a subscriber appeared or disappeared [s]."""
         return time.monotonic() - self._changed
 
     @property
     def room(self) -> bool:
-        """Whether one more message may be published."""
+        """Return whether one more message may be published."""
         return all(self._has_room(each) for each in self._listeners.values())
 
     @property
     def pending_listeners(self) -> list[str]:
-        """Names of those who have not taken everything."""
+        """Return the names of nodes that have not processed all messages."""
         return sorted(n for n, each in self._listeners.items() if any(self._open(each).values()))
 
     def _open(self, listener: _Listener) -> dict[str, int]:
-        """Return the messages by topic that it has not taken."""
+        """Return the number of messages not processed, by topic."""
         if not listener.taken:
             return {}
         return {
@@ -129,14 +130,14 @@ class Listeners:
 
     def _has_room(self, listener: _Listener) -> bool:
         if not listener.taken and listener.client.service_is_ready():
-            return False  # it came just now, and will tell
+            return False  # just discovered; it will answer
         waiting = self._open(listener)
         size = sum(n * self._bytes[t] / max(self._published[t], 1) for t, n in waiting.items())
         most = max(waiting.values(), default=0)
         return not most or (most < _MOST_OPEN and size < _MOST_OPEN_BYTES)
 
     def look(self) -> None:
-        """Hear what they have answered, and ask again who had not taken everything."""
+        """Take the answers, and ask the nodes that have not processed all messages."""
         now = time.monotonic()
         if now - self._looked >= _PRESENCE_PERIOD_S:
             self._looked = now
@@ -194,7 +195,7 @@ class Listeners:
     def _enter(self, listener: _Listener, counts: Mapping[str, int], now: float) -> None:
         taken = {topic: counts.get(topic, 0) for topic in listener.topics | listener.taken.keys()}
         for topic, count in taken.items():
-            # One that is new, or began anew, is not sent what was published before.
+            # A new or restarted node does not get the messages published before.
             if topic not in listener.taken or count < listener.taken[topic]:
                 listener.before[topic] = count - self._published[topic]
         if taken != listener.taken:
@@ -202,7 +203,7 @@ class Listeners:
         listener.taken = taken
 
     def _find_again(self, name: str, listener: _Listener) -> None:
-        """Take back as lost what came late after all: nobody takes more than was published."""
+        """Reduce the lost messages by those that arrived late."""
         for topic, count in listener.taken.items():
             surplus = count - listener.before[topic] - self._published[topic]
             if surplus > 0:
@@ -213,8 +214,8 @@ class Listeners:
         self._node.destroy_client(self._listeners.pop(name).client)
         self.deaf.add(name)
         self._node.get_logger().warning(
-            f"{name} listens but does not say what it has taken (service {PROCESSED}): it is not "
-            "waited for, and loses what its queue does not hold"
+            f"{name} subscribes but does not report what it has processed (service {PROCESSED}): "
+            "it is not waited for, and loses messages beyond its queue"
         )
 
     def _count_lost(self, name: str, listener: _Listener, now: float) -> None:
@@ -223,7 +224,7 @@ class Listeners:
         self.lost[name] += (lost := sum(waiting.values()))
         for topic, count in waiting.items():
             listener.before[topic] -= count
-        self._node.get_logger().error(f"{name} has lost {lost} messages on their way")
+        self._node.get_logger().error(f"{name} has lost {lost} messages")
 
     def _forget_all(self) -> None:
         while self._listeners:
@@ -231,28 +232,28 @@ class Listeners:
 
 
 def _counts(text: str) -> dict[str, int]:
-    found = json_and_yaml.object_of(text, DataError, "what a listener has taken")
+    found = json_and_yaml.object_of(text, DataError, "the counts of a subscriber")
     return {name: count for name, count in found.items() if type(count) is int}
 
 
 PARAMETERS = (
     Parameter("bag", "", ".mcap file or rosbag2 folder to play", required=True),
     Parameter("cell", "", "namespace of the cell in the bag, e.g. /cell2; empty = the only one"),
-    Parameter("topics", "", "what to play, e.g. 'axes confocal'; empty = all but points"),
-    Parameter("rate", 1.0, "seconds of the bag a second; 0 = no faster than all take it",
+    Parameter("topics", "", "topics to play, e.g. 'axes confocal'; empty = all but points"),
+    Parameter("rate", 1.0, "seconds of the bag per second; 0 = as fast as all process it",
               quantities.PLAY_RATE),
-    Parameter("start", 0.0, "seconds of the bag to pass over", quantities.PLAY_TIME),
+    Parameter("start", 0.0, "seconds of the bag to skip", quantities.PLAY_TIME),
     Parameter("duration", 0.0, "seconds of the bag to play; 0 = to its end", quantities.PLAY_TIME),
     Parameter("loop", False, "begin again at the end"),
     Parameter("paused", False, "wait for ~/resume or ~/step"),
     Parameter("clock", False, "publish the time of the bag on /clock"),
-    Parameter("listeners", 1, "begin when so many nodes listen to each of axes and confocal",
+    Parameter("listeners", 1, "number of nodes that must subscribe to axes and confocal first",
               quantities.LISTENERS),
-    Parameter("wait_for", "", "nodes that have to be among them, e.g. 'corrector viewer'"),
-    Parameter("delay", 0.0, "begin so long after the last of them came", quantities.PLAY_TIME),
+    Parameter("wait_for", "", "nodes that must be among them, e.g. 'corrector viewer'"),
+    Parameter("delay", 0.0, "seconds to wait after the last one appeared", quantities.PLAY_TIME),
 )  # fmt: skip
 RECORDED_POINTS = "recorded/points"
-"""Where recorded points go if they are asked for: never among those that are corrected now."""
+"""Topic of recorded points, apart from those that are corrected now."""
 
 _TYPES = {
     topics.AXES_TOPIC: AxisBlock,
@@ -266,12 +267,12 @@ _NEEDED = (topics.AXES_TOPIC, topics.DISTANCE_TOPIC)
 _SAMPLES = (*_NEEDED, topics.REFERENCE_TOPIC)
 _TICK_S = 0.005
 _LATE_S = 1.0
-# An answer may take so long on a busy computer; a node that ends before loses it.
+# An answer may take this long on a busy computer; it is lost if the node ends before [s].
 _ANSWER_S = 1.0
 
 
 class PlayerNode(ManagedNode):
-    """Publishes recorded messages byte for byte; ends when all who listen have taken the last."""
+    """Publishes recorded messages unchanged; ends when all subscribers have processed the last."""
 
     def __init__(self) -> None:
         super().__init__("player", PARAMETERS)
@@ -311,13 +312,13 @@ class PlayerNode(ManagedNode):
 
     def _publisher(self, undo: ExitStack, topic: str) -> Publisher:
         name = RECORDED_POINTS if topic == topics.POINTS_TOPIC else relative(topic)
-        if topic in topics.LATCHED_TOPICS:  # others may tell it too: the newest is in force
+        if topic in topics.LATCHED_TOPICS:  # other nodes may publish it too
             return publish_on(self, undo, _TYPES[topic], name, LATCHED_QOS)
         return self.publish_on(undo, _TYPES[topic], name, SAMPLES_QOS)
 
     def activate(self, undo: ExitStack) -> None:
         """Play."""
-        # What is latched cannot be missed, and others may tell it, too.
+        # Latched messages are not lost, and other nodes may publish them too.
         streams = [p for topic, p in self._offers.items() if topic not in topics.LATCHED_TOPICS]
         self._listeners = Listeners(self, streams, undo)
         self._time = (
@@ -339,7 +340,7 @@ class PlayerNode(ManagedNode):
 
     def _in_order(self) -> Iterator[tuple[str, int, bytes]]:
         begin, end = self._span
-        # Who listens from here on has to know what was latched before.
+        # Subscribers need the latched messages from before the start.
         latched = [topic for topic in self._topics if topic in topics.LATCHED_TOPICS]
         before = {
             topic: (topic, begin, cdr) for topic, _, cdr in self._bag.messages(latched, None, begin)
@@ -385,17 +386,19 @@ class PlayerNode(ManagedNode):
                     "samples: end it, or play in another namespace (-r __ns:=/replay)"
                 )
             if topic in _NEEDED and publisher.get_subscription_count() < self.values["listeners"]:
-                return f"nobody listens to {name} yet (parameter listeners)"
+                return f"no node subscribes to {name} yet (parameter listeners)"
             if topic in _NEEDED and (missing := self._missing(name)):
-                return f"{' and '.join(missing)} must listen to {name} first (parameter wait_for)"
+                return (
+                    f"{' and '.join(missing)} must subscribe to {name} first (parameter wait_for)"
+                )
         if not self._listeners.known:
-            return "who listens has not answered yet"
+            return "a subscriber has not answered yet"
         if self._listeners.seconds_since_change < (delay := self.values["delay"]):
-            return f"it begins {delay:g} s after the last listener came (parameter delay)"
+            return f"it begins {delay:g} s after the last subscriber appeared (parameter delay)"
         return ""
 
     def _missing(self, name: str) -> list[str]:
-        """Who has to listen to the topic and does not: a recorder alone is no reason to begin."""
+        """Return the nodes of ``wait_for`` that do not subscribe to the topic ``name``."""
         found = {info.node_name for info in self.get_subscriptions_info_by_topic(name)}
         return [node for node in self.values["wait_for"].split() if node not in found]
 
@@ -410,7 +413,7 @@ class PlayerNode(ManagedNode):
     def _tell_time(self, now: float) -> None:
         if self._time is None:
             return
-        # Never ahead of what was published: time stands while somebody is waited for.
+        # Never ahead of the published messages: time stands while a subscriber is waited for.
         ahead = self._next[1] if self._next is not None else self._position_ns
         due = self._playback.time_ns(now) if self.values["rate"] else self._position_ns
         sec, nanosec = divmod(max(min(due, ahead), self._position_ns), NANOSECONDS_PER_S)
@@ -421,7 +424,9 @@ class PlayerNode(ManagedNode):
             self._begin()
             return
         lost = ", ".join(f"{name} lost {n}" for name, n in (+self._listeners.lost).items())
-        self.get_logger().info(f"played {self._played()}; {lost or 'all who listen took them'}")
+        self.get_logger().info(
+            f"played {self._played()}; {lost or 'all subscribers processed them'}"
+        )
         self.trigger_shutdown()
 
     def _played(self) -> str:
@@ -443,7 +448,7 @@ class PlayerNode(ManagedNode):
             raise OmsmError("it is playing; call pause before step")
         if self._next is None or not self._listeners.room:
             raise OmsmError(
-                "there is no next message, or the last ones have not been taken; ask again"
+                "there is no next message, or the last ones are not processed yet; ask again"
             )
         topic, stamp, _ = self._next
         self._asked_at = time.monotonic()
@@ -452,7 +457,7 @@ class PlayerNode(ManagedNode):
         response.success, response.message = True, f"{relative(topic)} of {stamp} ns"
 
     def report(self) -> Report:
-        """Return how far it is, and what it waits for."""
+        """Return the position, and what the player waits for."""
         position = (self._position_ns - self._bag.start_ns) / NANOSECONDS_PER_S
         report = Report("playing", {relative(topic): n for topic, n in self._counts.items()})
         report.values["position_s"] = position
@@ -463,9 +468,9 @@ class PlayerNode(ManagedNode):
         if self._obstacle:
             report.add(ERROR, self._obstacle)
         for name, count in (+self._listeners.lost).items():
-            report.add(WARN, f"{name} lost {count} messages on their way")
+            report.add(WARN, f"{name} lost {count} messages")
         if self._late > _LATE_S:
-            report.add(WARN, f"{self._late:.1f} s behind: who listens takes no more a second")
+            report.add(WARN, f"{self._late:.1f} s behind: a subscriber is too slow")
         return report
 
 

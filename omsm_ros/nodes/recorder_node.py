@@ -25,7 +25,7 @@ from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
     Parameter("path", "", "the .mcap file to write; it must not exist yet", required=True),
-    Parameter("numbered", False, "where it exists, write scan.2.mcap, scan.3.mcap, … beside it"),
+    Parameter("numbered", False, "if it exists, write scan.2.mcap, scan.3.mcap, … instead"),
 )
 _TOPICS = {
     topics.AXES_TOPIC: AxisBlock,
@@ -40,15 +40,15 @@ _TOPICS = {
 }
 
 _FLUSH_PERIOD_S = 0.5
-# Looks in a row that find nothing, until nothing is on its way: 0.2 s, a hundred times what a
-# message takes. Looks, not time, for on a busy machine neither this process nor its middleware
-# may have had its turn in that time.
+# After 20 looks (0.2 s, a hundred times the latency of a message) without a message, no more are
+# expected. Looks are counted, not time, since a busy computer may give this process no time.
 _LOOKS, _LOOK_S = 20, 0.01
-_LONGEST_S = 3.0  # of publishers that are not ended; a launch waits for five
+# For publishers that do not end; a launch waits for five seconds [s].
+_LONGEST_S = 3.0
 
 
 class RecorderNode(ManagedNode):
-    """Takes messages as they are on the wire; what is older than a second is on the disk."""
+    """Records serialised messages; all that are older than a second are on the disk."""
 
     def __init__(self) -> None:
         super().__init__("recorder", PARAMETERS)
@@ -75,7 +75,7 @@ class RecorderNode(ManagedNode):
         undo.callback(self._complete)
 
     def activate(self, undo: ExitStack) -> None:
-        """Begin to record; at the end, take what was published before it."""
+        """Begin to record; at the end, take the messages published before it."""
         for topic, kind in _TOPICS.items():
             qos = LATCHED_QOS if topic in topics.LATCHED_TOPICS else SAMPLES_QOS
             self._heard[topic] = listen(
@@ -95,8 +95,8 @@ class RecorderNode(ManagedNode):
         undo.callback(self._take_what_is_on_its_way)
 
     def _take(self, topic: str, cdr: bytes, info: MessageInfo) -> None:
-        # A bag without an index is read in its order, which must be that of its stamps; the
-        # clock of the machine may be set back.
+        # A bag without an index is read in the order of writing, which must be that of the
+        # stamps; the clock of the computer may be set back.
         self._last_stamp = max(self._last_stamp, self.get_clock().now().nanoseconds)
         write = partial(self._bag.write_raw, topic, self._last_stamp, cdr, info["source_timestamp"])
         if self._written(write):
@@ -107,7 +107,7 @@ class RecorderNode(ManagedNode):
             try:
                 write()
             except BagError as err:
-                self.fatal = err  # there is nothing left to do
+                self.fatal = err  # no further message can be recorded
                 self.get_logger().error(f"{type(err).__name__}: {err}")
                 self.diagnostics.publish()
         return self.fatal is None
@@ -127,7 +127,7 @@ class RecorderNode(ManagedNode):
             time.sleep(_LOOK_S)
 
     def report(self) -> Report:
-        """Return what was recorded, and lost."""
+        """Return the messages recorded and lost."""
         lost = sum(self._lost.values())
         publishers = {s.topic_name: s.get_publisher_count() for s in self._heard.values()}
         report = Report("recording", {**self._counts, "lost": lost})
@@ -135,14 +135,14 @@ class RecorderNode(ManagedNode):
         if self.fatal is not None:
             report.add(ERROR, str(self.fatal))
         if lost:
-            report.add(WARN, f"{lost} messages were lost on their way here")
+            report.add(WARN, f"{lost} messages were lost before recording")
         if self.active and not any(publishers.values()):
-            report.add(WARN, "recording, but nobody publishes what is recorded")
+            report.add(WARN, "recording, but no node publishes a recorded topic")
         return report
 
 
 def main() -> None:
-    """Run ``ros2 run omsm_ros recorder``; exit code 2 if the disk took no more."""
+    """Run ``ros2 run omsm_ros recorder``; exit code 2 without space on the disk."""
     run(RecorderNode)
 
 

@@ -1,7 +1,7 @@
-"""How every node of this package starts, answers requests, and ends.
+"""Starts nodes, serves requests, and ends nodes in order.
 
-No message, request or parameter ends a node: what is wrong is refused with its reason, and a
-defect of ours is logged, counted in the diagnostics, and survived.
+No message, request or parameter ends a node: an invalid one is refused with the reason, and an
+internal error is logged and counted in the diagnostics.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ from omsm_ros.nodes.memory import freeze_garbage_collector
 from omsm_ros.nodes.start import ENDING
 from omsm_ros.nodes.topics import REQUESTS_QOS
 
-_BAD_INPUT, _DEFECT = 2, 70  # as of the commands
-# A node that has not ended so long after it was asked to ends at the next signal, as it stands.
+_BAD_INPUT, _DEFECT = 2, 70  # exit codes, as of the commands
+# After this time since the first signal, the next one ends the process at once [s].
 _PATIENCE_S = 5.0
-# For a log message of a node that cannot start to reach who listens on /rosout.
+# For the last log message of a node that cannot start to reach subscribers of /rosout [s].
 _SHUTDOWN_LOG_S = 1.0
-# Between two requests of one service: a client that is held up for ten of them loses nothing.
+# Between two requests of one service, so that the queue of a slow client does not overflow [s].
 _PACE_S = 0.01
 
 
 def run(make_node: Callable[[], ManagedNode]) -> None:
     """Build a node, start it and spin it until SIGINT, SIGTERM, SIGHUP or a requested shutdown.
 
-    Exits with one line on stderr if it cannot start, or not go on: 2 for bad input, 70 for a
-    defect of ours.
+    Exits with one line on stderr if it cannot start or continue: 2 for bad input, 70 for an
+    internal error.
     """
     node = None
     try:
         with exit_on_signal_while_loading(ENDING):
             _init()
-        ending = _SignalEnd()  # after rclpy, which puts back the handlers of the system
+        ending = _SignalEnd()  # after rclpy, which resets the handlers
         node = make_node()
         node.start()
         freeze_garbage_collector()
@@ -79,13 +79,11 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
 
 def _init() -> None:
     domain = os.environ.get("ROS_DOMAIN_ID", "").strip()
-    if domain.isdecimal():  # Fast DDS ends the process where there are no ports for it
+    if domain.isdecimal():  # Fast DDS ends the process if there are no ports for it
         quantities.DOMAIN.checked(int(domain[:20]), ConfigurationError, "ROS_DOMAIN_ID")
     try:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    except (
-        RuntimeError
-    ) as err:  # a parameter file that is missing or no YAML, an argument of no kind
+    except RuntimeError as err:  # a parameter file that is missing or no YAML, an invalid argument
         raise ConfigurationError(str(err).split(", at ")[0]) from err
     for flag, name in pairwise(sys.argv):
         if flag == "--params-file":
@@ -93,7 +91,7 @@ def _init() -> None:
 
 
 def _check_parameter_file(path: Path) -> None:
-    """Refuse what rcl passes over: a text that is one single value, or none at all."""
+    """Refuse a text that rcl ignores: a single value, or none."""
     # A pipe has been read by now.
     if path.is_file() and not json_and_yaml.begins_as_mapping(path.read_bytes()):
         raise ConfigurationError(
@@ -119,10 +117,10 @@ def _give_up(node: ManagedNode | None, err: Exception) -> None:
 
 
 class _SignalEnd:
-    """Hears signals to end, at any time and in any thread, and interrupts nothing.
+    """Receives the signals to end, without interrupting the node.
 
-    A launch sends SIGINT twice; a handler that raises in the middle of an orderly end would leave
-    it half done.
+    A launch sends SIGINT twice; a handler that raises an exception during the orderly end would
+    leave it incomplete.
     """
 
     def __init__(self) -> None:
@@ -130,10 +128,10 @@ class _SignalEnd:
         self._wake: Callable[[], object] = lambda: None
         self._heard, woken = os.pipe()
         os.set_blocking(woken, False)
-        # First of all: one that came between a handler that does nothing and this would be lost.
+        # Set first, so that no signal is lost before the handlers are set.
         signal.set_wakeup_fd(woken)
         for number in ENDING:
-            # Below nohup, it is to be ignored.
+            # nohup lets it be ignored.
             if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, lambda *_: None)
         threading.Thread(target=self._wait, daemon=True).start()
@@ -159,7 +157,7 @@ class _SignalEnd:
 
 
 def _ignore_signals() -> None:
-    """Let none that is still to come spoil the exit code; Python lets go of its handlers."""
+    """Ignore further signals, which would change the exit code once Python has no handlers."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)
 
@@ -181,10 +179,10 @@ def settings_of(text: str) -> dict[str, object]:
 
 
 class PacedService(ReentrantCallbackGroup):  # type: ignore[misc]
-    """Lets a service take one request after the other, a moment apart.
+    """Lets a service take one request after the other, with a short pause.
 
-    Requests wait in the node's own queue, which is deep. A client's holds ten answers by default:
-    of hundreds that come in one go it would lose most, and wait for them for ever.
+    Requests wait in the node's queue, which is deep. A client's queue has ten answers by default;
+    of hundreds at once it would lose most, and wait for them without end.
     """
 
     def __init__(self, node: Node, undo: ExitStack) -> None:
@@ -196,7 +194,7 @@ class PacedService(ReentrantCallbackGroup):  # type: ignore[misc]
         undo.callback(node.destroy_timer, self._pause)
 
     def can_execute(self, entity: Any) -> bool:
-        """Return whether the next request may be taken; asked by the executor, as the other."""
+        """Return whether the next request may be taken; called by the executor."""
         return self._ready
 
     def beginning_execution(self, entity: Any) -> bool:
@@ -217,7 +215,7 @@ def serve(
 ) -> None:
     """Offer the service ``name`` until ``undo``; ``answer`` fills in the response.
 
-    Whatever it raises is answered as not successful (or not safe), with the reason.
+    An exception of ``answer`` is answered as not successful (or not safe), with the reason.
     """
 
     def callback(request: Any, response: Any) -> Any:
@@ -235,7 +233,7 @@ def serve(
 
 
 def refuse(response: Any, reason: str) -> None:
-    """Fill in a response that says no, and why."""
+    """Fill in a refusal with its reason."""
     for name in ("success", "safe"):
         if hasattr(response, name):
             setattr(response, name, False)

@@ -1,9 +1,7 @@
-"""Where the command of every node begins; without ROS it ends there, in one line with the remedy.
+"""The commands of all nodes; without ROS they end with one line and the remedy.
 
-Nothing is imported here that takes time: a Ctrl-C while the rest loads is an end like any other.
-
-``pip install`` puts the commands of the nodes beside ``omsm``, and ``ros2 run`` finds them in a
-workspace whose messages were not built. ``python -m omsm_ros.nodes.start corrector …`` is the same.
+The module has no slow imports, so that Ctrl-C while the others load is an orderly end too.
+``python -m omsm_ros.nodes.start corrector …`` is the same as the command ``corrector``.
 """
 
 from __future__ import annotations
@@ -23,12 +21,12 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that ask a node to end."""
 
 LAUNCHED_BY = "OMSM_LAUNCHED_BY"
-"""Variable with the process number of the launch that started a node, and that it ends with."""
+"""Variable with the process number of the launch that started a node, which ends with it."""
 
 _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
-_PROFILES_OF_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"  # is read too, where it exists
+_PROFILES_OF_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"  # read by Fast DDS if it exists
 _TRANSPORTS_CHOSEN = (_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
-_MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # memory and mode, and not by the next
+_MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # also memory and publication mode
 _PUBLICATION_MODE = "RMW_FASTRTPS_PUBLICATION_MODE"
 _BAD_INPUT = 2
 _PR_SET_PDEATHSIG = 1  # of <linux/prctl.h>
@@ -59,7 +57,7 @@ def main() -> None:
         sys.exit(f"no node {name!r}, expected one of {sorted(NODES)}")
     _check_open_files(name)
     with exit_on_signal_while_loading(ENDING):
-        use_single_malloc_arena(ENDING)  # first, for the process may begin again
+        use_single_malloc_arena(ENDING)  # first, since the process may execute itself again
         one_thread_of_blas()
         end_with_launch()
         set_up_fast_dds()
@@ -77,7 +75,7 @@ def main() -> None:
 
 
 def _check_open_files(name: str) -> None:
-    """End where ROS could not begin: short of files, it hangs, or ends without a word."""
+    """Exit if too few files may be opened: ROS would hang, or end silently."""
     if (most := open_files()) < FEWEST_OPEN_FILES:
         print(
             f"{name}: too few open files: a process may hold {most} here, and a node needs "
@@ -88,15 +86,15 @@ def _check_open_files(name: str) -> None:
 
 
 def end_with_launch() -> None:
-    """Let SIGTERM be sent to this process when the launch that started it ends, however it does.
+    """Let SIGTERM be sent to this process when the launch that started it ends.
 
-    ``ros2 launch`` hands Ctrl-C on; a SIGTERM, as ``docker stop`` sends one, or a SIGKILL ends it
-    alone, and its nodes would keep the device and the recording until somebody finds them.
+    ``ros2 launch`` passes Ctrl-C on to its nodes; SIGTERM, as of ``docker stop``, or SIGKILL would
+    end it alone, and its nodes would keep the device and the recording.
     """
     launch = os.environ.pop(LAUNCHED_BY, "")
     if not launch or sys.platform != "linux":
         return
-    child = launch == str(os.getppid())  # and not a child of a prefix, as a terminal or debugger
+    child = launch == str(os.getppid())  # not of a prefix, such as a terminal or debugger
     if child:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if (child and launch != str(os.getppid())) or not os.path.exists(f"/proc/{launch}"):
@@ -104,20 +102,18 @@ def end_with_launch() -> None:
 
 
 def set_up_fast_dds() -> None:
-    """Let Fast DDS take what our profile (``fast_dds.xml``) says, unless the user has chosen.
+    """Let Fast DDS use our profile (``fast_dds.xml``), unless the user has chosen another.
 
-    Messages come by UDP. A listener that stands still for a second or two has its queue in shared
-    memory replaced, and what waited there keeps its places in the sender's memory, which soon has
-    room in small pieces alone. What was missed is sent again in large ones: each fails without a
-    word, again and again, until something else frees that memory.
+    Messages use UDP. With shared memory, a subscriber that pauses for a second or two loses its
+    queue, while its messages keep their places in the publisher's segment; once that is fragmented,
+    sending again fails silently until the memory is freed.
 
-    Its first word to the processes that are there is sent from a thread, too, which Fast DDS 2.14
-    does only under a limit to the bytes of a second. Otherwise their answers come before it listens
-    to them, are lost, and who was there is known only when he announces himself anew, up to three
-    seconds later.
+    Discovery messages are also sent from a thread, which Fast DDS 2.14 does only with a limit on
+    the bytes per second. Otherwise the answers arrive before the participant can receive them, and
+    others are discovered only at their next announcement, up to three seconds later.
 
-    The memory of a message is freed when all have it. In the pool that is the default, each place
-    stays as large as the largest message that it ever held, and the longest wait adds places.
+    The memory of a message is freed after delivery. In the default pool each place stays as large
+    as its largest message, and each backlog adds places.
     """
     chosen = any(os.environ.get(name) for name in _TRANSPORTS_CHOSEN)
     if not chosen and not Path(_PROFILES_OF_FOLDER).exists():
@@ -128,10 +124,10 @@ def set_up_fast_dds() -> None:
 
 
 def _send_from_own_thread() -> None:
-    """Let Fast DDS send from a thread of its own: a listener that stands still stops nobody.
+    """Let Fast DDS send from its own thread, so that a blocked subscriber blocks no publisher.
 
-    Whoever publishes would wait for it, a second and more; after 0.1 s Fast DDS forgets to send the
-    message at all, and what follows it reaches that listener only when the queue has run over.
+    A publisher would wait for it for a second or more; after 0.1 s Fast DDS drops the message, and
+    later ones reach that subscriber only when its queue has overflowed.
     """
     os.environ.setdefault(_PUBLICATION_MODE, "ASYNCHRONOUS")
 

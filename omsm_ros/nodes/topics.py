@@ -1,4 +1,4 @@
-"""How samples and calibrations travel: quality of service, and many messages taken at once."""
+"""Publishers and subscriptions of the nodes, and their quality of service."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from omsm_ros.io import json_and_yaml
 MessageInfo: TypeAlias = "dict[str, int]"
 
 SAMPLES_QOS = QoSProfile(
-    # Reliable, and deep enough for seconds of blocks: a loss must be a fault, not a policy.
+    # Reliable, and deep enough for several seconds of blocks, so that a loss is a fault.
     reliability=ReliabilityPolicy.RELIABLE,
     history=HistoryPolicy.KEEP_LAST,
     depth=2000,
@@ -36,31 +36,31 @@ LATCHED_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,
 )
-# For who hears several that latch: the last to arrive need not be the newest.
+# For subscribers of several latched publishers: the last to arrive may not be the newest.
 LATCHED_BY_MANY_QOS = QoSProfile(
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
     history=HistoryPolicy.KEEP_LAST,
     depth=20,
 )
-# Requests wait for their turn while a node computes; ten, the usual depth, are soon lost.
+# Requests wait while a node computes; the usual depth of ten overflows soon.
 REQUESTS_QOS = QoSProfile(depth=1000)
 
 PROCESSED = "taken"
-"""Service of every node, below its name: how many messages it has taken of each topic, as JSON."""
+"""Service of each node, below its name: number of messages processed of each topic, as JSON."""
 
 _processed: Counter[str] = Counter()
 
-# At most so many messages are taken in a row, so that timers and services have their turn.
+# Most messages taken in a row, so that timers and services are not delayed.
 _BULK = 500
 
 
 def publish_on(
     node: Node, undo: ExitStack, kind: Any, topic: str, qos: QoSProfile = SAMPLES_QOS
 ) -> Publisher:
-    """Return a publisher, which ends with ``undo``; parameters qos_overrides.* are honoured."""
+    """Return a publisher, which ends with ``undo``; qos_overrides.* parameters apply."""
     with _overrides_understood(topic):
-        # A copy, for rclpy writes the overrides into what it is given.
+        # A copy, since rclpy writes the overrides into its argument.
         made = node.create_publisher(kind, topic, copy(qos), qos_overriding_options=_overriding())
     undo.callback(node.destroy_publisher, made)
     return made
@@ -80,10 +80,10 @@ def listen(
 ) -> Subscription:
     """Call ``callback(message, info)`` for each message, until ``undo``.
 
-    after: called when no more wait, or some hundreds have been taken
-    lost: called with the number of messages in all that were lost on their way
-    One round of the executor costs more than a message of one sample, so all that have come are
-    taken in one.
+    after: called when no more messages wait, or some hundreds have been taken
+    lost: called with the total number of lost messages
+    A round of the executor takes longer than a short message, so all waiting messages are taken in
+    one round.
     """
 
     def take(message: Any, info: MessageInfo) -> None:
@@ -113,7 +113,7 @@ def listen(
 
 
 def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInfo], None]) -> int:
-    """Call ``callback`` for messages that wait, some hundreds at most; return how many."""
+    """Call ``callback`` for up to some hundreds of waiting messages; return their number."""
     for count in range(_BULK):
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -126,14 +126,14 @@ def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInf
 def answer_processed_counts(
     request: Trigger.Request, response: Trigger.Response
 ) -> Trigger.Response:
-    """Answer how many messages of each topic this process has dealt with."""
+    """Answer the number of messages of each topic that this process has processed."""
     response.success, response.message = True, json_and_yaml.text_of(dict(_processed))
     return response
 
 
 @contextmanager
 def _overrides_understood(topic: str) -> Iterator[None]:
-    """Raise ConfigurationError for a parameter qos_overrides.* of no kind that there is."""
+    """Raise ConfigurationError for an invalid parameter qos_overrides.*"""
     try:
         yield
     except (RuntimeError, InvalidParameterTypeException) as err:

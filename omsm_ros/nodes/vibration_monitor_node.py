@@ -1,4 +1,4 @@
-"""``vibration_monitor``: what shakes, how much, and what it does to a height."""
+"""``vibration_monitor``: measures vibration and its effect on heights."""
 
 from __future__ import annotations
 
@@ -46,16 +46,13 @@ PARAMETERS = (
 
 
 class VibrationMonitorNode(ManagedNode):
-    """Listens to ``acceleration`` and ``calibration``; tells levels on ``vibration``.
-
-    And through its diagnostics.
-    """
+    """Subscribes to ``acceleration`` and ``calibration``; publishes levels on ``vibration``."""
 
     def __init__(self) -> None:
         super().__init__("vibration_monitor", PARAMETERS)
 
     def configure(self, undo: ExitStack) -> None:
-        """Take up options, alarm and calibration."""
+        """Set options, alarm and calibration."""
         values = self.values
         self._running = RunningSpectrum(
             MonitorOptions(
@@ -76,7 +73,7 @@ class VibrationMonitorNode(ManagedNode):
             self._calibration = load_calibration(path)
 
     def activate(self, undo: ExitStack) -> None:
-        """Begin to listen, and to tell."""
+        """Begin to receive and publish."""
         self._task_result = 0
         self._publisher = publish_on(self, undo, String, "vibration")
         listen(self, undo, AccelerationBlock, "acceleration", self._take)
@@ -98,7 +95,7 @@ class VibrationMonitorNode(ManagedNode):
         if levels is not None and self._alarm.update(levels.total_effect) != was:
             text = "raised" if self._alarm.raised else "ended"
             self.get_logger().warning(f"vibration alarm {text}: {self._line(levels)}")
-        # Once for each spectrum, however short the blocks are.
+        # Once for each spectrum, also with short blocks.
         if levels is not None and levels.windows != self._task_result:
             self._task_result = levels.windows
             content = {**levels.entry(), "alarm": self._alarm.raised, "limit": self._alarm.limit}
@@ -146,7 +143,7 @@ class VibrationMonitorNode(ManagedNode):
         return report
 
     def _add_silence(self, report: Report, now: float) -> None:
-        """Say that nothing comes: the levels are those of before."""
+        """Report a silence: the levels are of before."""
         self._flow.update(self._running.received, now)
         silent = self._flow.silent(now)
         if silent is not None and silent > max(_SILENCE_S, _SILENCE_BLOCKS * self._block):

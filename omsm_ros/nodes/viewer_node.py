@@ -1,4 +1,4 @@
-"""``viewer``: the running scan in a browser; it only looks."""
+"""``viewer``: shows the running scan in a browser."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from omsm_ros.nodes.topics import LATCHED_QOS, MessageInfo, listen
 from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
-    Parameter("host", "127.0.0.1", "to listen on; another than loopback needs a token"),
-    Parameter("port", 8080, "of the page", quantities.TCP_PORT),
+    Parameter("host", "127.0.0.1", "address of the page; another than loopback needs a token"),
+    Parameter("port", 8080, "TCP port of the page", quantities.TCP_PORT),
     Parameter(
         "token_file",
         "",
@@ -46,14 +46,14 @@ _LEVELS = {
 
 
 class ViewerNode(ManagedNode):
-    """Listens to points, calibration, acceleration and diagnostics, and shows them."""
+    """Subscribes to points, calibration, acceleration and diagnostics, and shows them."""
 
     def __init__(self) -> None:
         super().__init__("viewer", PARAMETERS)
         self._refused = 0
 
     def configure(self, undo: ExitStack) -> None:
-        """Make the page and what it shows."""
+        """Make the page and its content."""
         nominal = self.values["nominal"]
         self._view = LiveView(load_surface(Path(nominal)) if nominal else None)
         where = self.get_namespace().strip("/")
@@ -66,7 +66,7 @@ class ViewerNode(ManagedNode):
         )
 
     def activate(self, undo: ExitStack) -> None:
-        """Serve the page, and begin to listen."""
+        """Serve the page, and begin to receive."""
         self._server.start()
         undo.callback(self._server.stop)
         self.get_logger().info(f"look at {self._shown}")
@@ -78,12 +78,12 @@ class ViewerNode(ManagedNode):
 
     @property
     def _shown(self) -> str:
-        """Return the address for logs and diagnostics, which everybody on the network can read."""
+        """Return the address for logs and diagnostics, which others on the network can read."""
         hint = "?token=…" if self.values["token_file"] else ""
         return f"{self._server.address}{hint}"
 
     def report(self) -> Report:
-        """Return where the page is, and what it could not show."""
+        """Return the address of the page, and the number of messages refused."""
         return Report(f"look at {self._shown}", {"refused_messages": self._refused})
 
     def _on_points(self, message: Any, info: MessageInfo) -> None:

@@ -102,7 +102,7 @@ def test_stamps_are_even_though_arrivals_are_not(host):
     stamps = np.array([b.stamp_ns for b in blocks])[200:]
     true = np.array([start + b.first_sample * PERIOD_NS for b in blocks])[200:]
     assert np.all(np.diff(stamps) > 0)
-    # The mean lateness of a millisecond stays; nothing tells it from the sensor's own.
+    # The mean lateness of a millisecond stays; it cannot be distinguished from that of the sensor.
     assert np.std(stamps - true) < 100e3
 
 
@@ -172,7 +172,7 @@ class DaqError(Exception):
 
 
 class Task:
-    """What the driver uses of nidaqmx.Task, with what NI's manual says of it."""
+    """The part of nidaqmx.Task that the driver uses, after NI's manual."""
 
     def __init__(self, world):
         self.world, self.started = world, False

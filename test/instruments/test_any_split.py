@@ -1,4 +1,4 @@
-"""What a decoder finds is a function of the bytes alone: garbage or not, cut where you will."""
+"""The result of a decoder does not depend on the portions in which bytes arrive."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def of_blocks(found: Any) -> Found:
 
 
 class Three:
-    """What is believed of three bytes a value, with its places of damage."""
+    """Decoder of values of three bytes, and filter of confirmed ones."""
 
     def __init__(self) -> None:
         self._decoder, self._believed = SerialDecoder(2), PlausibleValueFilter(2)

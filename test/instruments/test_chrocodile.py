@@ -29,7 +29,7 @@ def cell(bench: Callable[..., Any]) -> Callable[..., Any]:
     return make
 
 
-# What arrives.
+# Samples.
 
 
 @pytest.mark.parametrize(
@@ -192,7 +192,7 @@ def test_bad_answers_delay_setting_up_and_no_more(cell: Any, fault: str, value: 
     run.check()
 
 
-# What is refused.
+# Refusals.
 
 
 def test_a_device_at_another_rate_than_it_says_is_withheld(cell: Any) -> None:

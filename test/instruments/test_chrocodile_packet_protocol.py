@@ -43,7 +43,7 @@ def data(first: int, count: int, form: DataFormat = FORMAT) -> bytes:
 
 
 def decoded(wire: bytes, decoder: PacketDecoder | None = None) -> list[Message]:
-    """What is in ``wire``, which nothing follows."""
+    """Return the messages in ``wire``, the last bytes of a stream."""
     decoder = decoder or PacketDecoder()
     return decoder.feed(wire) + decoder.settle()
 

@@ -1,4 +1,4 @@
-"""What signals mean: encoder counts of an exposure, distances, verdicts."""
+"""Signals are converted to encoder counts, distances and status."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ TRAVEL = np.array([[8, -8, 0, 3, 40], [20, -6, 0, 1, -60]])
 
 
 def records(starts, travel):
-    """What the device says of its encoders: 32 bits, with a sign."""
+    """Encoder counts as the device sends them: signed 32 bits."""
 
     def signed(counts):
         return ((counts + 2**31) % ENCODER_RANGE - 2**31).astype(np.int32)
@@ -53,7 +53,7 @@ def test_each_axis_has_the_encoder_it_is_on():
     np.testing.assert_array_equal(found[:, :4], STARTS[:, [3, 2, 1, 0]])
 
 
-# What the distance signals mean: written from the manual, with fractions where they are exact.
+# Distance signals after the manual, as exact fractions.
 
 SCA_M = 300e-6
 

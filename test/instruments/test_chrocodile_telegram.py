@@ -75,7 +75,7 @@ def test_a_line_by_hand() -> None:
     assert layout.lines(made) == [b" 7 12.2500 -3\r\n", b" 8 -0.5000 0\r\n"]
 
 
-# What the device describes.
+# Layouts described by the device.
 
 
 @given(selections)
@@ -212,7 +212,7 @@ def test_an_encoder_at_rest_around_zero_is_not_taken_for_a_sync(seed: int) -> No
     found = everything(decoder(), *portions)
     sent = {record.tobytes() for record in records}
     wrong = sum(record.tobytes() not in sent for record in found)
-    # What two telegrams left may be as long as one, and count on.
+    # The remains of two telegrams may have the length of one and the next counter.
     assert losses > 20
     assert wrong <= losses / 20
     assert len(found) - wrong >= len(records) - 2.2 * losses
@@ -226,7 +226,7 @@ def test_a_counter_that_leaps_costs_nothing_where_the_sync_is_in_its_place(resta
 
 
 def test_two_telegrams_that_make_one_are_none() -> None:
-    """What is left of both is as long as one, and FF FF of the second stands for a sync."""
+    """The remains of both have the length of one, with FF FF of the second as sync."""
     records = some(12)
     for name in ("66", "67", "68", "69"):
         records[name] = -1

@@ -17,7 +17,7 @@ EPOCH = 1_700_000_000_000_000_000
 
 
 def stamps_of(clock: DeviceClock, device: np.ndarray, arrival: np.ndarray) -> np.ndarray:
-    """What the clock says of each sample, told of it as it arrives."""
+    """Return the stamp of each sample, entered when it arrives."""
     found = []
     for taken, arrived in zip(device.tolist(), arrival.tolist(), strict=True):
         clock.observe(taken, arrived)

@@ -105,7 +105,7 @@ def feed(name: str, size: int) -> None:
             fed += len(data)
             assert decoder.statistics.bytes_pending <= most
     before = good_ones(decoder)
-    # What is left over from the noise costs no more than itself and its neighbour.
+    # The rest of the noise costs at most one further frame.
     for _ in range(3):
         decoder.feed(good)
     assert good_ones(decoder) > before

@@ -30,7 +30,7 @@ from omsm_ros.instruments.parameters import (
 from omsm_ros.instruments.registry import ACCELEROMETERS, PROBES, REFERENCES, Model, loaded
 from omsm_ros.instruments.six_channel.protocol import COLUMNS
 
-# What a device measures with must be stated; the emulated one's scales will do.
+# The scales of a device must be stated; here those of the emulated one.
 STATED = emulated("six_channel").driver
 
 

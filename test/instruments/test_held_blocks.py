@@ -1,4 +1,4 @@
-"""What waits for the next block or packet is stamped when it came, and not waited for for ever."""
+"""Samples that wait for the next block keep their arrival time, and wait for a limited time."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def counters(found: list[MeasurementBlock]) -> list[int]:
 
 
 def decoded(sent: bytes, made: BlockDecoder | None = None) -> list[MeasurementBlock]:
-    """What is in ``sent``, which nothing follows."""
+    """Return the blocks in ``sent``, the last bytes of a stream."""
     made = made or decoder()
     return made.feed(sent) + made.settle()
 

@@ -100,7 +100,7 @@ def test_a_grossly_wrong_rate_shows_within_some_two_seconds(bench: Any, rate: fl
 
 
 NOISE = np.random.default_rng(5)
-# What another baud rate makes of a stream: few bytes, in any order.
+# Bytes of a stream received at another baud rate: few different ones.
 BAUD = np.array([0, 0xF8, 0xFE, 0x80, 0xE0, 0x1E, 0x66, 0x9E, 0xFF], np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""What else may be on the port, or wrong in the settings: one line that says so."""
+"""Other services on the port, and wrong settings, are reported in one line."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from omsm_ros.instruments.six_channel.protocol import CsvDecoder, FrameDecoder
 from . import plain_wires as wires
 
 Values = list[tuple[float, ...]]
-# What makes a decoder, its frames, their values, and how values are taken of what it found.
+# Maker of a decoder, frames, their values, and the function that takes values of its result.
 Wire = tuple[Callable[[], Any], list[bytes], Values, Callable[..., Any]]
 COUNT = 9
 

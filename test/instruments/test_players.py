@@ -31,7 +31,7 @@ HALF_STEP = {"confocaldt": 100e-6 / 65_536 / 2}
 
 
 def play(name: str, link: str, recording: Recording, lapse: float = 20.0) -> list[BlockPair]:
-    """What a driver makes of a motion."""
+    """Return the blocks of a driver that reads a motion."""
     got: list[BlockPair] = []
     stop = threading.Event()
     with line_for(link) as line:

@@ -96,7 +96,7 @@ def lasting(name: str) -> st.SearchStrategy[Fault]:
     return st.floats(0.05, LASTS_S).map(lambda s: lambda i: getattr(i, name)(s))
 
 
-# Of a device that is read as a memory: without noise and cuts, and nobody asks it anything.
+# Faults of a device that is read as a memory: no noise, cuts or commands.
 MEMORY_FAULTS = (
     count("lose", 40),
     count("duplicate", 40),
@@ -117,7 +117,7 @@ FAULTS = (
     st.floats(0.05, 0.5).map(lambda s: lambda i: setattr(i.faults, "merge", s)),
     st.just(lambda i: setattr(i.faults, "merge", 0.0)),
 )
-# What is cut out of a stream without a length or a check may join two samples into one.
+# Bytes cut out of a stream without length or checksum may join two samples.
 CUT = count("cut", 200)
 
 

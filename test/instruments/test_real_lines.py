@@ -122,7 +122,7 @@ def test_a_reference_is_read_in_addition_to_its_command_port() -> None:
 
 
 def test_a_cable_that_is_pulled_while_something_is_sent_ends_nothing(tmp_path: Path) -> None:
-    """Whoever pulls it is another thread than that which serves, so it may be at any place."""
+    """Another thread than the serving one unplugs it, at any time."""
     with line_for(str(tmp_path / "probe")) as line:
         emulator = ChrocodileEmulator(line)
         sent = line.write

@@ -1,4 +1,4 @@
-"""Whole turns of an encoder: of any motion, in any blocks, and past garbled counts."""
+"""Whole turns of an encoder are added for any motion and blocks, also after spoilt counts."""
 
 import numpy as np
 import pytest
@@ -48,7 +48,7 @@ def test_garbled_counts_lose_no_turn_of_those_after(share, block):
     assert np.array_equal(found[3100:] - found[0], truth[3100:] - truth[0])
     if share < 0.01:
         assert np.mean(found - found[0] == truth - truth[0]) > 0.97
-    # What was garbled is not repaired: it stands as it came, with some turns.
+    # Spoilt counts are not repaired; they keep their value plus whole turns.
     assert np.array_equal(found % WRAP, seen)
 
 

@@ -318,7 +318,7 @@ def test_a_file_of_a_folder_that_unpacks_to_gigabytes_is_refused(tmp_path, messa
 
 
 def defined_in(folder, lines):
-    """A bag whose one message is defined in so many lines, most of them remarks."""
+    """Return a bag whose message is defined in ``lines`` lines, most of them remarks."""
     text = "# a remark\n" * (lines - 1) + "float64 data\n"
     with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         ours = writer.add_connection(bags.AXES_TOPIC, AXES, msgdef=text, rihs01="RIHS01_")
@@ -355,7 +355,7 @@ def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, message, ch
 
 
 def test_a_path_that_would_be_read_as_an_address_is_refused(tmp_path, message):
-    """Of "%41" SQLite makes "A": another file would be read."""
+    """SQLite decodes "%41" to "A": another file would be read."""
     folder = foreign_bag(tmp_path / "A", [message], plugin=StoragePlugin.SQLITE3)
     other = folder.rename(tmp_path / "%41")
     foreign_bag(tmp_path / "A", [message] * 2, plugin=StoragePlugin.SQLITE3)

@@ -1,4 +1,4 @@
-"""What can be saved of a bag that was cut short or damaged."""
+"""The valid messages of an incomplete or damaged bag are copied."""
 
 import struct
 from dataclasses import replace
@@ -144,7 +144,7 @@ def test_messages_of_another_definition_are_saved_as_they_are(whole, tmp_path):
 
 
 def write_axes(writer, pairs):
-    """What rosbag2 writes of the axes, with its own writer."""
+    """Write axes with the writer of rosbags."""
     store, kind = message_mapping.typestore(), bags.TOPIC_TYPES[bags.AXES_TOPIC]
     with writer:
         connection = writer.add_connection(bags.AXES_TOPIC, kind, typestore=store)

@@ -100,7 +100,7 @@ def test_the_bag_says_which_topics_are_latched(tmp_path):
     with path.open("rb") as stream:
         channels = make_reader(stream).get_summary().channels.values()
     (profile,) = yaml.safe_load(channels.__iter__().__next__().metadata["offered_qos_profiles"])
-    # What rosbag2 writes of a publisher that set no deadline.
+    # The value of rosbag2 for a publisher without a deadline.
     assert profile["deadline"] == {"sec": 9223372036, "nsec": 854775807}
     assert {c.metadata["topic_type_hash"][:7] for c in channels} == {"RIHS01_"}
 
@@ -282,7 +282,7 @@ def test_a_full_tmpfs(tmp_path, small_scan_blocks):
 
 
 def test_the_index_of_a_day_fits_into_memory(tmp_path, axes):
-    """Of each chunk less is kept than is written of it in the end: 50 bytes, two a second."""
+    """For each chunk at most 50 bytes are kept, at two chunks a second."""
     with BagWriter(tmp_path / "long.mcap", (bags.AXES_TOPIC,)) as bag:
         tracemalloc.start()
         for k in range(2000):

@@ -118,7 +118,7 @@ def test_a_set_of_calibrations_is_unchanged_by_the_message(true_calibration):
     heard = message_mapping.calibration(message)
     assert isinstance(heard, CalibrationSet)
     assert (heard.id, heard.positions) == (made.id, (0.0, 0.01))
-    # Whoever knows no sets sees the member nearest to the middle.
+    # Readers that do not know sets see the middle member.
     assert np.array_equal(message.numerator, made.dynamics.numerator)
     message.certificate = message.certificate.replace('"along": "x"', '"along": "z"')
     with pytest.raises(message_mapping.CalibrationError, match="altered"):

@@ -79,7 +79,7 @@ def test_what_continues_is_one_block_of_the_same_values(
             assert getattr(block, name).flags.aligned
         for name in ("stamp_ns", "first_sample", "sample_period"):
             assert getattr(block, name) == getattr(made[0], name)
-        # What shows two counters that are apart: one stamp of four would not.
+        # All stamps are kept, since they show an offset of two counters.
         assert block.parts.tolist() == [[b.first_sample, b.stamp_ns] for b in made]
 
 

@@ -1,4 +1,4 @@
-"""No leaf of a calibration's file can be changed without a word; its layout does not matter.
+"""A change of any value in a calibration file is detected; its layout does not matter.
 
 The id made again by hashlib and json alone, after the words of the format.
 """
@@ -111,7 +111,7 @@ def test_the_id_is_the_hash_of_the_content(content):
 
 @pytest.mark.parametrize("change", [other, gone])
 def test_every_leaf_counts(content, change):
-    """To the last bit of each number: who turns one is told, whatever it is."""
+    """A change of the last bit of any number is detected."""
     ways = list(leaves(content))
     assert len(ways) > 30
     for way in ways:

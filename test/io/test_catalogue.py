@@ -1,4 +1,4 @@
-"""A catalogue that somebody changed by hand is told in one line, and never believed."""
+"""A catalogue that was changed by hand is reported in one line and not used."""
 
 import sqlite3
 from contextlib import closing

@@ -1,4 +1,4 @@
-"""Who comes second is refused, until the first has ended, however it ended."""
+"""A second process is refused until the first one has ended."""
 
 from __future__ import annotations
 

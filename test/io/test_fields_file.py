@@ -79,5 +79,5 @@ def test_a_damaged_number_is_refused_without_a_warning(tmp_path):
     path = tmp_path / "systematic.npz"
     wrong = np.full((1, 4), 0x7F800001, np.uint32).view(np.float32)
     np.savez(path, names=np.array(["tilt"]), fields=wrong, every=1)
-    with pytest.raises(FileError, match="hold what is no number; correct the scan again"):
+    with pytest.raises(FileError, match="hold values that are not finite; correct the scan again"):
         load_fields(path)

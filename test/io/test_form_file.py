@@ -1,4 +1,4 @@
-"""What stands beside a measurement is what a registration writes, or refused by its place."""
+"""A form file has the content that a registration writes; errors name their place."""
 
 from __future__ import annotations
 

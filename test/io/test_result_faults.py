@@ -1,4 +1,4 @@
-"""Whatever fails while results are put in place, nobody reads files of two runs as one result."""
+"""After any fault while results are written, files of two runs are never read as one result."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def held(path):
 @pytest.mark.parametrize("earlier", [True, False])
 @pytest.mark.parametrize("step", range(10))
 def test_a_fault_at_any_step_leaves_no_mixture(tmp_path, earlier, step):
-    """What says that a result is whole stands beside files of its own run alone, or not at all."""
+    """The file that marks a complete result is never with files of another run."""
     out = tmp_path / "out"
     if earlier:
         run(out, "1")
@@ -66,7 +66,7 @@ def test_a_fault_at_any_step_leaves_no_mixture(tmp_path, earlier, step):
         run(out, "2", step)
         assert held(out) == dict.fromkeys(NAMES, "2")
     assert [part.name for part in tmp_path.iterdir()] == ["out"][: int(out.is_dir())]
-    # And the next run mends it.
+    # The next run repairs it.
     run(out, "3")
     assert held(out) == dict.fromkeys(NAMES, "3")
 
@@ -81,7 +81,7 @@ def test_a_folder_in_the_place_of_a_file_is_named_before_anything_goes(tmp_path)
 
 
 def test_a_user_file_next_to_the_result_is_not_replaced(tmp_path):
-    """Only an earlier run's may be: whose else it is, nobody knows."""
+    """Only files of an earlier run may be replaced, since others belong to the user."""
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "notes").write_text("mine")
 
@@ -143,7 +143,7 @@ def test_a_folder_on_the_way_is_made_and_a_longest_name_is_written(tmp_path):
 
 
 def test_a_reader_of_the_old_file_reads_on(tmp_path):
-    """A new file takes its name; who has the old one open sees none of the new bytes."""
+    """A new file replaces the name; a reader of the old one sees none of the new bytes."""
     save_text(tmp_path / "a", "old text")
     with open_regular(tmp_path / "a", FileError, "note") as reader:
         save_text(tmp_path / "a", "new")
@@ -204,8 +204,8 @@ def test_a_text_is_read_up_to_its_bound(tmp_path, size):
     [
         (OSError(errno.ENOSPC, "No space left on device", "/a/secret"), "No space left on device"),
         (ValueError("two\n  lines\tand more"), "two lines and more"),
-        (KeyError("a.b"), "what it holds does not fit together"),
-        (MemoryError(), "it asks for more memory than there is"),
+        (KeyError("a.b"), "its content is inconsistent"),
+        (MemoryError(), "it needs more memory than there is"),
         (ValueError(), "ValueError"),
         (ValueError("x" * 999), "x" * 200),
     ],

@@ -1,4 +1,4 @@
-"""What RFC 8259 calls JSON is read as it stands, and nothing else is."""
+"""JSON of RFC 8259 is read exactly, and nothing else is accepted."""
 
 import json
 import math

@@ -94,7 +94,7 @@ def test_a_map_is_a_surface(tmp_path):
 
 
 def test_a_map_may_be_part_of_a_sum_or_parent_of_a_section(tmp_path):
-    """What a surface has beyond its formula is often known as a map alone."""
+    """The deviation of a surface from its formula is often given as a map."""
     x, y = (v.ravel() for v in np.meshgrid(np.linspace(-8, 8, 81), np.linspace(-6, 6, 61)))
     wave = 1e-3 * np.cos(0.3 * x) * np.sin(0.2 * y)
     np.savetxt(tmp_path / "map.xyz", np.column_stack([x, y, wave]), fmt="%.15g")

@@ -1,4 +1,4 @@
-"""What the vibration monitor told, through a bag, to the one who looks into it."""
+"""Levels of the vibration monitor are read from a bag."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ SIZE, FREQUENCY = 50e-9, 680.0
 
 
 def levels():
-    """Of a probe that swings by 50 nm at 680 Hz, seen by an accelerometer on it."""
+    """Acceleration of a probe that vibrates by 50 nm at 680 Hz."""
     time = np.arange(8000) / 4000.0
     z = SIZE * (2 * np.pi * FREQUENCY) ** 2 * np.sin(2 * np.pi * FREQUENCY * time)
     running = RunningSpectrum(MonitorOptions())

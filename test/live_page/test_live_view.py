@@ -150,7 +150,7 @@ def test_a_node_that_falls_silent_turns_it_red(clock, true_calibration):
     clock.now += 11
     light = view.state()["light"]
     assert light["colour"] == "red"
-    assert light["reasons"] == ["/omsm/corrector: says nothing any more"]
+    assert light["reasons"] == ["/omsm/corrector: no message for 10 s"]
 
 
 def test_another_calibration_begins_another_map(clock, true_calibration):

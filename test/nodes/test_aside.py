@@ -17,7 +17,7 @@ from omsm_ros.nodes.background_worker import BackgroundWorker
 
 
 def outcome(awaited):
-    """What a coroutine returns, without an executor."""
+    """Return the result of a coroutine without an executor."""
     while True:
         try:
             awaited.send(None)

@@ -17,7 +17,7 @@ SECOND = 10**9
 
 
 class Cell:
-    """One node and its topic; refuses what it is told to."""
+    """A node and its topic; it refuses the calibrations in ``refuses``."""
 
     def __init__(self, listens=True):
         self.node, self.taken, self.refuses = FakeNode(), [], set()

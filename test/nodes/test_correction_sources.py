@@ -1,4 +1,4 @@
-"""What the corrector is told of the machine, and the light that it shows of itself."""
+"""Stated uncertainties of the machine, and the verdict of the corrector."""
 
 from __future__ import annotations
 

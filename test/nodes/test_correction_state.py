@@ -1,4 +1,4 @@
-"""What the corrector says of its state."""
+"""The corrector reports a counter offset that its motion shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the corrector says of its counts: nothing yet, silence, refusals, losses, waiting."""
+"""The corrector reports its counts: nothing yet, silence, refusals, losses, waiting."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def heard(state, first, now, streams=("axes", "distance"), period=PERIOD):
 
 
 def flowing(seconds, corrector=None):
-    """A state after so many seconds of both streams, and when that was."""
+    """Return a state after ``seconds`` of both streams, and the time."""
     state = CorrectionState()
     for i in range(round(seconds / (BLOCK * PERIOD))):
         heard(state, i * BLOCK, i * BLOCK * PERIOD)

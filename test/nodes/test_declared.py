@@ -87,7 +87,7 @@ def test_none_may_be_set_where_it_would_take_no_effect():
     answer = node.callbacks[0]([SimpleNamespace(name="window", value=2.0)])
     assert not answer.successful
     assert answer.reason == "'window' takes effect later"
-    # What is not of this package, such as use_sim_time, is not ours to refuse.
+    # Parameters of rclpy, such as use_sim_time, are not refused.
     assert node.callbacks[0]([SimpleNamespace(name="use_sim_time", value=True)]).successful
 
 

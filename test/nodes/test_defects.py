@@ -1,4 +1,4 @@
-"""What nobody foresaw is told where a shop looks: in the diagnostics, as long as the node lives."""
+"""Internal errors stay in the diagnostics as long as the node runs."""
 
 from types import SimpleNamespace
 

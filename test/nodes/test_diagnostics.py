@@ -1,4 +1,4 @@
-"""A report has the level of its gravest finding, says all of them, and is told every second."""
+"""A report has the level of its most severe finding, lists all, and is published each second."""
 
 import itertools
 
@@ -80,7 +80,7 @@ def test_simulated_time_that_nobody_sets_is_reported(simulated, now_ns, reported
     node = FakeNode()
     node.simulated, node.now_ns = simulated, now_ns
     _, status = published(node, Report("correcting"))
-    assert ("nobody publishes /clock" in status.message) == reported
+    assert ("no node publishes /clock" in status.message) == reported
     assert status.level == (DiagnosticStatus.WARN if reported else DiagnosticStatus.OK)
 
 

@@ -1,4 +1,4 @@
-"""What a driver publishes of its blocks, settings and state: with a device that is written down."""
+"""A driver publishes blocks, settings and state of a scripted device."""
 
 import json
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Who is waited for, and how long: on a clock that is set, listeners that are written down."""
+"""Subscribers are waited for within limits: scripted ones, on a simulated clock."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ def held_kib():
 
 
 class Cycle:
-    """What refers to itself."""
+    """An object that refers to itself."""
 
     def __init__(self):
         self.itself = self

@@ -1,4 +1,4 @@
-"""What every command of a node sets before ROS is loaded."""
+"""Each command of a node sets its environment before ROS is loaded."""
 
 import os
 from pathlib import Path

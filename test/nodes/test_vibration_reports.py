@@ -1,4 +1,4 @@
-"""What the vibration monitor tells of known lines: levels, alarms, silence, refused blocks."""
+"""The vibration monitor reports known lines: levels, alarms, silence, refused blocks."""
 
 import json
 import math
@@ -151,7 +151,7 @@ def test_on_the_slide_the_effect_needs_a_calibration(made, true_calibration):
     shake(monitor, 2.0, 10e-9)
     report = monitor.report()
     assert report.values["response_valid_up_to"] == true_calibration.valid_up_to
-    # What the encoder sees and the probe follows: a height moves by |1 - G| of it.
+    # The probe follows what the encoder measures, so the height changes by |1 - G| of it.
     response = complex(true_calibration.dynamics.normalised().response(np.array([LINE_HZ]))[0])
     expected = 10e-9 / math.sqrt(2) * abs(1 - response)
     assert monitor.reported[-1]["height_total"] == pytest.approx(expected, rel=0.1)

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.timeout(120)
 
 
 def account(cell, stream):
-    """What the corrector says of a stream: received, corrected, pending, and the other counts."""
+    """Return the corrector's counts of a stream: received, corrected, pending, others."""
     status = cell.operator._status["corrector"]
     counts = {
         key.removeprefix(f"{stream}_"): int(value)
@@ -151,7 +151,7 @@ def test_corrector_without_calibration_counts_and_waits(cell, true_calibration):
         lambda: (
             cell.operator.value("confocal_driver", "axes_subscribers") >= 1
             and cell.operator.value("confocal_driver", "confocal_subscribers") >= 1
-            # What is played before the driver has opened the port reaches nobody.
+            # Samples before the driver has opened the port are lost.
             and cell.operator.value("confocal_driver", "connections") >= 1
         ),
     )

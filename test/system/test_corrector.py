@@ -107,7 +107,7 @@ def test_a_refused_calibration_leaves_the_one_in_force(cell, true_calibration):
     assert "loose" in answer.message
     assert answer.id == true_calibration.id
     cell.wait(
-        "who is in force",
+        "the calibration in force",
         lambda: cell.operator.text("corrector", "calibration") == true_calibration.id,
     )
 
@@ -134,7 +134,7 @@ def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_cal
 
 
 def test_geometry_parameters_place_the_points(cell, true_calibration):
-    """At rest in z, a point is where rotation matrices put it, and H(z) is z."""
+    """With constant z, H(z) is z, and rotation matrices give the point."""
     given = {
         "centre_x": 1e-3, "centre_y": -2e-3, "probe_x": 5e-3, "probe_z": 20e-3,
         "beam_x": 0.02, "beam_y": -0.01,

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.timeout(180)
 
 
 class Listener:
-    """Who joins late: what is latched when it comes."""
+    """A late subscriber, which gets the latched messages."""
 
     def __init__(self, cell):
         self._cell, self._heard = cell, {}

@@ -1,4 +1,4 @@
-"""Killed at any moment and started again: right within seconds, and what was lost is told."""
+"""A node killed at any moment and restarted works within seconds, and reports its losses."""
 
 import random
 import signal

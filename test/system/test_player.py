@@ -84,7 +84,7 @@ def played(cell):
 
 
 def live_cloud(cell, path, calibration_file, **parameters):
-    """What the corrector publishes of a bag that is played to it."""
+    """Return the clouds of the corrector for a played bag."""
     cell.processes.start("corrector", calibration=str(calibration_file))
     clouds = cell.clouds()
     cell.wait("corrector", lambda: cell.operator.value("corrector", "points_subscribers") >= 1)
@@ -198,7 +198,7 @@ def hear(cell, kind, topic, qos=SAMPLES_QOS):
 
 
 def test_recorded_points_go_elsewhere_and_only_if_asked_for(cell, small_scan_blocks):
-    """And /clock tells the time of the bag; a part of the bag is played."""
+    """A part of a bag is played, with its time on /clock."""
     from sensor_msgs.msg import PointCloud2
 
     pairs = small_scan_blocks[:BLOCKS]
@@ -292,7 +292,7 @@ def test_what_cannot_be_played_is_one_line(cell, small_scan_blocks, name, value,
 
 
 def test_blocks_are_cut_without_a_change():
-    """Of the helper above."""
+    """Check of the helper above."""
     whole = blocks.AxisBlock(
         stamp_ns=5, first_sample=7, sample_period=1e-3, **{n: np.arange(5.0) for n in "xyzbc"}
     )

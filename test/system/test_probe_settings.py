@@ -38,7 +38,7 @@ class Bench:
         parameters = self.plan.driver_parameters()
         self.processes.start("confocal_driver", **parameters, averaging=averaging)
         listeners = 2 + ("recorder" in self.processes._running)
-        # What is known of it is of the one before until it tells that it has sent nothing yet.
+        # Its diagnostics are those of the earlier one until it reports 0 blocks.
         self.cell.wait("a new one", lambda: self.node.value("confocal_driver", "blocks") == 0)
         self._until("it", "confocal_driver", "axes_subscribers", listeners)
         self._until("the device", "confocal_driver", "connections", 1)
@@ -59,7 +59,7 @@ class Bench:
         self.node.call(Trigger, f"/omsm/cell_emulator/{motion}", Trigger.Request())
 
     def identified(self):
-        """What the calibrator answers after a step test."""
+        """Return the calibrator's answer after a step test."""
         self.move("step_test")
         held = ("axes_held", "distance_held")
         _follow(self.node, "calibrator", held, self.plan.step_test_samples, int)

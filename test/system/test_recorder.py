@@ -1,4 +1,4 @@
-"""What was published before a recorder was ended is in its bag, however it was ended."""
+"""Messages published before a recorder ends are in its bag, however it ends."""
 
 import os
 import resource
@@ -24,7 +24,7 @@ SAMPLES = 20
 def start_recorder(cell, path):
     cell.processes.start("recorder", path=str(path))
     publisher = cell.publisher("axes", AxisBlock)
-    # What is published before both sides have found each other may come seconds late.
+    # Messages before both sides have discovered each other may arrive seconds late.
     cell.wait("it hears", lambda: cell.operator.value("recorder", "publishers_of_/omsm/axes") == 1)
     return publisher
 
@@ -153,7 +153,7 @@ def test_the_calibration_is_recorded_and_its_durability(cell, true_calibration):
     publisher.publish(
         message_mapping.calibration_message(message_mapping.ros_messages(), true_calibration, 7)
     )
-    # The recorder comes later, and is told.
+    # The recorder starts later, and gets it.
     start_recorder(cell, path)
     cell.wait("it recorded", lambda: cell.operator.value("recorder", "/omsm/calibration") == 1)
     end(cell, signal.SIGINT)

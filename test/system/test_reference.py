@@ -1,4 +1,4 @@
-"""A second sensor on /omsm/reference, live: its scale is told, and it can be the input."""
+"""A second sensor on /omsm/reference: its scale is reported, and it can be the input."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""An hour at 1 kHz with a fault every minute: every sample is told of, memory stays as it is."""
+"""An hour at 1 kHz with a fault each minute: all samples are counted, memory does not grow."""
 
 import itertools
 import os
@@ -148,7 +148,7 @@ class Hour:
             assert self.cell.call(kind, name, **fields).message
 
     def identified(self):
-        """What is no fault, but the largest piece of work that a node is asked for."""
+        """Identify a bag: no fault, but the largest work of a node."""
         assert self.cell.call(Identify, "calibrator/identify", bag=str(self.steps)).success
 
     def killed(self, node):
@@ -160,7 +160,7 @@ class Hour:
         print(f"{node} is back after {time.monotonic() - begin:.1f} s")
 
     def faults(self):
-        """What may happen at any time, and what begins a node anew."""
+        """Return faults that may happen at any time, and those that restart a node."""
         lasting = [self.network_gone, self.connection_cut, self.noise_on_the_wire]
         lasting += [lambda n=node: self.stopped(n) for node in NODES]
         lasting += [lambda: self.deactivated("confocal_driver"), self.foolish_requests]
@@ -207,7 +207,7 @@ def growth_of(readings, node):
 
 
 def strike(hour, faults, until):
-    """Let faults come until so many samples are played."""
+    """Let faults occur until ``until`` samples are played."""
     for fault in faults:
         if hour.played >= until:
             break

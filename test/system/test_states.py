@@ -1,4 +1,4 @@
-"""What a shop sees on /diagnostics: the state now, told by everyone whom it concerns."""
+"""The nodes concerned report the present state on /diagnostics."""
 
 import os
 import signal
@@ -103,7 +103,7 @@ def test_a_second_emulator_is_refused_and_the_first_keeps_its_port(cell):
 @pytest.mark.soak
 def test_simulated_time_that_nobody_tells_is_reported(cell):
     cell.processes.start("calibrator", use_sim_time=True, output=str(cell.folder / "cal.json"))
-    until(cell, "calibrator", WARN, "nobody publishes /clock")
+    until(cell, "calibrator", WARN, "no node publishes /clock")
 
 
 def test_two_cells_side_by_side(cell, true_calibration):

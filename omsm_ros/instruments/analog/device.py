@@ -1,4 +1,4 @@
-"""Analog sensors through a converter, to blocks: an accelerometer, a capacitive probe."""
+"""Reads analog sensors through a converter: an accelerometer, a capacitive probe."""
 
 from __future__ import annotations
 
@@ -17,32 +17,30 @@ from omsm_ros.instruments.parameters import NowNs, Values, block_settings
 from omsm_ros.instruments.transport import parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# Voltages of an analog-to-digital converter: National Instruments', or a synthetic one.
-
-# The driver's buffer holds ten seconds: longer than any pause of a healthy host.
+# The buffer of the converter's driver is longer than any pause of a healthy host [s].
 _BUFFER_S = 10.0
 # NI-DAQmx: samples were overwritten before they were read.
 _OVERWRITTEN = (-200279, -200278)
 
 
 class AnalogInput(Protocol):
-    """Several channels sampled together and evenly.
+    """Several channels that are sampled together at a constant rate.
 
-    name: for messages
+    name: in messages
     """
 
     @property
     def name(self) -> str:
-        """Return what the input is called in messages."""
+        """Return the name in messages."""
         ...
 
     def open(self, rate: float) -> None:
         """Begin to sample at ``rate`` [Hz]; raises DeviceError."""
 
     def read(self, timeout: float) -> FloatArray:
-        """Return what was sampled since, (n, channels) [V], waiting up to ``timeout`` [s].
+        """Return the samples since the last call, (n, channels) [V], waiting up to ``timeout`` [s].
 
-        Raises DeviceError where samples were lost or the converter is gone.
+        Raises DeviceError if samples were lost or the converter is gone.
         """
 
     def close(self) -> None:
@@ -50,14 +48,14 @@ class AnalogInput(Protocol):
 
 
 class NidaqInput:
-    """``daq://Dev1/ai0:2?range=10&clock=PFI0``: by NI's own driver and its Python package.
+    """Reads ``daq://Dev1/ai0:2?range=10&clock=PFI0`` by NI-DAQmx; not tested on hardware.
 
     range: largest voltage [V];  clock: terminal of an external sample clock, such as the probe's
-    trigger; the converter's own without. Imported where it is opened; untried on hardware.
+    trigger; without one the converter's own clock is used
     """
 
     def __init__(self, address: str, channels: int) -> None:
-        """Raise ConfigurationError for an address that is none."""
+        """Raise ConfigurationError for an address that is not valid."""
         parts = parts_of(address)
         query = {name: values[0] for name, values in parse_qs(parts.query).items()}
         if not parts.netloc or len(parts.path) < 2 or set(query) - {"range", "clock"}:
@@ -111,7 +109,7 @@ class NidaqInput:
             )
 
     def read(self, timeout: float) -> FloatArray:
-        """Return what was sampled since, (n, channels) [V]; raises DeviceError."""
+        """Return the samples since the last call, (n, channels) [V]; raises DeviceError."""
         if self._task is None:
             raise DeviceError(f"{self.name} is not open")
         nidaqmx = _nidaqmx()
@@ -140,16 +138,16 @@ class NidaqInput:
 
 
 class SyntheticInput:
-    """``synthetic://?frequency=680&amplitude=0.01&noise=0.001``: a sine on noise, in volts.
+    """Makes ``synthetic://?frequency=680&amplitude=0.01&noise=0.001``: a sine with noise [V].
 
-    On each channel a quarter of a turn later. For trials without a converter: it samples the host's
-    monotonic clock, so that its rate is true.
+    Each channel lags the one before by a quarter of a period. For trials without a converter: it
+    is sampled by the host's monotonic clock, so its rate is true.
     """
 
     def __init__(
         self, address: str, channels: int, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        """Raise ConfigurationError for an address that is none."""
+        """Raise ConfigurationError for an address that is not valid."""
         parts = parts_of(address)
         query = {name: values[0] for name, values in parse_qs(parts.query).items()}
         values = {"frequency": 100.0, "amplitude": 0.01, "noise": 1e-4}
@@ -174,7 +172,7 @@ class SyntheticInput:
         self._rate, self._start, self._taken = rate, self._monotonic(), 0
 
     def read(self, timeout: float) -> FloatArray:
-        """Return what a converter would have sampled since, (n, channels) [V]."""
+        """Return the samples since the last call, (n, channels) [V]."""
         if self._taken < 0:
             raise DeviceError(f"{self.name} is not open")
         due = int((self._monotonic() - self._start) * self._rate)
@@ -228,10 +226,11 @@ class AnalogSettings:
 
 
 class AnalogDevice:
-    """Samples a converter that runs freely and cuts what it gives into blocks.
+    """Reads a free-running converter and cuts its samples into blocks.
 
-    The converter numbers nothing, so samples are counted here; after a loss the count goes on by
-    the time that passed, and the difference is ``lost``. A kind of sensor fills in ``_block``.
+    The converter does not number its samples, so they are counted here; after a loss the count
+    continues by the time that passed, and the difference is ``lost``. A kind of sensor implements
+    ``_block``.
     """
 
     def __init__(
@@ -241,7 +240,7 @@ class AnalogDevice:
         now_ns: Callable[[], int] = time.time_ns,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """now_ns: the host clock that stamps refer to [ns];  monotonic: for the time lost [s]."""
+        """now_ns: the host clock of the stamps [ns];  monotonic: for the time lost [s]."""
         self._source, self._settings = source, settings
         self._now_ns, self._monotonic = now_ns, monotonic
         self._clock = DeviceClock()
@@ -284,16 +283,16 @@ class AnalogDevice:
 
     @property
     def identity(self) -> dict[str, str]:
-        """A converter knows nothing of its sensor."""
+        """Return nothing: a converter does not know its sensor."""
         return {}
 
     @property
     def trouble(self) -> str:
-        """Return why the samples cannot be used; they always can."""
+        """Return the empty text: the samples can always be used."""
         return ""
 
     def counts(self) -> dict[str, float]:
-        """Return what became of every sample: ``decoded = delivered + pending``; lost, gaps."""
+        """Return the counts of samples: ``decoded = delivered + pending``; lost, gaps."""
         return {
             "decoded": self._decoded,
             "delivered": self._delivered,
@@ -323,7 +322,7 @@ class AnalogDevice:
 
 
 class Accelerometer(AnalogDevice):
-    """Three axes; it cannot see 0 Hz if it is an IEPE sensor, and its offset is not removed."""
+    """Reads three axes; an IEPE sensor has no response at 0 Hz, and no offset is removed."""
 
     def __init__(
         self, source: AnalogInput, settings: AnalogSettings, sensitivity: float, **clocks: Any
@@ -338,7 +337,7 @@ class Accelerometer(AnalogDevice):
 
 
 class AnalogReference(AnalogDevice):
-    """A displacement sensor with a voltage; beyond its range it measures no distance."""
+    """Reads a displacement sensor; beyond its range there is no distance."""
 
     def __init__(
         self,

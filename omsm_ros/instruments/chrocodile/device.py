@@ -1,6 +1,7 @@
-"""Precitec CHRocodile: what the drivers of both its protocols have in common.
+"""Sets up and reads a Precitec CHRocodile, whatever its protocol; the base of both drivers.
 
-Untried on hardware. What the public facts leave open is a setting or is read tolerantly.
+Not tested on hardware. Details that the public documents leave open are settings, or several
+forms are accepted.
 """
 
 from __future__ import annotations
@@ -53,30 +54,30 @@ from omsm_ros.units import MICROMETRE_M
 
 TRIGGERS = {"free_run": "CTN", "each": "TRE", "once": "TRG", "window": "TRW"}
 FORMATS = {"binary": "BIN", "ascii": "ASC"}
-# In `TRE` the device's own rate must be just above that of the trigger.
+# In `TRE` the device's own rate must be slightly above that of the trigger.
 _ABOVE_TRIGGER = 1.05
-# Settings that a calibration belongs to; the lamp's is how long it shines within an exposure.
+# Settings on which a calibration depends; that of the lamp is its time within an exposure.
 _DECISIVE = {
     "model": "model", "SEN": "head", "SHZ": "rate", "AVD": "averaging", "LAI": "lamp",
     "SCA": "full_scale",
 }  # fmt: skip
 _COUNTER_RANGE = 2**16
-# How far a rate may be from a whole multiple of another [relative].
+# Relative deviation of a rate from a whole multiple of another [1].
 _MULTIPLE = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChrocodileSettings(BlockSettings):
-    """How the device is set up and read; None leaves as it is what the device has.
+    """Settings of the device; None keeps the device's own value.
 
     signals: numbers for `$SODX`; empty = counter, time, flags, distance, intensity, encoders
-    axes: scaling of the encoders on X, Y, Z, B, C; None = it has none
-    encoders: which of the device's encoders X Y Z U V (0 to 4) is on each axis
-    latch: of the encoders at the exposure's "start", "end" or their "mean"
+    axes: scaling of the encoders on X, Y, Z, B, C; None = no encoders
+    encoders: encoder X Y Z U V (0 to 4) of the device on each axis
+    latch: encoders at the exposure's "start", "end", or their "mean"
     trigger: "free_run", "each", "once" or "window";  format: "binary" or "ascii"
     lamp: 0-100;  averaging: samples;  threshold: of detection;  head: sensor head 0-15
     sync: the device's sync bytes
-    patience: for an answer, and for samples of a device that runs freely [s]
+    patience: for an answer, and for samples of a free-running device [s]
     """
 
     signals: tuple[int, ...] = ()
@@ -107,21 +108,21 @@ class ChrocodileSettings(BlockSettings):
 
     @property
     def latched(self) -> tuple[int, ...]:
-        """Signals that the axes are read from."""
+        """Return the signals of the encoders."""
         return sum(LATCHES[self.latch], ()) if self.axes is not None else ()
 
 
 class RefusedError(DeviceError):
-    """The device answered that it does not have the command, or not with this value."""
+    """The device refused a command or its value."""
 
 
 class Chrocodile(StreamDevice):
-    """Sets the device up, reads back what was set, and turns its signals into samples.
+    """Sets the device up, reads the settings back, and converts its signals to samples.
 
-    triggers_lost, triggers_delayed: samples the device flagged so
+    triggers_lost, triggers_delayed: samples with these flags of the device
     """
 
-    # What is asked for when no signals are given.
+    # The signals if the settings state none.
     usual: tuple[int, ...] = (SAMPLE_COUNTER, FLAGS, DISTANCE, INTENSITY)
     always_timed = False
 
@@ -152,18 +153,18 @@ class Chrocodile(StreamDevice):
         self._identity: dict[str, str] = {}
         self._asked = 0.0
         self._ever_set_up = False
-        self._exposures = 1  # that the device averages into a sample
+        self._exposures = 1  # averaged into a sample by the device
         self._slowed_by_averaging = True
-        self._unheard = False  # it answered, but no telegram could be read
+        self._unheard = False  # it answered, but sent no readable telegram
 
     @property
     def identity(self) -> dict[str, str]:
-        """Return what the device reported of itself and its settings."""
+        """Return identity and settings as the device reported them."""
         return self._identity
 
     @property
     def settings(self) -> dict[str, object]:
-        """Return what moves a reading in time, or makes it another: model, head, rate, lamp …"""
+        """Return the settings that change a reading or its time: model, head, rate, lamp …"""
         identity = self._identity
         reported = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
         if not reported:
@@ -176,7 +177,7 @@ class Chrocodile(StreamDevice):
         return super().counts() | flags
 
     def poll(self, timeout: float) -> list[BlockPair]:
-        """Return what came, as any device; one averaging at the same rate is set up anew."""
+        """Return the blocks; raise DeviceError if the device averages without a lower rate."""
         blocks = super().poll(timeout)
         self._unheard &= not blocks
         faster = (1 + self._cutter.period_deviation) * self._exposures
@@ -184,27 +185,23 @@ class Chrocodile(StreamDevice):
             self._slowed_by_averaging = False
             raise DeviceError(
                 f"{self._transport.name} averages {self._exposures} exposures and sends no fewer "
-                "samples; it is set up anew for that"
+                "samples; it is set up again for that"
             )
         return blocks
 
     def dark_reference(self) -> None:
-        """Take the dark reference: no target may be in range. It lasts about three seconds."""
+        """Take the dark reference, for about three seconds; no target may be in range."""
         self._ask("DRK", patience=self._wanted.patience + 8.0)
 
-    # What a protocol fills in.
-
     def _begin(self) -> None:
-        """Make the device listen; raises DeviceError."""
+        """Make the device accept commands; raises DeviceError."""
 
     def _finish(self) -> None:
-        """Make the device send what was selected; raises DeviceError."""
+        """Make the device send the selected signals; raises DeviceError."""
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
         """Return the answer to a command; DeviceTimeoutError if none comes. Samples are kept."""
         raise NotImplementedError
-
-    # Setting up.
 
     def _prepare(self) -> None:
         wanted = self._wanted
@@ -225,26 +222,26 @@ class Chrocodile(StreamDevice):
         for name in ("SEN", "LAI"):
             self._read(name)
         if not intact:
-            self._try(TRIGGERS[wanted.trigger])  # some of them start the counter anew
+            self._try(TRIGGERS[wanted.trigger])  # some of these reset the counter
             self._tracker.restart_count()
         self._ever_set_up = True
         self._finish()
         self._asked = self._monotonic()
 
     def _try(self, name: str, *arguments: str | float) -> Answer:
-        """Return the answer to a command that not every model has; an empty one if refused."""
+        """Return the answer to a command; an empty one if the model refuses it."""
         try:
             return self._ask(name, *arguments)
         except RefusedError:
             return Answer(b"", "")
 
     def _read(self, name: str) -> None:
-        """Enter a setting that was left as it is; not every model reports it."""
+        """Enter a setting of the device, if the model reports it."""
         if name not in self._identity and (found := self._try(name, QUERY).numbers):
             self._identity[name] = " ".join(f"{number:g}" for number in found)
 
     def _set(self, name: str, *values: float) -> None:
-        """Set and read back; DeviceError if the device has other values then."""
+        """Set values and read them back; DeviceError if they differ."""
         self._ask(name, *values)
         found = self._ask(name, QUERY).numbers
         self._identity[name] = " ".join(f"{number:g}" for number in found)
@@ -255,7 +252,7 @@ class Chrocodile(StreamDevice):
             )
 
     def _set_rate(self) -> None:
-        """SHZ counts exposures: as many to a sample, or to a trigger, as are averaged into it."""
+        """Set SHZ, the rate of exposures: each sample or trigger has as many as are averaged."""
         averaging = _value(self._identity.get("AVD", "1"))
         averaged = isinstance(averaging, float) and averaging > 1 and self._slowed_by_averaging
         self._exposures = round(averaging) if averaged and isinstance(averaging, float) else 1
@@ -268,13 +265,13 @@ class Chrocodile(StreamDevice):
         self._identity["SHZ"] = f"{found[0]:g}"
         if free and abs(found[0] / rate - 1) > RATE_TOLERANCE / 2:
             raise DeviceError(
-                f"{self._transport.name}: {rate:.6g} Hz was asked for, the device measures at "
+                f"{self._transport.name}: {rate:.6g} Hz was requested, the device measures at "
                 f"{found[0]:.6g} Hz; set sample_period to {self._exposures / found[0]:.9g} s"
             )
         if not free and found[0] < rate:
             raise DeviceError(
                 f"{self._transport.name}: its {found[0]:.6g} Hz are below the trigger's "
-                f"{rate:.6g} Hz, so triggers would be lost; shorten exposure or averaging"
+                f"{rate:.6g} Hz, so triggers would be lost; reduce exposure or averaging"
             )
 
     def _read_scale(self) -> None:
@@ -293,27 +290,25 @@ class Chrocodile(StreamDevice):
             )
         return DeviceTimeoutError(f"{self._transport.name} did not answer {name!r}; {hint}")
 
-    # Reading.
-
     def _listen_in(self, silent: float) -> None:
-        """Ask a silent device whether it is still set up; a device that runs freely must talk."""
+        """Check that a silent device still has its settings; a free-running one must send."""
         now = self._monotonic()
         if min(silent, now - self._asked) < self._wanted.patience:
             return
         self._asked = now
         if not self._selected():
             raise DeviceError(
-                f"{self._transport.name} lost its settings (a restart?); it is set up anew"
+                f"{self._transport.name} lost its settings (a restart?); it is set up again"
             )
         if self._wanted.trigger == "free_run":
             self._unheard = True
             raise NoSamplesError(
-                f"{self._transport.name} answers, but sent no telegram that could be read for "
-                f"{silent:.1f} s; check its trigger, and that no other program sets it up"
+                f"{self._transport.name} answers, but sent no readable telegram for "
+                f"{silent:.1f} s; check its trigger, and that no other program changes its settings"
             )
 
     def _selected(self) -> bool:
-        """Return whether the device still has our selection; one that was restarted has its own."""
+        """Return whether the device still has the selection; a restart sets it back."""
         found = self._ask("SODX", QUERY).numbers
         return not found or set(self._selection) <= set(found)
 
@@ -336,12 +331,12 @@ class Chrocodile(StreamDevice):
 
 
 def _version(text: str) -> str:
-    """The answer to VER; some devices answer it with words of refusal."""
+    """Return the model in an answer to VER; a refusal has no digits."""
     return text if any(map(str.isdigit, text)) else "CHRocodile"
 
 
 def _value(text: str) -> object:
-    """Return a number, where the text is one."""
+    """Return the number in a text, or the text."""
     try:
         return float(text)
     except ValueError:
@@ -349,14 +344,14 @@ def _value(text: str) -> object:
 
 
 def _agree(found: Sequence[float], wanted: Sequence[float], within: float) -> bool:
-    """Return whether an answer holds the values set, within a share of each; more may follow."""
+    """Return whether an answer has the values set, within a relative deviation; more may follow."""
     if within == 0:
         return set(wanted) <= set(found)  # in the device's own order
     return len(found) >= len(wanted) and np.allclose(found[: len(wanted)], wanted, rtol=within)
 
 
 def settings_from(values: Values) -> ChrocodileSettings:
-    """Return the settings that parameters describe; ConfigurationError for those that cannot be."""
+    """Return the settings that parameters describe; ConfigurationError if they are not valid."""
     return ChrocodileSettings(
         **block_settings(values),
         signals=_numbers("signals", values["signals"]),

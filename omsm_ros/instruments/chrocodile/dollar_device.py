@@ -44,7 +44,7 @@ _BITS_PER_BYTE = 10
 
 
 class ChrocodileDevice(Chrocodile):
-    """Reads telegrams, in the layout that the device describes."""
+    """Reads telegrams in the layout that the device describes."""
 
     usual = (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY)
 
@@ -72,7 +72,7 @@ class ChrocodileDevice(Chrocodile):
         self._early.clear()
         self._ask("STO")
         if self._unheard:
-            # Somebody may have set another sync sequence; its bytes follow the command at once.
+            # Another program may have changed the sync bytes, which follow this command at once.
             self._exchange(b"$SSQ" + self._wanted.sync + b"\r")
 
     def _finish(self) -> None:
@@ -84,7 +84,7 @@ class ChrocodileDevice(Chrocodile):
         self._ask("STA")
 
     def _layout(self) -> Layout:
-        """Return the layout that the device describes, or the table's where it does not."""
+        """Return the layout that the device describes, or that of the table if it does not."""
         answer = self._ask("DTF")
         try:
             layout = Layout.described(answer.text, self._wanted.sync)
@@ -108,7 +108,7 @@ class ChrocodileDevice(Chrocodile):
             )
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
-        """Return the answer to a command; DeviceTimeoutError if none comes. Telegrams are kept."""
+        """Return the answer to a command, keeping telegrams; DeviceTimeoutError without one."""
         return self._exchange(command(name, *arguments), patience)
 
     def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
@@ -132,7 +132,7 @@ class ChrocodileDevice(Chrocodile):
         return self._converted(early + self._stream.feed(data))
 
     def _ahead(self) -> float:
-        """A telegram counts when the next one has begun, so it had come a sample before."""
+        """Return 1 while a telegram waits for the next one, so it arrived a sample earlier."""
         decoder = self._stream.decoder
         binary = isinstance(decoder, BinaryDecoder)
         return float(binary and decoder is not None and decoder.statistics.bytes_pending > 0)
@@ -147,7 +147,7 @@ class ChrocodileDevice(Chrocodile):
         return samples
 
     def _unwrap(self, raw: IntArray) -> IntArray:
-        """Return device time [ns] that does not wrap; turns in a silence by the host's clock."""
+        """Return device time [ns] without wraps; those in a silence by the host's clock."""
         now = self._monotonic()
         previous = self._raw_time if self._raw_time is not None else int(raw[0])
         steps = np.diff(raw, prepend=previous) % _TIME_RANGE

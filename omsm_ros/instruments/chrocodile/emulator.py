@@ -1,12 +1,15 @@
-"""A CHRocodile in the dollar protocol, fed by the twin.
+"""Emulated CHRocodiles, in the dollar protocol and in the packet protocol.
 
-Imitated: commands with echo, answer and ``ready``, telegrams in both formats, mixed byte
-order, the selection of signals and its description, rounding of rates, counters that wrap,
-invalid samples as distance and intensity zero, encoders of 32 bits, settings that a power
-cycle loses, and the faults of ``Instrument``.
+Imitated in the dollar protocol: commands with echo, answer and ``ready``, telegrams in both
+formats, the selection of signals and its description, rounding of rates, counters that wrap,
+invalid samples as distance and intensity zero, encoders of 32 bits, settings that a power cycle
+sets back, and the faults of ``Instrument``. In the packet protocol also: updates and ``CONF`` to
+a new client, tickets, refusals, data formats with their counter, another order of signals than
+selected, packets of many samples, and the time offset of triggered samples.
 
-Not imitated: optics, exposure and averaging (an averaging is only remembered), the dark
-reference, upload of tables, a baud rate that is changed, samples measured during an answer.
+Not imitated: optics, exposure and averaging (only the setting is kept), the dark reference, upload
+of tables, spectra, changes of the baud rate, samples during an answer, several streams, channels
+and clients.
 """
 
 from __future__ import annotations
@@ -59,7 +62,7 @@ from omsm_ros.instruments.emulator_factory import OWN_ENCODERS, TWIN_READING, Em
 from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
 from omsm_ros.units import MICROMETRE_M
 
-# The device measures in whole steps of this [s], so rates are rounded.
+# The exposure is a multiple of this, so rates are rounded [s].
 _EXPOSURE_STEP_S = 1e-7
 _VERSION = "CHRocodile 2 emulated"
 
@@ -106,10 +109,8 @@ class ChrocodileEmulator(Instrument):
         """Return whether samples are to be sent."""
         return self._started_stream
 
-    # Commands.
-
     def receive(self, data: bytes) -> None:
-        """Take commands, in any portions."""
+        """Take commands, in portions of any size."""
         for request in self._requests.feed(data):
             self.say(answer_wire(request.wire, self._answer(request)))
 
@@ -156,8 +157,6 @@ class ChrocodileEmulator(Instrument):
         self._values[name] = " ".join(arguments)
         return ""
 
-    # Telegrams.
-
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
         """Return the wire bytes of each sample."""
         records = self._layout.records(len(measured))
@@ -197,15 +196,7 @@ def _pieces(records: Records) -> list[bytes]:
     return [wire[i : i + size] for i in range(0, len(wire), size)]
 
 
-# A CHRocodile 2 in the packet protocol, fed by the twin.
-#
-# Imitated beside what ``ChrocodileEmulator`` does: updates and ``CONF`` upon connecting, tickets,
-# refusals, data formats with their counter, signals in another order than they were selected,
-# packets of many samples with the device's time, and the time offset of triggered samples.
-#
-# Not imitated: several streams, channels and clients, spectra, transfer of tables.
-
-# Samples in a packet: a device that sent each alone would waste its line.
+# Samples in a packet.
 _SAMPLES = 64
 _REFUSED = "not valid"
 
@@ -221,7 +212,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
         self._describe()
 
     def greet(self) -> None:
-        """Tell a new client everything, ``CONF`` last."""
+        """Send all settings to a new client, ``CONF`` last."""
         self._packets.reset()
         for name in ("SHZ", "LAI", "AVD", "SODX"):
             values = tuple(map(_number, self._values[name].split()))
@@ -230,7 +221,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
         self.say(encode_command(PacketCommand(CONFIGURED, (), UPDATE)))
 
     def receive(self, data: bytes) -> None:
-        """Take commands, in any portions."""
+        """Take commands, in portions of any size."""
         for message in self._packets.feed(data):
             if isinstance(message, PacketCommand):
                 self._obey(message)
@@ -249,7 +240,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
             self.say(encode_format(self._format))
 
     def _describe(self) -> None:
-        """Announce a new data format; its order is the device's own."""
+        """Make a new data format, with the signals in the device's order."""
         self._format_counter += 1
         numbers = sorted(self._layout.signals)
         signals = tuple((n, SIGNALS[n].type, 1) for n in numbers)
@@ -258,7 +249,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
         self._format = DataFormat(self._format_counter, self.rate(), signals)
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
-        """Return packets in the places of their first samples."""
+        """Return the packets, each in the place of its first sample."""
         records = np.zeros(len(measured), self._format.dtype)
         pieces = [b""] * len(measured)
         for number, kind, _ in self._format.signals:

@@ -1,4 +1,4 @@
-"""A CHRocodile 2 in the packet protocol, over TCP."""
+"""Reads a CHRocodile 2 in the packet protocol, over TCP."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _TICKETS = 2**16
 
 
 class ChrocodilePacketDevice(Chrocodile):
-    """Reads packets; the device's own time, in every packet, is that of the samples."""
+    """Reads packets; each has the device's time of its samples."""
 
     always_timed = True
 
@@ -71,7 +71,7 @@ class ChrocodilePacketDevice(Chrocodile):
         self._try("STO")
 
     def _await_configuration(self) -> None:
-        """The device tells it to every new client; one that has not is asked for it once."""
+        """Wait for the configuration, which a device sends to a new client, or request it."""
         answer_patience = self._wanted.patience / 2
         try:
             self._await("CONF", lambda c: c.name == CONFIGURED, answer_patience)
@@ -101,10 +101,11 @@ class ChrocodilePacketDevice(Chrocodile):
             if not isinstance(value, bytes)
         )
         if query and answer.flags & QUERY and not answer.values:
-            raise self._unanswered(name, answer.name.encode())  # our own words come back
+            raise self._unanswered(name, answer.name.encode())  # the command was echoed
         if answer.flags & ERROR:
             raise RefusedError(
-                f"{self._transport.name} refused {name} {arguments!r}: {text!r}; choose what it has"
+                f"{self._transport.name} refused {name} {arguments!r}: {text!r}; choose a value "
+                "that it accepts"
             )
         return Answer(encode_command(asked), text)
 
@@ -125,7 +126,7 @@ class ChrocodilePacketDevice(Chrocodile):
                 raise self._unanswered(what, b"" if understood else self._said)
 
     def _receive(self, data: bytes) -> list[Data]:
-        """Return the samples in ``data``; commands are kept apart."""
+        """Return the samples in ``data``; commands are kept for ``_await``."""
         return self._sorted(self._decoder.feed(data))
 
     def _sorted(self, messages: Sequence[Message]) -> list[Data]:
@@ -142,7 +143,7 @@ class ChrocodilePacketDevice(Chrocodile):
         return self._joined([*early, *self._receive(data)])
 
     def _ahead(self) -> float:
-        """A packet counts when the next one has begun, of which samples have come, too."""
+        """Return the samples of the next packet that have arrived."""
         waiting = self._decoder.statistics.bytes_pending - HEADER.size - DATA_BODY.size
         return max(waiting, 0) / self._sample_bytes
 
@@ -151,13 +152,13 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def _joined(self, measured: Sequence[Data]) -> Samples:
         parts = [self._samples(message) for message in measured]
-        self._commands.clear()  # updates nobody asked for
+        self._commands.clear()  # unrequested updates
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
     def _samples(self, message: Data) -> Samples:
         self._signals = tuple(number for number, _, _ in message.format.signals)
         if missing := set(self._selection) - set(self._signals):
-            self._decoder.reset()  # what waits is no better
+            self._decoder.reset()  # the bytes that wait hold the same
             raise DeviceError(
                 f"{self._transport.name}: signals {sorted(missing)!r} were selected, the device "
                 f"sends {self._signals!r}; choose signals that it has"

@@ -1,8 +1,8 @@
-"""The packet protocol of Precitec CHRocodile 2 (TCP port 7891), little-endian throughout.
+"""Encodes and decodes the packet protocol of Precitec CHRocodile 2 (TCP port 7891).
 
-Every packet begins with a magic number and its length. Commands, their answers and updates
-carry arguments; a data format says what the samples of the data packets with the same counter
-hold. Distances and encoders are those of the dollar protocol, by the same signal numbers.
+All numbers are little-endian. Each packet begins with a magic number and its length. Commands,
+answers and updates carry arguments; a data format describes the samples of the data packets with
+the same counter. Signal numbers are those of the dollar protocol.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ QUERY, UPDATE, WARNING, ERROR = 0x0001, 0x2000, 0x4000, 0x8000
 INT, REAL, STRING, CHAR, BLOB = range(5)
 # The last update after connecting.
 CONFIGURED = "CONF"
-# No probe measures slower or faster; another rate is a damaged packet.
+# No probe measures slower or faster: another rate means a damaged packet [Hz].
 LEAST_RATE_HZ, GREATEST_RATE_HZ = 1e-3, 1e8
-# Of a triggered sample: its time after the packet's [s / 2^32].
+# Signal: time of a triggered sample after that of the packet [s / 2^32].
 TIME_OFFSET = 91
 
 FORMATS = {U16: "<u2", S16: "<i2", U32: "<u4", S32: "<i4", FLOAT: "<f4"}
@@ -47,14 +47,14 @@ Value: TypeAlias = int | float | str | bytes
 
 
 def name_code(name: str) -> int:
-    """Return a command's number: its letters, low byte first; ConfigurationError if none."""
+    """Return the number of a command, its letters low byte first; ConfigurationError."""
     if not (name.isascii() and name.isupper() and 3 <= len(name) <= 4):
         raise ConfigurationError(f"command {name!r}, expected three or four capitals")
     return int.from_bytes(name.encode(), "little")
 
 
 class PacketCommand(NamedTuple):
-    """A command, its answer, or an update.  ticket: of the command that is answered."""
+    """A command, an answer or an update.  ticket: of the command that is answered."""
 
     name: str
     values: tuple[Value, ...] = ()
@@ -64,7 +64,7 @@ class PacketCommand(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DataFormat:
-    """What samples hold.  rate: [Hz];  signals: number, type and channels of each, in order."""
+    """Describes samples.  rate: [Hz];  signals: number, type and channels of each, in order."""
 
     counter: int
     rate: float
@@ -73,7 +73,7 @@ class DataFormat:
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """One sample: a field a signal, named by its number, of its first channel."""
+        """Return the dtype of a sample: for each signal a field of its first channel, by number."""
         sizes = [channels * np.dtype(FORMATS[kind]).itemsize for _, kind, channels in self.signals]
         offsets = np.cumsum([0, *sizes]).tolist()
         return np.dtype(
@@ -97,9 +97,6 @@ class Data(NamedTuple):
 Message: TypeAlias = PacketCommand | DataFormat | Data
 
 
-# Encoding.
-
-
 def _packet(kind: int, body: bytes) -> bytes:
     return HEADER.pack(MAGIC, HEADER.size + len(body), kind) + body
 
@@ -114,7 +111,7 @@ def _argument(value: Value) -> bytes:
 
 
 def encode_command(command: PacketCommand) -> bytes:
-    """Wire bytes of a command, an answer or an update."""
+    """Return the bytes of a command, an answer or an update."""
     arguments = b"".join(map(_argument, command.values))
     head = _COMMAND.pack(
         name_code(command.name), 0, 0, command.flags, 0, command.ticket, len(command.values)
@@ -123,14 +120,14 @@ def encode_command(command: PacketCommand) -> bytes:
 
 
 def encode_format(form: DataFormat) -> bytes:
-    """Wire bytes of a data format."""
+    """Return the bytes of a data format."""
     signals = b"".join(_SIGNAL.pack(kind, 0, n, 0, number) for number, kind, n in form.signals)
     head = _FORMAT.pack(form.stream, form.counter, form.rate, len(form.signals))
     return _packet(DATA_FORMAT, head + signals)
 
 
 def encode_data(form: DataFormat, records: Records, time_ns: int) -> bytes:
-    """Wire bytes of a data packet; ConfigurationError if the samples do not fit into one.
+    """Return the bytes of a data packet; ConfigurationError if the samples do not fit into one.
 
     time_ns: of the first sample
     """
@@ -142,11 +139,8 @@ def encode_data(form: DataFormat, records: Records, time_ns: int) -> bytes:
     return _packet(DATA, head + records.tobytes())
 
 
-# Decoding.
-
-
 def decode_command(body: bytes) -> PacketCommand:
-    """Return the command in a packet's body; ProtocolError or struct.error if it is none."""
+    """Return the command in a packet's body; ProtocolError or struct.error without one."""
     code, _, _, flags, _, ticket, count = _COMMAND.unpack_from(body)
     name = code.to_bytes(4, "little").rstrip(b"\0").decode("latin-1")
     values: list[Value] = []
@@ -178,7 +172,7 @@ def _decode_argument(kind: int, body: bytes, place: int) -> tuple[Value, int]:
 
 
 def decode_format(body: bytes) -> DataFormat:
-    """Return the data format in a packet's body; ProtocolError or struct.error if none."""
+    """Return the data format in a packet's body; ProtocolError or struct.error without one."""
     stream, counter, rate, count = _FORMAT.unpack_from(body)
     rows = [_SIGNAL.unpack_from(body, _FORMAT.size + i * _SIGNAL.size) for i in range(count)]
     signals = tuple((number, kind, channels) for kind, _, channels, _, number in rows)
@@ -191,15 +185,12 @@ def decode_format(body: bytes) -> DataFormat:
     return DataFormat(counter, rate, signals, stream)
 
 
-# Packets of a CHRocodile 2, in any portions → commands, data formats and samples.
-
-
 @dataclass(frozen=True, slots=True)
 class PacketStatistics:
-    """What became of every byte: ``received = in packets + discarded + pending``.
+    """Counts of bytes: ``received = in packets + discarded + pending``.
 
-    packets: understood;  malformed: whose inside made no sense
-    unformatted: samples without the format that says what they hold
+    packets: decoded;  malformed: packets whose content is not valid
+    unformatted: samples without their data format
     """
 
     bytes_received: int
@@ -211,10 +202,10 @@ class PacketStatistics:
 
 
 class PacketDecoder:
-    """Bytes in any portions → messages; nothing raises, memory is one packet and a portion.
+    """Decodes bytes in any portions to messages; it never raises, memory is a packet and a portion.
 
-    Messages are a function of the bytes alone, however they were cut. So samples wait until
-    the next packet has begun, or for :meth:`settle`; commands and formats do not.
+    The messages do not depend on the portions. So samples wait until the next packet has begun,
+    or for :meth:`settle`; commands and formats do not.
     """
 
     def __init__(self) -> None:
@@ -224,12 +215,12 @@ class PacketDecoder:
         self._malformed = self._unformatted = 0
 
     def reset(self) -> None:
-        """Forget an unfinished packet and all formats, as after connecting anew."""
+        """Discard an incomplete packet and all formats, as after a new connection."""
         self._buffer = b""
         self._formats.clear()
 
     def feed(self, data: bytes) -> list[Message]:
-        """Return messages completed by ``data``; neighbouring samples of one format in one."""
+        """Return messages completed by ``data``; consecutive samples of a format are joined."""
         self._received += len(data)
         self._buffer += data
         found: list[Message] = []
@@ -248,7 +239,7 @@ class PacketDecoder:
         return found
 
     def settle(self) -> list[Message]:
-        """Return the packet that waited for what follows it, now that nothing does."""
+        """Return the packet that waited for the next one."""
         size = len(self._buffer)
         if not (self._buffer.startswith(MAGIC_BYTES) and self._length(0, last=True) == size):
             return []
@@ -260,7 +251,7 @@ class PacketDecoder:
 
     @property
     def statistics(self) -> PacketStatistics:
-        """Return what became of every byte."""
+        """Return the counts of bytes."""
         return PacketStatistics(
             bytes_received=self._received,
             bytes_discarded=self._received - self._understood - len(self._buffer),
@@ -271,9 +262,9 @@ class PacketDecoder:
         )
 
     def _length(self, place: int, *, last: bool = False) -> int | None:
-        """Return the length of the packet at ``place``; 0 = it is none; None = wait for more.
+        """Return the length of the packet at ``place``; 0 = no packet; None = wait for more.
 
-        last: nothing follows it
+        last: no bytes follow it
         """
         if place + HEADER.size > len(self._buffer):
             return None
@@ -287,15 +278,14 @@ class PacketDecoder:
         after = self._buffer[end : end + len(MAGIC_BYTES)]
         if kind != DATA or after == MAGIC_BYTES or (last and not after):
             return length
-        # Samples have no check of their own; what follows shows whether they are too many or few.
+        # Samples have no checksum; the next packet shows whether bytes were lost or added.
         return None if MAGIC_BYTES.startswith(after) else 0
 
     def _cut_off(self, place: int, end: int, kind: int) -> bool:
         """Return whether the next packet begins inside the one up to ``end``: its end is missing.
 
-        What cannot be told from the bytes before ``end`` is not: bytes that are not here yet
-        must not change the answer. Only samples wait for what follows them; in the end of the
-        others the magic alone counts.
+        Bytes that have not arrived must not change the answer, so only those before ``end`` are
+        used. Only samples wait for the next packet; in the end of others the magic alone counts.
         """
         inside = self._buffer.find(MAGIC_BYTES, place + len(MAGIC_BYTES), end)
         while 0 <= inside <= len(self._buffer) - HEADER.size and inside <= end - HEADER.size:
@@ -308,7 +298,7 @@ class PacketDecoder:
     def _open(
         self, place: int, length: int, found: list[Message], waiting: list[tuple[bytes, int, int]]
     ) -> int:
-        """Understand the packet at ``place``; how many bytes to go on."""
+        """Decode the packet at ``place``; return how many bytes to go on."""
         body = self._buffer[place + HEADER.size : place + length]
         (kind,) = NUMBER.unpack_from(self._buffer, place + HEADER.size - 4)
         try:
@@ -345,7 +335,7 @@ class PacketDecoder:
             self._unformatted += count
             return
         payload = body[DATA_BODY.size :]
-        if not 0 <= len(payload) - count * form.dtype.itemsize < 4:  # padded, at most
+        if not 0 <= len(payload) - count * form.dtype.itemsize < 4:  # padding
             raise ProtocolError(f"{count!r} samples in {len(payload)} bytes")
         if waiting and waiting[0][2] != stream:
             self._flush(found, waiting)
@@ -353,7 +343,7 @@ class PacketDecoder:
         waiting.append((payload[: count * form.dtype.itemsize], time_ns, stream))
 
     def _flush(self, found: list[Message], waiting: list[tuple[bytes, int, int]]) -> None:
-        """Join the samples that wait into one message."""
+        """Join the waiting samples into one message."""
         if not waiting:
             return
         form = self._formats[waiting[0][2]]
@@ -371,7 +361,7 @@ def _is_head(length: int, kind: int) -> bool:
 
 
 def _after(form: DataFormat, records: Records, within: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the time after the packet's [ns] of the ``within``-th sample of a packet."""
+    """Return the time of the ``within``-th sample of a packet, after that of the packet [ns]."""
     if str(TIME_OFFSET) in (records.dtype.names or ()):
         fraction = records[str(TIME_OFFSET)].astype(np.float64) / FIXED_POINT
         return np.rint(fraction * NANOSECONDS_PER_S).astype(np.int64)

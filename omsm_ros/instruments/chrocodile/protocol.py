@@ -1,7 +1,13 @@
-"""The dollar protocol of Precitec CHRocodile probes: commands, answers, and the stream between.
+"""Encodes and decodes the dollar protocol of Precitec CHRocodile probes.
 
 A command is ``$``, three or more capitals, arguments separated by spaces, CR. The device ends
-the telegram it is sending, echoes the command, answers, says ``ready`` CR LF and goes on.
+the telegram it is sending, echoes the command, answers, sends ``ready`` CR LF and continues.
+
+The two sync bytes of a telegram also occur in the data, in each telegram where an encoder is at -1.
+So the decoder counts bytes from ``ready`` on, and searches only if a sync is missing or the sample
+counter jumps. If several places could begin a telegram, the sample counter decides. A telegram is
+accepted once sync and counter of the next one have arrived: bytes lost inside it show there. A bit
+flipped in a value cannot be detected in this protocol.
 """
 
 from __future__ import annotations
@@ -25,28 +31,19 @@ from omsm_ros.instruments.chrocodile.telegram import (
     Records,
 )
 
-# Bytes of a CHRocodile in the dollar protocol → telegrams, in any portions.
-#
-# The sync pair also occurs in the data, in every telegram where an encoder stands at -1. So the
-# place is kept by counting, from ``ready`` on, and searched only when a sync is missing where it
-# is due, or what should be the sample counter leaps. Where several places could begin a
-# telegram, that counter tells which does. A telegram counts once sync and counter of the next one
-# have come: bytes lost inside it would show there. What a flipped bit does to a value, nothing in
-# this protocol can show.
-
-# Two telegrams found in garbage belong together if no more samples than this lie between.
+# Two telegrams between damaged bytes belong together if at most this many samples are missing.
 _NEAR = 16
-# Of several places, one where the counter has gone on so often is believed [telegrams].
+# A place is accepted after this many telegrams with consecutive counters.
 _DEEP = 8
-# In one way only: digits that could be split anywhere are tried in every way, for hours.
-_NUMBER_CHROCODILE_DECODER = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
+# Matches a number in one way only; with more ways a long run of digits takes hours.
+_NUMBER_BYTES = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
 
 
 @dataclass(frozen=True, slots=True)
 class TelegramStatistics:
-    """What became of every byte: ``received = in telegrams + discarded + pending``.
+    """Counts of bytes: ``received = in telegrams + discarded + pending``.
 
-    telegrams: decoded;  losses_of_sync: how often the place in the stream was lost
+    telegrams: decoded;  losses_of_sync: how often synchronisation was lost
     """
 
     bytes_received: int
@@ -57,7 +54,7 @@ class TelegramStatistics:
 
 
 class BinaryDecoder:
-    """Bytes in any portions → telegrams; nothing raises, memory is a portion and 11 telegrams."""
+    """Decodes bytes in any portions to telegrams; it never raises."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -66,13 +63,13 @@ class BinaryDecoder:
         self._buffer = b""
         self._synchronised = False
         self._counter = _Counter(layout)
-        # A telegram before a leap: it counts if the next one is found in its place.
+        # A telegram before a jump of the counter; it is accepted if the next one follows it.
         self._doubtful = b""
         self._in_place = False
         self._received = self._telegrams = self._losses = 0
 
     def reset(self, *, synchronised: bool) -> None:
-        """Forget an unfinished telegram; ``synchronised``: the next byte begins one."""
+        """Discard an incomplete telegram; ``synchronised``: the next byte begins one."""
         self._buffer = self._doubtful = b""
         self._synchronised, self._in_place = synchronised, False
         self._counter.forget()
@@ -91,7 +88,7 @@ class BinaryDecoder:
         return found
 
     def settle(self) -> Records:
-        """Return the last telegram, if whole and nothing came after it; shape (n,), n 0 to 2."""
+        """Return the last telegram if it is complete and no byte follows; shape (n,), n 0 to 2."""
         whole = len(self._buffer) == self._layout.length
         placed = self._synchronised or self._in_place
         if not (placed and whole and self._buffer.startswith(self._layout.sync)):
@@ -104,7 +101,7 @@ class BinaryDecoder:
 
     @property
     def statistics(self) -> TelegramStatistics:
-        """Return what became of every byte."""
+        """Return the counts of bytes."""
         decoded, waits = self._telegrams * self._layout.length, len(self._buffer + self._doubtful)
         return TelegramStatistics(
             bytes_received=self._received,
@@ -115,12 +112,12 @@ class BinaryDecoder:
         )
 
     def _cleared(self) -> bytes:
-        """Return the telegram in doubt, for the next one is in its place."""
+        """Return the telegram before a jump, since the next one follows it."""
         cleared, self._doubtful, self._in_place = self._doubtful, b"", False
         return cleared
 
     def _take(self) -> bytes:
-        """Return telegrams up to the last one whose successor has begun, or to a missing sync."""
+        """Return telegrams up to the last one that is followed by another, or to a missing sync."""
         length, buffer = self._layout.length, self._buffer
         whole = len(buffer) // length
         records = np.frombuffer(buffer, self._dtype, whole)
@@ -128,7 +125,7 @@ class BinaryDecoder:
         rest = buffer[whole * length :]
         if not len(bad) and not self._layout.sync.startswith(rest[:2]):
             bad = np.array([whole])
-        # The telegram before a missing sync is too short or too long: it is none.
+        # The telegram before a missing sync is too short or too long, so it is dropped.
         begun = int(bad[0]) if len(bad) else whole + (len(rest) >= self._counter.needs)
         count = max(0, begun - 1)
         leap = self._counter.leap(buffer, begun, count)
@@ -147,8 +144,8 @@ class BinaryDecoder:
         return buffer[: count * length]
 
     def _search(self) -> bool:
-        """Go to where telegrams begin; keep only what may still become that."""
-        size = 2 * (_DEEP + 2) * self._layout.length  # all that can be open is settled in it
+        """Go to the beginning of telegrams; drop the bytes before it."""
+        size = 2 * (_DEEP + 2) * self._layout.length  # enough for a decision
         while True:
             window = self._buffer[:size]
             size *= 4
@@ -164,7 +161,7 @@ class BinaryDecoder:
                 return settled
 
     def _places(self, window: bytes) -> dict[int, int]:
-        """Return where two telegrams in a row begin, or may, and by how much they count on."""
+        """Return the places where two telegrams begin, or may, and the step of their counters."""
         length, size = self._layout.length, len(window)
         raw = np.frombuffer(window + bytes(2 * length), np.uint8)
         first, second = self._layout.sync
@@ -177,11 +174,11 @@ class BinaryDecoder:
 
 
 def _first_of(places: dict[int, int], length: int, size: int) -> tuple[int | None, bool]:
-    """Return the first of ``places`` that begins a telegram, and whether that is settled.
+    """Return the first of ``places`` that begins a telegram, and whether that is decided.
 
-    places: [bytes], ascending, of ``size``: where two telegrams in a row begin, or may, and the
-    step of their counters. Of places within one telegram, the one counts from which telegrams
-    follow each other for longest; of those that go on, the one with the smallest steps.
+    places: [bytes], ascending, of ``size``: where two telegrams begin, or may, and the step of
+        their counters. The result is the place within one telegram with the longest
+        sequence of telegrams, and of equal ones that with the smallest steps.
     """
 
     def rank(place: int) -> tuple[float, float]:
@@ -210,7 +207,7 @@ def _first_of(places: dict[int, int], length: int, size: int) -> tuple[int | Non
 
 
 class _Counter:
-    """Follows the sample counter of telegrams, where they have one."""
+    """Follows the sample counter of telegrams that have one."""
 
     def __init__(self, layout: Layout) -> None:
         self._length = layout.length
@@ -226,20 +223,20 @@ class _Counter:
         self._step = 1
 
     def forget(self) -> None:
-        """Follow from the next telegram on."""
+        """Begin with the next telegram."""
         self._last, self._step = None, 1
 
     def steps(self, raw: NDArray[np.uint8], starts: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Return its steps from telegrams in ``raw`` at ``starts`` (n,) to the next ones."""
+        """Return the steps from telegrams in ``raw`` at ``starts`` (n,) to the next ones."""
         if not self._has_one:
             return np.ones(len(starts), np.intp)
         here, after = (self._read(raw, places) for places in (starts, starts + self._length))
         return np.asarray((after - here) % self._modulus)
 
     def leap(self, wire: bytes, begun: int, count: int) -> int:
-        """Return at which of the ``begun`` telegrams in ``wire`` it leaps first; ``begun`` = none.
+        """Return the first of the ``begun`` telegrams in ``wire`` after a jump, or ``begun``.
 
-        It may stand, and a step that comes twice is no leap. Those before ``count`` are done with.
+        A constant counter, or the same step twice, is no jump. Those before ``count`` are done.
         """
         if not self._has_one or not begun:
             return begun
@@ -258,25 +255,23 @@ class _Counter:
 
 
 class LineDecoder:
-    """ASCII telegrams in any portions → the records ``BinaryDecoder`` gives.
+    """Decodes ASCII telegrams in any portions to the records of ``BinaryDecoder``.
 
-    A line must begin with its space and hold as many numbers as there are signals; without a
-    checksum, a digit lost within a number cannot be noticed.
+    A line begins with a space and has a number for each signal; without a checksum, a digit lost
+    within a number cannot be detected.
     """
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
         self._dtype = layout.dtype
-        self._line = re.compile(
-            rb"(?: +%s){%d} *\r?" % (_NUMBER_CHROCODILE_DECODER, len(layout.signals))
-        )
+        self._line = re.compile(rb"(?: +%s){%d} *\r?" % (_NUMBER_BYTES, len(layout.signals)))
         self._limits = _limits(layout)
         self._tail = b""
         self._synchronised = False
         self._received = self._kept = self._telegrams = self._losses = 0
 
     def reset(self, *, synchronised: bool) -> None:
-        """Forget an unfinished line; ``synchronised``: the next byte begins one."""
+        """Discard an incomplete line; ``synchronised``: the next byte begins one."""
         self._tail = b""
         self._synchronised = synchronised
 
@@ -290,17 +285,17 @@ class LineDecoder:
         fits = self._fitting(values)
         values = values[fits]
         if lines:
-            # Before the first line's end is known, what precedes it may be half a line.
+            # The bytes before the first end of a line may be a part of a line.
             whole = bool(good and fits[0] and good[0] is lines[0])
             self._losses += len(lines) - len(values) - (not (self._synchronised or whole))
             self._synchronised = True
         self._kept += sum(len(line) + 1 for line, fit in zip(good, fits, strict=True) if fit)
         self._telegrams += len(values)
-        self._tail = tail[:MAX_TELEGRAM_BYTES]  # so long, it is no line already
+        self._tail = tail[:MAX_TELEGRAM_BYTES]  # a longer line is not valid
         return self._records(values)
 
     def settle(self) -> Records:
-        """Return no telegram, shape (0,): a line says by itself where it ends."""
+        """Return no telegram, shape (0,): a line has its own end."""
         return np.empty(0, self._dtype)
 
     @property
@@ -317,7 +312,7 @@ class LineDecoder:
         return len(line) < MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None
 
     def _fitting(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Return which rows of ``values`` (n, signals) their types can hold, shape (n,)."""
+        """Return which rows of ``values`` (n, signals) fit the signals' types, shape (n,)."""
         lowest, highest, whole = self._limits
         inside = (values >= lowest) & (values <= highest)
         return np.asarray((inside & (~whole | (values == np.rint(values)))).all(axis=1))
@@ -339,13 +334,13 @@ def _limits(layout: Layout) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
 
 READY = b"ready\r\n"
 QUERY = "?"
-# An answer longer than this is none; it bounds what is kept while waiting for ``ready``.
+# Bounds the memory of an answer without ``ready``.
 MAX_ANSWER_BYTES = 65_536
 MAX_COMMAND_BYTES = 1024
 
 _NAME = re.compile(r"[A-Z]{3,}")
 _COMMAND = re.compile(rb"\$([A-Z]{3,})([^A-Z].*)?", re.DOTALL)
-# With what ends its line, or without where a telegram follows at once.
+# The end of its line may be missing if a telegram follows at once.
 _READY = re.compile(
     rb"ready(?: *(?:\r\n|\r(?!\n)(?=.)|\n)|(?=[\x80-\xff])|(?= +[-+.\d]))",
     re.DOTALL | re.IGNORECASE,
@@ -354,7 +349,7 @@ _NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 def command(name: str, *arguments: str | float) -> bytes:
-    """Wire bytes of a command; ConfigurationError if it cannot be one."""
+    """Return the bytes of a command; ConfigurationError if it is not valid."""
     if not _NAME.fullmatch(name):
         raise ConfigurationError(f"command {name!r}, expected three or more capitals")
     words = [a if isinstance(a, str) else f"{a:.10g}" for a in arguments]
@@ -373,7 +368,7 @@ class Request(NamedTuple):
 
 
 class RequestParser:
-    """The device's side: bytes in any portions → commands; anything else is passed over."""
+    """Decodes the bytes that a device receives, in any portions, to commands."""
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -388,7 +383,7 @@ class RequestParser:
 
 
 def _request(line: bytes) -> Request | None:
-    """Return the command that ends ``line``, which a CR followed."""
+    """Return the command at the end of ``line``; None without one."""
     match = _COMMAND.fullmatch(line[line.rfind(b"$") :][:MAX_COMMAND_BYTES])
     if match is None:
         return None
@@ -397,46 +392,46 @@ def _request(line: bytes) -> Request | None:
 
 
 class Answer(NamedTuple):
-    """What the device said between the echo of ``command`` and ``ready``."""
+    """The text of a device between the echo of ``command`` and ``ready``."""
 
     command: bytes
     text: str
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """All numbers in the text, in order; the name of the command may stand before them."""
+        """Return all numbers in the text; the name of the command may precede them."""
         return tuple(float(word) for word in _NUMBER.findall(self.text))
 
 
 def answer_wire(wire: bytes, text: str) -> bytes:
-    """Return what the device sends upon the command ``wire``: echo, answer, ``ready``."""
+    """Return the bytes with which a device answers ``wire``: echo, answer, ``ready``."""
     separator = b"\r\n" if text else b""
     return wire + text.encode() + separator + READY
 
 
 class DollarStream:
-    """Everything the device sends, in any portions → telegrams and answers.
+    """Separates the bytes of the device, in any portions, into telegrams and answers.
 
-    Until a decoder is set, and after ``start``, what is no answer is discarded and counted.
+    Without a decoder, and after ``start``, all bytes but those of answers are counted and dropped.
     """
 
     def __init__(self) -> None:
         self.decoder: BinaryDecoder | LineDecoder | None = None
         self.bytes_outside = 0
         self.last_outside = b""
-        self._pending = b""  # a command whose echo has not come yet
+        self._pending = b""  # a command without echo so far
         self._held = b""
         self._answering = b""  # a command whose answer is being received
         self._answers: list[Answer] = []
 
     def start(self) -> None:
-        """Forget everything, as after connecting anew."""
+        """Discard everything, as after a new connection."""
         self.decoder = None
         self._pending = self._held = self._answering = b""
         self._answers.clear()
 
     def expect(self, wire: bytes) -> None:
-        """Await the answer to the command ``wire``, which is about to be sent."""
+        """Expect the answer to the command ``wire``, which is about to be sent."""
         self._pending = wire
         self._answers.clear()
 
@@ -461,13 +456,13 @@ class DollarStream:
         return [records for records in found if len(records)]
 
     def settle_answer(self) -> None:
-        """End an answer whose ``ready`` nothing follows: the line is silent."""
+        """End an answer if ``ready`` is followed by a silence."""
         if self._answering and self._held.rstrip().lower().endswith(b"ready"):
             self._held = self._held.rstrip() + b"\r\n"
             self._receive()
 
     def settle(self) -> list[Records]:
-        """Return the last telegram before a silence, if it is whole."""
+        """Return the last telegram before a silence, if it is complete."""
         if self._answering or self.decoder is None:
             return []
         found = self._decode(self._held) if not self._pending else []
@@ -475,25 +470,25 @@ class DollarStream:
         return [records for records in [*found, self.decoder.settle()] if len(records)]
 
     def _listen(self, found: list[Records]) -> bool:
-        """Return telegrams up to the echo; whether it has come."""
-        # Some echo neither the CR nor the case.
+        """Add the telegrams up to the echo to ``found``; return whether it has come."""
+        # Some models echo neither the CR nor the case.
         echo, held = self._pending.rstrip(b"\r").lower(), self._held.lower()
         place = held.find(echo)
         if place < 0:
-            # Keep what may be the beginning of the echo.
+            # Keep a possible beginning of the echo.
             keep = _overlap(held, echo)
             found += self._decode(self._held[: len(self._held) - keep])
             self._held = self._held[len(self._held) - keep :]
             return False
         found += self._decode(self._held[:place])
         if self.decoder is not None:
-            found.append(self.decoder.settle())  # commands begin where a telegram ended
+            found.append(self.decoder.settle())  # an echo follows a complete telegram
         self._held = self._held[place + len(echo) :]
         self._answering, self._pending = self._pending, b""
         return True
 
     def _receive(self) -> bool:
-        """Return the answer up to ``ready``; whether it is complete."""
+        """Take the answer up to ``ready``; return whether it is complete."""
         match = _READY.search(self._held)
         if match is None:
             self._held = self._held[-MAX_ANSWER_BYTES:]

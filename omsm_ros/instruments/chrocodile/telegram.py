@@ -1,9 +1,9 @@
-"""Measured values of a Precitec CHRocodile in the dollar protocol: telegrams ↔ records.
+"""Describes the telegrams of a Precitec CHRocodile, and converts their signals.
 
 A binary telegram is two sync bytes and the selected signals, 16-bit numbers big-endian and
 32-bit ones little-endian; it has no length and no checksum. An ASCII telegram is a line:
-a space, decimals separated by spaces, CR LF. Both become the same structured records, one
-field a signal, named by the signal's number.
+a space, decimals separated by spaces, CR LF. Both become the same structured records, with a
+field for each signal, named by its number.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FORMATS = {U16: ">u2", S16: ">i2", U32: "<u4", S32: "<i4", FLOAT: "<f4"}
 
 
 class Signal(NamedTuple):
-    """type: as the device sends it unless `$DTF` says otherwise."""
+    """A signal.  type: unless `$DTF` states another."""
 
     meaning: str
     type: int
@@ -60,13 +60,13 @@ SIGNALS = {
     SAMPLE_COUNTER: Signal("samples, wraps", U16),
 }
 
-# Longer telegrams than any selection of signals makes are a misread description.
+# No selection of signals makes longer telegrams; a longer one is a description misread.
 MAX_TELEGRAM_BYTES = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Where each signal stands in a telegram.
+    """The places of the signals in a telegram.
 
     signals, types, offsets: number, type and place [bytes from the first sync byte] of each
     length: of a telegram with its sync [bytes]
@@ -101,9 +101,9 @@ class Layout:
 
     @classmethod
     def of(cls, signals: Sequence[int], sync: bytes = SYNC) -> Layout:
-        """Return the layout that the table ``SIGNALS`` gives for a selection by `$SODX`.
+        """Return the layout of a selection by `$SODX`, after the table ``SIGNALS``.
 
-        Raises ConfigurationError for a signal whose type only `$DTF` knows.
+        Raises ConfigurationError for a signal that is not in the table.
         """
         if unknown := [number for number in signals if number not in SIGNALS]:
             raise ConfigurationError(
@@ -118,8 +118,8 @@ class Layout:
     def described(cls, text: str, sync: bytes = SYNC) -> Layout:
         """Return the layout in an answer to `$DTF`: length; number, type, offset of each signal.
 
-        Separators, a count of signals after the length, and whether length and offsets count
-        the sync are left open. Raises ProtocolError.
+        Any separators, an optional count of signals after the length, and lengths and offsets with
+        or without the sync are accepted. Raises ProtocolError.
         """
         numbers = [int(word) for word in re.findall(r"\d+", text)]
         head = len(numbers) % 3
@@ -133,18 +133,18 @@ class Layout:
             raise ProtocolError(f"description {text!r}: unknown types {sorted(unknown)!r}")
         ends = [p + np.dtype(FORMATS[t]).itemsize for p, t in zip(places, types, strict=True)]
         before = 0 if min(places) >= len(sync) else len(sync)
-        # A length that holds the last signal and its sync is the telegram's; else the payload's.
+        # A length without the sync is that of the payload.
         length = max(numbers[0] if head else 0, max(ends) + before)
         return cls(tuple(signals), tuple(types), tuple(p + before for p in places), length, sync)
 
     def describe(self) -> str:
-        """Return what the device answers to `$DTF`."""
+        """Return the answer to `$DTF`."""
         triples = zip(self.signals, self.types, self.offsets, strict=True)
         return " ".join([str(self.length), *(f"{n} {t} {o}" for n, t, o in triples)])
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """One telegram: field ``sync``, and one a signal named by its number."""
+        """Return the dtype of a telegram: field ``sync``, and one for each signal by its number."""
         return np.dtype(
             {
                 "names": ["sync", *map(str, self.signals)],
@@ -155,7 +155,7 @@ class Layout:
         )
 
     def records(self, count: int) -> Records:
-        """Return the empty telegrams (count,), their sync filled in."""
+        """Return telegrams (count,) of zeros with their sync."""
         made = np.zeros(count, self.dtype)
         made["sync"] = int.from_bytes(self.sync, "big")
         return made
@@ -169,9 +169,7 @@ class Layout:
         return [(" " + " ".join(row) + "\r\n").encode() for row in zip(*columns, strict=True)]
 
 
-# What the signals of a CHRocodile mean: telegrams ↔ distance, intensity, verdict, counts.
-
-# Finest first: 16 bits over 100 µm are steps of 3 nm.
+# In the order of resolution, finest first: 16 bits over 100 µm are steps of 3 nm.
 DISTANCES = (DISTANCE_NM, DISTANCE, DISTANCE_16)
 INTENSITIES = (INTENSITY, INTENSITY_16)
 SATURATED, TRIGGER_LOST, TRIGGER_DELAYED = 1, 2, 4
@@ -185,11 +183,11 @@ ENCODER_RANGE = 2**32
 
 
 def check_selection(signals: Sequence[int], encoders: Sequence[int]) -> None:
-    """Raise ConfigurationError unless ``signals`` hold the counter and what axes are read from."""
+    """Raise ConfigurationError unless ``signals`` have the counter and all of ``encoders``."""
     if SAMPLE_COUNTER not in signals:
         raise ConfigurationError(
             f"signals {signals!r} lack {SAMPLE_COUNTER}, the sample counter: without it lost "
-            "samples would not show"
+            "samples are not detected"
         )
     if missing := sorted({*encoders} - {*signals}):
         raise ConfigurationError(
@@ -214,8 +212,8 @@ def distance_of(
 ) -> tuple[FloatArray, NDArray[np.float32], NDArray[np.uint8]]:
     """Return distance [m], intensity (0-1; NaN where not selected) and status of ``records`` (n,).
 
-    Distance zero and intensity zero together are no target; so is distance zero alone where
-    no intensity is selected. Raises ConfigurationError if no distance is.
+    Distance zero with intensity zero, or without a selected intensity, means no target. Raises
+    ConfigurationError if no distance is selected.
     """
     number = first_of(DISTANCES, signals)
     if number is None:
@@ -238,10 +236,10 @@ def distance_of(
 
 
 def counts_of(records: Records, latch: str, order: Sequence[int]) -> IntArray:
-    """Return the encoder counts (n, 5) of X, Y, Z, B, C, latched as ``latch`` says.
+    """Return the encoder counts (n, 5) of X, Y, Z, B, C at ``latch``, of LATCHES.
 
-    order: which of the device's encoders X Y Z U V (0 to 4) is on each axis. The mean of
-    start and end is rounded to a whole count.
+    order: encoder X Y Z U V (0 to 4) of the device on each axis. The mean of start and end is
+    rounded to a whole count.
     """
     at = [
         np.stack([records[str(numbers[i])].astype(np.int64) for i in order], axis=1)

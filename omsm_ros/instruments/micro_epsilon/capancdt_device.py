@@ -1,7 +1,7 @@
 """Micro-Epsilon capaNCDT 62xx, a digital capacitive reference: data and commands over TCP.
 
-Untried on hardware. A controller that is switched off and on leaves its old connection open
-and silent, so silence alone makes the driver connect anew.
+Not tested on hardware. A controller that is switched off and on leaves its old connection open
+and silent, so the driver connects again after a silence.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from omsm_ros.instruments.transport import CommandPort, Transport, transport_for
 from omsm_ros.units import MICROMETRE_M, MICROSECOND_S
 
 PROMPT = rb"OK *[\r\n]|\$WRONG|\$UNKNOWN"
-# A channel's 24 bits are its measuring range.
+# The range of a channel of 24 bits.
 FULL_SCALE = 0xFFFFFF
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CapaNcdtSettings(BlockSettings):
-    """How the controller is read.
+    """Settings of the controller.
 
     probe: ``full_scale`` is the channel's measuring range [m]
     channel: of the controller, from 1
-    triggered: samples come with a trigger from outside, not continuously
-    patience: for an answer, and for samples of a controller that runs freely [s]
+    triggered: samples come with an external trigger, not continuously
+    patience: for an answer, and for samples of a free-running controller [s]
     """
 
     probe: ProbeReading = field(default_factory=lambda: ProbeReading(full_scale=250 * MICROMETRE_M))
@@ -51,7 +51,7 @@ class CapaNcdtSettings(BlockSettings):
 
 
 class CapaNcdtDevice(BlockStreamDevice):
-    """Reads one channel, and sets the sample time where there is a command port."""
+    """Reads one channel, and sets the sample time if there is a command port."""
 
     prompt = PROMPT
 
@@ -63,7 +63,7 @@ class CapaNcdtDevice(BlockStreamDevice):
         monotonic: Callable[[], float] = time.monotonic,
         commands: Transport | None = None,
     ) -> None:
-        """commands: the controller's port 23; None = leave it as it is set."""
+        """commands: the controller's port 23; None = keep its settings."""
         settings = settings or CapaNcdtSettings()
         free = not settings.triggered
         super().__init__(
@@ -85,18 +85,18 @@ class CapaNcdtDevice(BlockStreamDevice):
         return identity
 
     def _set_sample_time(self, port: CommandPort) -> None:
-        """Set the next sample time that the controller has, which it reports."""
+        """Set the sample time; the controller rounds it and reports the result."""
         wanted = self._wanted.sample_period / MICROSECOND_S
         said = port.ask(f"$STI{wanted:.0f}", "\r", rb"\$STI")
         found = re.search(r"\$STI\d+,(\d+)\s*OK", said)
         if found is None:
             raise DeviceError(
-                f"{self._transport.name} did not take a sample time of {wanted:.0f} µs: {said!r}; "
-                "choose another sample_period"
+                f"{self._transport.name} did not accept a sample time of {wanted:.0f} µs: "
+                f"{said!r}; choose another sample_period"
             )
         if abs(float(found[1]) / wanted - 1) > RATE_TOLERANCE:
             raise DeviceError(
-                f"{self._transport.name}: {wanted:.0f} µs were asked for, the controller samples "
+                f"{self._transport.name}: {wanted:.0f} µs were requested, the controller samples "
                 f"every {found[1]} µs; set sample_period to {float(found[1]) * MICROSECOND_S:.9g} s"
             )
         port.ask(f"$TRG{int(self._wanted.triggered)}", "\r", rb"\$TRG")
@@ -118,7 +118,7 @@ class CapaNcdtDevice(BlockStreamDevice):
         raw = value * (self._wanted.probe.full_scale / FULL_SCALE)
         samples["distance"] = self._wanted.probe.distance(raw)
         samples["intensity"] = np.nan
-        outside = (value <= 0) | (value >= FULL_SCALE)  # at its stops, it tells no distance
+        outside = (value <= 0) | (value >= FULL_SCALE)  # at the ends of its range
         samples["status"] = np.where(outside, Status.OUT_OF_RANGE, Status.OK)
         return samples
 

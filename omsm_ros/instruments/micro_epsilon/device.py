@@ -1,8 +1,8 @@
 """Micro-Epsilon confocalDT controllers, over RS-422 or Ethernet.
 
-Untried on hardware. Over RS-422 the driver only listens: which values a frame holds is a
-setting. Over Ethernet the blocks say what they hold, and the rate is set and read back where
-a command port is given.
+Not tested on hardware. Over RS-422 the driver only listens, and the values in a frame are a
+setting. Over Ethernet the blocks state their content, and the rate is set and read back if a
+command port is given.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ from omsm_ros.instruments.transport import CommandPort, Transport
 from omsm_ros.units import NANOMETRE_M
 
 SERIAL_VALUES = ("distance", "intensity", "counter")
-# A value of the frame that is passed over.
+# Marks a value of the frame that is ignored.
 SKIPPED_VALUES = "-"
-# Of every answer to GETINFO; a controller that does not know it says so.
+# An answer to GETINFO contains one of these; the second is a refusal.
 _INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
 
 
 COUNTER_RANGE = 2**32
-# Begins the blocks of controllers whose heads do not say what the frames hold.
+# The beginning of blocks whose header does not describe the frames.
 _UNDESCRIBED = b"DATA"
 
 
 class BlockStreamDevice(StreamDevice):
-    """Decodes blocks, and talks to the controller where there is a command port.
+    """Decodes the blocks of an Ethernet controller, and sets it up if there is a command port.
 
-    A model fills in ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
-    (commands), and says what ends an answer (a regular expression).
+    A model implements ``_frame`` (its fields), ``_samples_of`` (a block → samples) and ``_set_up``
+    (commands); ``prompt`` is the regular expression of the end of an answer.
     """
 
     prompt: bytes = b""
@@ -80,8 +80,8 @@ class BlockStreamDevice(StreamDevice):
         now_ns: Callable[[], int] = time.time_ns,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """kind: of :class:`BlockDecoder`;  period: of a controller that runs freely [s], else 0
-        patience: for an answer [s];  commands: the controller's port 23; None = leave it as it is
+        """kind: of :class:`BlockDecoder`;  period: of a free-running controller [s], else 0
+        patience: for an answer [s];  commands: the controller's port 23; None = keep its settings
         """
         counting = Counting(COUNTER_RANGE, timed=False, period=period)
         super().__init__(transport, settings, channels, counting, now_ns, monotonic)
@@ -97,7 +97,7 @@ class BlockStreamDevice(StreamDevice):
 
     @property
     def identity(self) -> dict[str, str]:
-        """Return what the controller reported of itself."""
+        """Return the identity that the controller reported."""
         return self._identity
 
     def _prepare(self) -> None:
@@ -116,7 +116,7 @@ class BlockStreamDevice(StreamDevice):
         return samples
 
     def _ahead(self) -> float:
-        """A block counts when the next one has begun, of which frames have come, too."""
+        """Return the frames of the next block that have arrived, since a block waits for it."""
         waiting = self._decoder.statistics.bytes_pending - self._head_bytes
         return max(waiting, 0) / self._frame_bytes
 
@@ -135,22 +135,20 @@ class BlockStreamDevice(StreamDevice):
             try:
                 parts.append(self._samples_of(frames, counter))
             except DeviceError:
-                self._decoder.reset()  # what waits is no better
+                self._decoder.reset()  # the bytes that wait hold the same
                 raise
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
     def _listen_in(self, silent: float) -> None:
         if silent > UNREADABLE_S and self._undescribed:
             raise NoSamplesError(
-                f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not say "
-                "what they hold; read this controller over RS-422 (device: confocaldt)"
+                f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not "
+                "describe their content; read this controller over RS-422 (device: confocaldt)"
             )
         self._check_understood(silent, self._unread)
 
-    # What a model fills in.
-
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
-        """Return the fields of a frame, by the flags in the block's head."""
+        """Return the fields of a frame, by the flags in the block's header."""
         raise NotImplementedError
 
     def _samples_of(
@@ -160,20 +158,20 @@ class BlockStreamDevice(StreamDevice):
         raise NotImplementedError
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
-        """Set what was asked for, and return what the controller reports of itself."""
+        """Set the controller up, and return the identity that it reports."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConfocalDtSettings(BlockSettings):
-    """How the controller is read.
+    """Settings of the controller.
 
-    probe: ``full_scale`` is the measuring range, of which RS-422 values are parts
-    values: what a frame holds over RS-422, in order, of SERIAL_VALUES; "-" is passed over
+    probe: ``full_scale`` is the measuring range; RS-422 values are fractions of it
+    values: SERIAL_VALUES in a frame over RS-422, in order; "-" is ignored
     axes: scaling of X, Y, Z, B, C, or None;  wired: axes on encoders 1, 2, 3 (0 = X … 4 = C);
-    an axis without an encoder stands at its offset
-    trigger: "free_run", or anything else for a trigger from outside
-    patience: for an answer, and for samples of a controller that runs freely [s]
+        an axis without an encoder stays at its offset
+    trigger: "free_run", or anything else for an external trigger
+    patience: for an answer, and for samples of a free-running controller [s]
     """
 
     probe: ProbeReading = field(default_factory=ProbeReading)
@@ -197,18 +195,18 @@ class ConfocalDtSettings(BlockSettings):
 
     @property
     def period(self) -> float:
-        """Of a controller that runs freely [s]; 0 = triggered."""
+        """Return the period of a free-running controller [s]; 0 = triggered."""
         return self.sample_period if self.trigger == "free_run" else 0.0
 
 
 class ConfocalDtDevice(StreamDevice):
-    """Listens to three bytes a value.
+    """Reads values of three bytes each over RS-422.
 
-    Where no counter is selected, frames are counted: a place where bytes were missing counts
-    as one lost sample, a silence as a restart.
+    Without a counter among the values, frames are counted: a place with missing bytes counts as
+    one lost sample, a silence as a restart.
     """
 
-    described_by = "`signals` (what a frame holds)"
+    described_by = "`signals` (the values of a frame)"
 
     def __init__(
         self,
@@ -243,7 +241,7 @@ class ConfocalDtDevice(StreamDevice):
     def _decode(self, data: bytes) -> Samples:
         values, spoilt = self._believed.feed(*self._decoder.feed(data))
         self._unread = 0 if len(values) else self._unread + len(data)
-        columns = dict(zip(self._wanted.values, values.T, strict=True))  # "-": the last of them
+        columns = dict(zip(self._wanted.values, values.T, strict=True))
         samples = np.zeros(len(values), SAMPLE)
         raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
         samples["distance"] = self._wanted.probe.distance(raw)
@@ -266,7 +264,7 @@ class ConfocalDtDevice(StreamDevice):
 
 
 class ConfocalDtEthernetDevice(BlockStreamDevice):
-    """Reads blocks, and sets the measuring rate where there is a command port."""
+    """Reads blocks, and sets the measuring rate if there is a command port."""
 
     prompt = b"->"
 
@@ -278,7 +276,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         monotonic: Callable[[], float] = time.monotonic,
         commands: Transport | None = None,
     ) -> None:
-        """commands: the controller's port 23; None = leave it as it is set."""
+        """commands: the controller's port 23; None = keep its settings."""
         settings = settings or ConfocalDtSettings()
         super().__init__(
             transport,
@@ -292,11 +290,11 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             monotonic=monotonic,
         )
         self._wanted = settings
-        self._intensity_leads = False  # as the manual draws it, until the words tell
+        self._intensity_leads = False  # the order of the manual, until the data show another
 
     @property
     def settings(self) -> dict[str, object]:
-        """Return which controller it is, and its rate, where there is a command port."""
+        """Return the controller's identity and rate, if there is a command port."""
         reported = self._identity
         return {
             name: reported[name]
@@ -325,12 +323,12 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         ]
         if not answered:
             raise DeviceError(
-                f"{self._transport.name} did not tell its measuring rate ({said[-64:]!r}); check "
+                f"{self._transport.name} did not report its measuring rate ({said[-64:]!r}); check "
                 "that command_port is this controller's, or set it to 0"
             )
         if abs(answered[-1] / wanted - 1) > RATE_TOLERANCE:
             raise DeviceError(
-                f"{self._transport.name}: {wanted:.4g} kHz was asked for, the controller measures "
+                f"{self._transport.name}: {wanted:.4g} kHz was requested, the controller measures "
                 f"at {answered[-1]:g} kHz; set sample_period to {1e-3 / answered[-1]:.9g} s"
             )
 
@@ -358,7 +356,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
     def _peak(
         self, frames: np.ndarray[tuple[int], np.dtype[np.void]]
     ) -> tuple[IntArray, IntArray | None]:
-        """Distance and intensity of the first peak, in whichever order this controller sends."""
+        """Return distance and intensity of the first peak, in either order of the words."""
         distance: IntArray = frames["distance 1"].astype(np.int64)
         if "intensity 1" not in (frames.dtype.names or ()):
             return distance, None
@@ -386,7 +384,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
 def _check_not_silent(name: str, settings: ConfocalDtSettings, silent: float) -> None:
     if settings.period and silent > settings.patience:
         raise NoSamplesError(
-            f"{name} sent nothing that could be read for {silent:.1f} s; check power, output "
+            f"{name} sent no readable data for {silent:.1f} s; check power, output "
             "interface and (RS-422) baud rate"
         )
 

@@ -1,8 +1,8 @@
-"""Micro-Epsilon controllers, fed by the twin: confocalDT over RS-422 and Ethernet, capaNCDT.
+"""Emulated Micro-Epsilon controllers: confocalDT over RS-422 and Ethernet, capaNCDT.
 
-Imitated: the bytes of measured values, blocks of several frames, counters of 32 bits (18 over
-RS-422), error values, three encoders, rates that are rounded or refused, the command port's
-echo and prompt, and the faults of ``Instrument``.
+Imitated: values and error values, blocks of several frames, counters of 32 bits (18 over RS-422),
+three encoders, rates that are rounded or refused, echo and prompt of the command port, and the
+faults of ``Instrument``.
 
 Not imitated: exposure control, several peaks, video signals, statistics, mathematics between
 channels, linearisation, most commands (they are answered as unknown).
@@ -44,7 +44,7 @@ from omsm_ros.instruments.six_channel.emulator import SCALES, SixChannelEmulator
 from omsm_ros.twin.sensors import ReferenceSensor
 from omsm_ros.units import MICROSECOND_S, NANOMETRE_M
 
-# Frames in a block: what fits comfortably into a TCP packet.
+# Frames in a block, which fit into a TCP packet.
 _FRAMES = 30
 _ORDER, _SERIAL = 2_418_004, 11_020_009
 # Encoders 1 to 3, counter, time, intensity, value of peak 1.
@@ -55,7 +55,7 @@ _SAMPLE_STEP_US = 4
 
 
 class Controller(Instrument):
-    """A controller with a line of commands beside its data."""
+    """A controller with a second line for commands."""
 
     counter_range = 2**32
 
@@ -89,7 +89,7 @@ class Controller(Instrument):
         raise NotImplementedError
 
     def work(self) -> None:
-        """Answer what came over the line of commands."""
+        """Answer the commands that arrived."""
         if self._commands is None:
             return
         typed = self._typed + self._commands.read()
@@ -100,7 +100,7 @@ class Controller(Instrument):
 
 
 class ConfocalDtSerialEmulator(Controller):
-    """confocalDT over RS-422: distance, intensity and counter, or only the first of them."""
+    """Sends distance, intensity and counter over RS-422, or only the first of them."""
 
     def __init__(self, *arguments: object, width: int = 1, **options: object) -> None:
         """width: values in a frame, 1 to 3."""
@@ -122,7 +122,7 @@ class ConfocalDtSerialEmulator(Controller):
 
 
 class ConfocalDtEmulator(Controller):
-    """confocalDT over Ethernet: encoders 1 to 3, counter, time stamp, distance, intensity.
+    """Sends encoders 1 to 3, counter, time stamp, distance and intensity over Ethernet.
 
     wired: the axis on each encoder (0 = X … 4 = C)
     """
@@ -138,7 +138,7 @@ class ConfocalDtEmulator(Controller):
         super().__init__(*arguments, **options)  # type: ignore[arg-type]
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
-        """Return blocks in the places of their first samples."""
+        """Return the blocks, each in the place of its first sample."""
         frames = np.zeros(len(measured), confocal_dtype(_FLAGS))
         for number, axis in enumerate(self._wired, start=1):
             counts = self._axes[axis].counts(measured.axes[AXES[axis]])
@@ -167,12 +167,12 @@ class ConfocalDtEmulator(Controller):
 
 
 class CapaNcdtEmulator(Controller):
-    """capaNCDT 62xx with two channels, of which the first measures."""
+    """A capaNCDT 62xx with two channels, of which the first measures."""
 
     _KIND = (0b0101, 0)
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
-        """Return blocks in the places of their first samples."""
+        """Return the blocks, each in the place of its first sample."""
         frames = np.zeros(len(measured), [("channel 1", "<i4"), ("channel 2", "<i4")])
         share = np.nan_to_num(self._probe.raw(measured.distance) / self._probe.full_scale)
         frames["channel 1"] = np.rint(np.clip(share, 0, 1) * 0xFFFFFF)

@@ -1,8 +1,13 @@
-"""Blocks of measured values that Micro-Epsilon controllers send over TCP, little-endian.
+"""Encodes and decodes the values of Micro-Epsilon controllers, over TCP and RS-422.
 
-A header with a preamble, the controller's numbers, what the frames hold, how many there are
-and how long, and the counter of the first; then the frames. ``HEADERS`` has the two forms:
-confocalDT 24xx says by flags what a frame holds, capaNCDT 62xx by a field of channels.
+Over TCP they come in blocks, little-endian: a header with a preamble, the controller's numbers,
+the content, number and length of the frames, and the counter of the first one; then the frames.
+``HEADERS`` has the two forms: confocalDT 24xx states the content by flags, capaNCDT 62xx by a
+field of channels.
+
+Over RS-422 a value of a confocalDT has three bytes of six data bits, low part first. The two bits
+above mark them: 00 low, 01 middle, 10 high in the first value of a frame, 11 high in the others.
+So a missing byte always shows.
 """
 
 from __future__ import annotations
@@ -19,9 +24,9 @@ from numpy.typing import NDArray
 from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
 from omsm_ros.errors import ProtocolError
 
-# "MEAS" as text, and as a 32-bit number sent low byte first: manuals give both readings.
+# Manuals give both: "MEAS" as text, and as a 32-bit number sent low byte first.
 PREAMBLES = (b"MEAS", b"SAEM")
-# A TCP packet holds a block; a longer one is a misread header.
+# A block fits into a TCP packet; a longer one is a header that was misread.
 MAX_BLOCK_BYTES = 1 << 20
 
 HEADERS = {
@@ -32,10 +37,8 @@ HEADERS = {
     "capacitive": struct.Struct("<4sIIQIHHI"),
 }
 
-# What a frame holds.
-
 _VIDEO_BYTES = 1024
-# Bit of flags 1 → name and size [bytes] of what it adds to a frame, in the order of the frame.
+# Bit of flags 1 → name and size [bytes] of the field in a frame, in the order of the frame.
 FLAGS_1: tuple[tuple[int, str, int], ...] = (
     *((bit, f"video {bit}", _VIDEO_BYTES) for bit in (0, 2, 3, 4, 5, 6)),
     (7, "exposure", 4),
@@ -56,13 +59,13 @@ FLAGS_2: tuple[tuple[int, str, int], ...] = (
 # Intensity 100 % is 1024, in the lowest eleven bits; above them is the height of the peak.
 INTENSITY_MASK, INTENSITY_FULL = 0x7FF, 1024
 _NO_INTENSITY = 0xC000F800
-# Distances from here on are error codes, not nanometres.
+# Distances from this value on are error codes.
 FIRST_ERROR = 0x7FFFFF00
 _SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
 
 
 class MeasurementBlock(NamedTuple):
-    """One block.  kind: what its frames hold, in the header's own coding;  frames: (n, bytes)."""
+    """One block.  kind: content of its frames, as coded in the header;  frames: (n, bytes)."""
 
     order: int
     serial: int
@@ -72,9 +75,10 @@ class MeasurementBlock(NamedTuple):
 
 
 def confocal_dtype(flags: tuple[int, int]) -> np.dtype[np.void]:
-    """Return what the flags of a confocalDT say a frame holds; ProtocolError without a distance.
+    """Return the fields of a frame by the flags of a confocalDT.
 
-    Of a peak with intensity, the two words may stand in either order: see ``intensity_leads``.
+    Distance and intensity of a peak may be in either order: see ``intensity_leads``. Raises
+    ProtocolError if the flags have no distance.
     """
     fields = [(name, size) for bit, name, size in FLAGS_1 if flags[0] >> bit & 1]
     peaks = sum(flags[0] >> bit & 1 for bit in PEAK_BITS)
@@ -100,7 +104,7 @@ def _format(name: str, size: int) -> str:
 def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
     """Return whether the first of a peak's ``words`` (n, 2) is the intensity; None if unknown.
 
-    One manual draws the distance first, others name the intensity first. The words tell: in an
+    One manual has the distance first, others the intensity. The values show the order: in an
     intensity bits 11 to 15, 30 and 31 are zero; a distance is at most ``furthest`` [nm], or an
     error code.
     """
@@ -112,7 +116,7 @@ def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
 
 
 def channel_dtype(field: int) -> np.dtype[np.void]:
-    """Return what the channel field of a capaNCDT says a frame holds: 24-bit values by channel."""
+    """Return the fields of a frame by the channel field of a capaNCDT; ProtocolError if none."""
     present = [f"channel {i + 1}" for i in range(32) if field >> 2 * i & 0b11]
     if not present:
         raise ProtocolError(f"channel field {field:#x} names no channel")
@@ -120,21 +124,18 @@ def channel_dtype(field: int) -> np.dtype[np.void]:
 
 
 def encode_block(form: str, block: MeasurementBlock, preamble: bytes = PREAMBLES[0]) -> bytes:
-    """Wire bytes of a block; form: of HEADERS."""
+    """Return the bytes of a block; form: of HEADERS."""
     head = HEADERS[form].pack(
         preamble, block.order, block.serial, *block.kind, *block.frames.shape, block.counter
     )
     return head + block.frames.tobytes()
 
 
-# Decoding.
-
-
 @dataclass(frozen=True, slots=True)
 class BlockStatistics:
-    """What became of every byte: ``received = in blocks + discarded + pending``.
+    """Counts of bytes: ``received = in blocks + discarded + pending``.
 
-    packets: understood;  malformed: headers that make no sense
+    packets: decoded;  malformed: headers that are not valid
     """
 
     bytes_received: int
@@ -145,21 +146,21 @@ class BlockStatistics:
 
 
 class BlockDecoder:
-    """Bytes in any portions → blocks; nothing raises, memory is one block and a portion.
+    """Decodes bytes in any portions to blocks; it never raises, memory is a block and a portion.
 
-    Blocks are a function of the bytes alone, however they were cut. So a block waits until the
-    next one has begun, or for :meth:`settle`: bytes lost or added inside it show there.
+    The blocks do not depend on the portions. So a block waits until the next one has begun, or for
+    :meth:`settle`: bytes lost or added inside it show there.
     """
 
     def __init__(self, form: str, dtype_of: Callable[[tuple[int, int]], np.dtype[np.void]]) -> None:
-        """form: of HEADERS;  dtype_of: what frames hold, or ProtocolError."""
+        """form: of HEADERS;  dtype_of: fields of frames by their kind; may raise ProtocolError."""
         self._header = HEADERS[form]
         self._dtype_of = dtype_of
         self._buffer = b""
         self._received = self._understood = self._packets = self._malformed = 0
 
     def reset(self) -> None:
-        """Forget an unfinished block, as after connecting anew."""
+        """Discard an incomplete block, as after a new connection."""
         self._buffer = b""
 
     def feed(self, data: bytes) -> list[MeasurementBlock]:
@@ -185,7 +186,7 @@ class BlockDecoder:
         return found
 
     def settle(self) -> list[MeasurementBlock]:
-        """Return the block that waited for what follows it, now that nothing does."""
+        """Return the block that waited for the next one."""
         size = len(self._buffer)
         if self._find(0) != 0 or self._size(0, last=True) != size:
             return []
@@ -195,7 +196,7 @@ class BlockDecoder:
 
     @property
     def statistics(self) -> BlockStatistics:
-        """Return what became of every byte."""
+        """Return the counts of bytes."""
         return BlockStatistics(
             bytes_received=self._received,
             bytes_discarded=self._received - self._understood - len(self._buffer),
@@ -209,9 +210,9 @@ class BlockDecoder:
         return min((place for place in places if place >= 0), default=-1)
 
     def _size(self, place: int, *, last: bool = False) -> int | None:
-        """Return the bytes of the block at ``place``; 0 = it is none; None = wait for more.
+        """Return the bytes of the block at ``place``; 0 = no block; None = wait for more.
 
-        last: nothing follows it
+        last: no bytes follow it
         """
         if place + self._header.size > len(self._buffer):
             return None
@@ -230,7 +231,7 @@ class BlockDecoder:
         return None if any(preamble.startswith(after) for preamble in PREAMBLES) else 0
 
     def _shape(self, fields: tuple[int, ...]) -> tuple[int, int] | None:
-        """Frames, and bytes of each, whichever of the two stands first; None if neither fits."""
+        """Return number and length of the frames, in either order; None if neither fits."""
         try:
             width = self._dtype_of((fields[3], fields[4])).itemsize
         except ProtocolError:
@@ -240,7 +241,7 @@ class BlockDecoder:
         return (count, width) if count else None
 
     def _cut_off(self, place: int, end: int) -> bool:
-        """Return whether another block's head stands inside the one up to ``end``."""
+        """Return whether another block's header is inside the block up to ``end``."""
         inside = self._find(place + 1)
         while 0 <= inside <= min(end, len(self._buffer)) - self._header.size:
             if self._shape(self._header.unpack_from(self._buffer, inside)) is not None:
@@ -251,7 +252,7 @@ class BlockDecoder:
     def _block(self, place: int, size: int) -> MeasurementBlock:
         fields = self._header.unpack_from(self._buffer, place)
         shape = self._shape(fields)
-        assert shape is not None  # it was asked before
+        assert shape is not None  # _size has checked it
         count, width = shape
         raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self._header.size)
         self._packets += 1
@@ -261,25 +262,20 @@ class BlockDecoder:
         )
 
 
-# Measured values of a Micro-Epsilon confocalDT over RS-422: three bytes a value.
-#
-# Six data bits each, low part first. The two bits above mark them: 00 low, 01 middle, 10 high
-# in the first value of a frame, 11 high in the others. So a byte that is missing always shows.
-
 LOW, MIDDLE, HIGH_FIRST, HIGH_OTHER = 0b00, 0b01, 0b10, 0b11
 # distance = (value - ZERO) · range / SPAN
 ZERO, SPAN = 98_232, 65_536
-# Above it: error values.
+# Larger values are error codes.
 LAST_VALUE = 262_072
 NO_PEAK, BEFORE_RANGE, BEHIND_RANGE, NO_VALUE = 262_076, 262_077, 262_078, 262_079
 VALUE_BITS = 18
 _VALUE_BYTES = 3
-# So many values in a row have their marks by chance once in 64⁵ places, 10⁹ bytes.
+# Five values in a row have valid marks by chance once in 64⁵ places, 10⁹ bytes.
 _PLAUSIBLE_VALUES = 5
 
 
 def encode_frames(values: IntArray) -> bytes:
-    """Wire bytes of frames (n, m) of 18-bit values."""
+    """Return the bytes of frames (n, m) of 18-bit values."""
     parts = np.zeros((*values.shape, _VALUE_BYTES), np.uint8)
     parts[..., 0] = values & 0x3F
     parts[..., 1] = values >> 6 & 0x3F | MIDDLE << 6
@@ -309,9 +305,9 @@ def values_of(distance: FloatArray, measuring_range: float) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class SerialStatistics:
-    """What became of every byte: ``received = in frames + discarded + pending``.
+    """Counts of bytes: ``received = in frames + discarded + pending``.
 
-    frames: decoded;  malformed: places where something was missing or too much
+    frames: decoded;  malformed: places with missing or additional bytes
     """
 
     bytes_received: int
@@ -322,7 +318,7 @@ class SerialStatistics:
 
 
 class SerialDecoder:
-    """Bytes in any portions → frames of ``width`` values; nothing raises."""
+    """Decodes bytes in any portions to frames of ``width`` values; it never raises."""
 
     def __init__(self, width: int) -> None:
         """width: values in a frame."""
@@ -332,19 +328,18 @@ class SerialDecoder:
         marks[_VALUE_BYTES - 1] = HIGH_FIRST
         self._marks = marks.astype(np.uint8)
         self._buffer = b""
-        self._passed_over = False  # bytes since the last frame that begin none
+        self._passed_over = False  # whether bytes since the last frame were skipped
         self._received = self._frames = self._malformed = 0
 
     def reset(self) -> None:
-        """Forget an unfinished frame, as after connecting anew."""
+        """Discard an incomplete frame, as after a new connection."""
         self._buffer = b""
         self._passed_over = False
 
     def feed(self, data: bytes) -> tuple[IntArray, IntArray]:
         """Return values (n, width) of the frames completed by ``data``, and how many were spoilt.
 
-        The second, (n,), says for each frame in how many places since the frame before it
-        something was wrong.
+        The second, (n,), is for each frame the number of damaged places since the frame before.
         """
         self._received += len(data)
         raw = np.frombuffer(self._buffer + data, np.uint8)
@@ -356,7 +351,7 @@ class SerialDecoder:
             spoilt[0] |= self._passed_over
             rest, self._passed_over = int(starts[-1]) + self._size, False
         tail = raw[rest:]
-        if len(tail) >= self._size:  # no frame in it: only its end may still become one
+        if len(tail) >= self._size:  # it has no frame: only its end may still become one
             tail = tail[len(tail) - self._size + 1 :]
             self._passed_over = True
         self._buffer = tail.tobytes()
@@ -368,7 +363,7 @@ class SerialDecoder:
 
     @property
     def statistics(self) -> SerialStatistics:
-        """Return what became of every byte."""
+        """Return the counts of bytes."""
         decoded = self._frames * self._size
         return SerialStatistics(
             bytes_received=self._received,
@@ -379,7 +374,7 @@ class SerialDecoder:
         )
 
     def _starts(self, raw: NDArray[np.uint8]) -> NDArray[np.intp]:
-        """Return where whole frames begin; frames never overlap, since their marks do not."""
+        """Return where complete frames begin; their marks prevent an overlap."""
         if len(raw) < self._size:
             return np.empty(0, np.intp)
         windows = np.lib.stride_tricks.sliding_window_view(raw >> 6, self._size)
@@ -387,12 +382,12 @@ class SerialDecoder:
 
 
 class PlausibleValueFilter:
-    """Frames that are more than chance: enough of them came one after the other at once.
+    """Passes frames on once enough of them followed each other without a gap.
 
-    Nothing but the marks vouches for a value, and in noise, or at another baud rate, every 64th
-    place has them. So after every place where something was wrong frames wait for the next ones.
+    A value has no check but its marks, and in noise, or at another baud rate, every 64th place has
+    valid ones. So after each damaged place frames wait for the next ones.
 
-    unconfirmed: frames that waited in vain
+    unconfirmed: frames that were dropped because the next ones did not follow
     """
 
     def __init__(self, width: int) -> None:
@@ -403,12 +398,12 @@ class PlausibleValueFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Believe nothing, as after connecting anew."""
+        """Drop the frames that wait, as after a new connection."""
         self._waiting: list[tuple[IntArray, IntArray]] = []
         self._confirmed = False
 
     def feed(self, values: IntArray, spoilt: IntArray) -> tuple[IntArray, IntArray]:
-        """Return what to believe of what :meth:`SerialDecoder.feed` returned and of what waited."""
+        """Return the frames that are confirmed, of those from :meth:`SerialDecoder.feed`."""
         found: list[tuple[IntArray, IntArray]] = []
         breaks = np.flatnonzero(spoilt)
         edges = np.unique(np.concatenate([[0], breaks, [len(values)]]))

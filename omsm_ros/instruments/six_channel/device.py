@@ -1,4 +1,4 @@
-"""The generic six-channel stream from a transport to blocks."""
+"""Reads the generic six-channel stream, binary or text, from a line or a TwinCAT PLC."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ _SEQUENCE_RANGE = 2**32
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamSettings(BlockSettings):
-    """How the stream is read.  scaling: counts ↔ SI."""
+    """Settings of the stream.  scaling: counts ↔ SI."""
 
     scaling: StreamScaling = field(default_factory=StreamScaling)
 
 
 class GenericStreamDevice(StreamDevice):
-    """Reads the stream; the sender needs no setting up.
+    """Reads the binary stream; the sender needs no commands.
 
-    unknown_status: samples whose verdict this package does not know, delivered as LOST
+    unknown_status: samples with a status that this package does not know, delivered as LOST
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class GenericStreamDevice(StreamDevice):
 
     @property
     def wire(self) -> DecoderStatistics:
-        """What became of every byte."""
+        """Return the counts of all bytes."""
         return self._decoder.statistics
 
     def counts(self) -> dict[str, float]:
@@ -86,7 +86,7 @@ class GenericStreamDevice(StreamDevice):
 
     def _decode(self, data: bytes) -> Samples:
         frames = self._decoder.feed(data)
-        # Zeros are an idle line.
+        # Zeros mark an idle line.
         self._unread = 0 if len(frames) else self._unread + len(data) - data.count(0)
         self.unknown_status += int(np.sum(~known_status(frames)))
         return samples_of(frames, self._scaling)
@@ -106,17 +106,16 @@ def samples_of(frames: FrameArray, scaling: StreamScaling) -> Samples:
     return samples
 
 
-# The six-channel stream as text, from a transport to blocks.
-
-# Text may carry decimals of a count: so many parts of it are kept.
+# Text may carry decimals of a count: this many parts of a count are resolved.
 _PARTS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CsvSettings(BlockSettings):
-    """columns: of a line, in order;  scaling: counts ↔ SI;  modulus: where the sequence wraps.
+    """Settings of the text stream.
 
-    An axis without a column stands at its offset.
+    columns: of a line, in order;  scaling: counts ↔ SI;  modulus: of the sequence
+    An axis without a column stays at its offset.
     """
 
     columns: tuple[str, ...] = COLUMNS
@@ -125,9 +124,9 @@ class CsvSettings(BlockSettings):
 
 
 class CsvStreamDevice(StreamDevice):
-    """Reads lines; the sender needs no setting up."""
+    """Reads the text stream; the sender needs no commands."""
 
-    described_by = "`columns` (what a line holds)"
+    described_by = "`columns` (the columns of a line)"
 
     def __init__(
         self,
@@ -216,12 +215,10 @@ def make_text(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamD
     return CsvStreamDevice(transport, settings, now_ns)
 
 
-# A TwinCAT PLC's ring buffer over Beckhoff ADS, delivered as the six-channel stream.
-#
-# Reading variables one by one is neither synchronous with the trigger nor fast enough, so the PLC
-# writes each sample, with its trigger counter, into a ring, and the whole ring is read at once:
-# ADS answers between two cycles of the PLC, so what comes belongs together. In structured text,
-# packed to one byte::
+# Variables read one by one over Beckhoff ADS are neither synchronous with the trigger nor fast
+# enough. So the PLC writes each sample, with its trigger counter, into a ring buffer, and the whole
+# ring is read at once: ADS answers between two cycles of the PLC, so the samples are consistent.
+# In structured text, packed to one byte::
 #
 #     TYPE OmsmSample : STRUCT
 #         sequence : UDINT; device_time : ULINT; distance : DINT; status : USINT;
@@ -229,31 +226,31 @@ def make_text(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamD
 #     END_STRUCT END_TYPE
 #     TYPE OmsmRing : STRUCT
 #         written : ULINT;                       (* samples so far *)
-#         samples : ARRAY[0..999] OF OmsmSample; (* sample n lies at n MOD 1000 *)
+#         samples : ARRAY[0..999] OF OmsmSample; (* sample n is at n MOD 1000 *)
 #     END_STRUCT END_TYPE
 #
-# Tried against pyads' own test server; untried on hardware.
+# Tested against the test server of pyads, not on hardware.
 
 _DEFAULT_PORT = 851
 _DEFAULT_SYMBOL = "GVL.omsm"
 _DEFAULT_SAMPLES = 1000
 
 _WRITTEN = np.dtype("<u8")
-# At 1 kHz twenty samples at a time; a ring of a thousand lasts a second.
+# At 1 kHz this gives twenty samples at a time, and a ring of a thousand holds a second [s].
 _POLL_S = 0.02
 _MOST_SAMPLES = 200_000
 
 
 class AdsRing:
-    """Transport that reads ``ads://host[:port][/AMS.net.id][?symbol=GVL.omsm&samples=1000]``.
+    """Reads ``ads://host[:port][/AMS.net.id][?symbol=GVL.omsm&samples=1000]``.
 
-    Without a net id it is the host's address with ``.1.1``, as TwinCAT sets it. The PLC must have
-    a route to this computer. Samples that were overwritten before they were read are a gap of the
-    trigger counter.
+    The ring is delivered as the six-channel stream. Without a net id it is the host's address with
+    ``.1.1``, as TwinCAT sets it. The PLC must have a route to this computer. Samples that were
+    overwritten before they were read are a gap of the trigger counter.
     """
 
     def __init__(self, address: str) -> None:
-        """Raise ConfigurationError for an address that is none."""
+        """Raise ConfigurationError for an address that is not valid."""
         parts = parts_of(address)
         query = parse_qs(parts.query)
         samples = query.get("samples", [str(_DEFAULT_SAMPLES)])[0]
@@ -308,7 +305,7 @@ class AdsRing:
         return data
 
     def write(self, data: bytes) -> None:
-        """Raise DeviceError: nothing is written into a PLC."""
+        """Raise DeviceError: nothing is written to a PLC."""
         raise DeviceError(f"{self.name} is only read")
 
     def close(self) -> None:
@@ -317,13 +314,13 @@ class AdsRing:
             plc, self._plc = self._plc, None
             try:
                 plc.close()
-            except Exception:  # whatever state it was in, it is let go
+            except Exception:  # it is closed in any state
                 return
 
     def _new(self) -> bytes:
         raw = self._snapshot()
         written = self._written(raw)
-        if written < self._taken:  # the PLC was restarted and counts anew
+        if written < self._taken:  # the PLC was restarted
             self._taken = 0
         count = min(written - self._taken, self._capacity)
         if not count:
@@ -341,7 +338,7 @@ class AdsRing:
             found = self._plc.read_by_name(self._symbol, ctypes.c_ubyte * self._size)
         except (pyads.ADSError, OSError, RuntimeError) as err:
             raise DeviceError(
-                f"{self.name} gives no {self._symbol!r} of {self._size} bytes: {err}; check the "
+                f"{self.name} returns no {self._symbol!r} of {self._size} bytes: {err}; check the "
                 f"PLC, the network, and that its ring has {self._capacity} samples, packed to one "
                 "byte"
             ) from err

@@ -1,6 +1,6 @@
 """Senders of the six-channel stream, binary and text, fed by the twin.
 
-Imitated: quantisation to counts and whole nanometres, the probe's verdict, a sequence that wraps,
+Imitated: quantisation to counts and whole nanometres, the probe's status, a sequence that wraps,
 the sender's own clock, and the faults of ``Instrument``.
 
 Not imitated: resolution of the sender's clock, overruns as ``halsampler`` reports them, commands.
@@ -26,7 +26,7 @@ from omsm_ros.units import NANOMETRE_M
 
 
 class SixChannelEmulator(Instrument):
-    """One frame a trigger."""
+    """Sends one frame a trigger."""
 
     counter_range = 2**32
     _scaling = StreamScaling()
@@ -44,7 +44,7 @@ class SixChannelEmulator(Instrument):
 
 
 class CsvStreamEmulator(Instrument):
-    """One line a trigger."""
+    """Sends one line a trigger."""
 
     counter_range = 2**32
     _scaling = StreamScaling()

@@ -1,9 +1,14 @@
-"""The generic six-channel stream: one frame a trigger, one probe and five encoders.
+"""Encodes and decodes the six-channel stream: one probe, five encoders, one frame a trigger.
 
 Each frame is the little-endian table ``FRAME``, its last four bytes the CRC-32 of all
 before them, encoded by COBS and ended by 00. COBS leaves no 00 inside a frame, so a
-reader that lost its place finds it again at the next 00. Empty frames (00 00) are idle
-line and mean nothing.
+reader that lost its place finds it again at the next 00. Empty frames (00 00) mark an idle
+line.
+
+As text, each trigger sends a line: columns by name, separated by commas or blanks, as LinuxCNC's
+``halsampler -t`` writes them (the sample's number first, then the pins in their order). Axes are
+counts, which may have decimals; distance is in nanometres, time in nanoseconds. Lines end with LF,
+CR or both. A line with another content or number of columns is malformed.
 """
 
 from __future__ import annotations
@@ -28,7 +33,7 @@ FRAME = np.dtype(
         ("sequence", "<u4"),  # trigger counter, wraps
         ("device_time", "<u8"),  # [ns]
         ("distance", "<i4"),  # [nm]
-        ("status", "u1"),  # core.records.Status
+        ("status", "u1"),  # core.streams.blocks.Status
         ("counts", "<i8", (len(AXES),)),  # encoders in the order of AXES
         ("crc", "<u4"),  # of all bytes before it
     ]
@@ -37,7 +42,7 @@ FrameArray: TypeAlias = NDArray[np.void]
 """Structured array of shape (n,), dtype ``FRAME``."""
 
 BODY_SIZE = FRAME.fields["crc"][1]  # type: ignore[index]
-# COBS adds exactly one byte to, and takes it from, anything shorter than 254.
+# COBS adds exactly one byte to data shorter than 254 bytes.
 SEGMENT_SIZE = FRAME.itemsize + 1
 ENCODED_SIZE = SEGMENT_SIZE + 1
 TERMINATOR = b"\0"
@@ -46,7 +51,7 @@ CRC_RESIDUE = 0x2144DF1C
 
 
 def encode_frames(frames: FrameArray) -> bytes:
-    """Wire bytes of ``frames`` (n,): n · ENCODED_SIZE; the field ``crc`` is filled in here."""
+    """Return the bytes of ``frames`` (n,), n · ENCODED_SIZE; fills in the field ``crc``."""
     raw = frames.tobytes()
     parts = []
     for start in range(0, len(raw), FRAME.itemsize):
@@ -57,9 +62,9 @@ def encode_frames(frames: FrameArray) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class DecoderStatistics:
-    """What became of every byte: ``received = ENCODED_SIZE · frames + discarded + pending``.
+    """Counts of bytes: ``received = ENCODED_SIZE · frames + discarded + pending``.
 
-    bad_length, bad_cobs, bad_crc: segments between terminators that are no frame
+    bad_length, bad_cobs, bad_crc: segments between terminators that are not a frame
     """
 
     bytes_received: int
@@ -72,9 +77,9 @@ class DecoderStatistics:
 
 
 class FrameDecoder:
-    """Bytes in any portions → frames that passed length, COBS and CRC-32.
+    """Decodes bytes in any portions to frames with valid length, COBS and CRC-32.
 
-    Nothing raises, whatever arrives; memory is bounded by one frame and one portion.
+    It never raises; memory is bounded by one frame and one portion.
     """
 
     def __init__(self) -> None:
@@ -86,20 +91,20 @@ class FrameDecoder:
         """Return frames completed by ``data``, shape (n,), in the order of arrival; n may be 0."""
         self._bytes += len(data)
         *segments, tail = (self._tail + data).split(TERMINATOR)
-        # A byte more than a frame already tells that this segment is none: keep no more of it.
+        # One byte more than a frame shows that the segment is invalid, so no more is kept.
         self._tail = tail[: SEGMENT_SIZE + 1]
         bodies = [body for segment in segments if (body := self._open(segment)) is not None]
         self._frames += len(bodies)
         return np.frombuffer(b"".join(bodies), FRAME)
 
     def reset(self) -> None:
-        """Forget a frame that was cut off, as after a lost connection."""
+        """Discard an incomplete frame, as after a lost connection."""
         self._bad["length"] += bool(self._tail)
         self._tail = b""
 
     @property
     def statistics(self) -> DecoderStatistics:
-        """Return all counts since the decoder was made."""
+        """Return all counts since the decoder was created."""
         return DecoderStatistics(
             bytes_received=self._bytes,
             bytes_discarded=self._bytes - ENCODED_SIZE * self._frames - len(self._tail),
@@ -127,9 +132,9 @@ class FrameDecoder:
 
 @dataclass(frozen=True, slots=True)
 class ProbeScaling:
-    """How the probe's int32 [nm] becomes a distance.
+    """Scaling of the probe's int32 [nm].
 
-    full_scale: a reading further from zero than this is OUT_OF_RANGE [m]
+    full_scale: a reading with a larger absolute value is OUT_OF_RANGE [m]
     polarity: -1 for a probe whose reading grows towards the target
     invalid: the reading that means "no target" [nm]
     """
@@ -149,7 +154,7 @@ class ProbeScaling:
     def readings(self, frames: FrameArray) -> tuple[FloatArray, NDArray[np.uint8]]:
         """Return the distance [m], NaN where there is none, and status, each of shape (n,).
 
-        What the device calls bad stays so; a status this package does not know is LOST.
+        A status other than OK is kept; one that this package does not know becomes LOST.
         """
         raw = frames["distance"]
         nothing = raw == self.invalid
@@ -168,7 +173,7 @@ class ProbeScaling:
 
 
 def known_status(frames: FrameArray) -> NDArray[np.bool_]:
-    """Return True where the device's verdict is one of ``Status``, shape (n,)."""
+    """Return True where the device's status is one of ``Status``, shape (n,)."""
     return np.asarray(frames["status"] <= max(Status))
 
 
@@ -178,7 +183,7 @@ ROTARY = AxisScaling(counts_per_unit=1e9)  # 1 nrad a count
 
 @dataclass(frozen=True, slots=True)
 class StreamScaling:
-    """Counts ↔ SI for the five axes and the probe."""
+    """Scaling of the five axes and the probe."""
 
     x: AxisScaling = LINEAR
     y: AxisScaling = LINEAR
@@ -189,38 +194,31 @@ class StreamScaling:
 
     @property
     def axes(self) -> tuple[AxisScaling, ...]:
-        """In the order of AXES."""
+        """Return the scaling of the axes in the order of AXES."""
         return tuple(getattr(self, name) for name in AXES)
 
-
-# The six-channel stream as text: one line a sample, columns by name.
-#
-# Separated by commas or blanks, so what LinuxCNC's ``halsampler -t`` pipes out is read too (the
-# sample's number first, then the pins in their order). Axes are counts, with decimals if they
-# have any; distance is in nanometres, time in nanoseconds. Lines end with LF, CR or both. One that
-# holds anything else, or another number of columns, is no sample.
 
 COLUMNS = ("sequence", "device_time", "distance", "status", *AXES)
 SKIPPED = "-"
 _WHOLE = ("sequence", "device_time", "status")
-# A longer line is none.
+# Bounds the memory of a line without end.
 MAX_LINE_BYTES = 1024
 _INTEGER = re.compile(rb"[-+]?\d{1,19}")
 _NUMBER = re.compile(rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
 _SEPARATOR = re.compile(rb"[,;\s]+")
 
 
-# A line whose numbers cannot be what they are called is none: counts that no counter reaches,
-# times of centuries, positions of hundreds of metres in tenths of a nanometre.
+# Numbers beyond these ranges are damage: counts that no counter reaches, times of centuries,
+# positions of hundreds of metres in tenths of a nanometre.
 _RANGES = {"sequence": (0, 2**52), "device_time": (-(2**62), 2**62)}
 _RANGES |= dict.fromkeys(AXES, (-(2**40), 2**40))
 _OTHER_RANGE = (-(2**62), 2**62)
 
 
 def check_columns(columns: Sequence[str]) -> None:
-    """Raise ConfigurationError unless ``columns`` can be read.
+    """Raise ConfigurationError unless ``columns`` are valid.
 
-    Each is one of COLUMNS, once, or SKIPPED; the sequence must be there, and something measured.
+    Each is one of COLUMNS, once, or SKIPPED; the sequence, and distance or an axis, are required.
     """
     named = [name for name in columns if name != SKIPPED]
     if set(named) - set(COLUMNS) or len(set(named)) < len(named):
@@ -230,13 +228,13 @@ def check_columns(columns: Sequence[str]) -> None:
 
 
 def row_dtype(columns: Sequence[str]) -> np.dtype[np.void]:
-    """Return one line: whole numbers int64, the others float64."""
+    """Return the dtype of a line: whole numbers int64, the others float64."""
     named = [name for name in columns if name != SKIPPED]
     return np.dtype([(name, "<i8" if name in _WHOLE else "<f8") for name in named])
 
 
 def encode_lines(rows: NDArray[np.void], columns: Sequence[str] = COLUMNS) -> list[bytes]:
-    """Wire bytes of ``rows`` (n,) with a field a column."""
+    """Return the bytes of each of ``rows`` (n,), which have a field for each column."""
     lists = [rows[name].tolist() for name in columns]
     return [(",".join(map(_text, row)) + "\n").encode() for row in zip(*lists, strict=True)]
 
@@ -247,7 +245,7 @@ def _text(value: float) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LineStatistics:
-    """What became of every byte and line.  lines: read;  malformed: lines that are no sample."""
+    """Counts of bytes and lines.  lines: decoded;  malformed: lines that hold no sample."""
 
     bytes_received: int
     bytes_pending: int
@@ -256,10 +254,10 @@ class LineStatistics:
 
 
 class CsvDecoder:
-    """Bytes in any portions → rows; nothing raises, memory is one line and a portion."""
+    """Decodes bytes in any portions to rows; it never raises, memory is a line and a portion."""
 
     def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
-        """Raises ConfigurationError for columns that cannot be read."""
+        """Raise ConfigurationError for columns that are not valid."""
         check_columns(columns)
         self._columns = tuple(columns)
         self._dtype = row_dtype(columns)
@@ -267,7 +265,7 @@ class CsvDecoder:
         self._received = self._lines = self._malformed = 0
 
     def reset(self) -> None:
-        """Forget a line that was cut off."""
+        """Discard an incomplete line."""
         self._malformed += bool(self._tail)
         self._tail = b""
 
@@ -282,7 +280,7 @@ class CsvDecoder:
 
     @property
     def statistics(self) -> LineStatistics:
-        """Return what became of every byte and line."""
+        """Return the counts of bytes and lines."""
         return LineStatistics(self._received, len(self._tail), self._lines, self._malformed)
 
     def _row(self, line: bytes) -> tuple[float, ...] | None:

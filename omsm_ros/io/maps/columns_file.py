@@ -1,4 +1,4 @@
-"""Text with a column each for x, y and height: ``.xyz``, ``.asc``, ``.csv``, ``.txt``."""
+"""Reads and writes text with columns for x, y and height, and profiles of DABAM."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from omsm_ros.io.table_file import rows_in
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.units import LengthUnits, metres_in, name_and_unit, needed, refuse_other
 
-# As many points as a map may have, in lines of sixty characters.
+# The greatest number of points of a map, in lines of sixty characters.
 MAX_TEXT_BYTES = 60 * int(MAP_POINTS.high)
 _COMMENTS = ("#", "!", "%")
 _LONGEST_HEADER, _LONGEST_LINE = 50, 10_000
@@ -40,9 +40,9 @@ _PORTION = 100_000
 
 
 def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read a text of points; its units from its header, or ``units`` where it names none.
+    """Read a text of points; its units from its header, or ``units`` if it states none.
 
-    Raises FileError for a text that is no table of points, or names no unit and none is given.
+    Raises FileError for a text that is no table of points, or without any unit.
     """
     what = f"map {str(path)!r}"
     with open_regular(path, FileError, "map") as stream:
@@ -69,7 +69,7 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
 def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
     """Return the lines before the first line of numbers, and that line."""
     header: list[str] = []
-    # Old Macs end lines with CR alone, which bytes do not know; detached, it leaves stream open.
+    # Text also ends lines at CR, as old Macs write; detached, it leaves the stream open.
     text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="surrogateescape")
     lines = [*islice(iter(lambda: text.readline(_LONGEST_LINE), ""), _LONGEST_HEADER)]
     text.detach()
@@ -87,7 +87,7 @@ def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
 def _decoded(raw: bytes) -> str:
     try:
         return raw.decode("utf-8")
-    except UnicodeDecodeError:  # a µ as Windows writes it
+    except UnicodeDecodeError:  # µ in the encoding of Windows
         return raw.decode("latin-1")
 
 
@@ -105,7 +105,7 @@ def _delimiter(line: str) -> str | None:
 
 
 def _cells(line: str) -> tuple[int, int]:
-    """Return how many cells a line of numbers has, without and with empty ones at its end."""
+    """Return the number of cells of a line, without and with empty ones at its end."""
     mark = _delimiter(line)
     full = line.rstrip(f" {mark}") if mark else line
     return len(full.split(mark)), len(line.split(mark))
@@ -114,7 +114,7 @@ def _cells(line: str) -> tuple[int, int]:
 def _columns(
     header: list[str], first: str, units: LengthUnits | None, what: str
 ) -> tuple[dict[str, int], dict[str, float], int]:
-    """Return place and metres in one number of each column by its role, and cells in a line."""
+    """Return place and unit [m] of each column by its role, and the cells of a line."""
     named, count = _roles(header, _cells(first), what)
     places = {role: place for role, (place, _) in named.items()}
     if not named:
@@ -138,7 +138,7 @@ def _columns(
 
 
 def _agreed_until(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
-    """Refuse a column whose name states another unit than was given."""
+    """Raise FileError for a column whose name states another unit than ``units``."""
     if units is None:
         return
     own = (stated, units.height) if role in "xy" else (units.lateral, stated)
@@ -148,10 +148,10 @@ def _agreed_until(units: LengthUnits | None, role: str, stated: float, what: str
 def _roles(
     header: list[str], cells: tuple[int, int], what: str
 ) -> tuple[dict[str, tuple[int, float | None]], int]:
-    """Return place and unit of each column by its role, none if no line names them, and the cells.
+    """Return place and unit of each named column by its role, and the cells of a line.
 
-    Raises FileError where the line of names has more or fewer than the numbers have columns, names
-    one twice, or states another unit than a line of units below it.
+    Raises FileError if the line of names has another number of cells than the numbers, repeats a
+    name, or states another unit than a line of units below it.
     """
     for place in reversed(range(len(header))):
         names = _names(header[place])
@@ -159,7 +159,7 @@ def _roles(
         if not {"x", "y", "height"} <= set(found):
             continue
         if not cells[0] <= len(names) <= cells[1]:
-            if header[place].startswith(_COMMENTS):  # words that happen to be such names
+            if header[place].startswith(_COMMENTS):  # a comment with such words
                 continue
             raise FileError(
                 f"{what}: line {place + 1} names {len(names)} columns, below it stand numbers in "
@@ -173,7 +173,7 @@ def _roles(
 
 
 def _names(line: str) -> list[str]:
-    """Return the cells of what may be a line of names; an empty one counts between delimiters."""
+    """Return the cells of a possible line of names, with empty ones between delimiters."""
     text = line.lstrip("#!% ").replace("/t", "\t").rstrip(" ,;\t")
     if _delimiter(text):
         return [part.strip().strip('"') for part in re.split("[,;]", text)]
@@ -182,11 +182,11 @@ def _names(line: str) -> list[str]:
 
 
 def _named(names: list[str]) -> dict[str, tuple[int, float | None]]:
-    """Return place and unit by role, of the columns that have one."""
+    """Return place and unit of the columns with a role."""
     found: dict[str, tuple[int, float | None]] = {}
     for place, (name, unit) in enumerate(map(name_and_unit, names)):
         role = _ROLES.get(name)
-        # A cloud of ours has its height twice, and "height" is the one of full precision.
+        # Our clouds have the height twice; "height" has full precision.
         if role and (role not in found or name == "height"):
             found[role] = (place, unit)
     return found
@@ -195,7 +195,7 @@ def _named(names: list[str]) -> dict[str, tuple[int, float | None]]:
 def _with_units(
     found: dict[str, tuple[int, float | None]], below: list[str], what: str
 ) -> dict[str, tuple[int, float | None]]:
-    """Return ``found`` with the units of a line of units, if one stands below the names."""
+    """Return ``found`` with the units of a line of units below the names, if any."""
     for line in below:
         units = [metres_in(name.strip("[]() ")) for name in _names(line)]
         for role, (place, own) in found.items():
@@ -247,11 +247,9 @@ def _portions(columns: Mapping[str, NDArray[np.generic]]) -> Iterator[NDArray[np
         yield np.column_stack([part[start : start + _PORTION] for part in columns.values()])
 
 
-# Profiles of the DABAM collection: columns in ``NAME.dat``, what they are in ``NAME.txt``.
-#
-# ``FILE_FORMAT`` 1 has slopes in the second column, 2 heights; 3 and 4 the same in pairs of
-# columns.
-# Further columns (residuals) are derived, and are left out.
+# A profile of the DABAM collection has its columns in ``NAME.dat`` and a description in
+# ``NAME.txt``. ``FILE_FORMAT`` 1 has slopes in the second column, 2 heights; 3 and 4 the same in
+# pairs of columns. Further columns (residuals) are derived and ignored.
 
 _MAX_HEADER_BYTES = 100_000
 _MAX_DATA_BYTES = 200_000_000
@@ -264,7 +262,7 @@ class DabamProfile:
 
     position: [m], (n,);  value: heights [m] or slopes [rad], (n,)
     slopes: whether ``value`` is slopes
-    header: what the text beside it says
+    header: content of ``NAME.txt``
     """
 
     position: FloatArray
@@ -274,7 +272,7 @@ class DabamProfile:
 
 
 def has_dabam_header(path: Path) -> bool:
-    """Tell whether a text beside ``path`` describes it as a profile of DABAM."""
+    """Return whether ``NAME.txt`` describes ``path`` as a profile of DABAM."""
     header_path = path.with_suffix(".txt")
     if path.suffix.lower() != ".dat" or header_path == path or not header_path.is_file():
         return False
@@ -290,7 +288,7 @@ def _header(path: Path) -> dict[str, Any]:
 
 
 def load_dabam(path: Path) -> DabamProfile:
-    """Read columns and header; FileError where they do not fit each other."""
+    """Read columns and header; FileError if they do not agree."""
     what = f"profile {str(path)!r}"
     header = _header(path.with_suffix(".txt"))
     form, skip = header.get("FILE_FORMAT"), header.get("FILE_HEADER_LINES")
@@ -316,12 +314,12 @@ def load_dabam(path: Path) -> DabamProfile:
 def read_dabam(path: Path) -> MeasuredPoints:
     """Read a profile as points along x at y = 0; slopes are integrated by the trapezoidal rule.
 
-    Raises FileError where columns and header do not fit each other.
+    Raises FileError if columns and header do not agree.
     """
     profile = load_dabam(path)
     height, notes = profile.value, ("a profile along x",)
     if profile.slopes:
-        # Here, because to load it takes half a second, and every map passes through this module.
+        # Imported here, because it takes half a second to load, and each map needs this module.
         from scipy.integrate import cumulative_trapezoid
 
         height = cumulative_trapezoid(profile.value, profile.position, initial=0.0)

@@ -1,8 +1,8 @@
-"""Grid sag of optical design programs (Zemax OpticStudio ``.DAT``).
+"""Reads and writes grid sag of optical design programs (Zemax OpticStudio ``.DAT``).
 
 First line: columns, rows, spacing in x and y, unit (0 mm, 1 cm, 2 inch, 3 m), decentre in x and y.
-Then a line a point: height, its three derivatives, and a flag that is not zero where there is no
-datum. The first point is at the least x and the greatest y; x runs first, then y falls.
+Then a line for each point: height, its three derivatives, and a flag, nonzero for a missing point.
+The first point is at the least x and the greatest y; x runs first, then y falls.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _LONGEST_LINE = 10_000
 
 
 def is_grid_sag(first: str, second: str) -> bool:
-    """Tell whether the first two lines of a text, comments left out, are those of a grid sag file.
+    """Return whether the first two lines of a text, without comments, are those of grid sag.
 
-    One of an unknown unit is one, too, where its second line shows that it is no table.
+    With an unknown unit, the second line must show that the text is no table.
     """
     numbers = _first_line(first)
     if numbers is None:
@@ -58,10 +58,9 @@ def _has_unit(first: tuple[float, ...]) -> bool:
 def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
     """Read a grid sag file; a point flagged "no data" is missing.
 
-    units: what the reader takes the file for, if anything
+    units: expected ones, or None
 
-    Raises FileError for a file of other lines, of fewer or more points than it says, or of other
-    ``units``.
+    Raises FileError for other lines, another number of points than stated, or other ``units``.
     """
     what = f"grid sag {str(path)!r}"
     with open_regular(path, FileError, "grid sag") as stream:
@@ -115,7 +114,7 @@ def _grid(first: tuple[float, ...], table: FloatArray) -> HeightGrid:
 
 
 def write_grid_sag(path: Path, grid: HeightGrid) -> None:
-    """Write a map in metres, with the derivatives that it has inside and zeros elsewhere.
+    """Write a map in metres, with its derivatives, zero at the edges of missing points.
 
     Raises FileError for fewer than five rows or columns, which readers refuse.
     """
@@ -137,7 +136,7 @@ def write_grid_sag(path: Path, grid: HeightGrid) -> None:
 
 
 def _derivatives(grid: HeightGrid) -> tuple[FloatArray, ...]:
-    """Return the slopes and twist by central differences; zero where a neighbour is missing."""
+    """Return slopes and twist by central differences; zero next to missing points."""
     slope_y, slope_x = np.gradient(grid.height, grid.dy, grid.dx)
     twist = np.gradient(slope_x, grid.dy, axis=0)
     return tuple(np.nan_to_num(part, nan=0.0) for part in (slope_x, slope_y, twist))

@@ -1,4 +1,4 @@
-"""HDF5: our own tables of points, and the maps of Zygo Mx (``.datx``)."""
+"""Reads maps of instruments: HDF5 (ours and Zygo ``.datx``), MetroPro, and others by a library."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _DATX_SURFACES = "Data/Surface"
 
 
 def read_hdf5(path: Path) -> MeasuredPoints:
-    """Read a table of ours, or the first surface of a ``.datx``; both carry their units.
+    """Read a table of ours, or the first surface of a ``.datx``; both state their units.
 
     Raises FileError for other HDF5 files, and for those that are damaged.
     """
@@ -45,7 +45,7 @@ def read_hdf5(path: Path) -> MeasuredPoints:
                     return _datx(h5py, content, what)
         except FileError:
             raise
-        except Exception as err:  # whatever the library makes of a damaged file
+        except Exception as err:  # the library raises many kinds
             raise FileError(
                 f"{what} cannot be read: {exception_text(err)}; write it again"
             ) from err
@@ -92,7 +92,7 @@ def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
     if no_data is not None:
         height[height >= float(np.ravel(no_data)[0])] = np.nan
     dx, dy = (_pixel(surface, f"{axis} Converter", what) for axis in "XY")
-    # The first row is the upper one of the camera.
+    # The first row is the upper row of the camera.
     scaled = np.flipud(height) * _datx_scale(surface, what)
     notes = (f"the first of its {len(surfaces)} surfaces",) if len(surfaces) > 1 else ()
     return HeightGrid(height=scaled, x0=0.0, y0=0.0, dx=dx, dy=dy).points(notes)
@@ -129,12 +129,12 @@ def write_hdf5(path: Path, columns: Mapping[str, NDArray[np.generic]], comment: 
             dataset.attrs["units"] = "1" if name in _NO_LENGTHS else "m"
 
 
-# Zygo MetroPro binary maps (``.dat``), after the layout that Zygo publishes with the program.
+# Zygo MetroPro binary maps (``.dat``), by the layout in Zygo's manual.
 
-MAGIC_METROPRO_FILE = b"\x88\x1b\x03"
+METROPRO_MAGIC = b"\x88\x1b\x03"
 _HEADER_BYTES = 834
 _LARGEST_HEADER = 65_536
-# Phase values from here on say why there is none.
+# Phase values from here on are error codes.
 _NO_DATUM = 2_147_483_640
 # Steps of the phase in one fringe, by the entry "phase resolution".
 _STEPS = {0: 4096, 1: 32768, 2: 131072}
@@ -145,12 +145,12 @@ def read_metropro(path: Path) -> MeasuredPoints:
 
     height = phase · wavelength · scale factor · obliquity / steps
 
-    Raises FileError for a file that is none, was cut short, or lacks phase or its scales.
+    Raises FileError for another or an incomplete file, or one without phase or scales.
     """
     what = f"MetroPro file {str(path)!r}"
     with open_regular(path, FileError, "MetroPro file") as stream:
         head = stream.read(_HEADER_BYTES)
-        if len(head) < _HEADER_BYTES or not head.startswith(MAGIC_METROPRO_FILE):
+        if len(head) < _HEADER_BYTES or not head.startswith(METROPRO_MAGIC):
             raise FileError(f"{what} has no header of MetroPro, or was cut short; save it again")
         size = _at(">I", head, 6)
         columns, rows = _at(">H", head, 68), _at(">H", head, 70)
@@ -191,15 +191,13 @@ def _at(form: str, head: bytes, place: int) -> Any:
     return struct.unpack_from(form, head, place)[0]
 
 
-# Formats of other instruments, by the library SurfaceTopography.
-
 MAX_FOREIGN_BYTES = 1_000_000_000
 
 
 def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read a map by whatever reader of SurfaceTopography knows it; ``units`` where it has none.
+    """Read a map by the library SurfaceTopography; ``units`` if the file states none.
 
-    Raises FileError where none knows it, or it is no map of two directions.
+    Raises FileError if no reader knows it, or it is no map of two directions.
     """
     what = f"map {str(path)!r}"
     open_regular(path, FileError, "map").close()
@@ -208,11 +206,11 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     topography = import_optional("SurfaceTopography", what)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what the file lacks; we ask for it ourselves
+            warnings.simplefilter("ignore")  # of missing values, which are checked below
             with topography.open_topography(str(path)) as reader:
                 found = reader.topography()
             height = np.ma.filled(np.ma.asarray(found.heights(), np.float64), np.nan)
-    except Exception as err:  # a reader of forty formats fails in as many ways
+    except Exception as err:  # its readers raise many kinds
         raise FileError(
             f"{what} is of no known format, convert it to xyz: {exception_text(err)}"
         ) from err

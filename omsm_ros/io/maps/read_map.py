@@ -1,4 +1,4 @@
-"""Which format is this file? Read it as points in metres."""
+"""Reads a map of any known format as points in metres."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
 
 def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
-    """Read a map or cloud of any known format, known by its content; a folder is a result of ours.
+    """Read a map or cloud; the content determines the format; a folder is a result of ours.
 
-    units: of a file that does not carry them itself
+    units: of a file that does not state them
 
-    Raises FileError for a file that is of no known format, is damaged, or needs ``units``.
+    Raises FileError for a file of unknown format, a damaged one, or one that needs ``units``.
     """
     file = path / CLOUD if path.is_dir() else path
     try:
@@ -43,7 +43,7 @@ def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
 
 
 def _head(path: Path) -> bytes:
-    """Return how a file begins; refuse one that is empty, or a bag."""
+    """Return the beginning of a file; FileError for an empty one or a bag."""
     with open_regular(path, FileError, "map") as stream:
         head = stream.read(_HEAD_BYTES)
     if not head:
@@ -65,7 +65,7 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     if head.startswith((b"# .PCD", b"VERSION")):
         return read_pcd(path, units)
     if (found := _in_metres(path, head)) is not None:
-        # Their layout fixes what they count in: nothing can contradict it.
+        # These formats fix the units, so ``units`` are not used.
         unasked = (NOT_USED,) if units else ()
         return replace(found, notes=(*found.notes, *unasked))
     text, suffix = b"\0" not in head, path.suffix.lower()
@@ -78,7 +78,7 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
 
 def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
     """Read a file of a format that fixes its units; None for any other."""
-    if head.startswith(instrument_files.MAGIC_METROPRO_FILE):
+    if head.startswith(instrument_files.METROPRO_MAGIC):
         return instrument_files.read_metropro(path)
     if head.startswith(instrument_files.MAGIC):
         return instrument_files.read_hdf5(path)
@@ -88,7 +88,7 @@ def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
 
 
 def _first_lines(head: bytes) -> tuple[str, str]:
-    """Return the first two lines that are neither empty nor comments, empty where there is none."""
+    """Return the first two lines that are neither empty nor comments; "" without one."""
     lines = head.decode("utf-8-sig", "replace").splitlines()
     data = [line for line in lines if line.strip() and not line.startswith("!")]
     first, second = (*data[:2], "", "")[:2]

@@ -1,4 +1,4 @@
-"""Point clouds as records: PLY (Stanford) and PCD (Point Cloud Library, version 0.7)."""
+"""Reads and writes point clouds: PLY (Stanford), PCD (Point Cloud Library, version 0.7)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.units import NOT_USED, LengthUnits, needed
 
 IN_METRES = "lengths in metres"
-"""What a comment of ours says of the coordinates."""
+"""The comment on units in our files."""
 
 _OURS = {"x", "y", "height", "dynamic_error", "uncertainty"}
 _MOST_LINES, _LONGEST_LINE = 500, 1000
@@ -36,7 +36,7 @@ _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 def read_ply(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     """Read the vertices of a PLY file; metres if it is one of ours, else ``units``.
 
-    Raises FileError for what is no such file, was cut short, or names no unit and none is given.
+    Raises FileError for another or an incomplete file, or one without any unit.
     """
     what = f"cloud {str(path)!r}"
     with open_regular(path, FileError, "cloud") as stream:
@@ -52,7 +52,7 @@ def read_ply(path: Path, units: LengthUnits | None) -> MeasuredPoints:
 def read_pcd(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     """Read the points of a PCD file; metres if it is one of ours, else ``units``.
 
-    Raises FileError for what is no such file, was cut short, or names no unit and none is given.
+    Raises FileError for another or an incomplete file, or one without any unit.
     """
     what = f"cloud {str(path)!r}"
     with open_regular(path, FileError, "cloud") as stream:
@@ -133,7 +133,7 @@ def _records(
     begin = stream.tell()
     held = stream.seek(0, io.SEEK_END) - begin
     stream.seek(begin)
-    # The last line of a text need not end.
+    # The last line of a text may have no end.
     least = 2 * len(dtype) * count - 1 if ascii_text else dtype.itemsize * count
     if held < least:
         raise FileError(
@@ -141,7 +141,7 @@ def _records(
             "short, write it again"
         )
     if not ascii_text:
-        # Mapped: the columns are taken out of it one by one.
+        # Mapped, since the columns are read one by one.
         return np.memmap(stream, dtype, mode="r", offset=begin, shape=(count,))
     lines = (line.decode("latin-1") for line in stream)
     columns = rows_in(lines, f"{what}, below its header", "write a line a point", max_rows=count).T
@@ -172,10 +172,7 @@ def _points(
 
 
 def _skip_unremarkable(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
-    """Return ``scale`` times values (n,), without NaN of the signalling kind.
-
-    Damaged bytes may be such.
-    """
+    """Return ``scale`` times values (n,), without signalling NaN, which damaged bytes may be."""
     with np.errstate(invalid="ignore"):
         found = values.astype(np.float64)
     found[np.isnan(found)] = np.nan

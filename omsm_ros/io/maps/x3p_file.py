@@ -1,6 +1,6 @@
-"""x3p (ISO 25178-72): a map, a profile or a cloud with its axes, in metres.
+"""Reads and writes x3p (ISO 25178-72): a map, a profile or a cloud, in metres.
 
-Written in the revision ``ISO5436 - 2000``, which every reader takes.
+Files are written in the revision ``ISO5436 - 2000``, which all readers accept.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from omsm_ros.io.files import atomic_file, exception_text, open_regular
 from omsm_ros.io.optional_libraries import import_optional
 from omsm_ros.quantities import MAP_POINTS
 
-# All points that are read, in eight bytes each, and what describes them.
+# The greatest number of points, of eight bytes each, and their description.
 MAX_UNPACKED_BYTES = 8 * int(MAP_POINTS.high) + 4_000_000
 
 _REVISION = re.compile(rb"<(?:[\w.-]+:)?Revision>([^<]*)<")
@@ -33,14 +33,14 @@ _REVISIONS = {
     b"iso25178722017amd12020": b"ISO25178-72:2017/DAM1",
 }
 
-# Types of heights that an increment makes lengths of.
+# Integer types of heights, which need an increment.
 _WHOLE = ("I", "L")
 
 
 def read_x3p(path: Path) -> MeasuredPoints:
     """Read the first layer of an x3p file, in its global frame.
 
-    Raises FileError for a file that is none, is damaged, or unpacks to more than is read.
+    Raises FileError for another or a damaged file, or one that unpacks to too many bytes.
     """
     what = f"x3p file {str(path)!r}"
     x3pio = import_optional("x3pio", what)
@@ -59,7 +59,7 @@ def read_x3p(path: Path) -> MeasuredPoints:
             place = _places(x3pio, content)
         except FileError:
             raise
-        except Exception as err:  # whatever zip, XML and heights make of a damaged file
+        except Exception as err:  # the libraries raise many kinds
             raise FileError(f"{what} cannot be read: {exception_text(err)}; save it again") from err
     layers = len(content.layers)
     notes = (f"the first of its {layers} layers",) if layers > 1 else ()
@@ -67,9 +67,9 @@ def read_x3p(path: Path) -> MeasuredPoints:
 
 
 def _with_known_revision(archive: zipfile.ZipFile) -> BytesIO | None:
-    """Return the archive with the spelling of its revision that x3pio knows; None if it has it.
+    """Return the archive with the revision spelled as x3pio expects; None if it already is.
 
-    The standards fix the text, and programs write their own: ISO5436_2000, ISO25178-72:2017.
+    Some programs deviate from the standard: ISO5436_2000, ISO25178-72:2017.
     """
     main = archive.read("main.xml")
     found = _REVISION.search(main)
@@ -79,7 +79,7 @@ def _with_known_revision(archive: zipfile.ZipFile) -> BytesIO | None:
     spelled = BytesIO()
     with zipfile.ZipFile(spelled, "w") as made:
         for member in archive.infolist():
-            # What it says of main.xml no longer holds.
+            # The checksum of main.xml is no longer valid.
             if member.filename.endswith("md5checksum.hex"):
                 continue
             content = archive.read(member)
@@ -93,13 +93,13 @@ def _with_known_revision(archive: zipfile.ZipFile) -> BytesIO | None:
 def _places(x3pio: Any, content: Any) -> FloatArray:
     """Return x, y, height (n, 3) [m] of the first layer; NaN = missing."""
     layer, header = content.layers[0], content.header
-    # Left out, it counts as one: heights in steps of a metre, which no instrument has.
+    # A missing increment reads as 1: steps of a metre, which no instrument has.
     if header.z.data_type.value in _WHOLE and header.z.increment == 1.0:
         raise ValueError("its heights are whole numbers without an increment; save it with one")
     if isinstance(content, x3pio.PointCloud):
         places = np.asarray(layer.points(), np.float64)
     elif not header.x.is_incremental or (np.ndim(layer.z) == 2 and not header.y.is_incremental):
-        raise ValueError("its places are listed one by one; save it with even spacings")
+        raise ValueError("its places are not evenly spaced; save it with even spacings")
     else:
         height = np.atleast_2d(np.asarray(layer.z, np.float64))
         dx = header.x.increment
@@ -113,7 +113,7 @@ def _places(x3pio: Any, content: Any) -> FloatArray:
 
 
 def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:
-    """Write a map [m] with its place as x3p of the revision that all readers take."""
+    """Write a map [m] with its place as x3p."""
     x3pio = import_optional("x3pio", f"writing {str(path)!r}")
     surface = x3pio.Surface.from_array(
         grid.height,

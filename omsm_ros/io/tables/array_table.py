@@ -1,7 +1,8 @@
-"""Tables in files of arrays: NumPy, MATLAB, HDF5.
+"""Reads tables in files of arrays: NumPy, MATLAB, HDF5, TDMS (LabVIEW, DIAdem).
 
-A column of a table is named ``dataset[3]``, counted from 0; a plain array's columns are ``[0]``,
-``[1]`` and so on. What lies in a group, a MATLAB structure or a structured array is ``group/name``.
+A column of a table is named ``dataset[3]``, counted from 0; columns of a single array are ``[0]``,
+``[1]`` and so on. Arrays in a group, a MATLAB structure or a structured array are ``group/name``,
+channels of TDMS ``group/channel``.
 """
 
 from __future__ import annotations
@@ -31,21 +32,18 @@ from omsm_ros.io.optional_libraries import walk_in_subprocess
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# Does a library live through a file? Some trust it so far that a damaged one ends the process.
-
 
 def probe_in_subprocess(read: Callable[[], object]) -> bool:
-    """Return whether a process that calls ``read`` lives on; what it raises is no matter.
+    """Return whether ``read`` does not crash its process; exceptions are ignored.
 
-    It is a copy of this one, so that nothing is loaded anew, as a process of its own would for a
-    second, and is gone with all that it read.
+    A damaged file may crash a library. The process is a fork, so no module is loaded again.
     """
     with warnings.catch_warnings():
-        # Python 3.12 warns where there are threads; the copy waits for none of them.
+        # Python 3.12 warns of threads; the fork does not wait for any of them.
         warnings.simplefilter("ignore", DeprecationWarning)
         child = os.fork()
     if child == 0:
-        faulthandler.disable()  # one line is told by who asked
+        faulthandler.disable()  # the caller reports a crash in one line
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         with contextlib.suppress(BaseException):
             read()
@@ -53,9 +51,9 @@ def probe_in_subprocess(read: Callable[[], object]) -> bool:
     return not os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
-# What is loaded whole: archives of NumPy, MATLAB's own files.
+# Archives of NumPy and MATLAB files are loaded completely.
 _MAX_WHOLE_BYTES = 4_000_000_000
-# No recording is packed a hundred times; an archive that is, and is large, was made to fill memory.
+# No recording has a compression ratio of 100; a large file with more was made to fill memory.
 _MAX_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 100_000_000
 _MAX_COLUMNS = 1000
 
@@ -80,7 +78,7 @@ class ArrayTable(ForeignTable):
             self._arrays = dict(_flat("", read()))
         except FileError:
             raise
-        except Exception as err:  # whatever a library says of a damaged file
+        except Exception as err:  # the libraries raise many kinds
             raise FileError(
                 f"{self} cannot be read: {exception_text(err)}; write it again, or as CSV"
             ) from err
@@ -104,7 +102,7 @@ class ArrayTable(ForeignTable):
             stream.seek(0)
             alone = stream.read(len(np.lib.format.MAGIC_PREFIX)) == np.lib.format.MAGIC_PREFIX
             stream.seek(0)
-            # Pickles are refused, by default.
+            # numpy refuses pickles by default.
             if alone:
                 return {"": np.load(self.path, mmap_mode="r")}
             loaded = np.load(stream)
@@ -115,32 +113,31 @@ class ArrayTable(ForeignTable):
 
         with open_regular(self.path, FileError, "table") as stream:
             head = stream.read(10)
-            if head == b"MATLAB 7.3":  # which is HDF5 under another name
+            if head == b"MATLAB 7.3":  # an HDF5 file
                 return self._hdf5()
             if head == b"MATLAB 5.0":
                 self._check_unpacked(_unpacked_matlab(stream))
 
         def load() -> Mapping[str, Any]:
-            with warnings.catch_warnings():  # complex numbers would lose a part without a word
+            with warnings.catch_warnings():  # else the imaginary part is lost silently
                 warnings.simplefilter("error", np.exceptions.ComplexWarning)
-                warnings.simplefilter("error", UserWarning)  # and orders of bytes be guessed
+                warnings.simplefilter("error", UserWarning)  # else the byte order is guessed
                 loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
             return loaded
 
         if not probe_in_subprocess(load):
             raise FileError(
-                f"{self} cannot be read: what it holds does not fit together; write it again, or "
-                "as CSV"
+                f"{self} cannot be read: its content is inconsistent; write it again, or as CSV"
             )
         return load()
 
     def _check_unpacked(self, size: int) -> None:
-        """Raise FileError for an archive that holds far more bytes than any recording would."""
+        """Raise FileError for an archive that unpacks to more bytes than any recording."""
         packed = self.path.stat().st_size
         if size > max(_MAX_PACKED * packed, _ALWAYS_UNPACKED_BYTES):
             raise FileError(
                 f"{self} has {packed} bytes and would unpack to {size}; check that it is a "
-                "recording, and leave out what is none"
+                "recording, and leave out other arrays"
             )
 
     def _hdf5(self) -> Mapping[str, Any]:
@@ -154,7 +151,7 @@ class ArrayTable(ForeignTable):
 
         def keep(name: str, item: object) -> None:
             if isinstance(item, h5py.Dataset):
-                # MATLAB writes a column of numbers as a table of one row.
+                # MATLAB writes a column as a table of one row.
                 row = item.ndim == 2 and item.shape[0] == 1
                 if row and item.dtype.names is not None and item.nbytes < _ALWAYS_UNPACKED_BYTES:
                     found[name] = item[0]
@@ -209,7 +206,7 @@ class _Row:
 
 
 def _unpacked_matlab(stream: IO[bytes]) -> int:
-    """Return how many bytes the variables of a MATLAB 5 file say that they have when unpacked."""
+    """Return the unpacked size of a MATLAB 5 file, as stated by its variables [bytes]."""
     stream.seek(126)
     order = "<" if stream.read(2) == b"IM" else ">"
     total = 0
@@ -225,11 +222,11 @@ def _unpacked_matlab(stream: IO[bytes]) -> int:
 
 
 def _flat(name: str, found: Any) -> Iterator[tuple[str, Any]]:
-    """Yield every array in ``found`` with its name; those of a structure below the name of it."""
+    """Yield each array in ``found`` with its name, which begins with that of its structure."""
     if isinstance(found, Mapping):
         parts = list(found.items())
     elif fields := getattr(getattr(found, "dtype", None), "names", None):
-        # A field of a data set in a file is a view, of an array in memory its part.
+        # A field of a data set is read by a view, that of an array by its name.
         read = found.fields if hasattr(found, "fields") else found.__getitem__
         parts = [(field, read(field)) for field in fields]
     else:
@@ -240,25 +237,23 @@ def _flat(name: str, found: Any) -> Iterator[tuple[str, Any]]:
         yield from _flat(f"{name}/{part}" if name else part, value)
 
 
-# Channels of a TDMS file, the format of LabVIEW and DIAdem; named ``group/channel``.
-
-# Properties that LabVIEW gives a channel (ni.com, "TDMS File Format Internal Structure").
+# Properties of a channel (ni.com, "TDMS File Format Internal Structure").
 _UNIT, _PERIOD = "unit_string", "wf_increment"
 _BEGINS = ("wf_start_time", "wf_start_offset")
 _SCALES, _MOST_SCALES = "NI_Number_Of_Scales", 100
-# Where the library warns that numbers are others than the file means, and goes on.
+# Loggers of the library that warn of wrong numbers, and go on.
 _NOT_PASSED_OVER = ("nptdms.scaling", "nptdms.base_segment", "nptdms.tdms_segment")
 
 
 class _Refusal(logging.Handler):
-    """A warning is an error: of a scale that is not known, the raw numbers would be read."""
+    """Makes a warning an error: with an unknown scale, raw numbers would be read."""
 
     def emit(self, record: logging.LogRecord) -> None:
         raise ValueError(record.getMessage())
 
 
 class TdmsTable(ForeignTable):
-    """The channels of one file; its units and its period are held against the map's."""
+    """The channels of one file; its units and period must agree with the map."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -276,7 +271,7 @@ class TdmsTable(ForeignTable):
             stream = opening.enter_context(open_regular(path, FileError, "table"))
             try:
                 self._take(opening.enter_context(TdmsFile.open(stream)))
-            except Exception as err:  # whatever the library says of a damaged file
+            except Exception as err:  # the library raises many kinds
                 raise self._damaged(err) from err
             self._opened = opening.pop_all()
 
@@ -293,7 +288,7 @@ class TdmsTable(ForeignTable):
         self._properties = properties
 
     def used(self, names: Sequence[str]) -> None:
-        """Take the period of the channels ``names``; FileError where they are not side by side."""
+        """Take the period of the channels ``names``; FileError if their times differ."""
         known_properties = {name: self._properties[name] for name in names}
         for key in (_PERIOD, *_BEGINS):
             values = {p[key]: name for name, p in known_properties.items() if p.get(key)}
@@ -337,20 +332,20 @@ class TdmsTable(ForeignTable):
         if dated:  # always UTC
             since = values.astype("datetime64[ns]").astype(np.int64)
             return np.asarray(since / NANOSECONDS_PER_S)
-        with np.errstate(invalid="ignore"):  # damaged singles; what is no number is told
+        with np.errstate(invalid="ignore"):  # damaged singles; NaN is reported later
             return np.asarray(values, np.float64)
 
 
 def _check_scales(properties: Mapping[str, object]) -> None:
-    """Raise ValueError for more scales than anybody chains: the library would make them all."""
+    """Raise ValueError for more scales than a file needs: the library would create them all."""
     scales = properties.get(_SCALES, 0)
     if isinstance(scales, int | float | np.number) and not scales <= _MOST_SCALES:
         raise ValueError(f"{_SCALES} is {scales}, expected at most {_MOST_SCALES}")
 
 
 def _kind(channel: Any) -> str:
-    """Return the kind of a channel's numbers; "f" where only reading it tells what is wrong."""
+    """Return the kind of a channel's numbers; "f" if it can only be known by reading."""
     try:
         return str(channel.dtype.kind)
-    except Exception:  # whatever the library says of a channel that nobody may want
+    except Exception:  # of a channel that may not be used
         return "f"

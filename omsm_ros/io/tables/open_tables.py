@@ -1,4 +1,4 @@
-"""Which kind of recording is this file, and which tables does it hold?"""
+"""Opens the tables of a recording of another program, of any known format."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ _BAGS = (".mcap", ".bag", ".db3")
 def open_tables(path: Path, form: TableForm, wanted: Sequence[str]) -> list[ForeignTable]:
     """Return the tables of a recording that have some of the columns ``wanted``.
 
-    They are one of a file, and one a topic of a bag.
-
-    Raises FileError for what cannot be read, or has none of them.
+    A file has one table; a bag has one for each topic. Raises FileError if it cannot be read, or
+    has none of the columns.
     """
     suffix = path.suffix.lower()
     if suffix in _BAGS or (path / "metadata.yaml").is_file():
@@ -32,7 +31,7 @@ def open_tables(path: Path, form: TableForm, wanted: Sequence[str]) -> list[Fore
 
 
 def _table(path: Path, suffix: str, form: TableForm) -> ForeignTable:
-    # Each where it is asked for: some are of optional packages, all take time to load.
+    # Imported when needed: some are optional packages, and all take time to load.
     if suffix in _ARRAYS:
         from omsm_ros.io.tables.array_table import ArrayTable
 

@@ -1,4 +1,4 @@
-"""What every recording of another program is, once it is opened: named columns of numbers."""
+"""The base of tables of other programs, and the map of their columns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ PIECE_ROWS = 100_000
 
 
 _IN_NAME = re.compile(r".*[\[(]\s*([^\[\]()/\s]+)\s*[\])]?\s*")
-# Without brackets a word may be no unit: log/V is a channel, y_in an input.
+# Without brackets the word may not be a unit: log/V is a channel, y_in an input.
 _AFTER_NAME = re.compile(r".*[_\s/]([^\[\]()/\s_]+)\s*")
 
 
@@ -33,12 +33,12 @@ _SURE = frozenset[str]().union(*UNITS.values()) - {DATE, "1"}
 
 @dataclass(frozen=True, slots=True)
 class TableForm:
-    """What a map says of how a table is written.
+    """The notation of a table, as stated by a map.
 
-    delimiter: between columns of a text, " " = any run of blanks;  decimal: before the fraction
+    delimiter: of columns, " " = any blanks;  decimal: the decimal sign
     lines_before: before the line of names;  lines_after: between it and the first numbers
     named: whether a text has a line of names; without one its columns are [0], [1], …
-    missing: texts that mean "no reading";  zone: of dates that state none, "Z" or "+01:00"
+    missing: texts that mean "no reading";  zone: of dates without one, "Z" or "+01:00"
     """
 
     delimiter: str = ","
@@ -51,11 +51,11 @@ class TableForm:
 
 
 class ForeignTable(ABC):
-    """Columns by name: ``names`` of all, ``units`` that the file itself states of some.
+    """Columns by name: ``names`` of all, ``units`` that the file states of some.
 
-    repeated_names: lines met so far that repeat the line of names, and hold no numbers
-    passed_over: messages met so far that hold none of the columns
-    sample_period: that the file itself states [s], None if it does not
+    repeated_names: lines so far that repeat the line of names
+    passed_over: messages so far that have none of the columns
+    sample_period: stated by the file [s], else None
     units_in_names: whether names of columns may hold units
     """
 
@@ -74,15 +74,15 @@ class ForeignTable(ABC):
 
     @property
     def label(self) -> str:
-        """Return what people call it."""
+        """Return the name for people."""
         return str(self.path)
 
     def pieces(self, names: Sequence[str], dates: Sequence[str]) -> Iterator[dict[str, FloatArray]]:
         """Yield the columns ``names`` in pieces of rows, each (n,) in the units of the file.
 
-        dates: those of them that hold dates, given in seconds since 1970
+        dates: those of them with dates, returned in seconds since 1970
 
-        Raises FileError for what is no number or date, naming the row.
+        Raises FileError for a value that is no number or date, with its row.
         """
         rows = self.repeated_names = self.passed_over = 0
         for piece in self._pieces(names, frozenset(dates)):
@@ -98,19 +98,19 @@ class ForeignTable(ABC):
         """Yield pieces of some rows."""
 
     def used(self, names: Sequence[str]) -> None:  # noqa: B027
-        """Say that the columns ``names`` will be read; FileError where they do not fit together."""
+        """Prepare to read the columns ``names``; FileError if they do not belong together."""
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._opened.close()
 
     def hint(self, names: Sequence[str]) -> str:
-        """Return what may help where columns ``names`` are not there; empty if nothing is seen."""
+        """Return a hint why columns ``names`` are missing; empty without one."""
         return ""
 
 
 def stated_unit(table: ForeignTable, name: str) -> str:
-    """Return the unit that a file states of a column, as in "Z [mm]" or z_mm too; empty if none."""
+    """Return the unit that a file states of a column, also as "Z [mm]" or z_mm; empty if none."""
     if name in table.units:
         return table.units[name].strip()
     if not table.units_in_names:
@@ -121,7 +121,7 @@ def stated_unit(table: ForeignTable, name: str) -> str:
     return found[1] if found and found[1] in _SURE else ""
 
 
-# ``MAP.yaml``: which column of a foreign recording is which channel, in which unit.
+# ``MAP.yaml`` assigns the columns of a recording to channels, with their units.
 
 _MAX_BYTES = 100_000
 _BY_POSITION = re.compile(r"\[\d{1,4}\]")
@@ -148,7 +148,7 @@ _MAP = form(
 
 
 def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
-    """Read ``MAP.yaml``; FileError for anything that is unclear, a unit above all."""
+    """Read ``MAP.yaml``; FileError if it is ambiguous, such as without a unit."""
     what = f"map {str(path)!r}"
     text = read_text(path, _MAX_BYTES, FileError, "map")
     content = json_and_yaml.mapping_of(text, FileError, what)
@@ -181,7 +181,7 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
 
 
 def _is_named(mapped: ColumnMap) -> bool:
-    """Return whether columns have names; where all are [0], [1], … a text has no line of them."""
+    """Return whether a text has a line of names; not if all columns are [0], [1], …"""
     names = mapped.names(CHANNELS)
     return not names or not all(_BY_POSITION.fullmatch(name) for name in names)
 
@@ -202,7 +202,7 @@ def _column(channel: str, given: Mapping[str, Any]) -> Column:
 
 
 def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
-    """Return the SI value of a column's unit. One that is not written is never guessed."""
+    """Return the SI value of a column's unit, which must be stated."""
     units = UNITS[channel]
     if channel == "trigger":
         return 1.0

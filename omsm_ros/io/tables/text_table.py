@@ -1,4 +1,4 @@
-"""A table in text: CSV and its like, as loggers, controls and spreadsheets write them."""
+"""Reads tables in text, such as CSV, of loggers, controls and spreadsheets."""
 
 from __future__ import annotations
 
@@ -20,24 +20,22 @@ from omsm_ros.io.tables.table import ForeignTable, TableForm
 from omsm_ros.quantities import shown
 from omsm_ros.units import NANOSECONDS_PER_S, WORDS
 
-# When is it that a text calls 2026-11-21T14:03:05.125+01:00?
-
 EXPECTED = "expected a date after ISO 8601, as 2026-11-21T14:03:05.125+01:00"
 
 _DATE = re.compile(
     r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d)?)(?:[.,](\d{1,9}))?\s*"
     r"(Z|[+-](?:0\d|1[0-4])(?::?[0-5]\d)?)?"
 )
-# What 64 bits of nanoseconds hold; a later one would be another date.
+# The range of 64 bits of nanoseconds; other dates would wrap.
 _FIRST_DAY, _LAST_DAY = "1700-01-01", "2261-12-31"
 
 
 def seconds_since_1970(texts: Sequence[str], zone: str) -> FloatArray:
-    """Return the instants (n,) that ``texts`` name, to a quarter of a microsecond.
+    """Return the instants (n,) of dates [s], rounded to a quarter of a microsecond.
 
-    zone: of those that state none; empty = they must
+    zone: of dates without one; empty = they must state it
 
-    Raises ValueError, which names the remedy, for a text that is no such date, or has no zone.
+    Raises ValueError with the remedy for another text, or a date without a zone.
     """
     days, shifts = [], []
     for text in texts:
@@ -58,20 +56,20 @@ def seconds_since_1970(texts: Sequence[str], zone: str) -> FloatArray:
 
 
 def shift_of(zone: str) -> float:
-    """Return how far a zone is ahead of UTC [s]: of "Z", "+01", "+01:00" or "+0100"."""
+    """Return the offset of a zone from UTC [s]: of "Z", "+01", "+01:00" or "+0100"."""
     if zone == "Z":
         return 0.0
     hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)
     return (1.0 if zone[0] == "+" else -1.0) * (hours * 3600.0 + minutes * 60.0)
 
 
-# A hundred thousand rows of five columns or so.
+# About a hundred thousand rows of five columns.
 _PIECE_CHARACTERS = 4_000_000
 _MAX_LINE_CHARACTERS = 100_000
 _PROBED_BYTES = 65_536
-# Lines among which a misplaced line of names is looked for.
+# Lines among which a misplaced line of names is searched.
 _HEAD_LINES = 1000
-# At the end of each piece, so of the file: averages, totals, "end of log".
+# Lines at the end of each piece that are checked for averages, totals, "end of log".
 _FOOT_LINES = 20
 _NO_TEXT = {
     b"PK\x03\x04": "it is a workbook or an archive; save the sheet as CSV",
@@ -86,7 +84,7 @@ _GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)
 
 
 class TextTable(ForeignTable):
-    """Lines of cells below a line of names; read piece by piece, whatever its length."""
+    """A table of lines below a line of names; read piece by piece."""
 
     def __init__(self, path: Path, form: TableForm) -> None:
         super().__init__(path)
@@ -112,7 +110,7 @@ class TextTable(ForeignTable):
             self.units.update(self._stated_units(line))
 
     def hint(self, names: Sequence[str]) -> str:
-        """Return where the line of names may be, or how its cells may be separated."""
+        """Return the place of the line of names, or the delimiter of its cells."""
         for number, line in enumerate(self._top):
             for mark in (self._form.delimiter, *_DELIMITERS):
                 if set(names) <= {cell.strip().strip('"') for cell in line.split(mark)}:
@@ -124,7 +122,7 @@ class TextTable(ForeignTable):
         return ""
 
     def _probed(self) -> str:
-        """Return how the file is encoded; FileError for what is no text."""
+        """Return the encoding of the file; FileError if it is not text."""
         with open_regular(self.path, FileError, "table") as stream:
             start = stream.read(_PROBED_BYTES)
         if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -147,7 +145,7 @@ class TextTable(ForeignTable):
         with io.TextIOWrapper(raw, self._encoding, "replace", newline=None) as stream:
             while text := stream.read(_PIECE_CHARACTERS):
                 lines = (rest + text).split("\n")
-                # The last line may have no end; it is no piece of its own.
+                # The last line may have no end.
                 rest = lines.pop() if len(text) == _PIECE_CHARACTERS or not lines[-1] else ""
                 if len(rest) > _MAX_LINE_CHARACTERS:
                     raise FileError(
@@ -164,7 +162,7 @@ class TextTable(ForeignTable):
         return line.split() if mark == " " else line.split(mark)
 
     def _named_cells(self, line: str) -> list[str]:
-        """Return the cells of the line of names, which alone may hold delimiters in quotes."""
+        """Return the cells of the line of names, which may have delimiters in quotes."""
         if len(line) > _MAX_LINE_CHARACTERS:
             raise FileError(
                 f"{self} has {len(line)} characters in a line; give a table of numbers, one row a "
@@ -198,7 +196,7 @@ class TextTable(ForeignTable):
         try:
             return rows.read(kept)
         except ValueError:
-            # Joined logs repeat their line of names: no numbers are lost with it.
+            # Joined logs repeat their line of names.
             lines_with = [pair for pair in lines_with if pair[1].strip() != self._head]
             self.repeated_names += len(kept) - len(lines_with)
             try:
@@ -207,7 +205,7 @@ class TextTable(ForeignTable):
                 raise self._culprit(lines_with, rows) from None
 
     def _check_foot(self, lines: list[str], first_number: int) -> None:
-        """Raise FileError for a line below the table, such as "mean;4.5", that is no sample."""
+        """Raise FileError for a line below the table that is no sample, such as "mean;4.5"."""
         known = {"", *(text.lower() for text in self._form.missing)}
         low = max(0, len(lines) - _FOOT_LINES)
         for number, line in enumerate(lines[low:], first_number + low):
@@ -221,7 +219,7 @@ class TextTable(ForeignTable):
                     )
 
     def _culprit(self, lines: list[tuple[int, str]], rows: _Rows) -> FileError:
-        """Return the first line that is no row of numbers, and what may be wrong with it."""
+        """Return the error of the first line that is no row of numbers."""
         good, bad = 0, len(lines)  # lines[:good] are rows, lines[:bad] are not all
         while bad - good > 1:
             middle = (good + bad) // 2
@@ -266,13 +264,13 @@ class TextTable(ForeignTable):
 
     @property
     def form(self) -> TableForm:
-        """How the text is written."""
+        """Return the notation of the text."""
         return self._form
 
     def cells(self, line: str) -> list[str]:
-        """Return the cells of a line of numbers; ValueError if they are not one a name.
+        """Return the cells of a line; ValueError if their number is not that of the names.
 
-        A cell too many, such as a decimal comma makes, would shift all that follow it.
+        A decimal comma, for example, adds a cell and would shift the others.
         """
         cells = self._cells(line)
         if len(cells) == len(self.names) + 1 and not cells[-1].strip():
@@ -292,7 +290,7 @@ class _Rows:
         self._missing = frozenset(text.lower() for text in table.form.missing)
 
     def read(self, lines: list[str]) -> list[FloatArray]:
-        """Return the columns, each (n,); ValueError for anything else than one a name."""
+        """Return the columns, each (n,); ValueError for another number of cells or a text."""
         if not lines:
             return [np.empty(0) for _ in self._places]
         numbers = iter(self._read_numbers(lines).T if self._numeric else ())
@@ -300,7 +298,7 @@ class _Rows:
         return [np.ascontiguousarray(next(dates if date else numbers)) for date in self._dates]
 
     def read_dates(self, lines: list[str]) -> list[FloatArray]:
-        """Return the columns of dates; ValueError, which names the remedy, for other texts."""
+        """Return the columns of dates; ValueError with the remedy for other texts."""
         found = [p for p, date in zip(self._places, self._dates, strict=True) if date]
         cells = [self._table.cells(line) for line in lines] if found else []
         return [seconds_since_1970([c[p] for c in cells], self._form.zone) for p in found]
@@ -326,7 +324,7 @@ class _Rows:
             return read(converters=self._number, encoding="utf-8")
 
     def _check_points(self, lines: list[str]) -> None:
-        """Raise FileError for points among decimal commas: 1.234 is another number there."""
+        """Raise ValueError for points among decimal commas, where 1.234 is another number."""
         for line in lines:
             if "." in line:
                 cells = self._table.cells(line)
@@ -334,7 +332,7 @@ class _Rows:
                     raise ValueError
 
     def _number(self, text: str) -> float:
-        """Return a number of a table; an empty cell is a reading that is not there."""
+        """Return a number of a table; an empty cell is a missing reading."""
         text = text.strip().strip('"').strip()
         if not text or text.lower() in self._missing:
             return float("nan")

@@ -1,9 +1,9 @@
-"""Messages of a ROS topic as rows of a table: any type whose fields are numbers.
+"""Reads the messages of a ROS topic as rows of a table, of any type with numbers.
 
-A column is named by its topic and the way to the field, as ``/probe.range``,
+A column is named by its topic and the path of the field, as ``/probe.range``,
 ``/joint_states.position[z_slide]`` by the joint's name, ``/gap.data`` or
-``/pose.pose.position.z``. ``header.stamp`` without a topic is that of each topic, and ``log_time``
-when each message was recorded; both are dates.
+``/pose.pose.position.z``. ``header.stamp`` without a topic is that of each topic, ``log_time`` is
+the time of recording; both are dates.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _Get = Callable[[Any], float]
 
 
 class ForeignBag:
-    """A bag of any topics, opened for reading."""
+    """Opens a bag of any topics for reading."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -65,23 +65,23 @@ class ForeignBag:
             self._stack = opening.pop_all()
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self._stack.close()
 
     def topics(self) -> list[TopicTable]:
-        """Return its topics, each a table."""
+        """Return a table for each topic."""
         names = sorted({c.topic for c in self.reader.connections if c.msgcount})
         return [TopicTable(self, topic) for topic in names]
 
 
 @lru_cache(maxsize=1)
 def _standard() -> Typestore:
-    """Return the types for bags that carry no definitions: sqlite3 before ROS 2 Iron."""
+    """Return the types for bags without definitions: sqlite3 before ROS 2 Iron."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 class TopicTable(ForeignTable):
-    """The messages of one topic; a row each."""
+    """The messages of one topic, a row for each."""
 
     units_in_names = False  # position[A] is a joint
 
@@ -95,7 +95,7 @@ class TopicTable(ForeignTable):
         if len(kinds) > 1:
             raise BagError(f"{self} has messages of {kinds}; record them on topics of their own")
         self._kind = kinds[0]
-        # Several nodes may publish their joints on one topic, each some of them.
+        # Several nodes may publish different joints on one topic.
         seen = [_leaves(message) for _, message in islice(self._messages(), _LOOKED_AT)]
         relative = [*dict.fromkeys(chain.from_iterable(seen)), LOG_TIME]
         self.names = [*relative, *(f"{topic}.{name}" for name in relative)]
@@ -109,7 +109,7 @@ class TopicTable(ForeignTable):
         return f"{self.path}:{self._topic}"
 
     def close(self) -> None:
-        """Let go of the bag, which its other topics need no more either."""
+        """Close the bag, also for its other topics."""
         self._bag.close()
 
     def _messages(self) -> Iterator[tuple[int, Any]]:
@@ -161,7 +161,7 @@ class TopicTable(ForeignTable):
 
     @staticmethod
     def _is_foreign_message(found: Sequence[float | None], fields: Sequence[str]) -> bool:
-        """Return whether a message holds nothing of what is wanted but its time."""
+        """Return whether a message has none of the columns but its time."""
         pairs = zip(found, fields, strict=True)
         return not any(v is not None for v, f in pairs if f != LOG_TIME and not f.endswith("stamp"))
 
@@ -172,7 +172,7 @@ def _columns(names: Sequence[str], rows: list[list[float]]) -> dict[str, FloatAr
 
 
 def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
-    """Yield the ways to the numbers of a message."""
+    """Yield the paths to the numbers of a message."""
     if deep > _DEEPEST:
         return
     labels = getattr(message, "name", None)
@@ -192,7 +192,7 @@ def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
 
 
 def _getter(field: str, kind: str) -> _Get | None:
-    """Return what takes ``field`` out of a message of type ``kind``; None: time of its record."""
+    """Return the getter of ``field`` of a message of type ``kind``; None = time of recording."""
     if field == LOG_TIME:
         return None
     parts = [(name, mark) for name, mark in _PART.findall(field)]
@@ -211,7 +211,7 @@ def _getter(field: str, kind: str) -> _Get | None:
 
 
 def _within_range(message: Any) -> float:
-    """Return a Range.msg's distance, NaN below range_min or above range_max, as it asks."""
+    """Return the distance of a Range.msg, NaN below range_min or above range_max."""
     value = float(message.range)
     stated = message.max_range > message.min_range
     outside = stated and not message.min_range <= value <= message.max_range

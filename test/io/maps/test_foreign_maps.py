@@ -1,4 +1,4 @@
-"""What the library SurfaceTopography reads, with the library written down here."""
+"""Maps read by SurfaceTopography, with a stand-in for the library."""
 
 import sys
 from contextlib import nullcontext
@@ -11,7 +11,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.units import LengthUnits
 
-# Of a plane, in both directions, and the sizes of its map and of one of its places [µm].
+# Slopes of a plane in both directions, size of its map [µm], number of places.
 SLOPES, SIZES, PLACES = (3e-3, -1e-3), (40.0, 15.0), (20, 5)
 
 

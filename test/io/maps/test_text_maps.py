@@ -69,7 +69,7 @@ def test_a_unit_that_the_text_contradicts_is_refused(tmp_path, name, text, repor
     path.write_text(text + "1 2 3\n" * 25)
     with pytest.raises(FileError, match=f"{reported}; leave --unit out"):
         read_points(path, units_of("um"))
-    # Of two files, the unit is that of the other.
+    # With two files, the unit is for the other one.
     read_points(path, replace(units_of("um"), where_unsaid=True))
 
 

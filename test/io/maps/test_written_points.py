@@ -1,4 +1,4 @@
-"""What we write of points is, bit for bit, what a plain reader finds, and ours."""
+"""Points that are written are read again bit for bit, by a plain reader and by ours."""
 
 import struct
 
@@ -176,7 +176,7 @@ def test_an_uncertainty_that_nobody_knows_is_none(tmp_path):
 
 
 def test_a_file_that_fails_on_the_way_is_not_there(tmp_path):
-    """And an earlier one of its name stays as it was."""
+    """An earlier file of its name stays unchanged."""
     (tmp_path / "a.csv").write_text("mine")
     with pytest.raises(KeyError):
         write_columns(tmp_path / "a.csv", Failing(x_m=np.zeros(2)), csv=True)
