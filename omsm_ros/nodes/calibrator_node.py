@@ -26,7 +26,7 @@ from omsm_ros.io.folders import exclusive_lock
 from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of
-from omsm_ros.nodes.diagnostics import WARN, Report
+from omsm_ros.nodes.diagnostics import WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
@@ -243,7 +243,7 @@ class CalibratorNode(ManagedNode):
     def _time_lapse(self) -> object:
         return self._settings.get("time_lapse", 1.0)
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the samples held, the calibration in force, and the blocks refused."""
         in_force = self._topic.calibration
         values: dict[str, object] = {
@@ -254,7 +254,7 @@ class CalibratorNode(ManagedNode):
         for topic, buffer in self._buffers.items():
             name = "distance" if topic == "confocal" else topic
             values |= {f"{name}_held": len(buffer), f"{name}_forgotten": buffer.forgotten}
-        report = Report(self._last, values)
+        report = StateReport(self._last, values)
         for topic in self._recent.update(self._refused, time.monotonic()):
             report.add(WARN, f"blocks on {topic} are refused, see the log")
         if self._trouble:

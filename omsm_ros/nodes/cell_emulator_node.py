@@ -25,7 +25,7 @@ from omsm_ros.instruments.emulator_factory import (
 from omsm_ros.io import message_mapping
 from omsm_ros.io.disturbance_file import load_disturbances
 from omsm_ros.io.folders import exclusive_lock, runtime_folder
-from omsm_ros.nodes.diagnostics import Report
+from omsm_ros.nodes.diagnostics import StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.quantities import Parameter
@@ -157,10 +157,10 @@ class CellEmulatorNode(ManagedNode):
         self._player.halt()
         response.success, response.message = True, f"{self._player.played} samples played"
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return whether a motion is played."""
         words = "playing" if self._player.playing else "waiting"
-        return Report(words, {"samples_played": self._player.played})
+        return StateReport(words, {"samples_played": self._player.played})
 
 
 def main() -> None:

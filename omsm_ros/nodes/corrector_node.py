@@ -38,7 +38,7 @@ from omsm_ros.nodes import topics
 from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
-from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
+from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
@@ -46,7 +46,7 @@ from omsm_ros.pipelines.measure import live_traffic_light, with_sources
 
 # A motion has paused after this time without a block, or the duration of three blocks [s].
 PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
-_STREAMS_CORRECTION_STATE = ("axes", "distance")
+_STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
 # Silence before a report: longer than the pauses of a step test, or five samples [s].
 _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
 # Half of the two seconds for which small blocks can wait [ms].
@@ -68,15 +68,15 @@ class CorrectionState:
     """Counts samples that are not corrected, and reports on all of them."""
 
     def __init__(self) -> None:
-        self.uncalibrated = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
-        self.refused = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
+        self.uncalibrated = dict.fromkeys(_STREAMS, 0)
+        self.refused = dict.fromkeys(_STREAMS, 0)
         self.refusal = ""
         self.published = 0
         self.load = LoadMeter()
         self.begins_at: dict[str, int] = {}
-        self._heard = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0)
-        self._period = dict.fromkeys(_STREAMS_CORRECTION_STATE, 0.0)
-        self._flows = {stream: SampleFlow() for stream in _STREAMS_CORRECTION_STATE}
+        self._heard = dict.fromkeys(_STREAMS, 0)
+        self._period = dict.fromkeys(_STREAMS, 0.0)
+        self._flows = {stream: SampleFlow() for stream in _STREAMS}
         self._recent = RecentIncrease()
         self._oldest_ns = 0
         self._resumes = 0.0
@@ -117,16 +117,14 @@ class CorrectionState:
         now: float,
         cpu: float,
         motion: LiveOffset | None = None,
-    ) -> Report:
+    ) -> StateReport:
         """Return the report; ``corrector`` is None without a calibration.
 
         motion: estimate of the offset of two devices' counters
         """
-        report = Report("correcting", {"clouds_published": self.published})
+        report = StateReport("correcting", {"clouds_published": self.published})
         for name, counts in (("uncalibrated", self.uncalibrated), ("refused", self.refused)):
-            report.values |= {
-                f"{stream}_{name}": counts[stream] for stream in _STREAMS_CORRECTION_STATE
-            }
+            report.values |= {f"{stream}_{name}": counts[stream] for stream in _STREAMS}
         report.values |= {f"begins_at_{name}": first for name, first in self.begins_at.items()}
         self._add_starved(report, now)
         if corrector is None:
@@ -148,7 +146,7 @@ class CorrectionState:
             report.add(WARN, f"falls behind: samples waited {waited / 1000:.1f} s")
         return report
 
-    def _account(self, report: Report, corrector: Corrector) -> dict[str, float]:
+    def _account(self, report: StateReport, corrector: Corrector) -> dict[str, float]:
         """Enter all counts into ``report``; return those that may mean a loss."""
         watched: dict[str, float] = {}
         for stream, account in self.account(corrector).as_dict().items():
@@ -164,9 +162,9 @@ class CorrectionState:
             watched[f"{stream} received"] = counts["received"]
         return watched
 
-    def _add_losses(self, report: Report, watched: dict[str, float], now: float) -> None:
+    def _add_losses(self, report: StateReport, watched: dict[str, float], now: float) -> None:
         rises = self._recent.update(watched, now)
-        for stream in _STREAMS_CORRECTION_STATE:
+        for stream in _STREAMS:
             received = rises.pop(f"{stream} received", 0)
             refused = rises.pop(f"{stream} refused", 0)
             if refused and not received:
@@ -177,7 +175,7 @@ class CorrectionState:
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in rises.items())
             report.add(WARN, f"just now: {text}")
 
-    def _add_starved(self, report: Report, now: float) -> None:
+    def _add_starved(self, report: StateReport, now: float) -> None:
         for stream, flow in self._flows.items():
             flow.update(self._heard[stream], now)
             report.values[f"rate_hz_{stream}"] = round(flow.rate, 3)
@@ -191,10 +189,8 @@ class CorrectionState:
 
 def _sum_of(one: Account, other: Account) -> Account:
     return Account(
-        **{
-            stream: _sum_of_stream(getattr(one, stream), getattr(other, stream))
-            for stream in _STREAMS_CORRECTION_STATE
-        }
+        axes=_sum_of_stream(one.axes, other.axes),
+        distance=_sum_of_stream(one.distance, other.distance),
     )
 
 
@@ -208,7 +204,7 @@ def _sum_of_stream(one: StreamAccount, other: StreamAccount) -> StreamAccount:
     )
 
 
-def _add_motion(report: Report, slip: TriggerSlip, motion: LiveOffset) -> None:
+def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> None:
     """Enter the counter offset estimated from a motion, and compare it with the stamps."""
     offset = motion.established
     report.values["motion_offset_samples"] = None if offset is None else offset.samples
@@ -256,7 +252,6 @@ def publish_frames(
     )
 
 
-_STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
 _COMPLAINT_PERIOD_S = 5.0
 _OVERRIDDEN = "_overridden"
 
@@ -460,7 +455,7 @@ class CorrectorNode(ManagedNode):
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=_COMPLAINT_PERIOD_S)
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the account, and the present faults."""
         if self._motion and self._corrector and not self._corrector.slips.same_stamps:
             self._motion.judge()

@@ -27,7 +27,7 @@ _defects: dict[str, tuple[int, str]] = {}
 
 
 @dataclass
-class Report:
+class StateReport:
     """The state of a node.  message: without findings;  values: counts and figures, by name."""
 
     message: str
@@ -54,7 +54,7 @@ class Diagnostics:
     """Publishes a node's report on ``/diagnostics`` every second of a steady clock."""
 
     def __init__(
-        self, node: Node, report: Callable[[], Report], hardware_id: Callable[[], str] = str
+        self, node: Node, report: Callable[[], StateReport], hardware_id: Callable[[], str] = str
     ) -> None:
         """report, hardware_id: called from the node's executor."""
         self._node, self._report, self._hardware_id = node, report, hardware_id
@@ -83,7 +83,7 @@ class Diagnostics:
         self._publisher.publish(array)
 
 
-def _add_clock(node: Node, report: Report) -> None:
+def _add_clock(node: Node, report: StateReport) -> None:
     clock = node.get_clock()
     if clock.ros_time_is_active and clock.now().nanoseconds == 0:
         report.add(WARN, "use_sim_time is set, but no node publishes /clock: stamps are 0")

@@ -37,7 +37,7 @@ from omsm_ros.instruments.reader import DeviceReader, State
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.io import json_and_yaml, message_mapping
 from omsm_ros.nodes.background_worker import BackgroundWorker
-from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, Report
+from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
@@ -134,7 +134,7 @@ class DriverNode(ManagedNode):
             self._reported = reported
             self._settings.publish(String(data=json_and_yaml.text_of(reported)))
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the counts of all samples, and the present faults."""
         counts, now = self._device.counts(), time.monotonic()
         self._flow.update(int(counts["decoded"]), now)
@@ -143,7 +143,7 @@ class DriverNode(ManagedNode):
         values["rate_hz"] = round(self._flow.rate, 3)
         for topic, publisher in self._outputs_by_topic():
             values[f"{topic}_subscribers"] = publisher.get_subscription_count()
-        report = Report(f"reading at {self._flow.rate:.6g} Hz", values)
+        report = StateReport(f"reading at {self._flow.rate:.6g} Hz", values)
         if self._reader.trouble:
             report.add(ERROR, self._reader.trouble)
         self._add_faults(report, counts, now)
@@ -154,13 +154,13 @@ class DriverNode(ManagedNode):
         both = ((self._axes_topic, self._axes), (self._distance_topic, self._distance))
         return [(topic, publisher) for topic, publisher in both if topic and publisher]
 
-    def _add_faults(self, report: Report, counts: dict[str, float], now: float) -> None:
+    def _add_faults(self, report: StateReport, counts: dict[str, float], now: float) -> None:
         faults = {name: n for name, n in counts.items() if name.startswith(_FAULTS)}
         if seen := self._recent.update(faults, now):
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in seen.items())
             report.add(WARN, f"just now: {text}")
 
-    def _add_silence(self, report: Report, now: float) -> None:
+    def _add_silence(self, report: StateReport, now: float) -> None:
         if self._reader.state is not State.READING:
             return
         patience = max(_SILENCE_S, _SILENCE_SAMPLES * self.values["sample_period"])

@@ -39,7 +39,7 @@ from std_srvs.srv import Trigger
 
 from omsm_ros.errors import ConfigurationError, OmsmError, one_line, shortened
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, Report, log_internal_error
+from omsm_ros.nodes.diagnostics import ERROR, WARN, Diagnostics, StateReport, log_internal_error
 from omsm_ros.nodes.memory import RETURN_PERIOD_S, return_free_memory
 from omsm_ros.quantities import Parameter
 
@@ -216,9 +216,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
     def activate(self, undo: ExitStack) -> None:
         """Begin to receive and publish data; raises OmsmError."""
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the state of a node that is configured."""
-        return Report("")
+        return StateReport("")
 
     def hardware_id(self) -> str:
         """Return the name of the node's device; empty without one."""
@@ -351,9 +351,9 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
             "`ros2 lifecycle set` it to deactivate and cleanup, set, then configure and activate"
         )
 
-    def _report(self) -> Report:
+    def _report(self) -> StateReport:
         if self.stage is LifecycleStage.UNCONFIGURED:
-            report = Report("")
+            report = StateReport("")
         else:
             report = self.report()
         if self.stage is not LifecycleStage.ACTIVE:

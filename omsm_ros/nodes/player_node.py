@@ -34,7 +34,7 @@ from omsm_ros.errors import BagError, ConfigurationError, DataError, OmsmError
 from omsm_ros.io import json_and_yaml, topics
 from omsm_ros.io.bags import BagReader
 from omsm_ros.io.topics import CellBag, relative
-from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
+from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
 from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, publish_on
@@ -456,10 +456,10 @@ class PlayerNode(ManagedNode):
         self._playback.go_to(stamp, time.monotonic())
         response.success, response.message = True, f"{relative(topic)} of {stamp} ns"
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the position, and what the player waits for."""
         position = (self._position_ns - self._bag.start_ns) / NANOSECONDS_PER_S
-        report = Report("playing", {relative(topic): n for topic, n in self._counts.items()})
+        report = StateReport("playing", {relative(topic): n for topic, n in self._counts.items()})
         report.values["position_s"] = position
         if not self.active:
             return report

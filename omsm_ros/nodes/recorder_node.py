@@ -17,7 +17,7 @@ from std_msgs.msg import String
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io import topics
 from omsm_ros.io.bag_writer import BagWriter, next_free
-from omsm_ros.nodes.diagnostics import ERROR, WARN, Report
+from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_waiting
@@ -126,11 +126,11 @@ class RecorderNode(ManagedNode):
             in_vain = 0 if came else in_vain + 1
             time.sleep(_LOOK_S)
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the messages recorded and lost."""
         lost = sum(self._lost.values())
         publishers = {s.topic_name: s.get_publisher_count() for s in self._heard.values()}
-        report = Report("recording", {**self._counts, "lost": lost})
+        report = StateReport("recording", {**self._counts, "lost": lost})
         report.values |= {f"publishers_of_{name}": n for name, n in publishers.items()}
         if self.fatal is not None:
             report.add(ERROR, str(self.fatal))

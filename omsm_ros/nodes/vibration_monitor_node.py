@@ -24,7 +24,7 @@ from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.io import json_and_yaml, message_mapping
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
-from omsm_ros.nodes.diagnostics import STALE, WARN, Report
+from omsm_ros.nodes.diagnostics import STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import MessageInfo, listen, publish_on
@@ -115,10 +115,10 @@ class VibrationMonitorNode(ManagedNode):
             f"{quantity(levels.height_line[0], 'Hz', 4)}; strongest line {line}"
         )
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return levels by band and axis, the effect on a height, and the alarm."""
         running, levels = self._running, self._levels()
-        report = Report("listening", {
+        report = StateReport("listening", {
             "samples": running.received, "samples_lost": running.lost,
             "restarts": running.restarts, "alarms": self._alarm.times,
             "alarm": self._alarm.raised,
@@ -142,8 +142,8 @@ class VibrationMonitorNode(ManagedNode):
             report.add(WARN, f"a block was refused: {self._refused}")
         return report
 
-    def _add_silence(self, report: Report, now: float) -> None:
-        """Report a silence: the levels are of before."""
+    def _add_silence(self, report: StateReport, now: float) -> None:
+        """StateReport a silence: the levels are of before."""
         self._flow.update(self._running.received, now)
         silent = self._flow.silent(now)
         if silent is not None and silent > max(_SILENCE_S, _SILENCE_BLOCKS * self._block):

@@ -19,7 +19,7 @@ from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import read_text
 from omsm_ros.live_page.live_view import LiveView
 from omsm_ros.live_page.server import LiveServer, render
-from omsm_ros.nodes.diagnostics import Report
+from omsm_ros.nodes.diagnostics import StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, MessageInfo, listen
@@ -82,9 +82,9 @@ class ViewerNode(ManagedNode):
         hint = "?token=…" if self.values["token_file"] else ""
         return f"{self._server.address}{hint}"
 
-    def report(self) -> Report:
+    def report(self) -> StateReport:
         """Return the address of the page, and the number of messages refused."""
-        return Report(f"look at {self._shown}", {"refused_messages": self._refused})
+        return StateReport(f"look at {self._shown}", {"refused_messages": self._refused})
 
     def _on_points(self, message: Any, info: MessageInfo) -> None:
         try:

@@ -8,7 +8,7 @@ import pytest
 
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.analog.device import (
-    Accelerometer,
+    AnalogAccelerometer,
     AnalogReference,
     AnalogSettings,
     NidaqInput,
@@ -60,7 +60,7 @@ def host():
 
 def accelerometer(source, host):
     clocks = {"now_ns": host.now_ns, "monotonic": host.monotonic}
-    return Accelerometer(source, SETTINGS, sensitivity=0.5 / 9.80665, **clocks)
+    return AnalogAccelerometer(source, SETTINGS, sensitivity=0.5 / 9.80665, **clocks)
 
 
 def feed(device, source, host, volts):

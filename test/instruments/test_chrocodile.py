@@ -201,7 +201,7 @@ def test_a_device_at_another_rate_than_it_says_is_withheld(cell: Any) -> None:
     run.run(3.0)
     assert run.delivered == 0
     assert run.device.statistics.withheld > 2000
-    assert "measures at 900 Hz, set is 1000 Hz" in run.device.trouble
+    assert "measures at 900 Hz, sample_period states 1000 Hz" in run.device.trouble
     run.instrument.faults.rate = 1.0
     run.run(2.0)
     assert run.delivered > 1500
@@ -212,7 +212,7 @@ def test_a_device_at_another_rate_than_it_says_is_withheld(cell: Any) -> None:
 
 def test_a_rate_that_is_rounded_away_is_named(cell: Any) -> None:
     run = cell(replace(SIX, sample_period=1.34e-6))
-    with pytest.raises(DeviceError, match=r"746269 Hz was asked for.*769231 Hz.*sample_period to"):
+    with pytest.raises(DeviceError, match=r"746269 Hz was requested.*769231 Hz.*sample_period to"):
         run.device.open()
 
 

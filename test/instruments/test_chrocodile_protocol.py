@@ -10,14 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.chrocodile.protocol import (
-    Answer,
-    BinaryDecoder,
-    DollarStream,
-    RequestParser,
-    answer_wire,
-    command,
-)
+from omsm_ros.instruments.chrocodile.emulator import RequestParser, answer_wire
+from omsm_ros.instruments.chrocodile.protocol import Answer, BinaryDecoder, DollarStream, command
 from omsm_ros.instruments.chrocodile.telegram import Layout
 
 LAYOUT = Layout.of((83, 256, 65))

@@ -65,7 +65,7 @@ def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
     run.run(4.0)
     run.end()
     assert len(run.troubles) == 1
-    assert "no telegram that could be read" in run.troubles[0]
+    assert "no readable telegram" in run.troubles[0]
     assert run.delivered > 800
 
 

@@ -66,6 +66,7 @@ def test_axes_in_millimetres_without_a_probe(bench: Any) -> None:
     run = bench(Halsampler, CsvStreamDevice, settings)
     run.run(0.5)
     run.end()
+    assert run.blocks
     for block in run.blocks:
         assert block.distance is None
         k = block.axes.first_sample + np.arange(len(block.axes))

@@ -218,7 +218,7 @@ def test_the_sample_time_is_set_and_what_it_becomes_is_checked() -> None:
     assert run.emulator.rate() == pytest.approx(2000)
     assert run.device.identity["model"].startswith("$VERDT6230")
     wrong = WithCommands(CapaNcdtEmulator, CapaNcdtDevice, CapaNcdtSettings(sample_period=250e-6))
-    with pytest.raises(DeviceError, match=r"250 µs were asked for, .* every 248 µs"):
+    with pytest.raises(DeviceError, match=r"250 µs were requested, .* every 248 µs"):
         wrong.device.open()
 
 

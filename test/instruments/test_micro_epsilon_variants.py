@@ -41,7 +41,7 @@ def test_a_greeting_is_no_answer(kept: str) -> None:
     answers = {"MEASRATE": f"MEASRATE\r\nMEASRATE {kept}\r\n->"} if kept else {}
     run.emulator.obey = lambda line: answers.get(line, usual(line))
     if kept:
-        with pytest.raises(DeviceError, match=r"1 kHz was asked for, .* at 2.5 kHz"):
+        with pytest.raises(DeviceError, match=r"1 kHz was requested, .* at 2.5 kHz"):
             run.device.open()
     else:
         run.device.open()

@@ -62,6 +62,6 @@ def test_a_counter_that_stands_still_is_reported() -> None:
             now[0] += 0.1
             device.poll(0.0)
 
-    with pytest.raises(NoSamplesError, match="repeats its sample counter, 512 last"):
+    with pytest.raises(NoSamplesError, match=r"repeats its sample counter \(512\)"):
         read()
     assert now[0] < 2.5

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from omsm_ros.instruments.chrocodile.emulator import RequestParser
 from omsm_ros.instruments.chrocodile.packet_protocol import (
     Data,
     DataFormat,
@@ -17,12 +18,7 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
     PacketDecoder,
     decode_command,
 )
-from omsm_ros.instruments.chrocodile.protocol import (
-    BinaryDecoder,
-    LineDecoder,
-    RequestParser,
-    command,
-)
+from omsm_ros.instruments.chrocodile.protocol import BinaryDecoder, LineDecoder, command
 from omsm_ros.instruments.chrocodile.telegram import Layout
 from omsm_ros.instruments.micro_epsilon.protocol import (
     BlockDecoder,

@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock
 
-from omsm_ros.nodes.diagnostics import Diagnostics, Report, log_internal_error
+from omsm_ros.nodes.diagnostics import Diagnostics, StateReport, log_internal_error
 
 
 class FakeNode:
@@ -36,7 +36,7 @@ class FakeNode:
 
 def test_the_last_internal_error_is_reported_with_their_number():
     node = FakeNode()
-    reported = Diagnostics(node, lambda: Report("correcting", {"received": 5}))
+    reported = Diagnostics(node, lambda: StateReport("correcting", {"received": 5}))
     reported.publish()
     assert node.published[-1].status[0].message == "correcting"
     for err in (ValueError("first"), KeyError("second")):

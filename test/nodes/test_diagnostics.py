@@ -14,7 +14,7 @@ from omsm_ros.nodes.diagnostics import (
     STALE,
     WARN,
     Diagnostics,
-    Report,
+    StateReport,
     log_internal_error,
 )
 
@@ -24,14 +24,14 @@ FINDINGS = [(WARN, "look"), (STALE, "nothing comes"), (ERROR, "it cannot")]
 
 
 def test_without_a_finding_it_is_well_and_says_its_message():
-    report = Report("correcting")
+    report = StateReport("correcting")
     assert (report.level, report.text, report.values) == (OK, "correcting", {})
 
 
 @pytest.mark.parametrize("order", [*itertools.permutations(range(3))])
 def test_the_gravest_comes_first_in_whatever_order_they_were_found(order):
     """To an operator silence is graver than a warning, although ROS numbers it higher than all."""
-    report = Report("correcting")
+    report = StateReport("correcting")
     for place in order:
         report.add(*FINDINGS[place])
     assert report.level == ERROR
@@ -40,14 +40,14 @@ def test_the_gravest_comes_first_in_whatever_order_they_were_found(order):
 
 @pytest.mark.parametrize(("found", "level"), [((0, 1), STALE), ((0,), WARN), ((1,), STALE)])
 def test_the_level_is_that_of_the_gravest(found, level):
-    report = Report("")
+    report = StateReport("")
     for place in found:
         report.add(*FINDINGS[place])
     assert report.level == level
 
 
 def test_findings_of_one_level_stay_in_their_order():
-    report = Report("")
+    report = StateReport("")
     for text in ("a", "b", "c"):
         report.add(WARN, text)
     assert report.text == "a; b; c"
@@ -62,7 +62,7 @@ def published(node, report, **more):
 
 def test_what_is_published_has_name_stamp_hardware_and_values():
     node = FakeNode("confocal_driver")
-    report = Report("reading", {"received": 5, "rate_hz": 1000.0, "state": "reading"})
+    report = StateReport("reading", {"received": 5, "rate_hz": 1000.0, "state": "reading"})
     array, status = published(node, report, hardware_id=lambda: "tcp://probe:7891")
     assert status.name == "/omsm/confocal_driver"
     assert status.hardware_id == "tcp://probe:7891"
@@ -79,7 +79,7 @@ def test_what_is_published_has_name_stamp_hardware_and_values():
 def test_simulated_time_that_nobody_sets_is_reported(simulated, now_ns, reported):
     node = FakeNode()
     node.simulated, node.now_ns = simulated, now_ns
-    _, status = published(node, Report("correcting"))
+    _, status = published(node, StateReport("correcting"))
     assert ("no node publishes /clock" in status.message) == reported
     assert status.level == (DiagnosticStatus.WARN if reported else DiagnosticStatus.OK)
 
@@ -89,8 +89,8 @@ def test_defects_are_those_of_the_node_itself():
     line = log_internal_error(one, ValueError("first"))
     assert "ValueError: first" in line
     assert one.logged == [("error", line)]
-    assert published(one, Report("well"))[1].level == DiagnosticStatus.ERROR
-    assert published(other, Report("well"))[1].message == "well"
+    assert published(one, StateReport("well"))[1].level == DiagnosticStatus.ERROR
+    assert published(other, StateReport("well"))[1].message == "well"
 
 
 def test_somebody_who_looks_for_a_defect_sees_it_raised(monkeypatch):

@@ -12,7 +12,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 from omsm_ros.errors import DeviceError
 from omsm_ros.nodes import managed
-from omsm_ros.nodes.diagnostics import ERROR, OK, WARN, Report
+from omsm_ros.nodes.diagnostics import ERROR, OK, WARN, StateReport
 from omsm_ros.nodes.managed import LifecycleStage, ManagedNode
 
 from .fake_node import FakeNode
@@ -59,7 +59,7 @@ class Managed(FakeNode):
         self.step("activate", undo)
 
     def report(self):
-        return Report("reading", {"received": 5})
+        return StateReport("reading", {"received": 5})
 
     def trigger_configure(self):
         self.on_configure(None)

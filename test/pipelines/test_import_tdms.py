@@ -123,7 +123,7 @@ def test_a_scale_is_applied_and_one_that_is_not_known_is_not_left_out(importer, 
     ("spoilt", "said"),
     [
         ({"NI_Number_Of_Scales": 1e6}, "is 1000000.0, expected at most 100"),
-        ({"NI_Number_Of_Scales": 50.0}, "does not fit together"),
+        ({"NI_Number_Of_Scales": 50.0}, "inconsistent"),
     ],
 )
 def test_invalid_scales_are_reported_at_once(importer, tdms_file, spoilt, said):

@@ -321,7 +321,7 @@ class AnalogDevice:
         raise NotImplementedError
 
 
-class Accelerometer(AnalogDevice):
+class AnalogAccelerometer(AnalogDevice):
     """Reads three axes; an IEPE sensor has no response at 0 Hz, and no offset is removed."""
 
     def __init__(
@@ -365,11 +365,13 @@ class AnalogReference(AnalogDevice):
         return BlockPair(None, DistanceBlock(**common, distance=distance, status=status))
 
 
-def make_accelerometer(values: Values, now_ns: NowNs) -> Accelerometer:
+def make_accelerometer(values: Values, now_ns: NowNs) -> AnalogAccelerometer:
     """Return the accelerometer that ``values`` describe."""
     settings = AnalogSettings(**block_settings(values))
     sensitivity = values["sensitivity"] / STANDARD_GRAVITY
-    return Accelerometer(analog_input(values["port"], 3), settings, sensitivity, now_ns=now_ns)
+    return AnalogAccelerometer(
+        analog_input(values["port"], 3), settings, sensitivity, now_ns=now_ns
+    )
 
 
 def make_reference(values: Values, now_ns: NowNs) -> AnalogReference:

@@ -14,9 +14,11 @@ and clients.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,7 +38,7 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
     encode_format,
 )
 from omsm_ros.instruments.chrocodile.packet_protocol import QUERY as CHROCODILE_PACKET_QUERY
-from omsm_ros.instruments.chrocodile.protocol import QUERY, Request, RequestParser, answer_wire
+from omsm_ros.instruments.chrocodile.protocol import QUERY, READY
 from omsm_ros.instruments.chrocodile.protocol import QUERY as ASK
 from omsm_ros.instruments.chrocodile.telegram import (
     DISTANCE,
@@ -65,6 +67,48 @@ from omsm_ros.units import MICROMETRE_M
 # The exposure is a multiple of this, so rates are rounded [s].
 _EXPOSURE_STEP_S = 1e-7
 _VERSION = "CHRocodile 2 emulated"
+
+
+MAX_COMMAND_BYTES = 1024
+_COMMAND = re.compile(rb"\$([A-Z]{3,})([^A-Z].*)?", re.DOTALL)
+
+
+class Request(NamedTuple):
+    """A command as the device received it."""
+
+    wire: bytes
+    name: str
+    arguments: tuple[str, ...]
+
+
+class RequestParser:
+    """Decodes the bytes that a device receives, in any portions, to commands."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> list[Request]:
+        """Return the commands completed by ``data``."""
+        *lines, rest = (self._buffer + data).split(b"\r")
+        found = [request for line in lines if (request := _request(line)) is not None]
+        start = rest.rfind(b"$")
+        self._buffer = rest[start:][:MAX_COMMAND_BYTES] if start >= 0 else b""
+        return found
+
+
+def _request(line: bytes) -> Request | None:
+    """Return the command at the end of ``line``; None without one."""
+    match = _COMMAND.fullmatch(line[line.rfind(b"$") :][:MAX_COMMAND_BYTES])
+    if match is None:
+        return None
+    words = (match[2] or b"").decode("latin-1").split()
+    return Request(match[0] + b"\r", match[1].decode(), tuple(words))
+
+
+def answer_wire(wire: bytes, text: str) -> bytes:
+    """Return the bytes with which a device answers ``wire``: echo, answer, ``ready``."""
+    separator = b"\r\n" if text else b""
+    return wire + text.encode() + separator + READY
 
 
 class ChrocodileEmulator(Instrument):

@@ -336,10 +336,8 @@ READY = b"ready\r\n"
 QUERY = "?"
 # Bounds the memory of an answer without ``ready``.
 MAX_ANSWER_BYTES = 65_536
-MAX_COMMAND_BYTES = 1024
 
 _NAME = re.compile(r"[A-Z]{3,}")
-_COMMAND = re.compile(rb"\$([A-Z]{3,})([^A-Z].*)?", re.DOTALL)
 # The end of its line may be missing if a telegram follows at once.
 _READY = re.compile(
     rb"ready(?: *(?:\r\n|\r(?!\n)(?=.)|\n)|(?=[\x80-\xff])|(?= +[-+.\d]))",
@@ -359,38 +357,6 @@ def command(name: str, *arguments: str | float) -> bytes:
     return ("$" + " ".join([name, *words]) + "\r").encode()
 
 
-class Request(NamedTuple):
-    """A command as the device received it."""
-
-    wire: bytes
-    name: str
-    arguments: tuple[str, ...]
-
-
-class RequestParser:
-    """Decodes the bytes that a device receives, in any portions, to commands."""
-
-    def __init__(self) -> None:
-        self._buffer = b""
-
-    def feed(self, data: bytes) -> list[Request]:
-        """Return the commands completed by ``data``."""
-        *lines, rest = (self._buffer + data).split(b"\r")
-        found = [request for line in lines if (request := _request(line)) is not None]
-        start = rest.rfind(b"$")
-        self._buffer = rest[start:][:MAX_COMMAND_BYTES] if start >= 0 else b""
-        return found
-
-
-def _request(line: bytes) -> Request | None:
-    """Return the command at the end of ``line``; None without one."""
-    match = _COMMAND.fullmatch(line[line.rfind(b"$") :][:MAX_COMMAND_BYTES])
-    if match is None:
-        return None
-    words = (match[2] or b"").decode("latin-1").split()
-    return Request(match[0] + b"\r", match[1].decode(), tuple(words))
-
-
 class Answer(NamedTuple):
     """The text of a device between the echo of ``command`` and ``ready``."""
 
@@ -401,12 +367,6 @@ class Answer(NamedTuple):
     def numbers(self) -> tuple[float, ...]:
         """Return all numbers in the text; the name of the command may precede them."""
         return tuple(float(word) for word in _NUMBER.findall(self.text))
-
-
-def answer_wire(wire: bytes, text: str) -> bytes:
-    """Return the bytes with which a device answers ``wire``: echo, answer, ``ready``."""
-    separator = b"\r\n" if text else b""
-    return wire + text.encode() + separator + READY
 
 
 class DollarStream:
