@@ -57,7 +57,7 @@ class RecordingSource:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self.length = len(recording.axes)
+        self.length: float = len(recording.axes)
         self.period = recording.axes.sample_period
 
     def take(self, first: int, count: int) -> Measured:
@@ -386,7 +386,9 @@ class Instrument:
     def _struck(self, rate: float, count: int) -> NDArray[np.bool_]:
         # No random number is used without a fault, so each fault alone repeats with its seed.
         struck: NDArray[np.bool_] = np.zeros(count, np.bool_)
-        return np.less(self._random.random(count), rate) if rate else struck
+        if rate:
+            struck |= self._random.random(count) < rate
+        return struck
 
     def _with_a_flipped_bit(self, piece: bytes) -> bytes:
         damaged = bytearray(piece)
@@ -429,6 +431,6 @@ class Instrument:
 
 def _use(faults: InstrumentFaults, name: str, most: int) -> int:
     """Use up to ``most`` of a counted fault."""
-    used = min(getattr(faults, name), most)
+    used: int = min(getattr(faults, name), most)
     setattr(faults, name, getattr(faults, name) - used)
     return used

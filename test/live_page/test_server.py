@@ -266,3 +266,6 @@ def test_a_server_that_never_began_is_stopped_all_the_same(serve, monkeypatch):
     monkeypatch.setattr(Server, "serve_forever", fail)
     monkeypatch.setattr(threading, "excepthook", lambda _: None)
     serve()
+    for thread in threading.enumerate():
+        if thread.name.endswith("(_serve)"):
+            thread.join(10.0)

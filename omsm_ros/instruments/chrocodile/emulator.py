@@ -318,7 +318,7 @@ def _number(word: str) -> Value:
 
 
 def _text(value: Value) -> str:
-    return value if isinstance(value, str) else f"{value:.9g}"
+    return f"{value:.9g}" if isinstance(value, int | float) else str(value)
 
 
 _DRIVER = {"encoders": "XYZUV"} | OWN_ENCODERS
