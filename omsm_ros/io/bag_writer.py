@@ -211,7 +211,7 @@ class BagWriter:
             raise BagError(
                 f"recording ended, {str(self.path)!r} takes no more: {exception_text(err)}; it is "
                 f"readable and holds the first {self._kept} messages, the last "
-                f"{self._taken - self._kept} are lost; make room and record anew"
+                f"{self._taken - self._kept} are lost; make room and record again"
             ) from err
 
     def write(self, topic: str, stamp_ns: int, message: object) -> None:

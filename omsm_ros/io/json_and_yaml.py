@@ -92,7 +92,7 @@ def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"the name {shown(twice)} stands twice in one object")
+        raise ValueError(f"the name {shown(twice)} is repeated in one object")
     return content
 
 
@@ -136,7 +136,7 @@ class _PlainLoader(yaml.SafeLoader):
             if not isinstance(key, yaml.ScalarNode) or key.tag != _tag("str"):
                 self._refuse(key, f"the name {shown(key.value)} is no text")
             if key.value in met:
-                self._refuse(key, f"the name {shown(key.value)} stands twice")
+                self._refuse(key, f"the name {shown(key.value)} is repeated")
             met.add(key.value)
         return super().construct_mapping(node, deep)
 

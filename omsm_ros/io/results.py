@@ -106,7 +106,8 @@ class CloudFile:
         lines = [line for line in head.splitlines() if not line.startswith((b"comment", b"end_"))]
         if lines != _header_lines(self.points) or held != self.points * _PLY_DTYPE.itemsize:
             raise FileError(
-                f"{str(path)!r} is none of our clouds, or was cut short; correct the scan again"
+                f"{str(path)!r} is not a cloud of omsm_ros, or was cut short; correct the scan "
+                "again"
             )
 
     def _opened(self) -> IO[bytes]:
@@ -318,7 +319,9 @@ def _numbers(values: object, what: str, axes: int) -> FloatArray:
     except (TypeError, ValueError) as err:
         raise FileError(f"{what} is no row of numbers: {exception_text(err)}; {_REPEATED}") from err
     if found.ndim != axes or not found.size or not np.all(np.isfinite(found)):
-        raise FileError(f"{what} has shape {found.shape!r} or what is no number; {_REPEATED}")
+        raise FileError(
+            f"{what} has shape {found.shape!r} or values that are not finite; {_REPEATED}"
+        )
     return found
 
 

@@ -81,7 +81,7 @@ def _where(text: str, names: tuple[str, ...]) -> str:
                 continue
             if mark != ",":
                 return f"line {number} has them between {mark!r}: write commas, and decimal points"
-            return f"line {number} has them: delete what stands above it"
+            return f"line {number} has them: delete the lines above it"
     return "name columns as that line does, each once"
 
 

@@ -178,7 +178,7 @@ class LiveServer:
         if self._token and not hmac.compare_digest(given.encode(), self._token.encode()):
             return _text(http.HTTPStatus.FORBIDDEN, "the address lacks its token\n")
         if not self._from_here(request):
-            return _text(http.HTTPStatus.FORBIDDEN, "asked for by another page\n")
+            return _text(http.HTTPStatus.FORBIDDEN, "requested by another page\n")
         if place.path == "/live":
             return None
         if place.path == "/":

@@ -80,7 +80,7 @@ class BackgroundWorker:
             try:
                 task = self._work.get(timeout=patience)
             except queue.Empty:
-                # Else the node keeps the memory of its largest request.
+                # The node would keep the memory of its largest request.
                 return_free_memory()
                 patience = None
                 continue

@@ -215,7 +215,8 @@ def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> N
             ERROR,
             f"the motion shows that the counts are {offset.samples} samples apart (± "
             f"{offset.uncertainty:.2g}), so heights are wrong by what Z moves meanwhile: state "
-            f"counter_offset {motion.in_use + offset.samples}, or identify anew if the lag changed",
+            f"counter_offset {motion.in_use + offset.samples}, or identify again if "
+            "the lag changed",
         )
     elif slip.samples:
         report.add(ERROR, "but the motion shows that equal counts are one trigger: a link is late")

@@ -200,7 +200,7 @@ class ConfocalDriverNode(DriverNode):
                 "it as the device's manual says"
             )
         await self._aside.do(partial(self._reader.ask, take, _DARK_REFERENCE_S))
-        response.success, response.message = True, "dark reference taken; identify anew"
+        response.success, response.message = True, "dark reference taken; identify again"
 
 
 class AxisDriverNode(DriverNode):

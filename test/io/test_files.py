@@ -192,7 +192,7 @@ def test_a_cut_or_foreign_cloud_is_refused(tmp_path):
     with pytest.raises(FileError, match="cut short"):
         results.CloudFile(path)
     path.write_text("solid cube")
-    with pytest.raises(FileError, match="none of our clouds"):
+    with pytest.raises(FileError, match="not a cloud of omsm_ros"):
         results.CloudFile(path)
 
 

@@ -185,7 +185,7 @@ def test_how_a_text_is_written_is_taken_over(file):
         (mapping(z="{name: Z, unit: m, scale: 2}"), "'scale' is unknown, expected one of"),
         (mapping("zone: CET\n", z="{name: Z, unit: m}"), "zone is 'CET'"),
         (mapping("lines_before_names: -1\n", z="{name: Z, unit: m}"), "is -1, expected 0 to 1000"),
-        (mapping("sample_period: 0.001\n", z="{name: Z, unit: m}"), "stands twice"),
+        (mapping("sample_period: 0.001\n", z="{name: Z, unit: m}"), "is repeated"),
         ("sample_period: 0.001\n", "columns is required and missing"),
     ],
 )

@@ -179,7 +179,7 @@ def test_a_calibration_is_the_bytes_of_the_standard(true_calibration):
     [
         ("[1]", "expected a JSON object"),
         ('{"a": NaN}', "NaN is not a JSON number"),
-        ('{"a": 1, "a": 2}', "stands twice"),
+        ('{"a": 1, "a": 2}', "is repeated"),
         (" " * 2_000_001, "of 2000001 characters, at most 2000000 are accepted; shorten it"),
     ],
 )

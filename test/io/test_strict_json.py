@@ -50,7 +50,7 @@ def test_thirty_two_levels_and_no_more(write):
         (str(2**64), "more than 64 bits"),
         (str(-(2**63) - 1), "more than 64 bits"),
         ("9" * 5000, "more than 64 bits"),
-        ('{"a": 1, "b": 2, "a": 3}', "'a' stands twice"),
+        ('{"a": 1, "b": 2, "a": 3}', "'a' is repeated"),
         ('"\\ud800"', "is not JSON"),
         ("{'a': 1}", "is not JSON"),
         ("[1,]", "is not JSON"),

@@ -35,7 +35,7 @@ def test_a_value_is_what_it_looks_like(written, value):
         ("a: &x 1\nb: *x", "line 1: aliases and anchors"),
         ("a: !!python/object/apply:os.system [ls]", "line 1: the tag"),
         ("a: !!timestamp 2026-01-01", "line 1: the tag"),
-        ("b: 1\na: 2\nb: 3", "line 3: the name 'b' stands twice"),
+        ("b: 1\na: 2\nb: 3", "line 3: the name 'b' is repeated"),
         ("1: 2", "is no text"),
         ("[1, 2]: 3", "is no text"),
         ("a: 1e400", "beyond the range of a float"),

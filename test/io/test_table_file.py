@@ -69,7 +69,7 @@ def test_what_windows_and_spreadsheets_add_is_read_past(tmp_path, text):
     [
         ("u;y\n1,5;2\n3;4\n", "line 1 has them between ';': write commas, and decimal points"),
         ("u\ty\n1\t2\n3\t4\n", r"between '\\t'"),
-        ("# log of 3 March\nu,y\n1,2\n3,4\n", "line 2 has them: delete what stands above it"),
+        ("# log of 3 March\nu,y\n1,2\n3,4\n", "line 2 has them: delete the lines above it"),
         ("u,y\nmm,um\n1,2\n3,4\n", "line 2: 'mm,um' is no row of numbers"),
         ("u,y\n1,2\nu,y\n3,4\n", "line 3: 'u,y' is no row of numbers"),
         ("u,y\n1,2\n\n3\n", "line 4: '3' is no row of numbers"),

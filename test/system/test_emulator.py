@@ -80,7 +80,7 @@ def test_a_dark_reference_is_taken_where_the_probe_can(cell):
     cell.wait("the driver", lambda: cell.operator.value("confocal_driver", "connections") >= 1)
     answer = cell.call(Trigger, "confocal_driver/dark_reference")
     assert answer.success, answer.message
-    assert "identify anew" in answer.message
+    assert "identify again" in answer.message
     assert cell.operator.value("confocal_driver", "connections") == 1
 
 

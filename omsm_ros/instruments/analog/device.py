@@ -104,7 +104,7 @@ class NidaqInput:
         if not self._clock and abs(found / rate - 1) > 1e-3:
             self.close()
             raise DeviceError(
-                f"{self.name} samples at {found:.6g} Hz where {rate:.6g} Hz was asked for; set "
+                f"{self.name} samples at {found:.6g} Hz where {rate:.6g} Hz was requested; set "
                 f"sample_period to {1 / found:.9g} s"
             )
 

@@ -162,7 +162,7 @@ def _roles(
             if header[place].startswith(_COMMENTS):  # a comment with such words
                 continue
             raise FileError(
-                f"{what}: line {place + 1} names {len(names)} columns, below it stand numbers in "
+                f"{what}: line {place + 1} names {len(names)} columns, the lines below have "
                 f"{cells[0]}; name each column once, and write decimal points"
             )
         for role, (at, _) in found.items():

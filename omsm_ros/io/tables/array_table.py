@@ -327,7 +327,7 @@ class TdmsTable(ForeignTable):
         if dated != (values.dtype.kind == "M"):
             holds = "numbers" if dated else "dates"
             raise FileError(
-                f"{self} has {holds} in {name!r}; its unit in the map says otherwise: correct it"
+                f"{self} has {holds} in {name!r}; its unit in the map does not match: correct it"
             )
         if dated:  # always UTC
             since = values.astype("datetime64[ns]").astype(np.int64)

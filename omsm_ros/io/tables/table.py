@@ -174,7 +174,7 @@ def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
     )
     if written.delimiter == written.decimal:
         raise FileError(
-            f"{what}: {written.decimal!r} stands between columns and before the fraction; "
+            f"{what}: {written.decimal!r} is both delimiter and decimal sign; "
             "write delimiter: ';' or what the file has"
         )
     return mapped, written
@@ -210,7 +210,8 @@ def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
     if unit == COUNT:
         if COUNT not in given:
             raise DataError(
-                f"{channel}: what is one count in SI? write it into the map, as count: 1e-9"
+                f"{channel}: the value of one count in SI is missing; write it into the map, as "
+                "count: 1e-9"
             )
         value = float(given[COUNT])
         if not 1e-15 <= abs(value) <= 1.0:
