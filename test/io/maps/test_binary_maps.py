@@ -84,7 +84,7 @@ def test_an_inverted_sign_is_reported(tmp_path):
         (metropro(np.zeros((2, 2)), pixel=0.0), "no lateral calibration"),
         (metropro(np.zeros((2, 2)), pixel=float("nan")), "no lateral calibration"),
         (metropro(np.zeros((2, 2)), resolution=9), "how high a fringe is"),
-        (metropro(np.full((2, 2), NO_DATUM)), "no points"),
+        (metropro(np.full((2, 2), NO_DATUM)), "without points"),
         (metropro(np.zeros((0, 0))), "number of points is 0"),
     ],
 )
@@ -134,7 +134,7 @@ def test_a_datx_carries_its_units(tmp_path, unit, metres):
         ({"unit": "Furlongs"}, "heights in 'Furlongs'"),
         ({"dx": 0.0}, "no lateral calibration"),
         ({"height": np.zeros(4)}, "shape"),
-        ({"height": np.full((2, 2), 1e300)}, "no points"),
+        ({"height": np.full((2, 2), 1e300)}, "without points"),
     ],
 )
 def test_a_datx_that_cannot_be_scaled_is_refused(tmp_path, change, reported):

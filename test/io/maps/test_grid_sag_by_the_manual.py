@@ -63,7 +63,7 @@ def test_each_unit_scales_places_and_heights(tmp_path, unit, signs):
 def test_derivatives_and_flags_may_be_left_out(tmp_path, form, missing):
     path = sag(tmp_path / "a.grd", (1, 1, 0), [form.format(k) for k in range(30)])
     if missing:
-        with pytest.raises(FileError, match="no points"):
+        with pytest.raises(FileError, match="without points"):
             read_points(path)
     else:
         points = read_points(path)
@@ -181,5 +181,5 @@ def test_the_unit_that_is_given_must_be_the_one_of_the_file(tmp_path):
     assert read_points(path, units_of("in")).height.max() == pytest.approx(29 * 0.0254)
     with pytest.raises(FileError, match="x and y are in inch, and --unit says mm"):
         read_points(path, units_of("mm"))
-    with pytest.raises(FileError, match="its heights are in in, and --unit says um"):
+    with pytest.raises(FileError, match="its heights are in inch, and --unit says um"):
         read_points(path, units_of("in,um"))

@@ -138,10 +138,10 @@ def test_a_height_that_is_missing_is_counted(tmp_path):
         ("x_m y_m z_m\n1 2 3\n4 5 six\n", "is no row of numbers.*decimal points"),
         ("x_m;y_m;z_m\n1.5;2.5;3.5\n1,5;2,5;3,5\n", "is no row of numbers.*decimal points"),
         ("x_m y_m z_m\n1 2 3\n4 5\n", "line 3: '4 5' is no row"),
-        ("x_m y_m z_m\n1 2 nan\n", "surface of no points"),
+        ("x_m y_m z_m\n1 2 nan\n", "surface without points"),
         ("x_m y_m z_m\n1 2 3\n1e9 2 3\n", "give it in metres"),
         ("x_m y_m z_m\n1 2 3\ninf 2 3\n", "give it in metres"),
-        ("x_mm,y_mm,z_mm\n1,5,2,5,3,5\n", "line 1 names 3 columns, .* in 6"),  # decimal commas
+        ("x_mm,y_mm,z_mm\n1,5,2,5,3,5\n", "line 1 names 3 columns, .* have 6"),  # decimal commas
         ("x_mm,y_mm,z_mm\n1,2,3\n1,5,2,3\n", "line 3: '1,5,2,3' is no row"),
         ("x_mm,y_mm,z_mm,z_mm\n1,2,3,4\n", "'z_mm' twice"),
         ("x_m,y_m,z_m\nmm,mm,mm\n1,2,3\n", "two units of x"),
