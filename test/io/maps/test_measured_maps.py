@@ -112,7 +112,7 @@ def test_slopes_of_a_circle_integrate_to_it(tmp_path):
         (HEADER.replace("0.001", "null"), None, "factors"),
         (HEADER.replace("1e-9", "-1"), None, "factors"),
         (HEADER, "x h\n1 2\n3 four\n", "line 3: '3 four' is no row"),
-        (HEADER, "x h\n", "without points"),
+        (HEADER, "x h\n", "no points"),
     ],
 )
 def test_a_profile_that_does_not_fit_its_header(tmp_path, header, data, reported):
