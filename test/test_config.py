@@ -16,7 +16,7 @@ from omsm_ros.io.topics import POINTS_TOPIC, TOPIC_TYPES
 from omsm_ros.nodes import start
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent
-NO_PARAMETERS = {"paper_mirror", "disturbances", "limits"}
+NO_PARAMETERS = {"paper_mirror", "disturbances", "limits", "sources"}
 NODES = sorted({path.stem for path in (ROOT / "config").glob("*.yaml")} - NO_PARAMETERS)
 
 
