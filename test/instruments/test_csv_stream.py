@@ -84,7 +84,7 @@ class Banner(Instrument):
 @pytest.mark.parametrize(
     ("device", "check"),
     [
-        (CsvStreamDevice, "`columns` (what a line holds), the baud rate and what is connected"),
+        (CsvStreamDevice, "`columns` (the columns of a line), the baud rate and what is connected"),
         (GenericStreamDevice, "the baud rate and what is connected"),
     ],
 )

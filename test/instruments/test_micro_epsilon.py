@@ -174,7 +174,7 @@ def test_a_wrong_baud_rate_is_no_sample_and_is_reported(bench: Any) -> None:
     run = bench(Garbled, ConfocalDtDevice, ConfocalDtSettings())
     run.run(5.0)
     assert run.delivered == 0
-    assert "`signals` (what a frame holds), the baud rate" in run.troubles[0]
+    assert "`signals` (the values of a frame), the baud rate" in run.troubles[0]
 
 
 # CapaNCDT.

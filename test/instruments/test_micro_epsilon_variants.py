@@ -57,7 +57,7 @@ def test_the_rate_is_read_back_without_echo_too(said: str, fits: bool) -> None:
         run.device.open()
         return
     with pytest.raises(
-        DeviceError, match="at 5 kHz" if said else "did not tell its measuring rate"
+        DeviceError, match="at 5 kHz" if said else "did not report its measuring rate"
     ):
         run.device.open()
 
