@@ -1,9 +1,9 @@
 """``omsm``: the offline commands.
 
-Exit status 0: done; 2: bad input, with one line on stderr that says what to do; 70: a defect
-of ours, with one line on stderr that says what to report; 130: interrupted.
-After SIGTERM and SIGHUP it removes what is unfinished and ends by them. With ``--json`` standard
-output holds one JSON object and nothing else.
+Exit status 0: done; 2: bad input, with one line on stderr that names the remedy; 70: a defect of
+omsm_ros, with one line on stderr to report; 130: interrupted. After SIGTERM and SIGHUP a command
+removes unfinished files and ends by the signal. With ``--json`` standard output holds one JSON
+object and nothing else.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from omsm_ros.loading import exit_on_signal_while_loading, one_thread_of_blas
 
 INTERRUPTED = 130
 INTERRUPTION = "interrupted; no unfinished file was left"
-# What loading brings stays to the end. Python looks through it again for each 700 new objects,
-# which took 4 to 6 per cent of a command.
+# The loaded modules live to the end; collecting for each 700 new objects, Python's default, took
+# 4 to 6 % of a command's time.
 _OBJECTS_BETWEEN_COLLECTIONS = 50_000
 
 
@@ -32,5 +32,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def interruptible() -> AbstractContextManager[None]:
-    """Let Ctrl-C while something only loads end the command as it does later."""
+    """Let Ctrl-C while modules are loading end the command as it does later."""
     return exit_on_signal_while_loading((signal.SIGINT,), INTERRUPTED, f"omsm: {INTERRUPTION}\n")

@@ -1,4 +1,4 @@
-"""The door for arguments: each is held against the table of quantities as it is read."""
+"""Arguments shared by commands; each number is checked against the table of quantities."""
 
 from __future__ import annotations
 
@@ -16,17 +16,21 @@ from omsm_ros.units import LengthUnits, units_of
 
 _LONGEST_MESSAGE = 480
 TABLE_SUFFIX = ".csv"
-"""By which a table is told from a bag, in small or capital letters."""
+"""Suffix of a table, in lower or upper case; other paths are bags."""
+
+
+OVERRIDE = "ignore a settings mismatch of the calibration (logged)"
+"""Help of ``--override``."""
 
 
 class UsageError(ConfigurationError):
-    """The command line cannot be understood."""
+    """The command line is not valid."""
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """Refuses in one line instead of repeating how it is used.
+    """A parser that reports errors in one line instead of printing the usage.
 
-    word: the command whose help is of use, where the parser of all commands refuses
+    word: the command whose help an error of the parser of all commands refers to
     """
 
     word = ""
@@ -34,12 +38,12 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError instead of printing and exiting."""
         words = " ".join(filter(None, (self.prog, self.word)))
-        message = shortened(one_line(message), _LONGEST_MESSAGE)  # it repeats what it was given
+        message = shortened(one_line(message), _LONGEST_MESSAGE)  # it repeats the input
         raise UsageError(f"{message}; see '{words} --help'")
 
 
 def number(quantity: Quantity) -> Callable[[str], Any]:
-    """Return the argument type: a plausible value of ``quantity``."""
+    """Return the argument type of a plausible value of ``quantity``."""
 
     def read(text: str) -> Any:
         try:
@@ -55,7 +59,7 @@ def number(quantity: Quantity) -> Callable[[str], Any]:
 
 
 def json_object(text: str) -> dict[str, object]:
-    """Return the argument type: a JSON object."""
+    """Parse an argument as a JSON object."""
     try:
         return json_and_yaml.object_of(text, ConfigurationError, shown(text))
     except ConfigurationError as err:
@@ -63,21 +67,21 @@ def json_object(text: str) -> dict[str, object]:
 
 
 def add_bags(sub: argparse.ArgumentParser, *names: str, **described: Any) -> None:
-    """Add arguments that name bags, and the options that say which of their topics are the cell's.
+    """Add arguments that name bags, and options that select the topics of one cell.
 
-    described: of each, as for ``add_argument``; :func:`cell_of` says what they name
+    described: options of ``add_argument`` for each;  :func:`cell_of` returns the bag
     """
     for name in names:
         sub.add_argument(name, type=Path, **described)
     sub.add_argument(
-        "--namespace", default="", metavar="/CELL", help="of the cell, in a bag of several"
+        "--namespace", default="", metavar="/CELL", help="namespace of the cell in a bag of several"
     )
     sub.add_argument(
         "--topics",
         type=_topics,
         default={},
         metavar="axes=/x/axes,…",
-        help="what the bag calls topics of the cell, where otherwise than it would by itself",
+        help="names of the cell's topics in the bag, if they are not the default ones",
     )
 
 
@@ -90,15 +94,16 @@ def _topics(text: str) -> dict[str, str]:
 
 
 def cell_of(path: Path, args: argparse.Namespace) -> AnyBag:
-    """Return the bag at ``path``, with the cell that was asked for of :func:`add_bags`."""
+    """Return the bag at ``path``, with the cell selected by the options of :func:`add_bags`."""
     return CellBag(path, args.namespace, args.topics) if _asked_for(args) else path
 
 
 def refuse_cell(path: Path, args: argparse.Namespace) -> None:
-    """Raise ConfigurationError if a cell was asked for in ``path``, which is no bag."""
+    """Raise ConfigurationError if a cell is selected although ``path`` is no bag."""
     if _asked_for(args):
         raise ConfigurationError(
-            f"{str(path)!r} is read as no bag and has no cells; leave out --namespace and --topics"
+            f"{str(path)!r} is not read as a bag and has no cells; leave out --namespace and "
+            "--topics"
         )
 
 
@@ -107,53 +112,56 @@ def _asked_for(args: argparse.Namespace) -> bool:
 
 
 def add_trigger(sub: argparse.ArgumentParser) -> None:
-    """Declare what is stated of the counters of axes and probe."""
+    """Add the options for the trigger counters of axes and probe."""
     sub.add_argument(
         "--counter-offset",
         type=number(COUNTER_OFFSET),
         default=0,
         metavar="SAMPLES",
-        help="added to the distance's trigger count, it gives the axes' count",
+        help="axes' trigger count minus the distance's trigger count",
     )
     sub.add_argument(
         "--stamp-tolerance",
         type=number(STAMP_TOLERANCE),
         default=TWO_DRIVERS_S,
         metavar="S",
-        help="by how much axes and probe may stamp one trigger differently [s]",
+        help="largest difference between the stamps of axes and probe for one trigger [s]",
     )
 
 
 def add_polarity(sub: argparse.ArgumentParser) -> None:
-    """Declare which way the distance of a bag goes."""
+    """Add the option for the sign of the distance."""
     sub.add_argument(
         "--polarity",
         type=int,
         choices=(1, -1),
         default=1,
-        help="1: the distance falls as z rises; -1: it rises",
+        help="1: the distance decreases as Z increases; -1: it increases",
     )
 
 
 def add_by_stamps(sub: argparse.ArgumentParser) -> None:
-    """Declare that axes and probe share no counter."""
+    """Add the option to join axes and probe by their stamps."""
     sub.add_argument(
-        "--by-stamps", action="store_true", help="probe and axes have clocks or rates of their own"
+        "--by-stamps",
+        action="store_true",
+        help="join probe and axes by their stamps: they share no trigger counter",
     )
 
 
 def trigger_of(args: argparse.Namespace) -> CommonTrigger:
-    """Return what is stated of the counters; ConfigurationError where none are used."""
+    """Return what is stated of the counters; ConfigurationError together with --by-stamps."""
     stated = (args.counter_offset, args.stamp_tolerance) != (0, TWO_DRIVERS_S)
     if args.by_stamps and stated:
         raise ConfigurationError(
-            "--by-stamps uses no counters; leave out --counter-offset and --stamp-tolerance, or it"
+            "--by-stamps uses no counters; leave out --counter-offset and --stamp-tolerance, or "
+            "leave out --by-stamps"
         )
     return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)
 
 
 def _unit(text: str) -> LengthUnits:
-    """Return the argument type: the unit of a file that does not carry it."""
+    """Parse the units of a file that does not state them."""
     try:
         return units_of(text)
     except FileError as err:
@@ -163,5 +171,5 @@ def _unit(text: str) -> LengthUnits:
 UNIT: dict[str, Any] = {
     "type": _unit,
     "metavar": "UNIT[,HEIGHT_UNIT]",
-    "help": "of files that do not carry it, as mm, or mm,nm",
+    "help": "unit of files that do not state it, such as mm, or mm,nm",
 }

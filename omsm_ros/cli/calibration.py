@@ -1,4 +1,4 @@
-"""Commands around a calibration: plan, verify, compare, calset."""
+"""Commands for calibrations: plan, verify, compare, calset."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ from omsm_ros.units import DEGREE_RAD
 
 
 def _declare_verify(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "bag", help="a free path (chirp) on a fixed target")
+    add_bags(sub, "bag", help="bag of a free path (chirp) on a fixed target")
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
     add_trigger(sub)
     add_by_stamps(sub)
     sub.add_argument(
         "--find-offset",
         action="store_true",
-        help="establish the counter offset by the motion itself; use it for --counter-offset",
+        help="determine the counter offset from the motion, for --counter-offset",
     )
 
 
@@ -89,7 +89,7 @@ def _rms(values: np.ndarray) -> float:  # type: ignore[type-arg]
 def _show_verify(facts: Facts) -> None:
     if offset := facts.get("counter_offset"):
         say(
-            f"counter offset {offset['samples']} samples; left of it "
+            f"counter offset {offset['samples']} samples; remaining fraction "
             f"{offset['fraction']:.3f} ± {offset['uncertainty']:.3f} (k = 1)"
         )
     say("     Hz", *(f"{w:>12}" for w in ("error before", "after", "lag before", "after")))
@@ -108,7 +108,7 @@ def _declare_compare(sub: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="*",
         metavar="MORE.json",
-        help="with three or more: do they scatter as little as they state?",
+        help="three or more: test whether they repeat within their uncertainties",
     )
 
 
@@ -132,23 +132,28 @@ def _declare_plan(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("what", choices=("steps",))
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     for name, kind, default, meaning in (
-        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "of the probe [s]"),
+        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
         ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
         (
             "--second-step",
             quantities.STEP,
             None,
-            "of every other step [m]; 3/9.8 of --step by default",
+            "height of every other step [m]; 3/9.8 of --step by default",
         ),
-        ("--count", quantities.COUNT, PLANNED_COUNT, "steps up and as many down, from the middle"),
+        (
+            "--count",
+            quantities.COUNT,
+            PLANNED_COUNT,
+            "number of steps up, and of steps down, from the middle",
+        ),
         (
             "--dwell",
             quantities.DWELL,
             PLANNED_DWELL_S,
-            "from edge to edge [s]; four times as long leaves half as much creep unseen",
+            "time from edge to edge [s]; four times the dwell halves the undetected creep",
         ),
-        ("--rise", quantities.RISE, 20e-3, "of an edge [s]"),
-        ("--half-range", quantities.STEP, 50e-6, "of the probe [m]"),
+        ("--rise", quantities.RISE, 20e-3, "rise time of an edge [s]"),
+        ("--half-range", quantities.STEP, 50e-6, "half the measuring range of the probe [m]"),
     ):
         sub.add_argument(name, type=number(kind), default=default, help=meaning)
 
@@ -196,11 +201,12 @@ _PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
 
 
 def _placed(text: str) -> tuple[Path, str, float]:
-    """Return the argument type: CAL.json@x=0.01, a calibration and its place."""
+    """Parse CAL.json@x=0.01 into path, axis and position of a calibration."""
     found = _PLACED.fullmatch(text)
     if found is None:
         raise argparse.ArgumentTypeError(
-            f"{quantities.shown(text)} has no place, expected such as CAL.json@x=0.01 (x, z or b)"
+            f"{quantities.shown(text)} states no position, expected such as CAL.json@x=0.01 "
+            "(x, z or b)"
         )
     kind = quantities.TABLE_ANGLE if found["axis"] == "b" else quantities.POSITION
     return Path(found["path"]), found["axis"], number(kind)(found["position"])
@@ -209,7 +215,7 @@ def _placed(text: str) -> tuple[Path, str, float]:
 def _declare_calset(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "placed", type=_placed, nargs="+", metavar="CAL.json@x=POSITION",
-        help="calibrations and where they were made: x or z in metres, b in radians",
+        help="calibrations and their positions: x or z in metres, b in radians",
     )  # fmt: skip
     sub.add_argument("--out", type=Path, required=True, metavar="SET.json")
 

@@ -1,4 +1,4 @@
-"""Commands for many recordings: batch."""
+"""The command batch: correct a folder of recordings."""
 
 from __future__ import annotations
 
@@ -28,25 +28,29 @@ from omsm_ros.quantities import shown
 
 _INDEX = "index.html"
 
-# What a campaign gives each bag itself, and how short nothing stands for an option yet.
-_DECIDED, _LEAST_SHORT = ("--out", "--calibration"), 3
+# Options that the campaign sets for each bag, and the length of "--" with one letter, the shortest
+# abbreviation that argparse accepts.
+_DECIDED, _SHORTEST = ("--out", "--calibration"), 3
 
 
 def _declare_batch(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("folder", type=Path, metavar="FOLDER", help="bags, at any depth")
+    sub.add_argument("folder", type=Path, metavar="FOLDER", help="folder of bags, at any depth")
     sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument(
         "--jobs",
         type=number(quantities.PROCESSES),
         default=0,
-        help="processes at a time; one a core if left out",
+        help="number of parallel processes; default: one per core",
     )
     sub.add_argument(
-        "--scheduler", default="", metavar="URL", help="of Dask: tcp:// here, or tls://"
+        "--scheduler",
+        default="",
+        metavar="URL",
+        help="address of a Dask scheduler: tcp:// on this host, or tls://",
     )
     declare_catalogue(sub)
-    sub.epilog = "Options of 'omsm correct' for every bag stand at the end, after '--'."
+    sub.epilog = "Options of 'omsm correct' for every bag follow after '--'."
 
 
 def _batch(args: argparse.Namespace) -> Facts:
@@ -60,15 +64,14 @@ def _batch(args: argparse.Namespace) -> Facts:
 
 
 def _options(args: argparse.Namespace) -> list[str]:
-    """Return the options of every correction; what the environment says, it reads for itself.
+    """Return the options of every correction, with the catalogue unless the environment names it.
 
-    Raises ConfigurationError for what a campaign decides: all results would lie in one folder, or
-    be of another calibration than their page says.
+    Raises ConfigurationError for options that the campaign sets for each bag.
     """
     for word in args.passed_on:
         if taken := next((o for o in _DECIDED if _is_abbreviation(word, o)), None):
             raise ConfigurationError(
-                f"{taken} stands after '--' as {shown(word)}; give it before, once for all bags"
+                f"{taken} is given after '--' as {shown(word)}; give it before, once for all bags"
             )
     if args.catalogue == os.environ.get(ADDRESS, ""):
         return list(args.passed_on)
@@ -76,13 +79,13 @@ def _options(args: argparse.Namespace) -> list[str]:
 
 
 def _is_abbreviation(word: str, option: str) -> bool:
-    """Return whether a ``word`` of the command line is ``option``, or short for it."""
+    """Return True if a ``word`` of the command line is ``option`` or an abbreviation of it."""
     name, _, _ = word.partition("=")
-    return len(name) > _LEAST_SHORT and option.startswith(name)
+    return len(name) > _SHORTEST and option.startswith(name)
 
 
 def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path) -> None:
-    # Here, because drawing takes long to load.
+    # Imported on demand, because loading the figures takes a second.
     from omsm_ros.report.campaign import CampaignEntry, render
 
     measurements = [
@@ -98,7 +101,7 @@ def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path)
 
 
 def _link(out: Path, entry: Entry) -> str:
-    """Return the way from the index to a bag's page, if it has one."""
+    """Return the link from the index to a bag's report; empty if it has none."""
     page = os.path.join(entry.folder, REPORT)
     return quote(page) if (out / page).exists() else ""
 
@@ -118,7 +121,7 @@ def _undone(facts: Facts) -> str:
         return ""
     return (
         f"{len(others)} bags gave no result, first {others[0]['bag']!r}: {others[0]['said']}; "
-        "the same command tries them again"
+        "the same command retries them"
     )
 
 

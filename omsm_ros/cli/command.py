@@ -1,4 +1,4 @@
-"""What every command is: arguments, an action that returns facts, and a way to print them."""
+"""The parts of a command: arguments, an action that returns facts, and how they are printed."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Facts: TypeAlias = "dict[str, Any]"
 
 @dataclass(frozen=True)
 class CliCommand:
-    """One word after ``omsm``; its place in the list and its line of help are in ``words``.
+    """One command of ``omsm``; its task and its line of help are in ``words``.
 
-    declare: adds its arguments;  act: does it and returns facts in SI for ``--json``
-    show: prints the facts for people
-    refusal: why the command failed although it returned facts; empty if it did not
+    declare: adds its arguments;  act: runs it and returns facts in SI units for ``--json``
+    show: prints the facts as text
+    refusal: returns why the command failed although it returned facts; empty if it did not
     """
 
     name: str
@@ -36,11 +36,11 @@ class CliCommand:
 
 @contextmanager
 def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[Progress]:
-    """Show a bar on stderr that counts messages or ``unit``; none for programs and in pipes."""
+    """Show a bar on stderr that counts messages or ``unit``; none without a terminal."""
     if quiet or not sys.stderr.isatty():
         yield no_progress
         return
-    # Here, because most commands run for programs, and nobody would see it.
+    # Imported on demand, because most commands run without a terminal.
     from tqdm import tqdm
 
     with tqdm(desc=title, unit=unit, leave=False) as bar:
@@ -53,7 +53,7 @@ def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[P
 
 
 def output_path_for(out: Path, verdict: str) -> Path:
-    """Return where to write a result: a rejected one never takes the place of a good one."""
+    """Return where to write a result: a rejected one must not replace a good one."""
     return out.parent / f"{out.stem}.rejected.json" if verdict == REJECTED else out
 
 
@@ -62,47 +62,42 @@ def rejected(facts: Facts) -> str:
     if facts["verdict"] != REJECTED:
         return ""
     kept = facts.get("calibration") or facts["model"]
-    return f"rejected: {'; '.join(facts['reasons'])}; kept for study in {kept!r}"
-
-
-# Where commands print for people: names and texts in a line may come from outside.
+    return f"rejected: {'; '.join(facts['reasons'])}; written for analysis to {kept!r}"
 
 
 def say(*words: str) -> None:
-    """Print one line; what in it would steer a terminal, or end the line, is written out."""
+    """Print one line; control characters in it, which may come from outside, are escaped."""
     print(printable(" ".join(words)))
 
 
 def say_lines(text: str) -> None:
-    """Print a text of ours that has several lines."""
+    """Print a text of several lines."""
     for line in text.split("\n"):
         say(line)
 
 
 def written(files: Iterable[str], folder: str = "") -> tuple[str, str]:
-    """Return the row of a table that says what was written: names and their folder, or paths."""
+    """Return the table row that names the files written, in ``folder`` or as paths."""
     names = ", ".join(files)
     return "written", f"{names} in {folder}" if folder else names
 
 
 def table(rows: list[tuple[str, str]]) -> None:
-    """Print names and values in two columns; nothing where there are none."""
+    """Print names and values in two columns; nothing without rows."""
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         say(f"{name:<{width}}  {value}")
 
 
-# The option that names the catalogue where what was calibrated or measured is written down.
-
 ADDRESS = "OMSM_CATALOGUE"
-"""Environment variable: the catalogue of this shop, where none is named."""
+"""Environment variable with the address of the default catalogue."""
 
 
 def declare_catalogue(sub: argparse.ArgumentParser) -> None:
-    """Add ``--catalogue`` to a command that makes something worth remembering."""
+    """Add ``--catalogue``, the database of calibrations and measurements."""
     sub.add_argument(
         "--catalogue",
         default=os.environ.get(ADDRESS, ""),
         metavar="FILE|URL",
-        help=f"write it down there, too; default: ${ADDRESS}",
+        help=f"catalogue (database) to add the result to; default: ${ADDRESS}",
     )

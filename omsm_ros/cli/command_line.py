@@ -19,7 +19,7 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
-from omsm_ros import __version__, quantities
+from omsm_ros import __version__, messages, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.command import say, say_lines, table, written
@@ -42,18 +42,15 @@ from omsm_ros.quantities import shown
 if TYPE_CHECKING:
     from omsm_ros.cli.command import CliCommand, Facts
 
-
-# Seconds on the terminal, where a command works for long and nobody can tell how long.
-
-# What is over before that needs no line.
-_PATIENCE_S = 1.0
+# Commands that end sooner show no elapsed time.
+_DELAY_S = 1.0
 
 
 @contextmanager
 def progress_in_background(title: str, quiet: bool) -> Iterator[None]:
-    """Count the seconds on stderr, with ``title``; silent for programs, in pipes and at first.
+    """Show the elapsed seconds on stderr, with ``title``; nothing if quiet or without a terminal.
 
-    Bars of what can be counted stand below it.
+    Progress bars stand below it.
     """
     if quiet or not sys.stderr.isatty():
         yield
@@ -63,23 +60,21 @@ def progress_in_background(title: str, quiet: bool) -> Iterator[None]:
 
 
 def _show(title: str, done: Event) -> None:
-    if done.wait(_PATIENCE_S):
+    if done.wait(_DELAY_S):
         return
     from tqdm import tqdm
 
     with tqdm(desc=title, bar_format="{desc}: {elapsed} so far", leave=False) as line:
-        line.start_t -= _PATIENCE_S
+        line.start_t -= _DELAY_S
         tick(line, done)
 
 
-# A command that is asked to end removes what it has not finished, as it does on Ctrl-C.
-
-# As "kill", "systemctl stop" or a batch system ask, and a terminal that is closed.
-_ASKED = (signal.SIGTERM, signal.SIGHUP)
+# Sent by "kill", "systemctl stop", a batch system, or a terminal that is closed.
+_TERMINATION_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 
 
 class TerminationRequestedError(KeyboardInterrupt):
-    """The signal ``number`` came; like Ctrl-C it is no error of what is being done."""
+    """The signal ``number`` came; like Ctrl-C it ends the command, which removes its files."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -88,17 +83,17 @@ class TerminationRequestedError(KeyboardInterrupt):
 
 @contextmanager
 def interrupt_on_signal() -> Iterator[None]:
-    """Raise TerminationRequestedError where a signal would end the process at once; the second one does."""
+    """Raise TerminationRequestedError on a termination signal; a second one ends the process."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # signals are the main thread's
+        yield  # Python handles signals in the main thread only.
         return
 
     def asked(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_DFL)
         raise TerminationRequestedError(number)
 
-    # What is ignored stays so, as SIGHUP below nohup.
-    ours = [one for one in _ASKED if signal.getsignal(one) is signal.SIG_DFL]
+    # Ignored signals stay ignored, such as SIGHUP under nohup.
+    ours = [one for one in _TERMINATION_SIGNALS if signal.getsignal(one) is signal.SIG_DFL]
     for one in ours:
         signal.signal(one, asked)
     try:
@@ -109,20 +104,14 @@ def interrupt_on_signal() -> Iterator[None]:
 
 
 def end_by_signal(number: int) -> None:
-    """End this process by the signal ``number``, so that who waits for it sees by what it ended."""
+    """End this process by the signal ``number``, so that its parent sees the cause."""
     signal.signal(number, signal.SIG_DFL)
     os.kill(os.getpid(), number)
 
 
-# May results be written there, or would they take the place of what was measured?
-#
-# A name completed by the shell is easily that of the recording itself. Every command puts its
-# result
-# in the place of an older one, so what is read, and any recording, is looked for before it begins.
-
 _OUTPUTS = ("out", "plot", "report")
 _RECORDINGS = (".mcap", ".db3", ".bag")
-# What a command makes of a file is one of the same kind, which may stand for it.
+# Commands that may replace this input by their output, which is of the same kind.
 _IN_PLACE = {
     ("latency", "calibration"),
     ("reversal", "calibration"),
@@ -132,7 +121,7 @@ _IN_PLACE = {
 
 
 def check_outputs(args: argparse.Namespace) -> None:
-    """Raise ConfigurationError where an output of a command is what it reads, or a recording."""
+    """Raise ConfigurationError if an output would overwrite an input or a recording."""
     given = vars(args)
     read = {
         name: [*_paths(value)]
@@ -146,16 +135,18 @@ def check_outputs(args: argparse.Namespace) -> None:
         what = f"--{output} {shortened(repr(str(written)), 200)}"
         if any(_same(written, path) for paths in read.values() for path in paths):
             raise ConfigurationError(
-                f"{what} is what is read, and would be lost; give another name"
+                f"{what} is an input and would be overwritten; give another name"
             )
-        # Who writes recordings takes the place of none, and says so.
+        # 'import' refuses an existing bag itself.
         taken = args.command != "import" and written.is_file()
         if taken and written.suffix.lower() in _RECORDINGS:
-            raise ConfigurationError(f"{what} is a recording, and would be lost; give another name")
+            raise ConfigurationError(
+                f"{what} is a recording and would be overwritten; give another name"
+            )
 
 
 def _paths(value: object) -> Iterator[Path]:
-    """Yield the paths in what an argument was taken for."""
+    """Yield the paths in the value of an argument."""
     if isinstance(value, list | tuple):
         for one in value:
             yield from _paths(one)
@@ -164,7 +155,7 @@ def _paths(value: object) -> Iterator[Path]:
 
 
 def _same(written: Path, path: Path) -> bool:
-    """Return whether both are one file, or one folder that is a bag."""
+    """Return True if both are one file, or one folder that is a bag."""
     try:
         alike = os.path.samefile(written, path)
     except (OSError, ValueError):
@@ -178,39 +169,38 @@ _WIDTH, _INDENT = 79, 14
 
 DEMO = "demo"
 
-# What stands after "--" is for the command that these run in turn.
+# Commands that pass the arguments after "--" on to another command.
 FORWARD_ARGUMENTS = ("batch",)
 
-
-# What the system says of a disk, without a name where it is said while reading.
+# Errors of a disk; those raised while reading carry no file name.
 _DISK_ERRORS = (errno.EIO, errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EROFS, errno.ESTALE)
 _NEXT_STEPS = """\
-omsm: measure optics on the machine that cut them, the dynamic error corrected.
+omsm: on-machine surface measurement, corrected for the dynamic error of machine and probe.
 
-  is this computer ready?       omsm doctor
-  see it all on a twin          omsm demo --out out/demo
-  bags to try things out        omsm twin --out trial/
-  on a machine, plan a test     omsm plan steps --out plan/
-  your own CSV, HDF5, MATLAB …  omsm import log.csv --map map.yaml --out steps.mcap
-  what is in a recording?       omsm inspect steps.mcap
+  check this computer           omsm doctor
+  demonstrate on a twin         omsm demo --out out/demo
+  write bags to try it out      omsm twin --out trial/
+  plan a step test              omsm plan steps --out plan/
+  import CSV, HDF5, MATLAB …    omsm import log.csv --map map.yaml --out steps.mcap
+  inspect a recording           omsm inspect steps.mcap
   identify the dynamics         omsm identify steps.mcap --out cal.json --report certificate/
-  how fast may a scan be?       omsm predict scan.csv --calibration cal.json
+  predict error and speed       omsm predict scan.csv --calibration cal.json
   correct a scan                omsm correct scan.mcap --calibration cal.json --out result/
-  what shape is the part?       omsm form result/ --nominal mirror.yaml --out form/
-  a folder full of scans        omsm batch scans/ --calibration cal.json --out week/
+  evaluate the form             omsm form result/ --nominal mirror.yaml --out form/
+  correct a folder of scans     omsm batch scans/ --calibration cal.json --out week/
 
-'omsm --help' has all commands, 'omsm COMMAND --help' its options."""
+'omsm --help' lists all commands, 'omsm COMMAND --help' the options of one."""
 
 
 def _command(word: str) -> CliCommand:
-    """Return the command ``word``; nothing is loaded but what its module needs."""
+    """Return the command ``word``, and load only its module."""
     with interruptible():
         module = importlib.import_module(f"omsm_ros.cli.{WORDS[word].module}")
     return next(command for command in module.COMMANDS if command.name == word)
 
 
 def _by_task() -> str:
-    """Return the commands with what each does, those of one task together."""
+    """Return the commands with their help, grouped by task."""
     lines = []
     for task, words in TASKS.items():
         lines += ["", f"{task}:"]
@@ -218,14 +208,14 @@ def _by_task() -> str:
             lines += textwrap.wrap(
                 f"  {name:<{_INDENT - 2}}{word.help}", _WIDTH, subsequent_indent=" " * _INDENT
             )
-    return "\n".join([*lines, "", "'omsm COMMAND --help' has the options of each."])
+    return "\n".join([*lines, "", "'omsm COMMAND --help' lists the options of a command."])
 
 
 def parser_of(wanted: Collection[str]) -> argparse.ArgumentParser:
-    """Return the parser of ``omsm``: it knows every word, and the arguments of those ``wanted``."""
+    """Return the parser of ``omsm`` with every command, and the arguments of those ``wanted``."""
     parser = OneLineParser(
         prog="omsm",
-        description="Identify, correct and judge recorded measurements.",
+        description="Identify dynamics, correct recorded scans and evaluate form.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog=_by_task(),
     )
@@ -253,15 +243,17 @@ def _declare(word: str, sub: argparse.ArgumentParser) -> None:
 def _declare_demo(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
-    sub.add_argument("--time-lapse", type=lapse, help="times faster than real (20)")
-    sub.add_argument("--device", default="six_channel", help="what the emulated probe speaks")
-    sub.add_argument("--disturbances", metavar="FILE", help="what is wrong with the machine")
+    sub.add_argument(
+        "--time-lapse", type=lapse, help="speed relative to real time; 20 if the device allows"
+    )
+    sub.add_argument("--device", default="six_channel", help="model of the emulated probe")
+    sub.add_argument("--disturbances", metavar="FILE", help="errors of the emulated machine")
     sub.add_argument("--view", action="store_true", help="show the scan in a browser")
-    sub.add_argument("--seed", type=seed, default=1, help="of the twin's noise")
+    sub.add_argument("--seed", type=seed, default=1, help="seed of the twin's noise")
     sub.add_argument(
         "--experiment",
         choices=("chirp", "circles", "vibration", "mirror"),
-        help="one of the paper's, Fig. 9, 10, 11 or 8, beside ours; needs no ROS",
+        help="repeat an experiment of the paper on the twin: Fig. 9, 10, 11 or 8; needs no ROS",
     )
 
 
@@ -281,7 +273,7 @@ def _experiment(args: argparse.Namespace) -> int:
 def _demo(args: argparse.Namespace) -> int:
     if args.experiment:
         return _experiment(args)
-    # The demonstration runs real nodes, so it is one; ROS is imported only there.
+    # The demonstration is a node itself, so that only its process imports ROS.
     command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_demo", "--out", str(args.out)]
     command += ["--device", args.device, "--seed", str(args.seed)]
     command += ["--time-lapse", str(args.time_lapse)] if args.time_lapse else []
@@ -293,6 +285,14 @@ def _demo(args: argparse.Namespace) -> int:
 @written_for(COMMAND)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
+    audience = messages.AUDIENCE.set(messages.COMMAND)
+    try:
+        return _main(arguments)
+    finally:
+        messages.AUDIENCE.reset(audience)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     _make_writable()
     if not given:
@@ -314,11 +314,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             end_by_signal(err.number)
         return INTERRUPTED
     except BrokenPipeError:
-        # Who read our output has enough of it; nothing more may be flushed to it at exit.
+        # The reader closed the pipe, so nothing more may be flushed to it at exit.
         os.dup2(_null_device(), sys.stdout.fileno())
         return DONE
     except MemoryError as err:
-        _warn(f"memory is short: {err or 'none is left'}; give less at once")
+        _warn(f"out of memory: {err or 'none is left'}; process less data at once")
         return BAD_INPUT
     except Exception as err:
         if os.environ.get(DEBUG):
@@ -327,22 +327,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _make_writable() -> None:
-    """Let anything be written to the standard streams, also where they are closed."""
+    """Make the standard streams accept any text, also if they are closed."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is None:  # closed by who has started this
+        if stream is None:  # closed by the parent process
             setattr(sys, name, os.fdopen(_null_device(), "w"))
         elif isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # names of files may be any bytes
+            stream.reconfigure(errors="backslashreplace")  # file names may be any bytes
 
 
 def _report_internal_error(err: Exception) -> int:
-    """Say what nobody foresaw; return the exit status."""
+    """Print an unexpected error; return the exit status."""
     if short := too_many_open_files(err):
         _warn(short)
         return BAD_INPUT
     if isinstance(err, OSError) and (err.filename is not None or err.errno in _DISK_ERRORS):
-        # Of a place that the system refuses: a name too long, no permission, a broken disk.
+        # The system refuses a path: a name too long, no permission, a broken disk.
         path = "a file" if err.filename is None else shown(os.fsdecode(err.filename))
         _warn(f"{path}: {err.strerror}; check the path, its permissions and the disk")
         return BAD_INPUT
@@ -351,16 +351,16 @@ def _report_internal_error(err: Exception) -> int:
 
 
 def _check_words(given: list[str]) -> None:
-    """Raise ConfigurationError for a word that ends in the middle, or an option without a value."""
+    """Raise ConfigurationError for a null character, or an option without a value."""
     for word in given:
-        if word.startswith("--") and word.endswith("=--"):  # argparse takes it for an empty list
+        if word.startswith("--") and word.endswith("=--"):  # argparse reads it as an empty list
             raise ConfigurationError(f"option {shown(word)} has no value; give one")
         if "\0" in word:
             raise ConfigurationError(f"argument {shown(word)} holds a null character; leave it out")
 
 
 def _split(given: list[str]) -> tuple[list[str], list[str]]:
-    """Return the arguments before and after "--", where the command passes the latter on."""
+    """Return the arguments before and after "--" of a command that passes the latter on."""
     if given[0] not in FORWARD_ARGUMENTS or "--" not in given:
         return given, []
     place = given.index("--")
@@ -390,17 +390,17 @@ def _tell(args: argparse.Namespace, facts: Facts) -> None:
     except OSError as err:
         if isinstance(err, BrokenPipeError) or err.filename is not None:
             raise
-        os.dup2(_null_device(), sys.stdout.fileno())  # what waits to be printed fails again at exit
+        os.dup2(_null_device(), sys.stdout.fileno())  # the rest would fail again at exit
         raise FileError(
-            f"standard output takes no more: {err.strerror}; the command was carried out; make "
-            "room there, or send it elsewhere"
+            f"cannot write to standard output: {err.strerror}; the command itself is done; free "
+            "space there, or redirect the output"
         ) from err
 
 
 def _warn(text: str) -> None:
     try:
         print("omsm:", one_line(text), file=sys.stderr, flush=True)
-    except OSError:  # nobody can be told, but the exit status is right
+    except OSError:  # stderr is closed; the exit status still reports the error
         os.dup2(_null_device(), sys.stderr.fileno())
 
 

@@ -1,4 +1,4 @@
-"""Commands around a scan: predict, correct."""
+"""Commands for a scan: predict, correct, align, report."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
+    OVERRIDE,
     TABLE_SUFFIX,
     add_bags,
     add_by_stamps,
@@ -39,19 +40,20 @@ from omsm_ros.io.descriptions import (
     load_pitch,
     load_sources,
     load_surface,
+    save_geometry,
 )
 from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
 from omsm_ros.pipelines.correct import Admission, StampJoining
 from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.pipelines.measure import RegistrationOptions, measure
-from omsm_ros.pipelines.recording import path_in
-from omsm_ros.readable import percent, plain, quantity
+from omsm_ros.pipelines.recording import Recording
+from omsm_ros.readable import measured, percent, plain, quantity
 
 CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 
 
 def sources_of(text: str | None) -> MachineSources:
-    """Return what is uncertain of the machine: from a file, or from JSON that stands there."""
+    """Return the uncertainty sources of the machine, from a file or from JSON text."""
     if text is None:
         return MachineSources()
     if text.lstrip().startswith("{"):
@@ -60,7 +62,7 @@ def sources_of(text: str | None) -> MachineSources:
 
 
 def geometry_of(path: Path | None) -> Geometry:
-    """Return the probe's place from a file, or none but zeros without one."""
+    """Return the geometry of the probe from a file; zeros without one."""
     return load_geometry(path) if path else Geometry()
 
 
@@ -74,29 +76,32 @@ def _declare_correct(sub: argparse.ArgumentParser) -> None:
         "--pitch",
         type=Path,
         metavar="PITCH.csv",
-        help="of Z, measured: columns z_m,pitch_rad; needs abbe_arm in the geometry",
+        help="measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry",
     )
     sub.add_argument(
-        "--lateral-lag", type=number(quantities.LAG), help="of the probe against X and C [s]"
+        "--lateral-lag",
+        type=number(quantities.LAG),
+        help="latency of the probe against X and C [s]; default: of the calibration",
     )
     _declare_uncertain(sub)
-    sub.add_argument("--settings", type=json_object, metavar="JSON", help="of this scan")
+    sub.add_argument("--settings", type=json_object, metavar="JSON", help="settings of this scan")
     add_by_stamps(sub)
     sub.add_argument(
         "--delay",
         type=number(quantities.STAMP_DELAY),
         default=0.0,
-        help="from the probe's stamp to its exposure [s]",
+        help="time from the probe's stamp to the middle of its exposure [s]",
     )
     sub.add_argument(
-        "--exposure", type=number(quantities.EXPOSURE), default=0.0, help="of the probe [s]"
+        "--exposure",
+        type=number(quantities.EXPOSURE),
+        default=0.0,
+        help="exposure time of the probe [s]",
     )
     add_trigger(sub)
-    sub.add_argument("--no-report", action="store_true", help="cloud and summary only")
+    sub.add_argument("--no-report", action="store_true", help="write cloud and summary only")
     add_polarity(sub)
-    sub.add_argument(
-        "--override", action="store_true", help="use a calibration that does not belong; recorded"
-    )
+    sub.add_argument("--override", action="store_true", help=OVERRIDE)
     declare_fit(sub, None)
     declare_tolerance(sub)
     declare_catalogue(sub)
@@ -106,12 +111,12 @@ def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--sources",
         metavar="SOURCES.yaml",
-        help='what is uncertain of the machine, or JSON of sizes such as {"encoder_noise": 4e-10}',
+        help='uncertainty sources of the machine, or JSON such as {"encoder_noise": 4e-10}',
     )
     sub.add_argument(
         "--accuracy",
         type=number(quantities.BUDGET),
-        help="asked for, k = 2 [m]: what the traffic light is held against",
+        help="required expanded uncertainty, k = 2 [m], which the traffic light is based on",
     )
     sub.add_argument(
         "--lateral",
@@ -124,19 +129,18 @@ def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
 def _check_options(args: argparse.Namespace) -> None:
     """Raise ConfigurationError for options that need others."""
     if args.fit and args.nominal is None:
-        raise ConfigurationError("--fit needs the surface to fit to; give --nominal SURFACE.yaml")
+        raise ConfigurationError("--fit needs the nominal surface; give --nominal SURFACE.yaml")
     if args.lateral and args.nominal is None:
         raise ConfigurationError(
-            "--lateral costs height by the slope of the surface; give --nominal SURFACE.yaml"
+            "--lateral needs the slope of the surface; give --nominal SURFACE.yaml"
         )
     if args.tolerance and not args.fit:
-        raise ConfigurationError("--tolerance needs a deviation to judge; give --fit auto")
+        raise ConfigurationError("--tolerance needs a registered deviation; give --fit auto")
     if args.aperture and not args.fit:
-        raise ConfigurationError("--aperture is the disc that is fitted; give --fit auto")
+        raise ConfigurationError("--aperture limits the fit; give --fit auto")
     if (args.delay or args.exposure) and not args.by_stamps:
         raise ConfigurationError(
-            "--delay and --exposure shift stamps, which counters do without; give --by-stamps, or "
-            "leave them out"
+            "--delay and --exposure apply to stamps only; give --by-stamps, or leave them out"
         )
 
 
@@ -154,7 +158,7 @@ def _correct(args: argparse.Namespace) -> Facts:
     )
     if options.pitch is not None and not options.geometry.abbe_arm:
         raise ConfigurationError(
-            "--pitch without an Abbe arm does nothing; give abbe_arm in --geometry GEOMETRY.yaml"
+            "--pitch has no effect without an Abbe arm; give abbe_arm in --geometry GEOMETRY.yaml"
         )
     with (
         result_folder(args.out, MEASUREMENT_FILES) as out,
@@ -194,7 +198,7 @@ def _show_correct(summary: Facts) -> None:
         reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
         text = f"{account['received']} received, {account['corrected']} corrected{reasons}"
         rows.append((stream, text))
-    if light := summary.get("light"):  # without one corrected sample there is none
+    if light := summary.get("light"):  # absent if no sample was corrected
         rows.append((light["level"], light["word"]))
         rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
     rows += [("warning", text) for text in summary.get("warnings", [])]
@@ -210,13 +214,14 @@ def _declare_predict(sub: argparse.ArgumentParser) -> None:
         "--budget",
         type=number(quantities.BUDGET),
         default=DEFAULT_BUDGET_M,
-        help="allowed residual, k = 2 [m]",
+        help="allowed residual error, k = 2 [m]",
     )
     sub.add_argument(
         "--limits",
         type=Path,
         metavar="LIMITS.yaml",
-        help="of servo, probe, spindle and axes, as config/limits.yaml; default: the paper's",
+        help="limits of servo, probe, spindle and axes, as config/limits.yaml; default: the "
+        "paper's machine",
     )
 
 
@@ -227,8 +232,11 @@ def _predict(args: argparse.Namespace) -> Facts:
         z, period = load_motion(args.motion)
         path = ScanPath(z=z, sample_period=period)
     else:
-        with progress_bar("reading", args.json) as progress:
-            path = path_in(cell_of(args.motion, args), progress)
+        with (
+            progress_bar("reading", args.json) as progress,
+            Recording(cell_of(args.motion, args), progress) as recording,
+        ):
+            path = recording.scan_path()
     limits = load_limits(args.limits) if args.limits else MachineLimits()
     return asdict(predict_error(calibration, path, args.budget, limits))
 
@@ -239,27 +247,116 @@ def _show_predict(facts: Facts) -> None:
             ("verdict", "safe" if facts["safe"] else "NOT safe"),
             ("dynamic error", f"{quantity(facts['peak_to_valley'], 'm', 4)} PV, "
                               f"{quantity(facts['rms'], 'm', 4)} rms"),
-            ("left after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
+            ("after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
             ("motion outside the band", percent(facts["outside_band_fraction"])),
-            ("may run faster by", f"{_times(facts['speed_factor'])}, bound by {facts['binding']}"),
+            ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
+                              f"{facts['binding']}"),
             *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
-            ("because", facts["message"]),
+            ("reason", facts["message"]),
         ]
     )  # fmt: skip
 
 
 def _limit_text(limit: Mapping[str, Any]) -> str:
     value, allowed, unit = limit["value"], limit["allowed"], limit["unit"]
-    faster = _times(limit["speed_factor"])
-    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, {faster} as fast"
+    fastest = _times(limit["speed_factor"])
+    return f"{quantity(value, unit)} of {quantity(allowed, unit)}, maximum speed {fastest}"
 
 
 def _times(factor: float) -> str:
-    return f"{plain(factor)}{' or more' if factor >= FASTEST else ''} times"
+    return f"{'≥ ' if factor >= FASTEST else ''}{plain(factor)} ×"
+
+
+_NO_SPHERE = (
+    "the residual is several times the noise: the surface is not a sphere of that radius, or its "
+    "form error or the probe's error on slopes is as large; the centre may be worse than stated"
+)
+# Beyond this ratio of residual to scatter, nine tenths of the mean square are not noise.
+_RESIDUAL_RATIO = 3.0
+
+
+def _declare_align(sub: argparse.ArgumentParser) -> None:
+    add_bags(sub, "bag", help="a scan of a reference sphere")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument(
+        "--radius",
+        type=number(quantities.RADIUS),
+        required=True,
+        help="radius of the sphere [m], negative if convex",
+    )
+    sub.add_argument(
+        "--geometry", type=Path, metavar="GEOMETRY.yaml", help="known values to start from"
+    )
+    sub.add_argument("--out", type=Path, required=True, metavar="GEOMETRY.yaml")
+
+
+def _align(args: argparse.Namespace) -> Facts:
+    # Imported on demand, because the other commands here do not need it.
+    from omsm_ros.pipelines.study_scans import alignment_of
+
+    calibration = load_calibration(args.calibration)
+    known = geometry_of(args.geometry)
+    with progress_bar("correcting", args.json) as progress:
+        scan = cell_of(args.bag, args)
+        found, account = alignment_of(scan, calibration, args.radius, known, progress)
+    save_geometry(args.out, found.geometry)
+    names = ("centre_x", "centre_y", "beam_x", "beam_y")
+    # JSON has no infinity, so the uncertainty of an unidentifiable beam direction is null.
+    spread = found.uncertainty if found.beam_found else (*found.uncertainty[:2], None, None)
+    return {
+        "geometry": asdict(found.geometry),
+        "uncertainty": dict(zip(names, spread, strict=True)),
+        "residual": found.residual,
+        "scatter": found.scatter,
+        "warnings": [_NO_SPHERE] * (found.residual > _RESIDUAL_RATIO * found.scatter),
+        "beam_found": found.beam_found,
+        "used": found.used,
+        "samples": account.as_dict(),
+        "file": str(args.out),
+    }
+
+
+def _show_align(facts: Facts) -> None:
+    rows = []
+    for name, spread in facts["uncertainty"].items():
+        value, length = facts["geometry"][name], name.startswith("centre")
+        stated = measured(value, spread, "m" if length else "rad")
+        rows.append(
+            (name, stated if spread is not None else f"{stated}, not identifiable in this scan")
+        )
+    residual, scatter = (quantity(facts[name], "m") for name in ("residual", "scatter"))
+    rows.append(("residual", f"{residual} rms, of which {scatter} noise"))
+    rows += [("warning", warning) for warning in facts["warnings"]]
+    corrected = facts["samples"]["axes"]["corrected"]
+    rows.append(("points", f"{corrected} corrected, {facts['used']} of them fitted"))
+    table([*rows, written([facts["file"]])])
+
+
+def _declare_report(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("result", type=Path, metavar="DIR", help="result folder of 'omsm correct'")
+    sub.add_argument("--calibration", **CALIBRATION)
+    sub.add_argument(
+        "--nominal", type=Path, metavar="SURFACE.yaml", help="nominal surface of the correction"
+    )
+
+
+def _report(args: argparse.Namespace) -> Facts:
+    # Imported on demand, because loading the figures takes a second.
+    from omsm_ros.pipelines.publish import report_again
+
+    nominal = load_surface(args.nominal) if args.nominal else None
+    page = report_again(args.result, load_calibration(args.calibration), nominal)
+    return {"report": str(page)}
+
+
+def _show_report(facts: Facts) -> None:
+    table([written([facts["report"]])])
 
 
 COMMANDS = (
     CliCommand("predict", _declare_predict, _predict, _show_predict),
     CliCommand("correct", _declare_correct, _correct, _show_correct),
+    CliCommand("align", _declare_align, _align, _show_align),
+    CliCommand("report", _declare_report, _report, _show_report),
 )

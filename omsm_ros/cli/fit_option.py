@@ -1,4 +1,4 @@
-"""The options of a registration, and how its result is shown: form, correct."""
+"""Options of a registration and rows of its result, for form, correct and difference."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from omsm_ros.report.measurement.page import correlated_moves, figure_rows, sett
 
 
 def dofs(text: str) -> tuple[str, ...]:
-    """Return the argument type: 'auto', or freedoms of a pose."""
+    """Parse 'auto' or the degrees of freedom of a pose."""
     try:
         return parse_dofs(text)
     except ConfigurationError as err:
@@ -23,7 +23,7 @@ def dofs(text: str) -> tuple[str, ...]:
 
 
 def aperture(text: str) -> Aperture:
-    """Return the argument type: R or R,X,Y [m]."""
+    """Parse an aperture R or R,X,Y [m]."""
     try:
         parts = [
             quantities.LENGTH.checked(float(part), ConfigurationError, name)
@@ -41,28 +41,28 @@ def aperture(text: str) -> Aperture:
 
 
 def declare_fit(sub: argparse.ArgumentParser, default: tuple[str, ...] | None) -> None:
-    """Add the arguments of a registration."""
+    """Add the options of a registration."""
     sub.add_argument(
         "--fit",
         type=dofs,
         default=default,
         metavar="PARAMETERS",
-        help="'auto', or of piston,tip,tilt,x,y,clocking,power: what is taken out",
+        help="pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power",
     )
     sub.add_argument(
         "--aperture",
         type=aperture,
         metavar="R[,X,Y]",
-        help="disc of the part that counts [m]; without it all points do",
+        help="disc of the part to evaluate [m]; default: all points",
     )
 
 
 def declare_tolerance(sub: argparse.ArgumentParser) -> None:
-    """Add what a registered part is held against."""
+    """Add the tolerance of a registered part."""
     sub.add_argument(
         "--tolerance",
         type=number(quantities.TOLERANCE),
-        help="of the peak to valley of 99.5 %% [m]; does the part hold it? With --fit",
+        help="tolerance of the peak to valley of 99.5 %% of the part [m]; needs --fit",
     )
 
 
@@ -70,7 +70,7 @@ _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 
 
 def form_rows(facts: Facts) -> list[tuple[str, str]]:
-    """Return what people read of a form."""
+    """Return the rows that show a form."""
     removed, points = facts["removed"], facts["points"]
     rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
     rows += [(f"{n} held", why) for n, why in removed["held"].items()]

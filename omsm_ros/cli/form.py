@@ -1,4 +1,4 @@
-"""Commands around the shape of a part: form, surface."""
+"""Commands for the form of a part: form, compensate, surface."""
 
 from __future__ import annotations
 
@@ -22,20 +22,22 @@ from omsm_ros.units import DEGREE_RAD
 
 
 def _declare_form(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "measured", help="result folder, cloud or map; a scan with its --calibration")
+    add_bags(sub, "measured", help="result folder, cloud or map; or a scan with --calibration")
     sub.add_argument("--nominal", type=Path, required=True, metavar="SURFACE.yaml")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument("--calibration", type=Path, metavar="CAL.json", help="of a scan")
+    sub.add_argument(
+        "--calibration", type=Path, metavar="CAL.json", help="calibration to correct a scan with"
+    )
     sub.add_argument("--unit", **UNIT)
     declare_fit(sub, (AUTO,))
     declare_tolerance(sub)
-    sub.add_argument("--no-report", action="store_true", help="no page")
+    sub.add_argument("--no-report", action="store_true", help="write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
         sub.add_argument(
             f"--{name}-filter",
             type=number(quantities.SPACING),
             metavar="WAVELENGTH",
-            help=f"texture without what is {what} [m] (ISO 25178)",
+            help=f"remove {what} wavelengths from the texture [m] (ISO 25178)",
         )
 
 
@@ -44,7 +46,7 @@ def _form(args: argparse.Namespace) -> Facts:
     with result_folder(args.out, MEASUREMENT_FILES if args.calibration else FORM_FILES) as out:
         source = args.measured
         if args.calibration:
-            # Here, because what corrects takes longer to load than many a form to judge.
+            # Imported on demand, because it takes longer to load than many forms to evaluate.
             from omsm_ros.pipelines.measure import measure
 
             calibration = load_calibration(args.calibration)
@@ -78,7 +80,7 @@ def _declare_compensate(sub: argparse.ArgumentParser) -> None:
         type=number(quantities.SPACING),
         required=True,
         metavar="WAVELENGTH",
-        help="of which half is compensated [m]; what is finer stays",
+        help="cutoff wavelength, of which half is compensated [m]; shorter waves remain",
     )
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
     sub.add_argument("--unit", **UNIT)
@@ -86,13 +88,13 @@ def _declare_compensate(sub: argparse.ArgumentParser) -> None:
         "--spiral",
         type=number(quantities.SPACING),
         metavar="FEED",
-        help=f"a turn of the next cut [m]: writes {PATH}, offsets of Z over X and C, as G-code",
+        help=f"feed per turn of the next cut [m]: write {PATH}, G-code of Z offsets over X, C",
     )
     sub.add_argument(
         "--per-turn",
         type=number(quantities.SPIRAL_PLACES),
         default=360,
-        help="places of the spiral",
+        help="points per turn of the spiral",
     )
     declare_fit(sub, (AUTO,))
 
@@ -113,30 +115,36 @@ def _show_compensate(facts: Facts) -> None:
     rows = [(name.replace("_", " "), quantity(facts[name], "m")) for name in lengths]
     rows += [("warning", text) for text in facts["warnings"]]
     rows += [("not evaluated", text) for text in facts["not_evaluated"]]
-    rows.append(("places", count(facts["places"])))
+    rows.append(("points", count(facts["places"])))
     files = [facts["file"]]
     if "path" in facts:
-        rows.append(("along the spiral", count(facts["path_places"])))
+        rows.append(("points on the spiral", count(facts["path_places"])))
         files.append(facts["path"])
     table([*rows, ("sign", facts["sign"]), written(files, facts["out"])])
 
 
 def _declare_surface(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("what", choices=("show",), help="show: extent, slopes, and who can follow")
+    sub.add_argument(
+        "what",
+        choices=("show",),
+        help="show: extent, slopes, and whether probe and axes can follow",
+    )
     sub.add_argument("surface", type=Path, metavar="SURFACE.yaml")
     radius, speed = number(quantities.STEP), number(quantities.SPEED)
-    sub.add_argument("--radius", type=radius, required=True, help="of the disc [m]")
+    sub.add_argument("--radius", type=radius, required=True, help="radius of the disc [m]")
     sub.add_argument(
-        "--feed", type=number(quantities.FEED), default=1e-4, help="of the spiral, a turn [m]"
+        "--feed", type=number(quantities.FEED), default=1e-4, help="feed per turn of the spiral [m]"
     )
-    sub.add_argument("--rpm", type=speed, default=30.0, help="of the spindle")
-    sub.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="as of omsm predict")
+    sub.add_argument("--rpm", type=speed, default=30.0, help="spindle speed [rpm]")
+    sub.add_argument(
+        "--limits", type=Path, metavar="LIMITS.yaml", help="machine limits, as of 'omsm predict'"
+    )
     sub.add_argument(
         "--probe-angle",
         type=number(quantities.PROBE_ANGLE),
-        help="to the normal, at which it reads [rad]",
+        help="largest angle to the surface normal at which the probe reads [rad]",
     )
-    sub.add_argument("--out", type=Path, metavar="DIR", help="for a picture")
+    sub.add_argument("--out", type=Path, metavar="DIR", help="folder for a figure")
 
 
 def _surface(args: argparse.Namespace) -> Facts:

@@ -1,4 +1,4 @@
-"""Commands about what was calibrated and measured before: history."""
+"""The command history: past calibrations and measurements."""
 
 from __future__ import annotations
 
@@ -15,22 +15,29 @@ from omsm_ros.quantities import shown
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 from omsm_ros.units import DAY_S
 
-if TYPE_CHECKING:  # the catalogue is loaded where it is asked for
+if TYPE_CHECKING:  # loading the catalogue takes long
     from omsm_ros.pipelines.history import MachineHistory
 
 _SHOWN_ROWS = 20
 _MOST_DRAWN = 30
 _USUAL = "catalogue.sqlite"
-_NO_NAME = """(no machine named; identify and correct with --settings '{"machine": "…"}')"""
+_NO_NAME = """(machine not named; identify and correct with --settings '{"machine": "…"}')"""
 
 
 def _declare_history(sub: argparse.ArgumentParser) -> None:
     declare_catalogue(sub)
-    sub.add_argument("--machine", default="", help="this one only")
+    sub.add_argument("--machine", default="", help="list this machine only")
     sub.add_argument(
-        "--add", type=Path, nargs="+", default=[], metavar="CAL.json|DIR", help="made earlier"
+        "--add",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="CAL.json|DIR",
+        help="add earlier calibrations or result folders to the catalogue",
     )
-    sub.add_argument("--plot", type=Path, metavar="FILE.png", help="lag, gain and form over time")
+    sub.add_argument(
+        "--plot", type=Path, metavar="FILE.png", help="draw lag, gain and form over time"
+    )
 
 
 def _history(args: argparse.Namespace) -> Facts:
@@ -39,12 +46,12 @@ def _history(args: argparse.Namespace) -> Facts:
     address = args.catalogue or _USUAL
     if not args.catalogue and not args.add and not Path(_USUAL).exists():
         raise ConfigurationError(
-            f"no catalogue is named, and there is no {_USUAL!r} here; give --catalogue, set "
-            "OMSM_CATALOGUE, or begin one with --add"
+            f"no catalogue is given, and there is no {_USUAL!r} here; give --catalogue, set "
+            "OMSM_CATALOGUE, or create one with --add"
         )
     if not args.add and "://" not in address and not Path(address).exists():
         raise ConfigurationError(
-            f"no catalogue at {shown(address)}; check the path, or begin one with --add"
+            f"no catalogue at {shown(address)}; check the path, or create one with --add"
         )
     added = sum(keep(address, path) for path in args.add)
     found = history(address, args.machine)
@@ -69,7 +76,7 @@ def _history(args: argparse.Namespace) -> Facts:
 
 def _plain(machine: MachineHistory) -> dict[str, Any]:
     """Return a machine for JSON, its times as text."""
-    # Not asdict() of the whole, which would copy every value of every row.
+    # asdict() of the whole would copy every value of every row.
     facts = {field.name: getattr(machine, field.name) for field in fields(machine)}
     facts = {name: asdict(part) if is_dataclass(part) else part for name, part in facts.items()}
     for rows in (machine.calibrations, machine.measurements):
@@ -100,22 +107,22 @@ def _show_history(facts: Facts) -> None:
         table(
             [
                 ("  calibrations, measurements", _counts(machine)),
-                ("  lag drifts a day", _drift(machine["delay"], "s")),
-                ("  static gain drifts a day", _drift(machine["static_gain"], "")),
-                ("  form's rms drifts a day", _drift(machine["deviation"], "m")),
+                ("  drift of the lag per day", _drift(machine["delay"], "s")),
+                ("  drift of the static gain per day", _drift(machine["static_gain"], "")),
+                ("  drift of the form's rms per day", _drift(machine["deviation"], "m")),
             ]
         )
     if facts["older"]:
         say(
-            f"{count(facts['older'])} older calibrations and measurements are not listed here, "
-            "nor in the drifts; --machine lists one machine"
+            f"{count(facts['older'])} older calibrations and measurements are neither listed nor "
+            "in the drifts; --machine lists one machine"
         )
     if "figure" in facts:
         table([written([facts["figure"]])])
 
 
 def _when(row: dict[str, Any]) -> str:
-    """Return when a row was recorded; where its recording has no date, when it was written down."""
+    """Return when a row was recorded; if unknown, when it was added."""
     return f"{row['recorded_at']} UTC" if row["recorded_at"] else f"added {row['added_at']} UTC"
 
 
@@ -125,12 +132,12 @@ def _counts(machine: dict[str, Any]) -> str:
 
 def _drift(found: dict[str, float] | None, unit: str) -> str:
     if found is None:
-        return f"{NOTHING} (not evaluated: fewer than five, or no times)"
+        return f"{NOTHING} (not evaluated: fewer than five values, or times unknown)"
     drift = LinearTrend(**found)
     low, high = (
         quantity(s * DAY_S, unit) if unit else plain(s * DAY_S) for s in (drift.low, drift.high)
     )
-    return f"{low} to {high} (95 %)" + ("" if drift.significant else ", which may be none")
+    return f"{low} to {high} (95 %)" + ("" if drift.significant else ", not significant")
 
 
 COMMANDS = (CliCommand("history", _declare_history, _history, _show_history),)

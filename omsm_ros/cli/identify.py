@@ -1,4 +1,4 @@
-"""``omsm identify``: a calibration from a recording, or a model of any two sampled quantities."""
+"""Commands to identify a calibration or a sampled model, and to validate a model."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.files import atomic_file
 from omsm_ros.io.model_file import load_model, save_model
-from omsm_ros.pipelines.history import record_in_catalogue
+from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
 from omsm_ros.pipelines.identify import (
     SampledRecord,
     intended_use_of,
     model_of,
-    motion_of_bag,
     record_of_motion,
     record_of_table,
-    recorded_ns_of_bag,
     run_of,
-    settings_of_bag,
     text_of_run,
+    write_certificate,
+    write_model_page,
 )
+from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import shown
 from omsm_ros.readable import count, measured, percent, plain, quantity
 from omsm_ros.report.verdict import verdict_text
@@ -62,7 +62,7 @@ _MAX_DELAY = 3
 
 
 def _declare(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "recording", help="a bag of a motion on a fixed target, or a table RECORD.csv")
+    add_bags(sub, "recording", help="bag of a motion on a fixed target, or a table RECORD.csv")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
     sub.add_argument(
         "--order", type=number(quantities.ORDER), default=0, help="number of poles; 0 = choose"
@@ -70,30 +70,37 @@ def _declare(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--input",
         default=ENCODER,
-        help="'encoder' or 'reference' of a bag; of a table, the name of a column",
+        help="of a bag, 'encoder' or 'reference'; of a table, the input column",
     )
-    sub.add_argument("--output", help="of a table, the name of a column")
+    sub.add_argument("--output", help="of a table, the output column")
     sub.add_argument(
-        "--period", type=number(quantities.SAMPLE_PERIOD), help="of a table, from line to line [s]"
+        "--period", type=number(quantities.SAMPLE_PERIOD), help="of a table, the sample period [s]"
     )
     sub.add_argument(
         "--hold",
         choices=HOLDS,
         default=BAND_LIMITED,
-        help="what the input does between samples; 'band-limited' for what was measured, the "
-        "others for a command, which give a model and no calibration",
+        help="behaviour of the input between samples: 'band-limited' for a measured input; the "
+        "others, for a command signal, give a model instead of a calibration",
     )
     sub.add_argument(
         "--max-delay",
         type=number(quantities.MAX_DELAY_SAMPLES),
         metavar="SAMPLES",
-        help=f"of a held input, the longest delay tried; {_MAX_DELAY} if left out",
+        help=f"of a held input, the longest delay to try; default {_MAX_DELAY}",
     )
     sub.add_argument(
-        "--duration", type=number(quantities.DURATION), default=0.0, help="[s] to use; 0 = all"
+        "--duration",
+        type=number(quantities.DURATION),
+        default=0.0,
+        help="use the first seconds only [s]; 0 = all",
     )
     sub.add_argument(
-        "--settings", type=json_object, default={}, metavar="JSON", help="what it belongs to"
+        "--settings",
+        type=json_object,
+        default={},
+        metavar="JSON",
+        help="settings of machine and probe that the calibration is valid for",
     )
     _declare_use(sub)
     add_trigger(sub)
@@ -110,20 +117,20 @@ def _declare_use(sub: argparse.ArgumentParser) -> None:
         dest="scan",
         type=Path,
         metavar="SCAN",
-        help="the scan that will be corrected, a bag or a plan as CSV time_s,z_m, from which the "
-        "limits of the verdict follow; default: the paper's, 30 rpm over its mirror",
+        help="intended scan, a bag or a plan as CSV time_s,z_m, which sets the limits of the verdict; "
+        "default: the paper's, 30 rpm over its mirror",
     )
     sub.add_argument(
         "--accuracy",
         type=number(quantities.UNCERTAINTY),
-        help="of a height of that scan, k = 2, asked for [m]",
+        help="required expanded uncertainty of a height of that scan, k = 2 [m]",
     )
     sub.add_argument(
         "--origin",
         type=json_object,
         default={},
         metavar="JSON",
-        help="for the certificate: machine, probe, probe_serial_number, target, temperature_c, "
+        help="entries of the certificate: machine, probe, probe_serial_number, target, temperature_c, "
         "operator, laboratory, method",
     )
 
@@ -137,56 +144,47 @@ def _identify(args: argparse.Namespace) -> Facts:
             args.recording, args.input, args.output, args.period, args.duration
         )
         return _model_facts(record, args)
-    with progress_bar("reading", args.json) as progress:
-        motion = motion_of_bag(
-            cell_of(args.recording, args),
+    bag, stated = cell_of(args.recording, args), args.settings or {}
+    with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
+        motion = recording.motion(
             duration=args.duration,
-            time_lapse=(args.settings or {}).get("time_lapse", 1.0),
+            time_lapse=stated.get("time_lapse", 1.0),
             trigger=trigger_of(args),
             by_stamps=args.by_stamps,
-            progress=progress,
         )
+        settings = recording.settings(stated) if args.hold == BAND_LIMITED else stated
     if args.hold != BAND_LIMITED:
         return _model_facts(record_of_motion(motion), args)
-    bag = cell_of(args.recording, args)
     identified = identify(
         motion,
         order=args.order,
         input=args.input,
-        settings=settings_of_bag(bag, args.settings or {}),
+        settings=settings,
         use=intended_use_of(args.scan, args.accuracy),
         origin=replace(
             from_json(Origin, args.origin, "origin"),
-            recorded_ns=recorded_ns_of_bag(bag),
+            recorded_ns=recording.recorded_ns,
             software=f"omsm_ros {__version__}",
         ),
     )
-    facts = calibration_facts(identified.calibration)
+    calibration = identified.calibration
+    facts = calibration_facts(calibration)
     path = output_path_for(args.out, facts["verdict"])
-    save_calibration(path, identified.calibration)
+    save_calibration(path, calibration)
     facts["calibration"] = str(path)
     facts["warnings"] = [
         *facts["warnings"],
-        *_record_identification(args, identified.calibration, path),
+        *record_in_catalogue(
+            args.catalogue,
+            lambda: keep_calibration(
+                args.catalogue, calibration, path, args.recording, recording.recorded_ns
+            ),
+        ),
     ]
     if args.report is not None:
-        # Drawing takes a second to import; most commands do without.
-        from omsm_ros.pipelines.identify import write_certificate
-
         page = write_certificate(args.report, identified, source=args.recording.name)
         facts["report"] = str(page)
     return facts
-
-
-def _record_identification(
-    args: argparse.Namespace, calibration: Calibration, path: Path
-) -> list[str]:
-    def keep() -> bool:
-        from omsm_ros.pipelines.history import keep_calibration
-
-        return keep_calibration(args.catalogue, calibration, path, args.recording)
-
-    return record_in_catalogue(args.catalogue, keep)
 
 
 def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
@@ -194,19 +192,20 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
         missing = [n for n in ("output", "period") if getattr(args, n) is None]
         if missing:
             raise ConfigurationError(
-                f"a table needs --{' and --'.join(missing)}: the name of the column that follows "
-                "the input, and the seconds from line to line"
+                f"a table needs --{' and --'.join(missing)}: the output column, and the sample "
+                "period in seconds"
             )
         _check_for_bags(args)
     elif args.output is not None or args.period is not None:
         raise ConfigurationError(
-            f"--output and --period are for a table; {str(args.recording)!r} is no {TABLE_SUFFIX} "
-            "file, and a bag knows both: leave them out"
+            f"--output and --period are for a table; {str(args.recording)!r} is not a "
+            f"{TABLE_SUFFIX} file, and a bag states both: leave them out"
         )
 
     if args.max_delay is not None and args.hold == BAND_LIMITED:
         raise ConfigurationError(
-            "--max-delay is of a held input; give --hold zero-order or first-order, or leave it out"
+            "--max-delay is for a held input; give --hold zero-order or first-order, or leave it "
+            "out"
         )
     if not of_table and args.hold != BAND_LIMITED and args.input != ENCODER:
         raise ConfigurationError(
@@ -216,7 +215,7 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
 
 
 def _check_for_bags(args: argparse.Namespace) -> None:
-    """Raise ConfigurationError for what a table has not, and would be passed over."""
+    """Raise ConfigurationError for options that have no effect on a table."""
     stated = {
         "--by-stamps": args.by_stamps,
         "--counter-offset": args.counter_offset != 0,
@@ -226,10 +225,10 @@ def _check_for_bags(args: argparse.Namespace) -> None:
         "--accuracy": args.accuracy is not None,
         "--origin": bool(args.origin),
     }
-    if passed_over := [name for name, given in stated.items() if given]:
+    if unused := [name for name, given in stated.items() if given]:
         raise ConfigurationError(
-            f"{' and '.join(passed_over)} is for a bag; a table has no counters, stamps or "
-            "settings: leave it out"
+            f"{' and '.join(unused)} is for a bag; a table has no counters, stamps or settings: "
+            "leave it out"
         )
 
 
@@ -251,15 +250,12 @@ def _model_facts(record: SampledRecord, args: argparse.Namespace) -> Facts:
 
 
 def _drawn(out: Path, model: SampledModel, record: SampledRecord, source: Path) -> str:
-    # Drawing takes a second to import; most commands do without.
-    from omsm_ros.pipelines.identify import write_model_page
-
     run = run_of(model, record)
     return str(write_model_page(out, model, record, run, source=source.name))
 
 
 def calibration_facts(calibration: Calibration) -> Facts:
-    """Return what a calibration says in a few words."""
+    """Return the main results of a calibration."""
     certificate = calibration.certificate
     return {
         "id": calibration.id,
@@ -278,8 +274,8 @@ def calibration_facts(calibration: Calibration) -> Facts:
 
 
 _RISES = (
-    "rises when Z rises: turn its sign where recordings come from (map, driver) and identify "
-    "again, or correct with --polarity -1"
+    "increases with Z: invert its sign in the map or driver and identify again, or correct with "
+    "--polarity -1"
 )
 
 
@@ -294,10 +290,10 @@ def _show(facts: Facts) -> None:
     if "model" in facts:
         rows += [
             ("hold", facts["hold"]),
-            ("accounts for", f"{percent(facts['explained'], 4)} of what was fitted"),
-            ("free runs", f"{percent(facts['predicted'], 4)} of what was hidden"),
+            ("fit", f"{percent(facts['explained'], 4)} of the fitted samples"),
+            ("validation", f"{percent(facts['predicted'], 4)} of held-out samples, simulated"),
             (
-                "valid",
+                "valid from",
                 " to ".join(quantity(facts[f"valid_{end}"], "Hz") for end in ("from", "up_to")),
             ),
         ]
@@ -320,12 +316,12 @@ def _show(facts: Facts) -> None:
 def _declare_validate(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("model", type=Path, metavar="MODEL.json")
     sub.add_argument(
-        "record", type=Path, metavar="RECORD.csv", help="another one, sampled as the model is"
+        "record", type=Path, metavar="RECORD.csv", help="another record of the same sample period"
     )
-    sub.add_argument("--input", required=True, help="name of a column")
-    sub.add_argument("--output", required=True, help="name of a column")
-    sub.add_argument("--out", type=Path, metavar="RUN.csv", help="write what the model makes of it")
-    sub.add_argument("--report", type=Path, metavar="DIR", help="write a page")
+    sub.add_argument("--input", required=True, help="input column")
+    sub.add_argument("--output", required=True, help="output column")
+    sub.add_argument("--out", type=Path, metavar="RUN.csv", help="write the simulated output")
+    sub.add_argument("--report", type=Path, metavar="DIR", help="write a report")
 
 
 def _validate(args: argparse.Namespace) -> Facts:
@@ -338,7 +334,7 @@ def _validate(args: argparse.Namespace) -> Facts:
         "residual_rms": run.rms,
         "samples": len(record.input),
     }
-    with ExitStack() as both:  # neither stands where the other cannot be written
+    with ExitStack() as both:  # if one output cannot be written, neither is kept
         if args.out is not None:
             stream = both.enter_context(atomic_file(args.out, "w"))
             stream.write(text_of_run(record, run))
@@ -350,9 +346,9 @@ def _validate(args: argparse.Namespace) -> Facts:
 
 def _show_validate(facts: Facts) -> None:
     rows = [
-        ("model", facts["model_verdict"] or "not judged"),
-        ("free run accounts for", f"{percent(facts['explained'], 4)} of the output"),
-        ("residual, rms", f"{plain(facts['residual_rms'], 4)} in the units of the output"),
+        ("model", facts["model_verdict"] or "no verdict"),
+        ("simulation fit", f"{percent(facts['explained'], 4)} of the output"),
+        ("residual, rms", f"{plain(facts['residual_rms'], 4)} in units of the output"),
         ("samples", count(facts["samples"])),
     ]
     table([*rows, *((name, facts[name]) for name in ("run", "report") if name in facts)])

@@ -1,4 +1,4 @@
-"""Commands that divide a lag into structure and latency: selfcal, reversal, latency."""
+"""Commands that split a lag into structural dynamics and latency: selfcal, reversal, latency."""
 
 from __future__ import annotations
 
@@ -35,14 +35,16 @@ from omsm_ros.units import RPM_RAD_S
 
 
 def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="two or more of one part")
-    sub.add_argument("--calibration", type=Path, metavar="STEP.json", help="from a step test")
+    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="two or more scans of one part")
+    sub.add_argument(
+        "--calibration", type=Path, metavar="STEP.json", help="calibration from a step test"
+    )
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
     sub.add_argument(
         "--harmonics",
         type=number(quantities.HARMONICS),
         default=DEFAULT_HARMONICS,
-        help="highest of the surface in a turn",
+        help="highest harmonic of the surface in a turn",
     )
     sub.add_argument(
         "--clocking",
@@ -55,16 +57,20 @@ def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
         "--static-gain",
         type=number(quantities.GAIN),
         default=1.0,
-        help="of the probe, without a step test",
+        help="static gain of the probe, used without a step test",
     )
     sub.add_argument(
         "--gain-uncertainty",
         type=number(quantities.GAIN_UNCERTAINTY),
         default=UNINFORMATIVE_GAIN,
-        help="standard, as a share of it",
+        help="relative standard uncertainty of the static gain",
     )
     sub.add_argument(
-        "--settings", type=json_object, default={}, metavar="JSON", help="without a step test"
+        "--settings",
+        type=json_object,
+        default={},
+        metavar="JSON",
+        help="settings of the calibration, used without a step test",
     )
 
 
@@ -123,9 +129,10 @@ def _show_selfcal(facts: Facts) -> None:
             ("lag of Z", _time(facts["lag"], facts["lag_uncertainty"])),
             *_latency_rows(facts["latency"]),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
-            ("left on this surface", f"{quantity(facts['left_on_this_surface'], 'm')} rms (k = 1)"),
+            ("residual error", f"{quantity(facts['left_on_this_surface'], 'm')} rms on this "
+                               "surface (k = 1)"),
             ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
-            *(("not determined", text) for text in facts["not_told"]),
+            *(("not identifiable", text) for text in facts["not_told"]),
             written([facts["calibration"]]),
         ]
     )  # fmt: skip
@@ -139,16 +146,18 @@ def _time(seconds: float, spread: float | None) -> str:
 def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
     share = latency["share"]
     return [
-        ("of it latency", _time(latency["delay_s"], latency["uncertainty_s"])),
-        ("share", "not known" if share is None else percent(share, 3)),
-        ("by", f"{latency['source']}: {latency['reason']}"),
+        ("probe latency", _time(latency["delay_s"], latency["uncertainty_s"])),
+        ("share of the lag", "unknown" if share is None else percent(share, 3)),
+        ("source", f"{latency['source']}: {latency['reason']}"),
     ]
 
 
 def _declare_reversal(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "clockwise", "counterclockwise")
     sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument("--out", type=Path, metavar="CAL.json", help="with the latency in it")
+    sub.add_argument(
+        "--out", type=Path, metavar="CAL.json", help="write the calibration with the latency"
+    )
 
 
 def _reversal(args: argparse.Namespace) -> Facts:
@@ -168,16 +177,16 @@ def _reversal(args: argparse.Namespace) -> Facts:
 
 
 _MEANINGS = {
-    True: "the probe is late: X and C must be delayed too",
-    False: "the lag is mechanical, in Z only",
-    None: "not decided: it is neither zero nor the lag of Z",
+    True: "the lag is latency of the probe: X and C must be delayed, too",
+    False: "the lag is mechanical: it affects Z only",
+    None: "undecided: the lag is neither zero nor that of Z",
 }
 
 
 def _show_reversal(facts: Facts) -> None:
     table(
         [
-            ("lateral lag", _time(facts["lag"], facts["uncertainty"])),
+            ("probe latency", _time(facts["lag"], facts["uncertainty"])),
             ("lag of Z", quantity(facts["lag_of_z"], "s", 4)),
             ("meaning", _MEANINGS[facts["latency"]]),
             ("residual", f"{quantity(facts['residual'], 'm')} rms"),
@@ -190,9 +199,11 @@ def _show_reversal(facts: Facts) -> None:
 def _declare_latency(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("calibration", type=Path, metavar="CAL.json")
     delay, spread = number(quantities.LAG), number(quantities.TIME_UNCERTAINTY)
-    sub.add_argument("--delay", type=delay, required=True, help="of the probe [s]; 0 for none")
-    sub.add_argument("--uncertainty", type=spread, required=True, help="standard, k = 1 [s]")
-    sub.add_argument("--reason", required=True, help="where the figure comes from")
+    sub.add_argument("--delay", type=delay, required=True, help="latency of the probe [s]")
+    sub.add_argument(
+        "--uncertainty", type=spread, required=True, help="its standard uncertainty, k = 1 [s]"
+    )
+    sub.add_argument("--reason", required=True, help="source of these figures")
     sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
 
 

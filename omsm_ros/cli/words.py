@@ -1,6 +1,6 @@
-"""Every word after ``omsm``: the module of its command, and what it does, in one line.
+"""The commands of ``omsm``: the module of each, and its line of help.
 
-The list of all commands comes from here, because loading all that they need takes seconds.
+They are listed here so that ``omsm --help`` need not load their modules, which takes seconds.
 """
 
 from __future__ import annotations
@@ -9,94 +9,99 @@ from typing import NamedTuple
 
 
 class Word(NamedTuple):
-    """One command of the list: ``module``, in this room, knows the rest; ``help`` is one line."""
+    """One command: its ``module`` in this package, and its line of ``help``."""
 
     module: str
     help: str
 
 
-# As one comes to need them.
+# In the order of use.
 TASKS: dict[str, dict[str, Word]] = {
     "begin": {
-        "doctor": Word("start", "is this computer ready to run a cell? What to do where it is not"),
+        "doctor": Word("start", "check whether this computer can run a cell, with remedies"),
         "demo": Word("", "calibrate and measure on the digital twin (needs ROS)"),
-        "twin": Word("start", "bags of the digital twin: a step test and a scan to work on"),
+        "twin": Word("start", "write bags of the digital twin: a step test and a scan"),
         "completion": Word(
-            "completion",
-            "a script for the shell that completes commands, options and names of files",
+            "start", "print a shell script that completes commands, options and file names"
         ),
     },
     "recordings": {
-        "inspect": Word("inspect", "show what a bag holds, or repair it"),
+        "inspect": Word("recordings", "list the streams and faults of a bag, or repair it"),
         "import": Word(
-            "import_recording",
-            "make a bag of CSV, NumPy, MATLAB, HDF5 or TDMS files, or of foreign ROS topics",
+            "recordings",
+            "convert CSV, NumPy, MATLAB, HDF5 or TDMS files, or other ROS topics, to a bag",
         ),
     },
     "dynamics of probe and machine": {
         "plan": Word("calibration", "write a step test for the machine"),
         "identify": Word(
-            "identify", "the transfer function from encoder to probe, from a step test"
+            "identify", "identify the transfer function from encoder to probe from a step test"
         ),
         "verify": Word(
             "calibration",
-            "check a calibration on a free path: errors and phase lags before and after",
+            "verify a calibration on a free path: errors and phase lags before and after",
         ),
         "compare": Word(
             "calibration",
-            "has the machine changed between two calibrations? Do three or more repeat?",
+            "test two calibrations for a change, or the repeatability of three or more",
         ),
         "calset": Word(
-            "calibration", "calibrations along X, Z or B as one, for dynamics that vary"
+            "calibration",
+            "combine calibrations at several positions of X, Z or B, for dynamics that vary",
         ),
     },
     "latency": {
         "selfcal": Word(
             "latency",
-            "dynamics from two or more scans of one part at different speeds or directions",
+            "estimate dynamics from scans of one part at different speeds or directions",
         ),
         "reversal": Word(
-            "latency", "is the lag latency? From two scans with opposite spindle directions"
+            "latency", "estimate the probe latency from two scans with opposite spindle directions"
         ),
         "latency": Word(
-            "latency", "declare how much of a calibration's lag is latency, with a reason"
+            "latency", "declare how much of a calibration's lag is probe latency, with a reason"
         ),
     },
     "a scan": {
-        "surface": Word("form", "what a nominal surface asks of probe and axes"),
-        "predict": Word("correct", "what a motion will cost, and how fast it may run"),
+        "surface": Word(
+            "form",
+            "show extent and slopes of a nominal surface, and whether probe and axes can follow",
+        ),
+        "predict": Word("correct", "predict the dynamic error of a motion and its maximum speed"),
         "align": Word(
-            "align", "spindle centre and beam direction from a scan of a reference sphere"
+            "correct",
+            "estimate spindle centre and beam direction from a scan of a reference sphere",
         ),
         "correct": Word("correct", "correct a recorded scan: cloud, summary and report"),
         "adjust": Word(
             "adjust", "adjust two or more scans of one part together: form, sources, verdict"
         ),
-        "report": Word(
-            "report", "the page of a finished correction once more, as after --no-report"
-        ),
+        "report": Word("correct", "write the report of a finished correction again"),
     },
     "the part": {
-        "form": Word("form", "the part's pose and its form: deviation, Zernike terms, texture"),
-        "compensate": Word("form", "offsets of the next cut, from the form that was measured"),
-        "difference": Word(
-            "difference", "do two measurements of one part agree? E_n, maps, verdict"
+        "form": Word(
+            "form", "fit the pose and evaluate the form: deviation, Zernike terms, texture"
         ),
+        "compensate": Word("form", "compute offsets of the next cut from the measured form"),
+        "difference": Word("analysis", "compare two measurements of one part: E_n, maps, verdict"),
         "spectrum": Word(
-            "spectrum",
-            "lines in scans of one part, and what each is: on the part, vibration, folded, spindle",
+            "analysis",
+            "find spectral lines in scans of one part and their sources: part, vibration, aliased "
+            "vibration, spindle",
         ),
-        "export": Word("export", "write a cloud or map in the format of another program"),
+        "export": Word("analysis", "write a cloud or map in the format of another program"),
     },
     "many scans": {
         "batch": Word(
-            "campaign", "correct every bag of a folder; an index page with outliers and trends"
+            "campaign", "correct every bag of a folder; index page with outliers and trends"
         ),
-        "history": Word("history", "what was calibrated and measured, and how each machine drifts"),
+        "history": Word(
+            "history", "list past calibrations and measurements, and each machine's drift"
+        ),
     },
     "models of other systems": {
         "validate": Word(
-            "identify", "run a model over another record: how much of it does it account for?"
+            "identify", "simulate a model on another record and compare with its output"
         ),
     },
 }

@@ -211,26 +211,29 @@ class CalibratorNode(ManagedNode):
         """Return the work of a request; the samples that it needs are taken now."""
         duration = quantities.DURATION.checked(request.duration)
         order = quantities.ORDER.checked(request.order)
+        options = {"order": order, "input": request.input or "encoder"}
         if bag:
-            motion = partial(self._motion_of_bag, bag, duration)
-        else:
-            motion = partial(
-                self._live_motion, *(self._buffers[topic].recent(duration) for topic in _STREAMS)
+            return partial(self._identify_bag, bag, duration, self._settings, options)
+        streams = [self._buffers[topic].recent(duration) for topic in _STREAMS]
+        options |= {
+            "settings": settings_with(self._settings, [self._probe]),
+            "origin": _origin(int(self.get_clock().now().nanoseconds)),
+        }
+        return lambda: _identified(self._live_motion(*streams), **options)
+
+    def _identify_bag(
+        self, bag: Path, duration: float, stated: dict[str, object], options: dict[str, Any]
+    ) -> Identification:
+        # Loaded on demand, because reading bags takes long to import.
+        from omsm_ros.pipelines.recording import Recording
+
+        with Recording(bag) as recording:
+            motion = recording.motion(
+                duration=duration, time_lapse=self._time_lapse, trigger=self._trigger
             )
-        stated, source = self._settings, request.input or "encoder"
-        if bag:
-            settings_reader = partial(_reported_settings_of_bag, bag, stated)
-        else:
-            now_ns = int(self.get_clock().now().nanoseconds)
-            settings_reader = partial(_reported_settings_live, stated, self._probe, now_ns)
-        return lambda: _identified(motion(), order=order, input=source, **settings_reader())
-
-    def _motion_of_bag(self, bag: Path, duration: float) -> MotionRecord:
-        from omsm_ros.pipelines.identify import motion_of_bag
-
-        return motion_of_bag(
-            bag, duration=duration, time_lapse=self._time_lapse, trigger=self._trigger
-        )
+            settings = recording.settings(stated)
+        origin = _origin(recording.recorded_ns)
+        return _identified(motion, settings=settings, origin=origin, **options)
 
     def _live_motion(self, *streams: list[Any]) -> MotionRecord:
         faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
@@ -266,18 +269,6 @@ def _identified(*motion: Any, **options: Any) -> Identification:
     from omsm_ros.core.identification.identify import identify
 
     return identify(*motion, **options)
-
-
-def _reported_settings_of_bag(bag: Path, stated: dict[str, object]) -> dict[str, Any]:
-    from omsm_ros.pipelines.identify import recorded_ns_of_bag, settings_of_bag
-
-    return {"settings": settings_of_bag(bag, stated), "origin": _origin(recorded_ns_of_bag(bag))}
-
-
-def _reported_settings_live(
-    stated: dict[str, object], probe: dict[str, object], now_ns: int
-) -> dict[str, Any]:
-    return {"settings": settings_with(stated, [probe]), "origin": _origin(now_ns)}
 
 
 def _origin(recorded_ns: int | None) -> Origin:

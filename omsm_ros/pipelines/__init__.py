@@ -1,1 +1,1 @@
-"""Whole tasks, shared by commands and nodes."""
+"""Pipelines: complete tasks from files to files, shared by commands and nodes."""

@@ -34,6 +34,7 @@ from omsm_ros.messages import sentence
 from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.recording import Recording
 from omsm_ros.readable import number
 from omsm_ros.units import RPM_RAD_S
 
@@ -76,7 +77,8 @@ def read_scan(
     axes: list[AxisBlock] = []
     parts: list[SurfacePoints] = []
     admission = admission or Admission()
-    with CorrectedScan(bag, calibration, options, admission=admission, progress=progress) as scan:
+    with Recording(bag, progress) as recording:
+        scan = CorrectedScan(recording, calibration, options, admission=admission)
         for block, points in scan.steps():
             if isinstance(block, AxisBlock):
                 axes.append(block)

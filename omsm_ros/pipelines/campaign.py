@@ -1,7 +1,6 @@
-"""Hundreds of bags corrected, each by a process of its own: a crash costs that bag.
+"""Correct many bags, each in a process of its own, so that a crash affects one bag only.
 
-What was done is written down after each bag, so that a campaign that was stopped, by whatever,
-goes on where it was.
+The state is saved after each bag; a campaign that was stopped continues from there.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ STATE = "campaign.json"
 
 _SCHEMA = "omsm-campaign/1"
 _MAX_STATE_BYTES = 50_000_000
-# A process that the system kills for want of memory may fare better when its neighbour is done.
+# A process that the system killed for lack of memory may succeed once others have ended.
 _ATTEMPTS = 2
 _LOCAL_HOSTS = ("127.0.0.1", "::1", "localhost")
 
@@ -67,12 +66,12 @@ _STATE_FORM = {
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """What became of one bag.
+    """State of one bag of a campaign.
 
-    bag: below the campaign's folder;  folder: of its result, below that of the results
-    fingerprint: of the bag, the calibration and the options that the result is of
+    bag: path below the campaign's folder;  folder: of its result, below that of the results
+    fingerprint: hash of bag, calibration and options
     state: "done", "refused" (said: why) or "crashed" (said: by which signal)
-    recorded_ns: when the recording began [ns, ROS time], None where the bag does not say
+    recorded_ns: when the recording began [ns, ROS time], None if unknown
     """
 
     bag: str
@@ -93,22 +92,22 @@ def run_campaign(
     scheduler: str = "",
     progress: Progress = no_progress,
 ) -> list[Entry]:
-    """Correct every bag below ``folder`` into ``out``; return what became of each, by name.
+    """Correct every bag below ``folder`` into ``out``; return the state of each, by name.
 
-    options: of ``omsm correct``, for every bag;  jobs: processes at a time, 0 = one a core
+    options: of ``omsm correct``, for every bag;  jobs: parallel processes, 0 = one per core
     scheduler: address of a Dask scheduler whose workers share these folders, empty = this host
 
-    A bag whose result is there, of the same bag, calibration and options, is not corrected
-    again. Raises FileError where there is no bag, or another campaign writes into ``out``.
+    A bag that has a result of the same bag, calibration and options is skipped. Raises FileError
+    if there is no bag, or another campaign writes into ``out``.
     """
     found = bags_below(folder, out)
     if not found:
         raise FileError(
             f"no bag below {str(folder)!r}; give a folder of .mcap files or rosbag2 bags; "
-            "other recordings become bags by 'omsm import'"
+            "convert other recordings with 'omsm import'"
         )
     sign = [load_calibration(calibration).id, *options, __version__]
-    with _run_alone(out):
+    with _locked(out):
         earlier = {entry.bag: entry for entry in load_campaign(out)}
         tasks = [_task(bag, folder, calibration, out, options, sign) for bag in found]
         entries = {t.bag: earlier[t.bag] for t in tasks if _is_done(earlier.get(t.bag), t, out)}
@@ -141,13 +140,8 @@ def bags_below(folder: Path, out: Path) -> list[Path]:
     return sorted(found)
 
 
-def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a bag of its own, whose result has the folder's name."""
-    return (folder / "metadata.yaml").is_file()
-
-
 def load_campaign(out: Path) -> list[Entry]:
-    """Return what an earlier run wrote down in ``out``, nothing where there was none."""
+    """Return the states that an earlier run saved in ``out``; none without one."""
     path = out / STATE
     if not path.exists():
         return []
@@ -165,7 +159,7 @@ def load_summary(out: Path, entry: Entry) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One bag to correct, and all that its process needs to know; plain texts, to be sent."""
+    """One bag to correct, as plain texts that can be sent to another host."""
 
     bag: str
     folder: str
@@ -175,7 +169,7 @@ class Task:
 
 
 def correct_one(task: Task) -> Entry:
-    """Correct one bag in a process of its own and say what became of it."""
+    """Correct one bag in a process of its own; return its state."""
     found = REFUSED, "not started"
     for _ in range(_ATTEMPTS):
         try:
@@ -197,18 +191,18 @@ def correct_one(task: Task) -> Entry:
 
 
 def _task_result(future: Future[Entry], task: Task) -> Entry:
-    """Return what became of a bag, also where every worker died that tried it."""
+    """Return the state of a bag, also if every worker died that tried it."""
     try:
         return future.result()
-    except Exception as err:  # whatever a scheduler says of workers, or of its own end
-        why = f"no worker came to an end with it ({type(err).__name__})"
+    except Exception as err:  # a scheduler raises errors of many kinds for lost workers
+        why = f"no worker finished it ({type(err).__name__})"
         return Entry(task.bag, task.folder, task.fingerprint, CRASHED, why)
 
 
 def _state(file: Path) -> tuple[str, int, int]:
-    """Return by what a file is known as it was: name, size and time; of a dangling link the name.
+    """Return name, size and time of a file; zeros for a dangling link.
 
-    Whoever corrects it says what is wrong, at the cost of that bag alone.
+    The correction of the bag then reports the error of that bag.
     """
     try:
         found = file.stat()
@@ -221,7 +215,9 @@ def _task(
     bag: Path, folder: Path, calibration: Path, out: Path, options: Sequence[str], sign: list[str]
 ) -> Task:
     name = bag.relative_to(folder)
-    result = name.with_suffix("") if bag.is_file() and not _is_bag(bag.with_suffix("")) else name
+    # A folder bag of the same stem has a result of that name.
+    taken = (bag.with_suffix("") / "metadata.yaml").is_file()
+    result = name.with_suffix("") if bag.is_file() and not taken else name
     files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
     states = [_state(file) for file in files]
     fingerprint = hashlib.sha256(repr((states, sign)).encode()).hexdigest()
@@ -237,7 +233,7 @@ def _task(
 
 
 def _is_done(entry: Entry | None, task: Task, out: Path) -> bool:
-    """Return whether a result of this very task is there; what failed is tried again."""
+    """Return True if the result of this task exists; failed ones are tried again."""
     return (
         entry is not None
         and entry.state == DONE
@@ -260,8 +256,8 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 
 
 @contextmanager
-def _run_alone(out: Path) -> Iterator[None]:
-    """Hold the folder, so that two campaigns never write into it."""
+def _locked(out: Path) -> Iterator[None]:
+    """Lock the folder, so that two campaigns never write into it."""
     try:
         make_folder(out)
         lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
@@ -273,7 +269,9 @@ def _run_alone(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as err:
-            raise FileError(f"another campaign writes into {str(out)!r}; wait for its end") from err
+            raise FileError(
+                f"another campaign writes into {str(out)!r}; wait until it has ended"
+            ) from err
         yield
     finally:
         os.close(lock)
@@ -282,7 +280,7 @@ def _run_alone(out: Path) -> Iterator[None]:
 @contextmanager
 def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
     if not scheduler:
-        # Threads that wait for processes: a killed process is an answer here, not a broken pool.
+        # Threads that wait for processes: a killed process would break a process pool.
         executor = ThreadPoolExecutor(jobs)
         try:
             yield executor
@@ -298,7 +296,7 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
     local = address.scheme == "tcp" and address.hostname in _LOCAL_HOSTS
     if not (local or address.scheme == "tls"):
         raise ConfigurationError(
-            f"scheduler {scheduler!r}: Dask runs whatever it is sent, so beyond this host it must "
+            f"scheduler {scheduler!r}: Dask runs any code it is sent, so on another host it must "
             "be tls://host:port, with the certificates in Dask's own configuration"
         )
     try:
@@ -309,8 +307,9 @@ def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
         client = Client(scheduler, timeout=10)
     except (OSError, ValueError, TypeError) as err:
         raise ConfigurationError(
-            f"no scheduler answers at {scheduler!r}: {exception_text(err)}; start 'dask scheduler' there"
+            f"no scheduler answers at {scheduler!r}: {exception_text(err)}; start one there with "
+            "'dask scheduler'"
         ) from err
     with client:
-        # A worker that dies takes its bag along; another one does it.
+        # If a worker dies, another one takes over its bag.
         yield client.get_executor(pure=False, retries=3)

@@ -1,4 +1,4 @@
-"""Two measurements of one part, ours or another instrument's: ``difference.json``."""
+"""Compare two measurements of one part, also of another instrument: ``difference.json``."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ _METHOD = (
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonOptions:
-    """How two measurements are compared.
+    """Options of a comparison.
 
-    dofs: in which the second is moved onto the first
-    uncertainty: standard uncertainty of the heights of a file that carries none [m]
+    dofs: degrees of freedom in which the second is moved onto the first
+    uncertainty: standard uncertainty of the heights of a file that states none [m]
     drift: standard deviation at the end of a scan whose fields hold none [m]
-    units: of files that do not carry them;  spacing: of the places compared [m]
-    length: over which errors of unknown form are correlated [m]
-    register: freedoms in which each is registered to the nominal surface first; None: it is not
+    units: of files that do not state them;  spacing: of the compared grid [m]
+    length: correlation length of errors of unknown form [m]
+    register: degrees of freedom to register each to the nominal surface first; None: not at all
     """
 
     dofs: Sequence[str] = SEATED
@@ -67,9 +67,10 @@ class ComparisonOptions:
 def measurement_at(
     path: Path, options: ComparisonOptions, nominal: Surface | None
 ) -> ComparedMeasurement:
-    """Read a result folder, a cloud or a map, less the ``nominal`` heights if there are any.
+    """Read a result folder, a cloud or a map, minus the ``nominal`` heights if given.
 
-    Raises FileError for what cannot be read, DataError for points beyond the nominal surface.
+    Raises FileError for a file that cannot be read, DataError for points beyond the nominal
+    surface.
     """
     units = options.units and replace(options.units, where_unsaid=True)
     points = _in_order(read_points(path, units), options.drift)
@@ -90,26 +91,26 @@ def measurement_at(
 
 
 def _in_order(points: MeasuredPoints, drift: float | None) -> MeasuredPoints:
-    """Return the points with the order of their scan, where somebody says that they ``drift``.
+    """Return the points with sample numbers in file order if a ``drift`` is stated [m].
 
-    Scattered points of another program stand in the order in which they were measured; what is
-    sorted, as a map, has none.
+    Scattered points of other programs are in the order of measurement; the points of a map are
+    sorted, so they get no numbers.
     """
     if points.sample is not None or as_grid(points) is not None:
         return points
     if drift:
-        note = "its points carry no numbers: their order in the file is taken for that of the scan"
+        note = "points without sample numbers: their order in the file is assumed to be the scan's"
         sample = np.arange(len(points), dtype=np.int64)
         return replace(points, sample=sample, notes=(*points.notes, note))
     note = (
-        "its points carry no numbers, so that its drift is taken for form; if they stand in the "
-        "order of the scan, state the drift, as --drift 20e-9"
+        "points without sample numbers: drift counts as form; if their order in the file is that "
+        "of the scan, state the drift, such as --drift 20e-9"
     )
     return replace(points, notes=(*points.notes, note)) if drift is None else points
 
 
 def _calibration_of(path: Path) -> str:
-    """Return what a result folder of ours was corrected by; empty if that is not known."""
+    """Return the calibration of a result folder; empty if unknown."""
     summary = path / SUMMARY
     if not summary.is_file():
         return ""
@@ -117,7 +118,7 @@ def _calibration_of(path: Path) -> str:
 
 
 def _fields_file_of(path: Path, points: MeasuredPoints) -> ScanFields | None:
-    """Return what the systematic errors of a scan of ours do to its points, if they are stored."""
+    """Return the fields of the systematic errors at the points of a result folder, if stored."""
     folder = path if path.is_dir() else path.parent
     if path.is_file() and path.name != "cloud.ply":
         return None
@@ -130,7 +131,7 @@ def _fields_file_of(path: Path, points: MeasuredPoints) -> ScanFields | None:
 def compare_measurements(
     a: Path, b: Path, options: ComparisonOptions, nominal: Surface | None
 ) -> tuple[Comparison, dict[str, Any]]:
-    """Compare two measurements, and return what was found with the content of its JSON."""
+    """Compare two measurements; return the comparison and the content of its JSON."""
     measured = [measurement_at(path, options, nominal) for path in (a, b)]
     found = compare_measurements_of_part(*measured, options.dofs, options.spacing, options.length)
     facts = facts_of(found)
@@ -147,7 +148,7 @@ def write_difference(out: Path, found: Comparison, facts: dict[str, Any]) -> Non
     if found.agreement is not None:
         columns["uncertainty_m"] = found.agreement.uncertainty
     write_columns(out / MAP, columns, csv=True)
-    # Here, because drawing takes longer to load than most of the rest.
+    # Imported on demand, because loading the figures takes a second.
     from omsm_ros.report.difference import render
 
     date = date_text(datetime.now(timezone.utc))

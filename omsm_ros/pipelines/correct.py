@@ -1,16 +1,11 @@
-"""From a recorded bag to a cloud, and to all that is said of it, in one pass.
-
-``bag → blocks → core → cloud.ply`` and the figures of the summary
-"""
+"""Correct a recorded bag in one pass: blocks → core → cloud.ply and the figures of its summary."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -40,30 +35,26 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.core.streams.trigger_slips import CommonTrigger, TriggerSlip
+from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.errors import BagError, ConfigurationError, Notice
-from omsm_ros.io import bags
 from omsm_ros.io.results import PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import MOST_JUDGED
+from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import quantity
 
-# The one pass over a recorded scan: its blocks go through the corrector as they are read.
-
-TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
-# A quarter of a gigabyte: one stream may be recorded that far ahead of the other.
-MAX_PENDING_BLOCKS = 4_000_000
+# Samples by which one stream may be recorded ahead of the other: a quarter of a gigabyte.
+MAX_PENDING_SAMPLES = 4_000_000
 
 
 @dataclass(frozen=True)
 class Admission:
-    """May a calibration be used here?
+    """How a calibration is admitted for a scan.
 
-    settings: of this scan, to be compared with the calibration's; None = not known
-    override: use it all the same; what spoke against it is written into every result
+    settings: of this scan, to be compared with the calibration's; None = unknown
+    override: use the calibration despite a mismatch, which is stated in every result
     """
 
     settings: Mapping[str, object] | None = None
@@ -72,10 +63,10 @@ class Admission:
 
 @dataclass(frozen=True)
 class StampJoining:
-    """Probe and axes joined by their stamps, not by a common trigger counter.
+    """Parameters to join probe and axes by their stamps instead of a common trigger counter.
 
     delay: from the probe's stamp to the middle of its exposure, on the axes' clock [s]
-    exposure: over which the probe averages [s]
+    exposure: time over which the probe averages [s]
     """
 
     delay: float = 0.0
@@ -83,69 +74,57 @@ class StampJoining:
 
 
 class CorrectedScan:
-    """A bag opened and its surface points as they are corrected; use it as a context manager.
+    """The surface points of an open recording, corrected block by block.
 
-    sample_period: of the scan [s];  time_lapse: how much faster it was played [1], if settings say
-    admitted, reasons: the decision to use the calibration
-    recorded_ns: when the recording began [ns, ROS time], None where nobody knows
-    temperatures: that were recorded (n,) [°C], in their order; NaN: cannot be
+    sample_period: of the scan [s]
+    time_lapse: how much faster it was played [1], by the settings; 1 if they do not say
+    reasons, admitted: mismatches of calibration and scan, and how the calibration was admitted
+    recorded_ns: when the recording began [ns, ROS time], None if unknown
+    temperatures: as recorded (n,) [°C], in their order; NaN: implausible
     by_stamps: join the streams by their stamps, for which all samples are held in memory;
         None: by the trigger counter they share, in bounded memory
 
     Raises BagError for a bag without samples, CalibrationError for a calibration that does not
-    belong to it, unless overridden.
+    match the scan, unless overridden.
     """
 
     def __init__(
         self,
-        path: AnyBag,
+        recording: Recording,
         calibration: Calibration,
         options: CorrectionOptions,
         *,
         admission: Admission = Admission(),
         by_stamps: StampJoining | None = None,
-        progress: Progress = no_progress,
     ) -> None:
-        self.path = path
-        self._calibration, self._options, self._admission = calibration, options, admission
-        self._by_stamps, self._progress = by_stamps, progress
-        self._stack = ExitStack()
-
-    def __enter__(self) -> CorrectedScan:
-        with ExitStack() as opening:
-            bag = opening.enter_context(bags.BagReader(self.path))
-            blocks = self._blocks(bag)
-            first = next(blocks, None)
-            if first is None:
-                raise BagError(f"{str(self.path)!r} has no samples on {TOPICS}; record a scan")
-            self.sample_period = float(first.sample_period)
-            self.time_lapse = self._time_lapse()
-            self._rest = chain([first], blocks)
-            self.recorded_ns, self.temperatures = bag.recorded_ns, bag.temperatures()
-            self.reasons = objections(
-                self._calibration,
-                sample_period=self.sample_period,
-                settings=self._admission.settings,
-                probe=bag.probe_settings(),
-                polarity=self._options.polarity,
-            )
-            self.admitted = admit(self._calibration, self.reasons, self._admission.override)
-            self._corrector = Corrector(self._calibration, self._options, MAX_PENDING_BLOCKS)
-            self._stack = opening.pop_all()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._stack.close()
+        self.path, self.options = recording.path, options
+        blocks = _blocks(recording, by_stamps)
+        first = next(blocks, None)
+        if first is None:
+            raise BagError(f"{str(self.path)!r} has no samples on {SCAN_TOPICS}; record a scan")
+        self.sample_period = float(first.sample_period)
+        self.time_lapse = TIME_LAPSE.checked(
+            {**calibration.settings, **(admission.settings or {})}.get("time_lapse", 1.0),
+            ConfigurationError,
+            "setting 'time_lapse'",
+        )
+        self._rest = chain([first], blocks)
+        self.recorded_ns = recording.recorded_ns
+        self.temperatures = recording.bag.temperatures()
+        self.reasons = objections(
+            calibration,
+            sample_period=self.sample_period,
+            settings=admission.settings,
+            probe=recording.bag.probe_settings(),
+            polarity=options.polarity,
+        )
+        self.admitted = admit(calibration, self.reasons, admission.override)
+        self._corrector = Corrector(calibration, options, MAX_PENDING_SAMPLES)
 
     def steps(self) -> Iterator[tuple[AxisBlock | DistanceBlock | None, SurfacePoints | None]]:
-        """Yield each block in turn, and the points it completed; None at the end, and the rest.
+        """Yield each block with the points that it completed; at the end None with the rest.
 
-        Raises BagError where samples had to be given up that have a partner later in the bag.
+        Raises BagError if samples were dropped although their partners come later in the bag.
         """
         for block in self._rest:
             if isinstance(block, AxisBlock):
@@ -158,7 +137,7 @@ class CorrectedScan:
 
     @property
     def account(self) -> Account:
-        """Where every sample read so far has gone."""
+        """Account of every sample read so far."""
         return self._corrector.account
 
     @property
@@ -168,7 +147,7 @@ class CorrectedScan:
 
     @property
     def trace(self) -> ScanTrace:
-        """Points that stand for the scan so far."""
+        """Points that represent the scan so far."""
         return self._corrector.trace
 
     @property
@@ -181,56 +160,39 @@ class CorrectedScan:
         """The last slip of the two counters so far, None without one."""
         return self._corrector.slips.found
 
-    @property
-    def options(self) -> CorrectionOptions:
-        """How it is corrected."""
-        return self._options
-
-    @property
-    def trigger(self) -> CommonTrigger:
-        """What is stated of the two counters."""
-        return self._options.trigger
-
-    def _time_lapse(self) -> float:
-        stated = {**self._calibration.settings, **(self._admission.settings or {})}
-        lapse = stated.get("time_lapse", 1.0)
-        return TIME_LAPSE.checked(lapse, ConfigurationError, "setting 'time_lapse'")
-
-    def _blocks(self, bag: bags.BagReader) -> Iterator[Any]:
-        total = bag.count(TOPICS)
-        if self._by_stamps is not None:
-            yield from _joined_by_stamps(bag, self._by_stamps)
-            self._progress(total, total)
-            return
-        for done, _, block in bag.blocks(*TOPICS):
-            yield block
-            self._progress(done, total)
-
     def _check_complete(self) -> None:
         name = RejectionReason.OVERDUE.name.lower()
         account = self.account
         lost = min(s.counted.get(name, 0) for s in (account.axes, account.distance))
         if lost:
             raise BagError(
-                f"{str(self.path)!r}: {lost} samples waited for their partners in vain, for one "
-                f"stream was recorded more than {MAX_PENDING_BLOCKS} samples ahead of the other; "
+                f"{str(self.path)!r}: {lost} samples were dropped before their partners came: one "
+                f"stream was recorded more than {MAX_PENDING_SAMPLES} samples ahead of the other; "
                 "record both at the same time"
             )
         received = (account.axes.received, account.distance.received)
-        for topic, samples in zip(TOPICS, received, strict=True):
+        for topic, samples in zip(SCAN_TOPICS, received, strict=True):
             if not samples:
                 raise BagError(f"{str(self.path)!r} has no samples on {topic!r}; record a scan")
 
 
-def _joined_by_stamps(
-    bag: bags.BagReader, how: StampJoining
-) -> Iterator[AxisBlock | DistanceBlock]:
-    """Yield the axes at the probe's samples, and the probe's blocks, as if one trigger had both.
+def _blocks(recording: Recording, by_stamps: StampJoining | None) -> Iterator[Any]:
+    if by_stamps is not None:
+        yield from _joined_by_stamps(recording, by_stamps)
+        return
+    for _, block in recording.stream(*SCAN_TOPICS):
+        yield block
 
-    A message that repeats samples or comes late has no axes; it is counted as what it is.
+
+def _joined_by_stamps(
+    recording: Recording, how: StampJoining
+) -> Iterator[AxisBlock | DistanceBlock]:
+    """Yield the probe's blocks, and the axes interpolated to its samples.
+
+    A message that repeats samples or comes late has no axes; the corrector counts its samples.
     """
     axes, distance = [], []
-    for _, _, block in bag.blocks(*TOPICS):
+    for _, block in recording.stream(*SCAN_TOPICS):
         (axes if isinstance(block, AxisBlock) else distance).append(block)
     moved = axes_at_probe(axes, distance, delay=how.delay, exposure=how.exposure)
     at_probe = next(moved, None)
@@ -241,23 +203,20 @@ def _joined_by_stamps(
         yield block
 
 
-# What errors that shift points laterally do to a cloud whose nominal surface nobody gave.
-#
-# They cost height by the slope of the surface. While the points pass it is not known; once they
-# have
-# passed, it is that of a polynomial through them, and the cloud is gone through once more.
-
 LATERAL_SOURCES = (
-    "{names}: not in the uncertainty of the points, because the surface's slopes are not known; "
+    "{names}: not in the uncertainty of the points, because the slopes of the surface are unknown; "
     "give --nominal SURFACE.yaml"
 )
 
 
 @dataclass(frozen=True, eq=False)
 class LateralErrors:
-    """heights: rms of what each such source does [m];  largest: uncertainty of a point now [m]
+    """Effect of lateral errors on a cloud without a nominal surface.
 
-    points: evenly chosen, as they are in the cloud now;  warnings: what could not be had
+    heights: rms effect of each source on the heights [m]
+    largest: largest standard uncertainty of a point [m]
+    points: evenly chosen rows of the updated cloud
+    warnings: sources that could not be evaluated
     """
 
     heights: dict[str, float]
@@ -269,10 +228,12 @@ class LateralErrors:
 def add_lateral_errors(
     cloud: Path, options: CorrectionOptions, trace: ScanTrace, most: int
 ) -> LateralErrors | None:
-    """Add to the uncertainty of each point of ``cloud`` what shifts it laterally.
+    """Add the effect of lateral errors to the uncertainty of each point of ``cloud``.
 
-    most: points to return. Return None where there is no such source, or its slope was known while
-    the points passed.
+    Lateral errors change heights by the slope of the surface. Without a nominal surface the slope
+    is that of a polynomial through all points, so the cloud is rewritten in a second pass.
+
+    most: points to return. Return None if there is no such source or a nominal surface is given.
     """
     sources = [source for source in options.systematic if source.needs_slope]
     if not sources or options.surface is not None or not trace.seen:
@@ -295,25 +256,25 @@ def _variance(fields: ScanFields, first: int, count: int) -> FloatArray:
     return np.asarray(np.sum(fields.at(first, count) ** 2, axis=0), np.float64)
 
 
-# No picture has so many pixels; the numbers of a summary come from all points.
+# More than the pixels of a figure; the numbers of a summary come from all points.
 MOST_DRAWN = 2**19
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What became of a bag.
+    """Result of the correction of one bag.
 
     account: of every sample, by stream;  budget: rms of each source of uncertainty [m]
-    stamp_skew: of the two streams' stamps for the same trigger [s], None if none was paired
-    admission, reasons: how the calibration was admitted, and what spoke against it
+    stamp_skew: difference of the streams' stamps for one trigger [s], None without a pair
+    admission, reasons: how the calibration was admitted, and its mismatches with the scan
     statistics: of the dynamic "error", and with a nominal surface of the "raw" and "corrected"
         deviation, over all points; empty without points
-    largest_uncertainty: [m];  points: evenly chosen, as in the cloud
-    trace: points that stand for the scan where its systematic errors are judged
-    path: its start, None without axes
-    recorded_ns: when the recording began [ns, ROS time], None where nobody knows
-    temperatures: that were recorded (n,) [°C], in their order; NaN: cannot be
-    sample_period: [s];  faults: what counters and stamps of the recording say against it
+    largest_uncertainty: of a point [m];  points: evenly chosen rows of the cloud
+    trace: points that represent the scan in the evaluation of its systematic errors
+    path: start of the scan path, None without axes
+    recorded_ns: when the recording began [ns, ROS time], None if unknown
+    temperatures: as recorded (n,) [°C], in their order; NaN: implausible
+    sample_period: [s];  faults: findings from counters and stamps of the recording
     """
 
     account: dict[str, Any]
@@ -346,26 +307,25 @@ def correct_bag(
 ) -> Correction:
     """Correct a bag into ``cloud`` (PLY).
 
-    nominal, lateral: surface, and standard lateral uncertainty of a point [m], which costs
-        height where the surface slopes
+    nominal: surface for the deviations;  lateral: standard uncertainty of x and y [m], which
+        adds to the uncertainty of heights by the slope of ``nominal``
     by_stamps: join the streams by their stamps; None: by the trigger counter they share
 
-    Memory does not grow with the bag, but for ``by_stamps``. When it fails, no cloud remains.
-    Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
+    Memory is bounded, except with ``by_stamps``. If the correction fails, no cloud remains.
+    Raises CalibrationError for a calibration that does not match the scan, unless overridden.
     """
-    scan = CorrectedScan(
-        path,
-        calibration,
-        options or CorrectionOptions(),
-        admission=admission or Admission(),
-        by_stamps=by_stamps,
-        progress=progress,
-    )
-    with scan:
+    with Recording(path, progress) as recording:
+        scan = CorrectedScan(
+            recording,
+            calibration,
+            options or CorrectionOptions(),
+            admission=admission or Admission(),
+            by_stamps=by_stamps,
+        )
         overridden = "; ".join(["OVERRIDDEN", *map(str, scan.reasons)]) if scan.reasons else ""
         comment = f"omsm_ros, metres, calibration {calibration.id} {overridden}"
         with PlyWriter(cloud, comment) as ply:
-            found = _Findings(nominal, lateral, by_counter=by_stamps is None)
+            found = _RunningResults(nominal, lateral, by_counter=by_stamps is None)
             for block, points in scan.steps():
                 found.see(block)
                 if points is not None:
@@ -377,8 +337,8 @@ def correct_bag(
         return done if shifted is None else _with_lateral_errors(done, shifted)
 
 
-class _Findings:
-    """What is learnt of the points while they pass."""
+class _RunningResults:
+    """Statistics of the points and findings of the streams, gathered during the pass."""
 
     def __init__(self, nominal: Surface | None, lateral: float, by_counter: bool) -> None:
         self._nominal, self._lateral, self._by_counter = nominal, lateral, by_counter
@@ -388,7 +348,7 @@ class _Findings:
         self._running = {name: RunningStatistics() for name in names}
         self.largest = 0.0
         self.drawn = EvenSelection(MOST_DRAWN)
-        self.path = ScanPathReader(MOST_JUDGED)
+        self.path = ScanPathReader(MAX_PATH_SAMPLES)
 
     def see(self, block: AxisBlock | DistanceBlock | None) -> None:
         if block is None:
@@ -400,7 +360,7 @@ class _Findings:
         (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
 
     def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
-        """Return what counters and stamps say against the scan; not of axes joined by stamps."""
+        """Return findings from counters and stamps; none of axes that are joined by stamps."""
         found: list[Notice | str] = [*self._distance.faults("distance")]
         if self._by_counter:
             skew = counter_skew(self._axes, self._distance)
@@ -415,19 +375,19 @@ class _Findings:
             if samples:
                 found.append(f"{samples} samples were not corrected: {scan.slip}")
             else:
-                found += skew_fault(skew, scan.sample_period, scan.trigger)
+                found += skew_fault(skew, scan.sample_period, scan.options.trigger)
         return (*map(str, found), *self._beyond(scan.options.pitch))
 
     def _beyond(self, pitch: PitchCurve | None) -> Iterator[str]:
-        """Yield where Z went beyond what was measured of its pitch."""
+        """Yield a fault if Z left the range in which its pitch was measured."""
         if pitch is None:
             return
         (low, high), first, last = self._z, pitch.position[0], pitch.position[-1]
         if low < first or last < high:
             yield (
-                f"Z goes from {quantity(low, 'm')} to {quantity(high, 'm')}, its pitch was "
-                f"measured from {quantity(first, 'm')} to {quantity(last, 'm')} and taken as level "
-                "beyond; measure it where Z goes"
+                f"Z goes from {quantity(low, 'm')} to {quantity(high, 'm')}, but its pitch was "
+                f"measured from {quantity(first, 'm')} to {quantity(last, 'm')} and taken as "
+                "constant beyond; measure it over the whole range of Z"
             )
 
     def add(self, points: SurfacePoints, packed: NDArray[np.void]) -> None:
@@ -459,7 +419,7 @@ def _with_lateral_errors(done: Correction, shifted: LateralErrors) -> Correction
     )
 
 
-def _correction(scan: CorrectedScan, found: _Findings) -> Correction:
+def _correction(scan: CorrectedScan, found: _RunningResults) -> Correction:
     return Correction(
         account=scan.account.as_dict(),
         budget=scan.budget,

@@ -1,4 +1,4 @@
-"""The demonstration: what came of it, beside the truth."""
+"""Run the demonstration on the digital twin and compare its results with the true values."""
 
 from __future__ import annotations
 
@@ -61,12 +61,10 @@ from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.twin.truth import TruthComparison, compare_with_truth
 from omsm_ros.units import PPM
 
-# The demonstration: where its results go, how the twin is set, what each node is told.
-
-# Where an emulated device has to be on TCP: one of these ports of this machine.
+# Range of TCP ports for emulated devices on this host.
 _FIRST_PORT, _PORTS = 20_000, 10_000
-# The paper's spiral, as fast as emulated lines carry it; nine bytes a sample over RS-422 at
-# 691 200 baud are 7.6 times faster than real at most, and of two devices one may lag behind.
+# The paper's spiral at the speed of emulated links. RS-422 at 691 200 baud with nine bytes a
+# sample allows 7.6 times real time; with two devices one may lag behind.
 _LAPSE, _RADIUS_M = 20.0, 12.7e-3
 _SLOW_LAPSE, _SMALL_RADIUS_M = 3.0, 3e-3
 OVERVIEW = "overview.png"
@@ -90,13 +88,13 @@ _RESULTS = (
 
 @dataclass(frozen=True)
 class Demonstration:
-    """Where the results go, and how the twin is set.
+    """Folder of the results and settings of the twin.
 
-    time_lapse: how much faster than real time the cell plays [1];  start_radius: [m]
-        None = as fast, and as large, as the device's line allows
-    device: what the emulated probe speaks
-    disturbance_file: what is wrong with the machine, None for nothing
-    view: whether a browser may look on
+    time_lapse: speed of the cell relative to real time [1];  start_radius: of the spiral [m];
+        None = as fast, and as large, as the device's link allows
+    device: model of the emulated probe
+    disturbance_file: errors of the machine, None for none
+    view: show the scan in a browser
     """
 
     out: Path
@@ -110,34 +108,34 @@ class Demonstration:
 
     @cached_property
     def scenario(self) -> Scenario:
-        """What the emulated cell does."""
+        """Scenario of the emulated cell."""
         return Scenario(seed=self.seed, start_radius=self.radius, sample_period=self.sample_period)
 
     @property
     def lapse(self) -> float:
-        """How much faster than real time the cell plays [1]."""
+        """Speed of the cell relative to real time [1]."""
         slow = emulated(self.device).baud_rate > 0
         return self.time_lapse or (_SLOW_LAPSE if slow else _LAPSE)
 
     @property
     def radius(self) -> float:
-        """Of the start of the spiral [m]."""
+        """Start radius of the spiral [m]."""
         slow = emulated(self.device).baud_rate > 0
         return self.start_radius or (_SMALL_RADIUS_M if slow else _RADIUS_M)
 
     @cached_property
     def disturbances(self) -> Disturbances:
-        """What is wrong with the machine."""
+        """Errors of the emulated machine."""
         return load_disturbances(self.disturbance_file) if self.disturbance_file else NOTHING
 
     @property
     def calibration_file(self) -> Path:
-        """Written by the calibrator node."""
+        """File that the calibrator node writes."""
         return self.out / "calibration.json"
 
     @property
     def bag(self) -> Path:
-        """Written by the recorder node."""
+        """Bag that the recorder node writes."""
         return self.out / "scan.mcap"
 
     @property
@@ -147,26 +145,26 @@ class Demonstration:
 
     @property
     def link(self) -> str:
-        """The emulated port."""
+        """Address of the emulated port."""
         if emulated(self.device).tcp:
             return _tcp_link()
         return str((self.out / "cell").absolute())
 
     @property
     def companion_link(self) -> str:
-        """The emulated port of the second device; empty without one."""
+        """Address of the second device's emulated port; empty without one."""
         if (second := emulated(self.device).second) is None:
             return ""
         return _tcp_link() if second.tcp else f"{self.link}_beside"
 
     @property
     def step_test_samples(self) -> int:
-        """Samples of the step test."""
+        """Number of samples of the step test."""
         return len(planned_test_of(self.scenario, self.disturbances).axes)
 
     @property
     def scan_samples(self) -> int:
-        """Samples of the scan."""
+        """Number of samples of the scan."""
         return round(spiral_of(self.scenario).duration / self.sample_period)
 
     @property
@@ -199,7 +197,7 @@ class Demonstration:
         return second.node, fixed | second.driver
 
     def settings(self) -> dict[str, object]:
-        """Return what the calibration will belong to."""
+        """Return the settings of the calibration."""
         return {
             "machine": "digital twin of the paper's cell",
             "fixture": "twin",
@@ -210,23 +208,23 @@ class Demonstration:
 
     @property
     def nominal_file(self) -> Path:
-        """What the mirror should be."""
+        """File of the mirror's nominal surface."""
         return self.out / NOMINAL
 
     def prepare(self) -> None:
-        """Make the folder and clear it of an earlier run's results.
+        """Make the folder, and remove the results of an earlier demonstration.
 
-        OmsmError if it holds anything, and is not the folder of a demonstration.
+        Raises OmsmError if it holds files and is not the folder of a demonstration.
         """
-        _ = self.disturbances  # a file that cannot be read is reported before anything is cleared
+        _ = self.disturbances  # report an unreadable file before removing anything
         mark = self.out / _MARK
-        # A scan and a calibration of a real machine have the same names.
+        # Scan and calibration of a real machine have the same file names.
         if self.out.is_dir() and any(self.out.iterdir()) and not mark.is_file():
             raise OmsmError(
-                f"{str(self.out)!r} holds files that no demonstration made; give a folder that is "
-                "empty or does not exist yet"
+                f"{str(self.out)!r} holds files that are not from a demonstration; give a folder "
+                "that is empty or does not exist yet"
             )
-        save_text(mark, "Whatever is in this folder, the next demonstration replaces.\n")
+        save_text(mark, "The next demonstration replaces the files in this folder.\n")
         stale = (
             self.calibration_file,
             self.bag,
@@ -246,7 +244,7 @@ def _tcp_link() -> str:
     return f"tcp://127.0.0.1:{_FIRST_PORT + os.getpid() % _PORTS}"
 
 
-# The step test begins at rest.
+# The step test begins with a stationary segment of at least this length.
 _REST_SAMPLES = 100
 RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
 TITLE = "Paraboloid mirror measured on the emulated cell"
@@ -271,7 +269,7 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
     summary["files"] |= {"scan_report": SCAN_REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
-    summary |= truth_entries(recording, cloud)  # replaces the estimate of the error before
+    summary |= truth_entries(recording, cloud)  # replaces the estimated error by the true one
     summary["response"] = response_errors(calibration, true_response(step_test))
     live = live_points(plan.bag)
     summary["live_equals_offline"] = same_points(live, cloud)
@@ -345,7 +343,7 @@ def _form_truth(plan: Demonstration, found: Adjustment) -> dict[str, float]:
 
 
 def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
-    """Return the entries of the summary that only the twin's truth can give; lengths in metres."""
+    """Return the entries of the summary that need the true values; lengths in metres."""
     truth: TruthComparison = compare_with_truth(
         recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
     )
@@ -357,9 +355,9 @@ def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, An
 
 
 def true_response(recording: Recording) -> TrueResponse:
-    """Return what an identification should have found."""
+    """Return the true response that an identification estimates."""
     if recording.truth is None:
-        raise OmsmError("this recording comes without the truth behind it; record it on the twin")
+        raise OmsmError("the recording holds no true values; record it on the twin")
     return recording.truth.response
 
 
@@ -375,14 +373,14 @@ def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[s
 
 
 def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
-    """Draw one wide picture: map before in µm, after in nm, identified and true response."""
+    """Draw the maps before [µm] and after [nm], and the identified and true response."""
     raw, corrected = (levelled(view, h, PAPER_MIRROR) for h in (view.raw_height, view.height))
     figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
     return style.png(figure, dpi=120)
 
 
 def live_points(bag: Path) -> NDArray[np.void]:
-    """Return all points the corrector node published while ``bag`` was recorded, in order."""
+    """Return all points that the corrector node published into ``bag``, in order."""
     with bags.BagReader(bag) as reader:
         clouds = [points for _, points in reader.records(bags.POINTS_TOPIC)]
     return np.concatenate(clouds) if clouds else np.empty(0, np.dtype(list(CLOUD_FIELDS)))
@@ -396,7 +394,7 @@ def same_points(live: NDArray[np.void], stored: NDArray[np.void]) -> bool:
 
 
 def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, bytes]:
-    """Draw a Bode plot against the truth, and what the model makes of the step test."""
+    """Draw a Bode plot with the true response, and the step test with the model's output."""
     axes, period = step.axes, calibration.sample_period
     recursion = Recursion(discretise(calibration.dynamics, period))
     recursion.start(past_motion(axes.z[:_REST_SAMPLES]))
@@ -411,7 +409,7 @@ def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, 
 
 
 def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
-    """Return the result for the terminal."""
+    """Return the result as text for the terminal."""
     where = printable(os.path.relpath(plan.out))
     written = ", ".join(summary["files"].values())
     rows = [*sample_rows(summary), *_accuracy_rows(summary), ("written", f"{written} in {where}")]
@@ -421,7 +419,7 @@ def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:
 
 
 def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
-    """Yield names and texts of where the samples went."""
+    """Yield rows of the account of the samples."""
     for stream, account in summary["samples"].items():
         reasons = "".join(f", {n} {reason}" for reason, n in account["counted"].items() if n)
         value = f"{account['received']} received, {account['corrected']} corrected{reasons}"
@@ -430,15 +428,15 @@ def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def _live_text(summary: dict[str, Any]) -> str:
-    """Say whether the corrector did live what was done offline, and what to do if it could not."""
+    """Return whether live and offline points are equal, with a remedy if not."""
     if summary["live_equals_offline"]:
         return "to the last bit"
     left_out = summary["samples"]["distance"]["corrected"] - summary["live_points"]
     if left_out <= 0:
         return "NO"
     return (
-        f"NO: {left_out} points were not made live, for this computer was too busy at that speed; "
-        "give a smaller --time-lapse"
+        f"NO: {left_out} points are missing live because this computer was too slow; give a "
+        "smaller --time-lapse"
     )
 
 
@@ -450,12 +448,12 @@ def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
     surface = summary["surface_deviation"]
     floor = quantity(surface["probe_noise_and_resolution"], "m")
     yield (
-        "cloud from true surface",
-        f"rms {quantity(surface['rms'], 'm')}; the probe alone has {floor}",
+        "cloud minus true surface",
+        f"rms {quantity(surface['rms'], 'm')}, of which {floor} from the probe's noise",
     )
     for row in summary["response"]:
         yield (
-            f"G at {quantity(row['frequency'], 'Hz')}, off by",
+            f"error of G at {quantity(row['frequency'], 'Hz')}",
             f"{quantity(row['gain_error'] / PPM, 'ppm', signed=True)}, "
             f"{quantity(row['phase_error_deg'], '°', signed=True)}",
         )

@@ -1,4 +1,4 @@
-"""Is this computer fit to run a cell? Python, packages, ROS, discovery, ports, clock, disk."""
+"""Check whether this computer can run a cell: Python, packages, ROS, ports, clock, disk."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _DISCOVERY_TIMEOUT_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class HostCheck:
-    """One thing that was looked at.
+    """Result of one check.
 
-    state: "fine", "doubtful" (works, but may not for long) or "faulty"
-    found: what is there;  remedy: what to do about it, empty where nothing is to be done
+    state: "fine", "doubtful" (works, with a risk) or "faulty"
+    found: the state in words;  remedy: what to do, empty if nothing
     """
 
     name: str
@@ -50,10 +50,10 @@ class HostCheck:
 
 
 def examine_host(folder: Path, port: str = "") -> list[HostCheck]:
-    """Look at everything that a cell on this computer depends on.
+    """Check everything that a cell on this computer depends on.
 
-    folder: where recordings will lie;  port: a serial device that must be there, such as
-    ``/dev/ttyUSB0``; empty to list those that are
+    folder: for recordings;  port: serial device that must exist, such as ``/dev/ttyUSB0``; empty
+    to list those that exist
     """
     return [
         _python(),
@@ -93,16 +93,16 @@ def _packages() -> Iterator[HostCheck]:
 
 
 def _open_files() -> HostCheck:
-    """Return whether a process may hold as many files as nodes and commands do."""
+    """Check that a process may open as many files as nodes and commands need."""
     most = open_files()
     if most >= FEWEST_OPEN_FILES:
         return HostCheck("open files", FINE, f"{most} at most" if most < math.inf else "any number")
-    found = f"a process may hold {most} open, and may need {FEWEST_OPEN_FILES}"
+    found = f"a process may open {most} files, and may need {FEWEST_OPEN_FILES}"
     return HostCheck("open files", FAULTY, found, MORE_FILES)
 
 
 def _ros(environment: os._Environ[str]) -> Iterator[HostCheck]:
-    """Yield whether nodes can start, and whether they find each other."""
+    """Check that nodes can start and find each other."""
     if importlib.util.find_spec("rclpy") is None:
         yield HostCheck(
             "ROS 2", DOUBTFUL, "not found: the offline commands work, nodes do not",
@@ -111,7 +111,7 @@ def _ros(environment: os._Environ[str]) -> Iterator[HostCheck]:
         return
     if importlib.util.find_spec("omsm_msgs") is None:
         yield HostCheck(
-            "ROS 2", FAULTY, "rclpy, but no omsm_msgs", "build it: make setup; . ./env.sh"
+            "ROS 2", FAULTY, "rclpy without omsm_msgs", "build it: make setup; . ./env.sh"
         )
         return
     yield HostCheck("ROS 2", FINE, environment.get("ROS_DISTRO", "jazzy, from PyPI"))
@@ -122,14 +122,14 @@ def _ros(environment: os._Environ[str]) -> Iterator[HostCheck]:
         yield HostCheck("DDS settings", FINE, found)
     else:
         yield HostCheck(
-            "DDS settings", DOUBTFUL, f"{found}: other computers may command these nodes",
+            "DDS settings", DOUBTFUL, f"{found}: other computers can control these nodes",
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, or a ROS_DOMAIN_ID of your own",
         )  # fmt: skip
     yield _discovery()
 
 
 def _discovery() -> HostCheck:
-    """Return whether two processes' worth of ROS find each other and pass a message."""
+    """Check that two ROS processes find each other and exchange a message."""
     if open_files() < FEWEST_OPEN_FILES:
         return HostCheck("DDS discovery", FAULTY, "not evaluated: too few open files", MORE_FILES)
     command = [sys.executable, "-m", "omsm_ros.nodes.discovery_check"]
@@ -150,9 +150,9 @@ def _discovery() -> HostCheck:
 def _serial(port: str) -> HostCheck:
     ports = serial_ports()
     if port and port not in ports and not Path(port).exists():
-        there = f"; there are: {', '.join(ports)}" if ports else "; there is none"
+        there = f"; available: {', '.join(ports)}" if ports else "; none is available"
         return HostCheck(
-            "serial port", FAULTY, f"no {port}{there}", "plug the device in; name its port"
+            "serial port", FAULTY, f"no {port}{there}", "connect the device; give its port"
         )
     wanted = [port] if port else ports
     closed = [p for p in wanted if not os.access(p, os.R_OK | os.W_OK)]
@@ -165,19 +165,19 @@ def _serial(port: str) -> HostCheck:
 
 
 def _clock(synchronised: Callable[[], bool | None]) -> HostCheck:
-    """Return whether stamps of this computer can be compared with those of another."""
-    remedy = "sudo timedatectl set-ntp true, where stamps of several computers are compared"
-    by_hand = "see that chrony or another NTP client runs, where several computers are compared"
+    """Check that stamps of this computer can be compared with those of another."""
+    remedy = "sudo timedatectl set-ntp true, if stamps of several computers are compared"
+    by_hand = "check that chrony or another NTP client runs, if several computers are compared"
     states = {
         True: HostCheck("clock", FINE, "synchronised"),
         False: HostCheck("clock", DOUBTFUL, "not synchronised", remedy),
-        None: HostCheck("clock", DOUBTFUL, "not evaluated: timedatectl says nothing here", by_hand),
+        None: HostCheck("clock", DOUBTFUL, "not evaluated: timedatectl is not available", by_hand),
     }
     return states[synchronised()]
 
 
 def _kernel_clock_synchronised() -> bool | None:
-    """Return what systemd says of the clock; None where it says nothing."""
+    """Return whether systemd reports a synchronised clock; None if it reports nothing."""
     try:
         done = subprocess.run(
             ["timedatectl", "show", "--property=NTPSynchronized", "--value"],

@@ -1,4 +1,4 @@
-"""A cloud or map in the format of another program."""
+"""Write a cloud or map in the format of another program."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _COMMENT = "written by omsm_ros, lengths in metres"
 def export(
     source: Path, out: Path, units: LengthUnits | None = None, spacing: float | None = None
 ) -> dict[str, Any]:
-    """Write ``source`` as ``out``, whose ending names the format; return what was done.
+    """Write ``source`` to ``out``, whose suffix names the format; return facts of the file.
 
-    units: of a source that does not carry them;  spacing: of a map made of scattered points [m]
+    units: of a source that does not state them;  spacing: of a map made of scattered points [m]
 
-    Raises FileError for a source or a format that is not known.
+    Raises FileError for an unknown source or format.
     """
     form = out.suffix.lower()
     if form in AS_POINTS:
@@ -47,13 +47,13 @@ def export(
     if form in AS_MAP:
         return _write_map(out, form, read_points(source, units), spacing)
     raise FileError(
-        f"format {out.suffix!r} of {str(out)!r} is not known; end it in one of "
+        f"format {out.suffix!r} of {str(out)!r} is unknown, expected one of "
         f"{', '.join((*AS_POINTS, *AS_MAP))}"
     )
 
 
 def _table(source: Path, units: LengthUnits | None) -> NDArray[np.void]:
-    """Return all columns of a cloud of ours; of another file those that every format has."""
+    """Return all columns of an own cloud; of another file those that every format has."""
     file = source / CLOUD if source.is_dir() else source
     try:
         cloud = CloudFile(file)
@@ -78,7 +78,7 @@ def _write_points(out: Path, form: str, table: NDArray[np.void]) -> None:
     if form == ".pcd":
         return write_pcd(out, table)
     names = list(table.dtype.names or ())
-    if "height" in names:  # z repeats it with fewer digits, for viewers
+    if "height" in names:  # z is the same in single precision, for viewers
         names.remove("z")
     columns = {("height" if name == "z" else name): table[name] for name in names}
     if form in (".h5", ".hdf5"):

@@ -42,13 +42,14 @@ _PORTION = 131_072
 
 @dataclass(frozen=True)
 class MeasurementMeasuredPortions:
-    """portions: reads all points from the start;  sources: of their systematic effects, by name
+    """Points of a measurement, read in batches with the effects of its systematic errors.
 
-    systematic: whether the effects of systematic errors are known at all
-    notes: what a reader of the results should know about how the file was understood
-    even: whether the points are those of an evenly spaced grid
+    portions: yields all points from the start;  sources: names of the systematic errors
+    systematic: True if the effects of systematic errors are known
+    notes: remarks on how the file was read
+    even: True for the points of an evenly spaced grid
     bounds: names of the sources of which only an upper bound is known
-    missing: how many points of a map, beside these, have no height
+    missing: number of further points of a map without a height
     """
 
     portions: PointBatches
@@ -66,7 +67,7 @@ class MeasurementMeasuredPortions:
         aperture: Aperture | None = None,
         filters: tuple[float | None, float | None] = (None, None),
     ) -> FormResult:
-        """Return the form against ``surface``, with all that is known of the points."""
+        """Return the form of the points against ``surface``."""
         return analyse_form(
             surface,
             self.portions,
@@ -80,10 +81,12 @@ class MeasurementMeasuredPortions:
 
 
 def open_measurement(path: Path, units: LengthUnits | None = None) -> MeasurementMeasuredPortions:
-    """Open a result folder, a cloud of ours, or a map or cloud of any other format.
+    """Open a result folder, an own cloud, or a map or cloud of any other format.
 
-    Our own clouds are read in bounded memory, with the fields that lie beside them.
-    units: of a file that does not carry them. Raises FileError for what cannot be read.
+    Own clouds are read in bounded memory, with the systematic fields in the same folder.
+    units: of a file that does not state them
+
+    Raises FileError for a file that cannot be read.
     """
     file = path / CLOUD if path.is_dir() else path
     if not file.exists():
@@ -108,11 +111,14 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     )
 
 
-def _slices(points: MeasuredPoints) -> Iterator[PointBatch]:
-    for first in range(0, len(points), _PORTION):
-        part = slice(first, first + _PORTION)
+def _slices(
+    points: MeasuredPoints, fields: ErrorFields | None = None, size: int = _PORTION
+) -> Iterator[PointBatch]:
+    for first in range(0, len(points), size):
+        part = slice(first, first + size)
         x, y, height = points.x[part], points.y[part], points.height[part]
-        yield PointBatch(x, y, height, np.empty((0, len(x))))
+        effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
+        yield PointBatch(x, y, height, effects)
 
 
 def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatch]:
@@ -124,9 +130,11 @@ def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatc
         first += len(x)
 
 
-# Of the areal density each way: a picture of it, in 70 kB.
+# Blocks of the areal density in each direction: enough for a figure, 70 kB in the file.
 _MOST_BLOCKS = 64
-_NO_SYSTEMATIC = "systematic errors of the measurement: only noise, form and pose are in here"
+_NO_SYSTEMATIC = (
+    "systematic errors of the measurement: the uncertainty covers noise, form and pose only"
+)
 
 
 def judge_form(
@@ -138,16 +146,17 @@ def judge_form(
     filters: tuple[float | None, float | None] = (None, None),
     tolerance: float | None = None,
 ) -> dict[str, Any]:
-    """Register a measurement to its nominal ``surface``; return what ``form.json`` says of it.
+    """Register a measurement to its nominal ``surface``; return the content of ``form.json``.
 
     Writes into ``out`` form.json, curves.json (profiles and power spectral densities) and
     deviation.ply: deviation along the normal over the part's x and y.
 
-    asked: freedoms of the fit, or "auto";  aperture: of the part, None for all points
-    filters: wavelengths of the S- and the L-filter [m], None for what the points allow
-    tolerance: of the peak to valley of 99.5 % [m], if there is one
+    asked: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
+    filters: wavelengths of the S- and the L-filter [m], None for those that the points allow
+    tolerance: of the peak to valley of 99.5 % of the part [m], None without one
 
-    Raises DataError for points that do not fit, or do not determine a freedom that was asked for.
+    Raises DataError for points that do not fit the surface, or do not determine a degree of
+    freedom that was asked for.
     """
     form = measured.form(surface, asked, aperture, filters)
     facts = form_facts(form, measured, surface)
@@ -161,11 +170,11 @@ def judge_form(
 
 
 def draw_form(measured: Path, out: Path) -> None:
-    """Write the page of a form that :func:`judge_form` has left in ``out``.
+    """Write the report of a form whose results :func:`judge_form` wrote into ``out``.
 
-    measured: what it is of; what a summary beside it says of the measurement is on the page
+    measured: file or folder of the measurement; its summary, if any, is part of the report
     """
-    # Here, because drawing takes longer to load than many a form to judge.
+    # Imported on demand, because loading the figures takes longer than many evaluations.
     from omsm_ros.pipelines.publish import publish_form
 
     folder = measured if measured.is_dir() else measured.parent
@@ -227,29 +236,29 @@ def _mismatch_text(form: FormResult, nominal: Surface) -> list[str]:
 
 
 def _counts(form: FormResult, missing: int) -> dict[str, int]:
-    """Return every point by what became of it, and those that never had a height."""
+    """Return the number of points by their use, with those that had no height."""
     added = {name: form.counts[name] + missing for name in ("read", "not_finite")}
     return form.counts | added
 
 
 def _advice(form: FormResult) -> list[str]:
-    """Return what would say more, where a move leaves less of the form than it is sure of."""
+    """Return advice where a fitted or held move and the form cannot be separated."""
     dofs, rms = form.registration.dofs, form.deviation["rms"]
     fitted = [n for n in dofs.fitted if n in MOVES]
     if rms.uncertainty is None or rms.value is None or rms.value >= 2 * rms.uncertainty:
         fitted = []
     advice = [
-        f"a move along {' and '.join(fitted)} looks like form here, and was fitted, so that little "
-        "is known of form that looks so; the figures of the best fit hold all the same; if the "
-        "part was not moved since it was cut, hold it: --fit piston,tip,tilt"
+        f"a move along {' and '.join(fitted)} cannot be separated from form here; it was fitted, "
+        "so form of that shape is uncertain; figures after best-fit alignment are not affected; if "
+        "the part was not moved since it was cut, hold it: --fit piston,tip,tilt"
     ] * bool(fitted)
     if dofs.held:
         others = ",".join(n for n in dofs.fitted if n not in dofs.held)
         advice.append(
-            f"{' and '.join(dofs.held)} held as in the nominal pose, for form looks like a "
-            "move there; how far the part may be off all the same is in every uncertainty but "
-            "those of the best fit, which no move changes; if it "
-            f"is known to sit within a micrometre, name what to fit: --fit {others}"
+            f"{' and '.join(dofs.held)} held at the nominal pose, because a move cannot be "
+            "separated from form there; the possible offset of the part is included in every "
+            "uncertainty except those after best-fit alignment; if the part is known to sit within "
+            f"a micrometre, state the fit: --fit {others}"
         )
     return advice
 
@@ -282,9 +291,7 @@ def _terms(form: FormResult) -> list[dict[str, Any]]:
     return known + [{"n": t.n, "m": t.m, "value": None, "uncertainty": None} for t in fit.left_out]
 
 
-# A measurement in the frame of its part, registered to the nominal surface.
-
-_PORTION_REGISTERED_POINTS = 65_536
+_REGISTERED_PORTION = 65_536
 POSE = "pose of the part"
 
 
@@ -293,8 +300,8 @@ def registered(
 ) -> ComparedMeasurement:
     """Return the measurement's deviations along the normal, in the frame of its part.
 
-    Its errors are what they are once the pose has followed them, and the pose's own are one more
-    source; what lies far from the smooth form of the part, as dust, is left out and noted.
+    The effects of its errors are those after the fit of the pose, and the uncertainty of the pose
+    is a further source. Outliers such as dust are left out and noted.
 
     Raises DataError for points that do not fit the surface.
     """
@@ -302,11 +309,7 @@ def registered(
     names = fields.names if fields is not None else ()
 
     def portions() -> Iterator[PointBatch]:
-        for first in range(0, len(points), _PORTION_REGISTERED_POINTS):
-            part = slice(first, first + _PORTION_REGISTERED_POINTS)
-            x, y, height = points.x[part], points.y[part], points.height[part]
-            effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
-            yield PointBatch(x, y, height, effects)
+        return _slices(points, fields, _REGISTERED_PORTION)
 
     found = register(nominal, portions, dofs, sources=names, even=as_grid(points) is not None)
     where = [placed(nominal, found.placement, portion) for portion in portions()]
@@ -340,7 +343,7 @@ def _points(
 
 @dataclass(frozen=True, eq=False)
 class _RegisteredFields:
-    """Fields of a scan once the pose has followed each error, as ``omsm form`` has them."""
+    """Fields of a scan's errors after the fit of the pose."""
 
     found: Registration
     at_: Placed
@@ -366,7 +369,7 @@ class _RegisteredFields:
 
 @dataclass(frozen=True, eq=False)
 class _PoseFields:
-    """What the pose may be wrong by, one row an independent part of it."""
+    """Fields of the uncertainty of the pose, one row for each independent component."""
 
     found: Registration
     at_: Placed

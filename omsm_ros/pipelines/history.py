@@ -1,4 +1,4 @@
-"""What was calibrated and measured, written down; and what became of each machine over months."""
+"""Record calibrations and measurements in a catalogue, and evaluate the drift of each machine."""
 
 from __future__ import annotations
 
@@ -26,12 +26,19 @@ _TABLES = ("calibrations", "measurements")
 
 
 def keep_calibration(
-    address: str, calibration: Calibration, path: Path, source: Path | None = None
+    address: str,
+    calibration: Calibration,
+    path: Path,
+    source: Path | None = None,
+    recorded_ns: int | None = None,
 ) -> bool:
-    """Add a calibration, its file and the bag that it came from; False if it is there already."""
+    """Add a calibration, its file and its bag; return False if the catalogue has it already.
+
+    recorded_ns: when the bag was recorded [ns, ROS time]; None: read it from the bag ``source``
+    """
     row = {
         "id": calibration.id,
-        "recorded_at": time_of(_recorded(source)),
+        "recorded_at": time_of(recorded_ns or _recorded(source)),
         "machine": _machine(calibration.settings),
         "verdict": verdict_text(calibration),
         "path": str(path.absolute()),
@@ -49,9 +56,10 @@ def keep_calibration(
 
 
 def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> bool:
-    """Add the finished measurement in ``folder``, of ``bag`` if it is not where its summary says.
+    """Add the finished measurement in ``folder``.
 
-    False if it is there already: the same summary in the same folder.
+    bag: its recording, if it was moved since;  return False if the catalogue has the same summary
+    of the same folder already
     """
     path = folder / SUMMARY
     text = read_text(path, MAX_RESULT_BYTES, FileError, "summary")
@@ -82,7 +90,7 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
 
 
 def keep(address: str, path: Path) -> bool:
-    """Add what lies at ``path``: a calibration's file, or the folder of a measurement."""
+    """Add a calibration file or the folder of a measurement."""
     if path.is_dir():
         return keep_measurement(address, path)
     return keep_calibration(address, load_calibration(path), path)
@@ -90,10 +98,10 @@ def keep(address: str, path: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class MachineHistory:
-    """One machine: its calibrations and measurements, and how its dynamics and results drift.
+    """Calibrations and measurements of one machine, and their linear trends.
 
-    delay: of the lag [s/s];  static_gain: [1/s];  deviation: of the form's rms [m/s]; None where
-    there are fewer than five
+    delay: trend of the lag [s/s];  static_gain: [1/s];  deviation: of the form's rms [m/s]; None
+    for fewer than five rows
     """
 
     machine: str
@@ -106,9 +114,9 @@ class MachineHistory:
 
 @dataclass(frozen=True, slots=True)
 class CatalogueHistory:
-    """What a catalogue holds, machine by machine.
+    """Contents of a catalogue by machine.
 
-    older: how many calibrations and measurements are older than those listed; zero unless a
+    older: number of calibrations and measurements that are older than those listed; zero unless a
         table holds more than ``catalogue.MOST_ROWS``
     """
 
@@ -117,7 +125,7 @@ class CatalogueHistory:
 
 
 def history(address: str, machine: str = "") -> CatalogueHistory:
-    """Return what the catalogue holds; of one machine, or of all."""
+    """Return the contents of the catalogue; of one machine, or of all."""
     older = 0
     rows: dict[str, dict[str, list[dict[str, Any]]]] = {}
     with Catalogue(address) as catalogue:
@@ -186,18 +194,15 @@ def _recorded(bag: Path | None) -> int | None:
         return None
 
 
-# Writing something into the catalogue must never cost a measurement.
-
-
 def record_in_catalogue(address: str, keep: Callable[[], bool]) -> list[str]:
-    """Write something down if there is a catalogue; return a warning where that failed.
+    """Call ``keep`` if there is a catalogue; return a warning if that failed.
 
-    A measurement is never lost because of a database: it lies in its folder already.
+    A failing database raises nothing, because the result is in its files already.
     """
     if not address:
         return []
     try:
         keep()
     except (OmsmError, OSError) as err:
-        return [f"not written into the catalogue: {err}; 'omsm history --add' does it later"]
+        return [f"not written into the catalogue: {err}; add it later with 'omsm history --add'"]
     return []

@@ -1,4 +1,4 @@
-"""A recording of another program, made into a bag."""
+"""Convert a recording of another program to a bag."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import shown
 from omsm_ros.units import DATE
 
-# Which trigger number has each row of a foreign recording, and when was it taken?
-
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where a stream's time and count begin.
+    """Origin of a stream's time and trigger count.
 
-    start: instant [s, Unix] of ``epoch``, a time [s] of the recording;  zero: that of trigger 0
+    start: instant [s, Unix] of ``epoch``, a time [s] of the recording
+    zero: time [s] of the recording at trigger 0
     """
 
     start: float = 0.0
@@ -51,10 +50,10 @@ class Origin:
 
 
 class RowCounter:
-    """Counts the rows of a stream by their triggers, else by their time, else one by one."""
+    """Number the rows of a stream by their triggers, else by their time, else one by one."""
 
     def __init__(self, stream: str, mapped: ColumnMap, timed: bool, triggered: bool) -> None:
-        """timed, triggered: which of both columns the ``stream``, a file or topic, has."""
+        """timed, triggered: whether the ``stream``, a file or topic, has these columns."""
         if not timed and mapped.sample_period is None:
             raise FileError(f"{stream} has no column of time; state sample_period in the map")
         self._mapped, self._timed, self._triggered = mapped, timed, triggered
@@ -63,7 +62,7 @@ class RowCounter:
         self.origin = Origin(mapped.start)
 
     def begin(self, first: Mapping[str, FloatArray]) -> tuple[float | None, float]:
-        """Take the period from the ``first`` rows; return the time of trigger 0, and it [s]."""
+        """Determine the period from the ``first`` rows; return time of trigger 0 and period [s]."""
         times = self._times(first)
         if times is None:
             return None, self._period
@@ -99,12 +98,12 @@ class RowCounter:
 
 @dataclass(slots=True)
 class ImportedFile:
-    """What came out of one file, or of one topic of a bag.
+    """Result of the import of one file, or of one topic of a bag.
 
-    missing: trigger numbers that it skips;  invalid: readings of the probe that are none
-    lost: rows where an axis is no number;  repeated_names: lines that repeat the line of names
-    passed_over: messages that hold none of the columns
-    own_clock: whether it shares no trigger with the others, only time
+    missing: missing trigger numbers;  invalid: invalid probe readings
+    lost: rows with an axis that is not a number;  repeated_names: repeated header lines
+    passed_over: messages without any of the columns
+    own_clock: whether it has no trigger in common with the others, only time
     """
 
     file: str
@@ -129,9 +128,9 @@ def import_recording(
 ) -> list[ImportedFile]:
     """Write the bag ``out`` from ``files``; each has the axes, the probe, or both.
 
-    Files with the same columns continue each other; a file of axes and one of the probe lie
-    side by side, row by row, or by their columns of trigger numbers or time. Raises FileError and
-    DataError for what is missing or unclear; the bag then does not appear.
+    Files with the same columns are concatenated. A file of axes and one of the probe are joined
+    by their trigger numbers, their times, or row by row. Raises FileError and DataError for
+    missing or ambiguous data; the bag is then not written.
     """
     with ExitStack() as opened:
         sources = []
@@ -154,7 +153,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
     topics += [bags.DISTANCE_TOPIC] * any(source.found.distance for source in sources)
     done = 0
     with atomic_bag(out, topics) as bag:
-        # By time, as they would have been recorded, so that no reader has to keep one back.
+        # Ordered by time, as in a recording, so that readers need not buffer one stream.
         merged = heapq.merge(*(s.blocks() for s in streams), key=lambda block: block.stamp_ns)
         for block in merged:
             if isinstance(block, AxisBlock):
@@ -169,7 +168,7 @@ def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: 
 def _check_streams(
     sources: Sequence[_Source], chains: list[tuple[str, ...]], mapped: ColumnMap
 ) -> None:
-    """Raise FileError unless each stream is whole and comes from files of one kind."""
+    """Raise FileError unless each stream is complete and from files with the same columns."""
     for channel in mapped.columns:
         if not mapped.has(channel):
             continue
@@ -179,25 +178,25 @@ def _check_streams(
         if len(holders) > 1 and channel not in COUNTING:
             raise FileError(
                 f"files with different columns have the column {name!r} of {channel}; import them "
-                "one by one, or leave out those that only repeat it"
+                "one by one, or leave out those that repeat it"
             )
 
 
 def _check_counted(streams: Sequence[_Stream]) -> None:
-    """Raise FileError where triggers are missing in one stream, and another cannot show it."""
+    """Raise FileError if triggers are missing in one stream and another has no count."""
     gaps = [s for s in streams if any(source.found.missing for source in s.sources)]
     uncounted = [s for s in streams if not s.counted]
     if gaps and uncounted:
         raise FileError(
-            f"{gaps[0].sources[0].found.file} lacks triggers, and "
-            f"{uncounted[0].sources[0].found.file} has no column that tells which rows belong to "
-            "the others; give it the trigger or the time, too"
+            f"triggers are missing in {gaps[0].sources[0].found.file}, and "
+            f"{uncounted[0].sources[0].found.file} has neither trigger nor time to assign its rows "
+            "by; add one of these columns"
         )
 
 
 @contextmanager
-def _import_remarks(file: str) -> Iterator[None]:
-    """Name the file where its rows cannot be counted."""
+def _named_in_errors(file: str) -> Iterator[None]:
+    """Name the file in a DataError."""
     try:
         yield
     except DataError as err:
@@ -205,7 +204,7 @@ def _import_remarks(file: str) -> Iterator[None]:
 
 
 class _Stream:
-    """Files of the same columns, one after the other, and the count of their rows."""
+    """Files of the same columns, one after the other, with one row counter."""
 
     def __init__(self, sources: Sequence[_Source], mapped: ColumnMap) -> None:
         self.sources = sources
@@ -214,7 +213,7 @@ class _Stream:
         self.counted = bool({*COUNTING} & {*channels})
         self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
         first = sources[0].first()
-        with _import_remarks(sources[0].found.file):
+        with _named_in_errors(sources[0].found.file):
             self.begins, self.period = self.counter.begin(first)
 
     def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:
@@ -224,7 +223,7 @@ class _Stream:
 
 
 def _align(streams: Sequence[_Stream], mapped: ColumnMap) -> None:
-    """Begin the count of all streams together, where their times do not forbid it."""
+    """Start the count of all streams at one origin, if their times share a trigger."""
     begun = [s.begins for s in streams if s.begins is not None]
     if not begun:
         return
@@ -240,7 +239,7 @@ def _align(streams: Sequence[_Stream], mapped: ColumnMap) -> None:
 
 
 class _Source:
-    """One table, and how far it was read."""
+    """One table, and the results of reading it."""
 
     def __init__(self, table: ForeignTable, mapped: ColumnMap) -> None:
         self._table, self._mapped = table, mapped
@@ -253,7 +252,7 @@ class _Source:
         lacking = [a for a in AXES if mapped.has(a) and a not in streams] if axes else []
         if lacking:
             raise FileError(
-                f"{table} has {sorted(axes)}, but not {lacking}; axes are latched together: "
+                f"{table} has {sorted(axes)}, but not {lacking}; the axes are sampled together: "
                 "give them in one file"
             )
         table.used(mapped.names(self.channels))
@@ -261,10 +260,10 @@ class _Source:
         self._check_period()
 
     def without(self, name: str, channel: str) -> str:
-        """Return why the column ``name`` of ``channel`` is not to be had here."""
+        """Return why the column ``name`` of ``channel`` is not available here."""
         if often := self._table.names.count(name):
             return (
-                f"{self._table} has {often} columns {name!r}, one of which is {channel}; "
+                f"{self._table} has {often} columns {name!r}, of which {channel} is one; "
                 "rename the others"
             )
         return (
@@ -281,7 +280,7 @@ class _Source:
             )
 
     def _check_units(self) -> None:
-        """Raise FileError where the map contradicts what the file itself says of a unit."""
+        """Raise FileError if the map contradicts a unit that the file states."""
         for channel in self.channels:
             column = self._mapped.columns[channel]
             stated = stated_unit(self._table, column.name)
@@ -293,16 +292,16 @@ class _Source:
                 )
 
     def first(self) -> Mapping[str, FloatArray]:
-        """Return the first rows; FileError where there are none."""
+        """Return the first rows; FileError if there are none."""
         for piece in self._pieces():
             return piece
         raise FileError(f"{self._table} has no row of numbers; check that it was written")
 
     def blocks(self, counter: RowCounter) -> Iterator[AxisBlock | DistanceBlock]:
-        """Yield the file's blocks; ``counter`` goes on from the file before."""
+        """Yield the file's blocks; ``counter`` continues from the file before."""
         found = self.found
         for piece in self._pieces():
-            with _import_remarks(found.file):
+            with _named_in_errors(found.file):
                 rows = counter.count(piece)
             skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
             self._last = int(rows.counter[-1])

@@ -1,4 +1,4 @@
-"""What is in a bag, and what is wrong with it."""
+"""Inspect a bag: its streams, their faults, and the vibration levels in it."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from omsm_ros.errors import Notice
 from omsm_ros.io import bags
 from omsm_ros.io.topics import relative
 from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.recording import Recording
 
 _NO_INDEX = (
-    "it has no index: its recording was ended hard, or the disk was full, so the last moments may "
-    "be missing; 'omsm inspect --repair' makes a copy with one"
+    "the file has no index: its recording was interrupted or the disk was full, so its end may be "
+    "missing; 'omsm inspect --repair' makes a copy with an index"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class StreamInspection:
-    """What a stream of blocks holds.
+    """Contents of one topic.
 
-    gaps: places where the trigger counter skips; missing: samples skipped there
-    restarts: places where it falls back
-    invalid: readings of the probe, or places of the axes, that are none
+    gaps: number of gaps in the trigger counter;  missing: samples missing in them
+    restarts: how often the counter started again
+    invalid: invalid readings of the probe or positions of the axes
     """
 
     topic: str
@@ -41,9 +42,9 @@ class StreamInspection:
 
 @dataclass(frozen=True)
 class Inspection:
-    """streams: by topic;  faults: what is wrong, in words for people.
+    """Contents of a bag: its topics, its faults as text, and vibration levels.
 
-    vibration: levels that the monitor told, see :func:`_vibration`; None where it told nothing
+    vibration: levels that the monitor reported, see :func:`_vibration`; None without any
     """
 
     streams: list[StreamInspection]
@@ -57,22 +58,21 @@ class Inspection:
 
 
 def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspection:
-    """Look through a bag: topics, samples, rates, gaps, restarts, invalid readings, faults."""
-    with bags.BagReader(path) as bag:
+    """Return topics, samples, rates, gaps, restarts, invalid readings and faults of a bag."""
+    with Recording(path, progress) as recording:
+        bag = recording.bag
         topics = bag.topics()
         present = [t.role for t in topics if t.role in bags.BLOCK_TOPICS and t.messages]
         watches = {topic: StreamWatch() for topic in present}
-        total = bag.count(present)
-        for done, topic, block in bag.blocks(*present):
+        for topic, block in recording.stream(*present):
             watches[topic].add(block)
-            progress(done, total)
-        if any(t.role == bags.ACCELERATION_TOPIC and t.messages for t in topics):
+        if recording.holds(bags.ACCELERATION_TOPIC):
             watches[bags.ACCELERATION_TOPIC] = StreamWatch()
             for topic, block in bag.records(bags.ACCELERATION_TOPIC):
                 watches[topic].add(block)
         faults = [] if bag.indexed else [_NO_INDEX]
         faults += [
-            f"no {what}: there is nothing on {bag.name_of(topic)!r} to identify or correct with"
+            f"no {what}: nothing on {bag.name_of(topic)!r}, which identify and correct need"
             for topic, what in ((bags.AXES_TOPIC, "axes"), (bags.DISTANCE_TOPIC, "distance"))
             if topic not in watches
         ]
@@ -82,12 +82,12 @@ def inspect_bag(path: bags.AnyBag, progress: Progress = no_progress) -> Inspecti
 
 
 def _vibration(levels: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
-    """Return the largest levels of all spectra that the monitor told; None of none.
+    """Return the largest levels of all spectra that the monitor reported; None without any.
 
     rms: of each axis by band [m/s²];  height, height_total: effect on a height, rms [m], None
-    where no calibration told it;  alarms: spectra during which the alarm was raised
+    without a calibration;  alarms: number of spectra during which the alarm was raised
     """
-    # Bands follow the sampling rate, so they are those of the last.
+    # The bands depend on the sampling rate; only spectra with those of the last one compare.
     alike = [one for one in levels if one["bands"] == levels[-1]["bands"]]
     if not alike:
         return None
@@ -103,7 +103,7 @@ def _vibration(levels: Sequence[Mapping[str, Any]]) -> dict[str, object] | None:
 
 
 def _largest(levels: Iterable[Sequence[float]]) -> list[float]:
-    """Return the largest of each band."""
+    """Return the largest level of each band."""
     return [float(max(band)) for band in zip(*levels, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""A finished measurement: its cloud, its summary and its page in one folder."""
+"""Correct a scan and evaluate it: cloud, summary and report in one folder."""
 
 from __future__ import annotations
 
@@ -45,16 +45,14 @@ if TYPE_CHECKING:
     from omsm_ros.pipelines.correct import Correction
 
 
-# What is the uncertainty of a corrected scan made of, and may it be relied on?
-
-# What a fit takes out of the deviations is no error of theirs any more; how well it does is in
-# the uncertainty of the form.
+# A fitted degree of freedom removes these sources from the deviations; the uncertainty of the fit
+# is part of the form's uncertainty.
 _POSE_DOFS: Mapping[str, tuple[str, ...]] = {
     "tilt": ("tip", "tilt"),
     "decentre": ("x", "y"),
     "clocking": ("clocking",),
 }
-# A map with more holes than this hides something.
+# With a smaller share of corrected samples the map may miss defects of the surface.
 _LEAST_SHARE_CORRECTED = 0.95
 
 
@@ -64,7 +62,7 @@ def with_sources(
     stated: MachineSources,
     nominal: Surface | None,
 ) -> CorrectionOptions:
-    """Return ``options`` with what is ``stated`` of the machine and the slopes of ``nominal``."""
+    """Return ``options`` with the ``stated`` uncertainty sources and the surface ``nominal``."""
     known = options.sources or ErrorSources.of(calibration)
     return replace(
         options,
@@ -76,11 +74,12 @@ def with_sources(
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a scan is judged by.
+    """Inputs of the uncertainty evaluation of a scan.
 
-    options: it was corrected with;  stated: of the machine;  accuracy: asked for, k = 2 [m]
+    options: of its correction;  stated: uncertainty sources of the machine
+    accuracy: required expanded uncertainty, k = 2 [m]
     out: folder for the fields of its systematic errors, None to keep none
-    fitted: freedoms of the pose that are fitted to the nominal surface, or "auto"
+    fitted: degrees of freedom of the pose that are fitted to the nominal surface, or "auto"
     """
 
     options: CorrectionOptions
@@ -138,7 +137,7 @@ def live_traffic_light(
     stated: MachineSources,
     accuracy: float | None,
 ) -> TrafficLight:
-    """Return the light of what has been corrected so far, by the uncertainty of its points."""
+    """Return the traffic light of the points so far, by their uncertainty."""
     shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
     return traffic_light_of(
         calibration,
@@ -155,8 +154,8 @@ def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[Tr
     missing = sorted(lateral - set(corrector.budget))
     if missing and corrector.trace.seen:
         yield TrafficLightReason(
-            f"{', '.join(missing)} not in the uncertainty of the points: no slopes are known",
-            "give the corrector the part's surface (parameter nominal)",
+            f"{', '.join(missing)} not in the uncertainty of the points: slopes are unknown",
+            "give the corrector the part's surface (parameter 'nominal')",
         )
 
 
@@ -166,12 +165,12 @@ def _losses(done: Correction) -> Iterator[TrafficLightReason]:
     for text in done.reasons:
         yield TrafficLightReason(
             f"the calibration was used although {text}",
-            "identify as the scan is made, and correct with that calibration",
+            "identify with the settings of the scan, and correct with that calibration",
         )
     if beyond := done.account["axes"]["counted"].get("beyond"):
         yield TrafficLightReason(
             f"{beyond} samples lie beyond the range of the calibration set",
-            "calibrate there too, and make the set anew with 'omsm calset'",
+            "calibrate there, too, and make a new set with 'omsm calset'",
         )
     for name, stream in done.account.items():
         lost = stream["received"] - stream["corrected"]
@@ -179,16 +178,16 @@ def _losses(done: Correction) -> Iterator[TrafficLightReason]:
             share = 100 * lost / stream["received"]
             yield TrafficLightReason(
                 f"{name}: {lost} samples ({share:.1f} %) gave no point",
-                "see the reasons of the account; run slower where the probe lost its target",
+                "see the account of the samples; scan slower if the probe lost its target",
             )
 
 
 @dataclass(frozen=True)
 class RegistrationOptions:
-    """How a part is registered to its nominal surface, and judged.
+    """Options of the registration to the nominal surface.
 
-    dofs: of the fit, or "auto";  aperture: of the part, None for all points
-    tolerance: of the peak to valley of 99.5 % [m], if there is one
+    dofs: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
+    tolerance: of the peak to valley of 99.5 % of the part [m], None without one
     """
 
     dofs: Sequence[str]
@@ -214,15 +213,16 @@ def measure(
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
 
-    Beside them systematic.npz, what the systematic errors do to the points, for ``omsm form``.
+    Also writes systematic.npz, the fields of the systematic errors, for ``omsm form``.
 
-    lateral: lateral standard uncertainty of a point [m]; needs ``nominal`` for the slope
+    lateral: standard uncertainty of x and y [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.pipelines.correct.correct_bag`
-    stated: what is uncertain of the machine;  accuracy: asked for, k = 2 [m]
-    register: how the points are registered to ``nominal``; None: they are not
-    report: False writes no page, which takes longer than everything else
+    stated: uncertainty sources of the machine
+    accuracy: required expanded uncertainty, k = 2 [m]
+    register: options of a registration to ``nominal``; None: no registration
+    report: False writes no report, which takes longer than everything else
 
-    Raises CalibrationError for a calibration that does not belong to the bag, unless overridden.
+    Raises CalibrationError for a calibration that does not match the scan, unless overridden.
     """
     used = with_sources(options or CorrectionOptions(), calibration, stated, nominal)
     done = correct_bag(
@@ -263,7 +263,7 @@ def _publish(
     calibration: Calibration,
     nominal: Surface | None,
 ) -> None:
-    # Here, because drawing takes longer to load than a scan to correct.
+    # Imported on demand, because loading the figures takes longer than correcting a scan.
     from omsm_ros.pipelines.publish import figures_of, map_of, publish, view_of
 
     view = view_of(done.points, done.sample_period)
@@ -275,8 +275,8 @@ def _publish(
 def add_form(
     out: Path, summary: dict[str, Any], nominal: Surface, register: RegistrationOptions
 ) -> None:
-    """Register the cloud in ``out``, and say in the ``summary`` what came of it."""
-    # Here, because most corrections do without.
+    """Register the cloud in ``out``, and add the result to ``summary``."""
+    # Imported on demand, because most corrections do not register.
     from omsm_ros.pipelines.form import judge_form, open_measurement
 
     facts = judge_form(
@@ -296,7 +296,7 @@ def add_form(
 def summarise(
     bag: AnyBag, done: Correction, calibration: Calibration, judgement: Judgement
 ) -> dict[str, Any]:
-    """Return what ``summary.json`` says of every measurement; lengths in metres."""
+    """Return the content of ``summary.json``; lengths in metres."""
     summary: dict[str, Any] = {
         "schema": "omsm-summary/1",
         "bag": str(bag),
@@ -322,7 +322,7 @@ def summarise(
         ],
     }
     if not done.statistics:
-        summary["warnings"] += [*done.faults, "not one sample could be corrected; see the reasons"]
+        summary["warnings"] += [*done.faults, "no sample could be corrected; see the account"]
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
@@ -334,10 +334,7 @@ def summarise(
 
 
 def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:
-    """Return when a scan was made, how old its calibration was then [s], and how warm it was [°C].
-
-    Each is None where nobody recorded it.
-    """
+    """Return time of the scan, age of its calibration [s], temperatures [°C]; None if unknown."""
     valid_temperatures = done.temperatures[np.isfinite(done.temperatures)]
     return {
         "recorded_ns": done.recorded_ns,
@@ -356,14 +353,14 @@ def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:
 def _implausible(temperatures: FloatArray) -> list[str]:
     lost = int(np.sum(~np.isfinite(temperatures)))
     said = (
-        f"{lost} of {len(temperatures)} temperatures cannot be, expected "
+        f"{lost} of {len(temperatures)} temperatures are implausible, expected "
         f"{TEMPERATURE.range_text}; {TEMPERATURE.remedy}"
     )
     return [said] * bool(lost)
 
 
 def _places(calibration: Calibration) -> dict[str, Any]:
-    """Return where the members of a calibration set were made."""
+    """Return the positions of the members of a calibration set."""
     if not isinstance(calibration, CalibrationSet):
         return {}
     places = {"along": calibration.along, "positions": list(calibration.positions)}
@@ -371,7 +368,7 @@ def _places(calibration: Calibration) -> dict[str, Any]:
 
 
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:
-    """Return whether the scan was slow enough to be trusted, and how good H was on its motion."""
+    """Return the predicted error of the scan's motion, and that of the digital filter on it."""
     try:
         prediction = predict_error(calibration, done.path)
         digital = discretise(calibration.dynamics, done.sample_period)
@@ -379,7 +376,7 @@ def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]
             calibration.dynamics, digital, done.path.z, calibration.valid_up_to
         )
     except DataError as err:
-        return {"warnings": [f"the motion could not be judged: {err}"]}
+        return {"warnings": [f"the motion could not be evaluated: {err}"]}
     return {
         "warnings": [] if prediction.safe else [prediction.message],
         "prediction": asdict(prediction),

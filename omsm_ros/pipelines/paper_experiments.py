@@ -1,4 +1,4 @@
-"""The paper's experiments on the twin: Fig. 8 to 11 and Table 1, each with its page."""
+"""Repeat the paper's experiments on the twin: Fig. 8 to 11 and Table 1, each with its report."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ TABLE_1 = {
 CIRCLE_RADIUS_M = 21.6 * MILLIMETRE_M
 SHAKING_HZ, SHAKING_M = 680.0, 4.5 * NANOMETRE_M
 _CIRCLE_SECONDS = 20.0
-# Of a probe that reads texture of 10 nm: less noise than that on a step test.
+# A probe that resolves texture of 10 nm has less noise than that of the step test.
 _TEXTURE_PROBE = Probe(noise=2 * NANOMETRE_M, resolution=1 * NANOMETRE_M)
-# Fig. 8: the deviation before and after, and a section.
+# Figures of Fig. 8: deviation before and after, and sections.
 _MAPS = ("raw_map", "corrected_map_same_scale", "corrected_map")
 _OF_MIRROR = (*_MAPS, "profile_x", "profile_y")
 _EXPOSURE_S, _ACCELEROMETER_S = 0.5e-3, 0.25e-3
@@ -66,7 +66,7 @@ class _Done:
 
 
 def run_experiment(name: str, out: Path, seed: int = 1) -> dict[str, Any]:
-    """Run the experiment ``name`` of :data:`EXPERIMENTS`; write its page, bags and figures."""
+    """Run the experiment ``name`` of :data:`EXPERIMENTS`; write its report, bags and figures."""
     with result_folder(out, EXPERIMENT_FILES) as folder:
         done = EXPERIMENTS[name](folder, seed)
         rows = [asdict(row) for row in done.page.rows]
@@ -93,13 +93,13 @@ def _chirp(out: Path, seed: int) -> _Done:
     model = float(-np.angle(PAPER_DYNAMICS.response([14.5])[0]))
     rows = [
         Compared("error before, rms", "", quantity(check.rms_before, "m"),
-                 "not stated; 40 µm through Eq. 12, unit gain at rest, give 0.26 µm"),
+                 "not stated; 40 µm through Eq. 12 with unit static gain give 0.26 µm"),
         Compared("error after, rms", "20 nm", quantity(check.rms_after, "m"),
-                 "the probe's noise and resolution; the paper blames sliding in its mount"),
+                 "the probe's noise and resolution; the paper names sliding in its mount"),
         Compared("reduction", "50 %", f"{100 * (1 - check.rms_after / check.rms_before):.1f} %"),
         Compared("lag at 14 to 15 Hz", "about 2°", f"{lag / DEGREE_RAD:.3f}°",
                  f"Eq. 12 gives {model / DEGREE_RAD:.3f}°"),
-        Compared("lag after correction there", "", f"{left / DEGREE_RAD:.3f}°"),
+        Compared("lag at 14 to 15 Hz after correction", "", f"{left / DEGREE_RAD:.3f}°"),
     ]  # fmt: skip
     time = np.arange(len(check.error_before)) * calibration.sample_period
     facts = {
@@ -111,13 +111,13 @@ def _chirp(out: Path, seed: int) -> _Done:
         "Free path, 0 to 15 Hz (Fig. 9)",
         f"error {quantity(check.rms_before, 'm')} → {quantity(check.rms_after, 'm')} rms",
         rows,
-        captions={"chirp": "Only bands of a hertz that the motion excites are shown."},
+        captions={"chirp": "Bands of 1 Hz; only those that the motion excites are shown."},
         figures={"chirp": style.png(experiments.chirp(time, check, true_lag))},
     ))  # fmt: skip
 
 
 def circle_scan(name: str, seed: int) -> Recording:
-    """Return one of F1 to F4 over marks of 15 µm; from F3 on the machine shakes at 680 Hz."""
+    """Return scan F1 to F4 over marks of 15 µm; in F3 and F4 the machine vibrates at 680 Hz."""
     rpm = TABLE_1[name][0]
     shaking = VibrationLine(amplitude_m=SHAKING_M, frequency_hz=SHAKING_HZ)
     errors = Disturbances(
@@ -155,7 +155,7 @@ def _circles(out: Path, seed: int) -> _Done:
         rows.append(Compared(f"{signal.name}: amplitude, rms", quantity(rms, "m"),
                              quantity(ours, "m"), _named(scan)))  # fmt: skip
     return _spectrum_page(scans, rows, "Marks of 15 µm at four speeds (Fig. 10, Table 1)",
-                          "F1 and F2 resolve the marks, F3 and F4 show images only")  # fmt: skip
+                          "F1 and F2 resolve the marks, F3 and F4 show aliases only")  # fmt: skip
 
 
 def _vibration(out: Path, seed: int) -> _Done:
@@ -166,8 +166,8 @@ def _vibration(out: Path, seed: int) -> _Done:
     true = aliased[0].frequency if aliased else float("nan")
     still = sum(row.kind != PART for row in quiet.named)
     rows = [
-        Compared("vibration measured by F3", "680 Hz", quantity(true, "Hz", 5)),
-        Compared("where the probe shows it", "about 350 Hz", quantity(seen, "Hz", 5),
+        Compared("vibration in F3", "680 Hz", quantity(true, "Hz", 5)),
+        Compared("alias in the probe's spectrum", "about 350 Hz", quantity(seen, "Hz", 5),
                  "the paper's own formula gives 320 Hz"),
         Compared("lines of F2 that are not on the part", "minimal vibration", str(still)),
         Compared("false wavelength in F3", "20 µm",
@@ -175,7 +175,7 @@ def _vibration(out: Path, seed: int) -> _Done:
                  "33.93 µm a sample at 320 Hz; 20 µm would take a radius of 4.1 mm"),
     ]  # fmt: skip
     return _spectrum_page(scans, rows, "An aliased vibration (Fig. 11)",
-                          "680 Hz, measured by the accelerometer, has its alias at 320 Hz")  # fmt: skip
+                          "the vibration at 680 Hz appears at 320 Hz")  # fmt: skip
 
 
 def _named(scan: SpectrumOfScan) -> str:
@@ -200,8 +200,8 @@ def _spectrum_page(
         for scan in scans
         for row in scan.named
     ]
-    columns = ("seen at", "amplitude", "σ", "is", "because")
-    table = Table("Lines", columns, lines, prose="because")
+    columns = ("apparent frequency", "amplitude", "σ", "source", "evidence")
+    table = Table("Lines", columns, lines, prose="evidence")
     facts = {"spectrum": summary_of(scans, SpectrumOptions())}
     captions = {name: CAPTIONS[name] for name in kept}
     return _Done(facts, ExperimentPage(title, summary, rows, (table,), captions, kept))
@@ -214,7 +214,7 @@ def _mirror(out: Path, seed: int) -> _Done:
     points = found["samples"]["distance"]["corrected"]
     rows = [
         Compared("deviation before, peak to valley", "6 µm", quantity(raw["peak_to_valley"], "m"),
-                 "with unit gain at rest; the paper's gain of 0.9921 adds micrometres"),
+                 "with unit static gain; the paper's gain of 0.9921 adds micrometres"),
         Compared("deviation before, rms", "2.3 µm", quantity(raw["rms_area_weighted"], "m")),
         Compared("deviation after, peak to valley", "0.5 µm",
                  quantity(corrected["peak_to_valley"], "m"),
@@ -223,10 +223,10 @@ def _mirror(out: Path, seed: int) -> _Done:
         Compared("dynamic error, peak to valley", "",
                  quantity(found["dynamic_error_before"]["peak_to_valley"], "m")),
         Compared("points", "290 011 in 6 minutes", count(points),
-                 "from 12.7 mm to the centre; 290 011 take a start at 14.5 mm"),
+                 "from 12.7 mm to the centre; 290 011 points need a start at 14.5 mm"),
     ]  # fmt: skip
     return _Done({"summary": found}, ExperimentPage(
-        "The off-axis paraboloid (Fig. 8)", "the dynamic error is gone", rows,
+        "The off-axis paraboloid (Fig. 8)", "the dynamic error is corrected", rows,
         captions={name: SCAN_CAPTIONS[name].text for name in _OF_MIRROR},
         figures=_mirror_figures(out),
         narrow=_MAPS,
@@ -234,7 +234,7 @@ def _mirror(out: Path, seed: int) -> _Done:
 
 
 def _mirror_figures(out: Path) -> dict[str, bytes]:
-    """Return the maps and profiles of Fig. 8, of the cloud in ``out``."""
+    """Return maps and profiles of the cloud in ``out``, as in Fig. 8."""
     view = view_of(CloudFile(out / CLOUD).read(MOST_DRAWN), Scenario().sample_period)
     if view is None:
         return {}

@@ -1,4 +1,4 @@
-"""How far is a task? Who does it tells whoever wants to know."""
+"""Report the progress of a task."""
 
 from __future__ import annotations
 
@@ -8,28 +8,25 @@ from threading import Event, Thread
 from typing import Protocol
 
 Progress = Callable[[int, int], None]
-"""Called with what is done and what there is in all: messages, lines or bags."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Report to nobody."""
-
-
-# The seconds of a line on a terminal, which go on while nothing is counted.
+"""Function of the number done and the total: messages, lines or bags."""
 
 _TICK_S = 0.5
 
 
+def no_progress(done: int, total: int) -> None:
+    """Ignore the progress."""
+
+
 class ProgressLine(Protocol):
-    """What shows a time, as a bar of ``tqdm`` does."""
+    """A line on the terminal with the elapsed time, such as a bar of ``tqdm``."""
 
     def refresh(self) -> object:
-        """Show it anew."""
+        """Draw the line again."""
 
 
 @contextmanager
 def refresh_in_thread(show: Callable[[Event], object]) -> Iterator[None]:
-    """Let ``show`` run in a thread of its own; its event is set at the end, which waits for it."""
+    """Run ``show`` in a thread; set its event at the end and wait for it."""
     done = Event()
     shown = Thread(target=show, args=(done,), daemon=True)
     shown.start()
@@ -41,6 +38,6 @@ def refresh_in_thread(show: Callable[[Event], object]) -> Iterator[None]:
 
 
 def tick(line: ProgressLine, done: Event) -> None:
-    """Refresh ``line`` twice a second until ``done``."""
+    """Refresh ``line`` twice per second until ``done``."""
     while not done.wait(_TICK_S):
         line.refresh()

@@ -1,4 +1,4 @@
-"""The page of a finished measurement, or of a part that was registered."""
+"""Write the report of a measurement, of a registered part, or of spectra."""
 
 from __future__ import annotations
 
@@ -53,16 +53,13 @@ def figures_of(
     nominal: Surface | None,
     sample_period: float,
 ) -> dict[str, bytes]:
-    """Return PNG files for the page of a cloud whose truth nobody knows."""
+    """Return the figures of a cloud as PNG files, by name."""
     figures = surface_figures(view, nominal) if view is not None else {}
     return figures | {"bode": style.png(bode(calibration, None, sample_period))}
 
 
 def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
-    """Return the columns of a cloud for the figures; None if it has no points.
-
-    Without the dynamic correction its height would be ``raw_height``.
-    """
+    """Return the columns of a cloud for the figures; None if it has no points."""
     if not len(cloud):
         return None
     sample = cloud["sample"].astype(np.int64)
@@ -79,7 +76,7 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
 
 
 def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> EmbeddedMap | None:
-    """Return the map that a reader can enlarge; of the registered deviation if ``out`` has one."""
+    """Return the zoomable map, with the registered deviation if ``out`` has one."""
     if view is None:
         return None
     layers = []
@@ -106,9 +103,9 @@ def publish(
     figures: Mapping[str, bytes],
     surface: EmbeddedMap | None = None,
 ) -> None:
-    """Write ``report.html`` into ``out``; with what ``form.json`` there says of the part.
+    """Write ``report.html`` into ``out``, with the content of ``form.json`` there, if any.
 
-    surface: map that a reader can enlarge
+    surface: zoomable map
     """
     form = read_form(out / FORM) if (out / FORM).is_file() else {}
     curves = read_curves(out / CURVES) if (out / CURVES).is_file() else {}
@@ -120,16 +117,13 @@ def publish(
 
 
 def publish_form(out: Path, title: str, summary: Mapping[str, Any] | None = None) -> None:
-    """Write ``report.html`` of a registered part, from what was written of it into ``out``.
+    """Write ``report.html`` of a registered part from its results in ``out``.
 
-    summary: of the measurement that its points are of, if there is one
+    summary: of the measurement of its points, if there is one
     """
     part = read_points(out / DEVIATION)
     layer = Layer("registered deviation", part.x, part.y, part.height, "nm")
     publish(out, title, summary or {}, None, {}, embedded([layer]))
-
-
-# The folder of ``omsm spectrum``: JSON, page, and the clouds without a stopped band.
 
 
 def publish_spectra(
@@ -140,7 +134,7 @@ def publish_spectra(
     report: bool = True,
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
-    """Study the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
+    """Analyse the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
     clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(paths))]
     with result_folder(out, (*clouds, *_clouds_before(out), REPORT, SPECTRUM)) as folder:
         scans = spectra_of(paths, options, progress)
@@ -150,7 +144,7 @@ def publish_spectra(
             _write_cloud(folder / name, scan)
             files[f"{scan.studied.signal.name} without the band"] = name
         if report:
-            # Here, because drawing takes longer to load than all else.
+            # Imported on demand, because loading the figures takes longer than the analysis.
             from omsm_ros.report.spectrum import SpectrumPage, drawn, render
 
             valid = options.calibration.valid_up_to if options.calibration else None
@@ -173,33 +167,29 @@ def _write_cloud(path: Path, scan: SpectrumOfScan) -> None:
         ply.write(without_bands(scan))
 
 
-# The page of a measurement that was corrected earlier, drawn from what lies in its folder.
-
-# What points evenly chosen, of a longer cloud, may say differently of all.
+# Relative difference of the rms of evenly chosen points from that of the whole cloud.
 _SAME_RMS = 0.05
 
 
 def report_again(result: Path, calibration: Calibration, nominal: Surface | None = None) -> Path:
     """Write ``report.html`` into the folder ``result`` of ``omsm correct``; return its path.
 
-    Nothing is computed anew: every figure comes from the summary there, every map from its cloud.
-    Raises FileError for a folder that holds no measurement, CalibrationError for another
-    calibration than the one it was corrected with, ConfigurationError where it had a nominal
-    surface and none is given, or another one.
+    All numbers come from the summary in the folder, all maps from its cloud. Raises FileError for
+    a folder without a measurement, CalibrationError for another calibration than that of the
+    correction, ConfigurationError for another nominal surface, or none if there was one.
     """
     summary = read_summary(result / SUMMARY)
     used = summary.get("calibration")
     if used != calibration.id:
         raise CalibrationError(
-            f"{str(result)!r} was corrected with calibration {str(used)[:12]!r}, given is "
-            f"{calibration.id[:12]!r}; give the one that it was corrected with"
+            f"{str(result)!r} was corrected with calibration {str(used)[:12]!r}, not with "
+            f"{calibration.id[:12]!r}; give the calibration of the correction"
         )
     if nominal is None and "deviation" in summary:
         raise ConfigurationError(
-            f"{str(result)!r} was corrected with a nominal surface, from which its figures "
-            "deviate; give it (--nominal)"
+            f"{str(result)!r} was corrected with a nominal surface; give the same one (--nominal)"
         )
-    # Another than the calibration's where that was overridden; older summaries do not say it.
+    # Differs from the calibration's after an override; summaries of old versions lack it.
     period = summary.get("sample_period", calibration.sample_period)
     view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), period)
     if nominal is not None and "deviation" in summary:
@@ -211,7 +201,7 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
 
 
 def _check_nominal(view: CloudView | None, nominal: Surface, rms: float) -> None:
-    """Raise ConfigurationError where the cloud does not deviate from ``nominal`` by ``rms`` [m]."""
+    """Raise ConfigurationError unless the cloud deviates from ``nominal`` by ``rms`` [m]."""
     if view is None:
         return
     found = RunningStatistics()
@@ -219,6 +209,6 @@ def _check_nominal(view: CloudView | None, nominal: Surface, rms: float) -> None
     here = found.statistics().rms
     if abs(here - rms) > _SAME_RMS * max(here, rms):
         raise ConfigurationError(
-            f"the cloud deviates from this nominal surface by {quantity(here, 'm')} rms, by "
-            f"{quantity(rms, 'm')} from the one that it was corrected with; give that one"
+            f"the cloud deviates by {quantity(here, 'm')} rms from this nominal surface, and by "
+            f"{quantity(rms, 'm')} from that of the correction; give the same surface"
         )

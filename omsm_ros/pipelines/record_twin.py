@@ -1,4 +1,4 @@
-"""Bags of the digital twin: a step test and a scan, to learn on and to try things out."""
+"""Write bags of the digital twin: a step test and a scan."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# A recording of the twin as a bag, as if its devices had been recorded.
-
 _BLOCK_SAMPLES = 1000
+# Bounds memory to half a gigabyte with all disturbances.
+_MOST_SAMPLES = 1_000_000
+STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
 
 
 def write_recording(path: Path, recording: Recording) -> Path:
-    """Write ``recording`` to the bag ``path``, and return it."""
+    """Write ``recording`` to the bag ``path``; return the path."""
     topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
     topics += [bags.ACCELERATION_TOPIC] if recording.acceleration is not None else []
     with BagWriter(path, topics) as bag:
@@ -54,14 +55,9 @@ def acceleration_blocks(whole: AccelerationBlock, size: int) -> Iterator[Acceler
         )
 
 
-# Half a gigabyte of memory, a whole with everything that may be wrong with a machine.
-_MOST_SAMPLES = 1_000_000
-STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
-
-
 @dataclass(frozen=True, slots=True)
 class TwinBags:
-    """Where the recordings lie, and how many samples each has."""
+    """Paths and numbers of samples of the recordings."""
 
     steps: str
     scan: str
@@ -73,8 +69,8 @@ class TwinBags:
 def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = None) -> TwinBags:
     """Write ``steps.mcap``, ``scan.mcap`` and the nominal ``mirror.yaml`` into ``out``.
 
-    Raises BagError where a bag of that name is there already, ConfigurationError for a scan beyond
-    the mirror or longer than memory holds.
+    Raises BagError if a bag of that name exists, ConfigurationError for a scan beyond the mirror
+    or too long for memory.
     """
     _check(scenario)
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
@@ -87,19 +83,19 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
 def _check(scenario: Scenario) -> None:
     if scenario.start_radius > PAPER_MIRROR_RADIUS_M:
         raise ConfigurationError(
-            f"a radius of {quantity(scenario.start_radius, 'm')} is beyond the twin's mirror, "
-            f"which ends at {quantity(PAPER_MIRROR_RADIUS_M, 'm')}; give it in metres"
+            f"radius is {quantity(scenario.start_radius, 'm')}, expected at most that of the "
+            f"twin's mirror, {quantity(PAPER_MIRROR_RADIUS_M, 'm')}; give it in metres"
         )
     samples = spiral_of(scenario).duration / scenario.sample_period
     if samples > _MOST_SAMPLES:
         raise ConfigurationError(
-            f"a scan of {count(round(samples))} samples, expected {count(_MOST_SAMPLES)} at most; "
-            "take a wider feed, a smaller radius or a faster spindle"
+            f"the scan has {count(round(samples))} samples, expected at most "
+            f"{count(_MOST_SAMPLES)}; give a wider feed, a smaller radius or a faster spindle"
         )
 
 
 def write_nominal(path: Path) -> None:
-    """Write what the twin's mirror should be."""
+    """Write the nominal surface of the twin's mirror."""
     nominal = {
         "shape": "off_axis_paraboloid",
         "parent_focal_length": PAPER_MIRROR.parent_focal_length,
@@ -109,6 +105,6 @@ def write_nominal(path: Path) -> None:
 
 
 def _write(path: Path, recording: Recording) -> int:
-    """Write a recording as a bag; return its samples."""
+    """Write a recording as a bag; return its number of samples."""
     write_recording(path, recording)
     return len(recording.axes)

@@ -1,53 +1,141 @@
-"""The blocks and the motion of a bag, read with progress."""
+"""A recorded bag: opened once, and each part of it read when a task needs it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
 
+from omsm_ros.core.calibration.calibration import settings_with
 from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
 from omsm_ros.core.streams.blocks import Block
-from omsm_ros.errors import BagError
+from omsm_ros.core.streams.motion_record import MotionRecord, assemble
+from omsm_ros.core.streams.stamps import check_period
+from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
+from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.quantities import TIME_LAPSE
 
-MOST_JUDGED = 2**20
-"""Samples of a path that are judged: a quarter of an hour at 1 kHz, of a spiral the fastest."""
+MAX_PATH_SAMPLES = 2**20
+"""Bound on the memory of a scan path: 17 minutes at 1 kHz, the fastest part of a spiral."""
 
-
-def read_blocks(
-    path: AnyBag, topics: Sequence[str], progress: Progress = no_progress
-) -> dict[str, list[Block]]:
-    """Return all blocks on ``topics``, by topic; BagError if one of the topics is not there."""
-    found: dict[str, list[Block]] = {topic: [] for topic in topics}
-    with bags.BagReader(path) as bag:
-        total = bag.count(topics)
-        for done, (topic, record) in enumerate(bag.records(*topics), start=1):
-            found[topic].append(record)
-            progress(done, total)
-    return found
+SCAN_TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
 
-def sample_period_in(path: AnyBag) -> float:
-    """Return the sample period of the probe in a bag [s]; BagError without samples of it."""
-    with bags.BagReader(path) as bag:
-        for _, block in bag.records(bags.DISTANCE_TOPIC):
+class Recording:
+    """A bag opened for one task; use it as a context manager.
+
+    bag: its reader, for what only one task needs;  recorded_ns: when the recording began
+        [ns, ROS time], None if its clock was never set
+
+    Raises BagError for a path that is no bag.
+    """
+
+    def __init__(self, path: AnyBag, progress: Progress = no_progress) -> None:
+        self.path, self.bag = path, bags.BagReader(path)
+        self._progress = progress
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Recording:
+        self._stack.enter_context(self.bag)
+        self.recorded_ns = self.bag.recorded_ns
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def holds(self, topic: str) -> bool:
+        """Return True if there are messages on ``topic``."""
+        return self.bag.count([topic]) > 0
+
+    def stream(self, *topics: str) -> Iterator[tuple[str, Any]]:
+        """Yield ``(topic, block)`` in the order of recording, short blocks joined."""
+        total = self.bag.count(topics)
+        for done, topic, block in self.bag.blocks(*topics):
+            yield topic, block
+            self._progress(done, total)
+
+    def blocks(self, *topics: str) -> dict[str, list[Block]]:
+        """Return all blocks by topic, as they were recorded; BagError if a topic is absent."""
+        found: dict[str, list[Block]] = {topic: [] for topic in topics}
+        total = self.bag.count(topics)
+        for done, (topic, block) in enumerate(self.bag.records(*topics), start=1):
+            found[topic].append(block)
+            self._progress(done, total)
+        return found
+
+    def sample_period(self) -> float:
+        """Return the sample period of the probe [s]; BagError without samples of it."""
+        for _, block in self.bag.records(bags.DISTANCE_TOPIC):
             return float(block.sample_period)
-    raise BagError(f"{str(path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan")
+        raise BagError(
+            f"{str(self.path)!r} has no samples on {bags.DISTANCE_TOPIC!r}; record a scan"
+        )
+
+    def scan_path(self) -> ScanPath:
+        """Return the start of the path, with the probe's readings if there are any.
+
+        Raises BagError without a position of Z.
+        """
+        reader = ScanPathReader(MAX_PATH_SAMPLES)
+        for _, block in self.stream(*filter(self.holds, SCAN_TOPICS)):
+            reader.add(block)
+        found = reader.path()
+        if found is None:
+            name = self.bag.name_of(bags.AXES_TOPIC)
+            raise BagError(f"{str(self.path)!r} has no position of Z on {name!r}; record a motion")
+        return found
+
+    def settings(self, stated: Mapping[str, object]) -> dict[str, object]:
+        """Return the settings of a calibration from this bag: ``stated``, and the probe's own."""
+        return settings_with(stated, self.bag.probe_settings())
+
+    def motion(
+        self,
+        *,
+        duration: float = 0.0,
+        time_lapse: object = 1.0,
+        trigger: CommonTrigger = EQUAL_COUNTS,
+        by_stamps: bool = False,
+    ) -> MotionRecord:
+        """Return the motion to identify from, its first ``duration`` seconds (0 = all).
+
+        time_lapse: how much faster than real time the recording was played [1]
+        trigger: what is stated of the counters of axes and distance
+        by_stamps: join both by their stamps, not by their counters
+        The reference sensor is used if it was recorded.
+
+        Raises DataError if the stamps contradict the sample period, or the counters each other.
+        """
+        faster = TIME_LAPSE.checked(time_lapse, ConfigurationError, "time_lapse")
+        topics = [*SCAN_TOPICS, *filter(self.holds, [bags.REFERENCE_TOPIC])]
+        blocks = self.blocks(*topics)
+        if not all(blocks[topic] for topic in SCAN_TOPICS):
+            raise BagError(
+                f"{str(self.path)!r} has its topics but no samples on them; record a step test"
+            )
+        axes, distance, *reference = (_first_seconds(blocks[topic], duration) for topic in topics)
+        for name, stream in (("axis", axes), ("distance", distance)):
+            check_period(name, stream, faster)
+        return assemble(  # type: ignore[misc]
+            axes,
+            distance,
+            *reference,
+            trigger=trigger,
+            by_stamps=by_stamps,  # type: ignore[arg-type]
+        )
 
 
-def path_in(path: AnyBag, progress: Progress = no_progress) -> ScanPath:
-    """Return the start of the path that a bag holds, with its readings where it has some."""
-    start = ScanPathReader(MOST_JUDGED)
-    with bags.BagReader(path) as bag:
-        wanted = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
-        present = [t.role for t in bag.topics() if t.messages and t.role in wanted]
-        total = bag.count(present)
-        for done, _, block in bag.blocks(*present):
-            start.add(block)
-            progress(done, total)
-        name = bag.name_of(bags.AXES_TOPIC)
-    found = start.path()
-    if found is None:
-        raise BagError(f"{str(path)!r} has no position of Z on {name!r}; record a motion")
-    return found
+def _first_seconds(blocks: list[Block], duration: float) -> list[Block]:
+    if duration == 0 or not blocks:
+        return blocks
+    end = blocks[0].first_sample + duration / blocks[0].sample_period
+    return [block for block in blocks if block.first_sample < end]

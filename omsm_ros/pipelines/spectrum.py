@@ -1,4 +1,4 @@
-"""Spectra of scans, and what each of their lines is: from bags to ``spectrum.json``."""
+"""Compute spectra of scans and classify their lines: from bags to ``spectrum.json``."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from omsm_ros.io import bags
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import sample_period_in
+from omsm_ros.pipelines.recording import Recording
 
 SCHEMA = "omsm-spectrum/1"
 NORMALISATION = (
@@ -47,16 +47,17 @@ NORMALISATION = (
     "(half of peak to valley) has the power a²/2; significance is that of a normal variable with "
     "the probability that noise alone gives such a line anywhere in the spectrum"
 )
-# Twenty minutes at 1 kHz; a line is no better known for more.
+# Twenty minutes at 1 kHz; more samples do not improve the lines.
 MOST_SAMPLES = 1_250_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class SpectrumOptions:
-    """How to look.
+    """Options of a spectral analysis.
 
-    calibration: None adds encoder and probe as they are;  nominal: taken off before, if given
-    stop: bands to be taken out of the heights [Hz];  polarity: of the probe
+    calibration: None adds encoder and probe without a dynamic correction
+    nominal: surface to subtract first;  stop: bands to remove from the heights [Hz]
+    polarity: of the probe
     """
 
     calibration: Calibration | None = None
@@ -68,9 +69,11 @@ class SpectrumOptions:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SpectrumOfScan:
-    """A scan as it was studied, for figures and results.
+    """Result of the spectral analysis of one scan.
 
-    motion: density of the Z encoder's motion;  points: as corrected;  stopped: None without bands
+    motion: density of the Z encoder's motion;  points: as corrected
+    received: number of points before the cut to MOST_SAMPLES
+    stopped: heights without the stopped bands, None without bands
     """
 
     studied: StudiedScan
@@ -95,7 +98,7 @@ class _Read:
 def spectra_of(
     paths: Sequence[AnyBag], options: SpectrumOptions, progress: Progress = no_progress
 ) -> list[SpectrumOfScan]:
-    """Study all scans, and say of each line of each what it is.
+    """Analyse all scans, and classify each spectral line.
 
     Raises BagError for a bag without samples, CalibrationError for a calibration of another
     machine, DataError for a scan that is too short.
@@ -119,7 +122,7 @@ def spectra_of(
 
 
 def _names(paths: Sequence[AnyBag]) -> list[str]:
-    """Return the names of the files, with a number where two have the same."""
+    """Return the names of the files, numbered if several have the same name."""
     stems = [Path(str(path)).stem for path in paths]
     return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 
@@ -127,17 +130,17 @@ def _names(paths: Sequence[AnyBag]) -> list[str]:
 def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> _Read:
     axes: list[AxisBlock] = []
     parts: list[SurfacePoints] = []
-    calibration = options.calibration or unit_calibration(sample_period_in(path))
     how = CorrectionOptions(polarity=options.polarity, accept_other_rate=options.admission.override)
-    with CorrectedScan(
-        path, calibration, how, admission=options.admission, progress=progress
-    ) as scan:
+    with Recording(path, progress) as recording:
+        calibration = options.calibration or unit_calibration(recording.sample_period())
+        scan = CorrectedScan(recording, calibration, how, admission=options.admission)
         for block, points in scan.steps():
             if isinstance(block, AxisBlock):
                 axes.append(block)
             if points is not None:
                 parts.append(points)
         account, period = scan.account.as_dict(), scan.sample_period
+        shaken = _acceleration_lines(recording)
     every = join_points(parts)
     points = every.part(slice(0, MOST_SAMPLES))
     height = points.height
@@ -148,7 +151,7 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     signal = scan_signal(name, period, (points.sample, height), (count, x, y, c))
     return _Read(
         signal=signal,
-        acceleration_lines=_acceleration_lines(path),
+        acceleration_lines=shaken,
         points=points,
         motion=_motion_density(z, period),
         account=account,
@@ -156,11 +159,10 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     )
 
 
-def _acceleration_lines(path: AnyBag) -> AccelerationLines | None:
-    with bags.BagReader(path) as bag:
-        if not any(t.role == bags.ACCELERATION_TOPIC and t.messages for t in bag.topics()):
-            return None
-        blocks = [block for _, block in bag.records(bags.ACCELERATION_TOPIC)]
+def _acceleration_lines(recording: Recording) -> AccelerationLines | None:
+    if not recording.holds(bags.ACCELERATION_TOPIC):
+        return None
+    blocks = [block for _, block in recording.bag.records(bags.ACCELERATION_TOPIC)]
     return acceleration_lines(
         *accelerations_of([b for b in blocks if isinstance(b, AccelerationBlock)])
     )
@@ -177,20 +179,20 @@ def _stopped(studied: StudiedScan, bands: Sequence[tuple[float, float]]) -> Band
 
 
 def without_bands(scan: SpectrumOfScan) -> SurfacePoints:
-    """Return the points of ``scan`` with the stopped bands taken out of their heights.
+    """Return the points of ``scan`` with the stopped bands removed from their heights.
 
-    Raises ConfigurationError where no band was stopped, or the points are not those studied.
+    Raises ConfigurationError if no band was stopped or the points are not those analysed.
     """
     if scan.stopped is None or len(scan.points) != len(scan.stopped.removed):
         raise ConfigurationError(
-            f"{scan.studied.signal.name!r}: no band was stopped, or its trigger started anew; "
+            f"{scan.studied.signal.name!r}: no band was stopped, or its trigger counter restarted; "
             "give --stop FROM TO and a scan in one piece"
         )
     return replace(scan.points, height=scan.points.height - scan.stopped.removed)
 
 
 def summary_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> dict[str, Any]:
-    """Return what ``spectrum.json`` says, in SI units."""
+    """Return the content of ``spectrum.json``, in SI units."""
     rows = [row for scan in scans for row in scan.named]
     calibration = options.calibration
     return {
@@ -233,7 +235,7 @@ def _scan_facts(scan: SpectrumOfScan, options: SpectrumOptions) -> dict[str, Any
 
 
 def _motion_facts(motion: Density, calibration: Calibration | None) -> dict[str, Any]:
-    """Return the path's own spectrum, and the share of its power beyond the calibrated band."""
+    """Return rms of the motion in all, and of its content above the calibrated band [m]."""
     top = float(motion.frequency[-1])
     total = motion.power(0.0, top)
     if calibration is None:

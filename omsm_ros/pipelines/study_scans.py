@@ -1,8 +1,9 @@
-"""What is learnt from whole scans: dynamics and latency, and how the probe sits."""
+"""Determine dynamics, latency and probe position from whole scans."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 
 from omsm_ros.core.adjustment.resolved_calibration import (
@@ -31,11 +32,11 @@ from omsm_ros.errors import BagError
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import sample_period_in
+from omsm_ros.pipelines.recording import Recording
 from omsm_ros.readable import counts_text
 
-# What is to be found must not be in the points already.
-_PLAIN = CorrectionOptions(lateral_lag=0.0)
+# The lateral lag is what these tasks estimate, so it must not be corrected before.
+_UNCORRECTED_LAG = CorrectionOptions(lateral_lag=0.0)
 
 
 def reversal_of(
@@ -43,20 +44,22 @@ def reversal_of(
 ) -> tuple[Reversal, list[Account]]:
     """Return the lag of the probe against X and C from scans with opposite spindle directions.
 
-    Also return where every sample of each scan has gone.
+    Also return the account of the samples of each scan.
     """
-    scans, accounts = _read_scans(bag_paths, calibration, _PLAIN, progress)
+    with ExitStack() as opened:
+        recordings = [opened.enter_context(Recording(path, progress)) for path in bag_paths]
+        scans, accounts = _read_scans(recordings, calibration, _UNCORRECTED_LAG)
     return reversal(scans, calibration), accounts
 
 
 @dataclass(frozen=True, kw_only=True)
 class SelfCalibrationOptions:
-    """How to calibrate on the part itself.
+    """Options of a self-calibration on the part.
 
-    harmonics: highest of the surface in a turn
-    clocking: standard uncertainty of C from scan to scan [rad], 10 if the part was re-mounted
-    polarity, static_gain, gain_uncertainty, settings: of the probe, where no step test
-        finds them; the uncertainty is a share of the gain
+    harmonics: highest harmonic of the surface in a turn
+    clocking: standard uncertainty of C between the scans [rad], 10 if the part was re-mounted
+    polarity, static_gain, gain_uncertainty, settings: of the probe, used without a step test;
+        the uncertainty is relative to the gain
     """
 
     harmonics: int = DEFAULT_HARMONICS
@@ -73,16 +76,18 @@ def self_calibration_of(
     options: SelfCalibrationOptions,
     progress: Progress = no_progress,
 ) -> tuple[SelfCalibration, Calibration, list[Account]]:
-    """Return what scans of one part say of the dynamics, and a calibration from it.
+    """Estimate the dynamics from scans of one part; return the estimate and a calibration.
 
-    step_test: from the same machine; None takes the scans alone
-    Also return where every sample of each scan has gone.
+    step_test: from the same machine; None uses the scans alone
+    Also return the account of the samples of each scan.
     """
-    period = sample_period_in(bag_paths[0])
-    base = step_test or unit_calibration(period, options.static_gain)
+    with ExitStack() as opened:
+        recordings = [opened.enter_context(Recording(path, progress)) for path in bag_paths]
+        period = recordings[0].sample_period()
+        base = step_test or unit_calibration(period, options.static_gain)
+        how = replace(_UNCORRECTED_LAG, polarity=options.polarity)
+        scans, accounts = _read_scans(recordings, base, how)
     prior = after_step_test(base) if step_test else without_step_test(options.gain_uncertainty)
-    plain = replace(_PLAIN, polarity=options.polarity)
-    scans, accounts = _read_scans(bag_paths, base, plain, progress)
     found = self_calibrate(scans, replace(prior, clocking=options.clocking), options.harmonics)
     if step_test:
         return found, resolved(step_test, found), accounts
@@ -91,24 +96,25 @@ def self_calibration_of(
 
 
 def _read_scans(
-    bag_paths: Sequence[AnyBag],
-    calibration: Calibration,
-    options: CorrectionOptions,
-    progress: Progress,
+    recordings: Sequence[Recording], calibration: Calibration, options: CorrectionOptions
 ) -> tuple[list[ScanColumns], list[Account]]:
     scans, accounts = [], []
-    for bag in bag_paths:
-        with CorrectedScan(bag, calibration, options, progress=progress) as scan:
-            reader = ScanReader(scan.sample_period)
-            for block, points in scan.steps():
-                if isinstance(block, AxisBlock):
-                    reader.add_axes(block)
-                if points is not None:
-                    reader.add(points)
-            _check_points(scan)
-            scans.append(reader.columns())
-            accounts.append(scan.account)
+    for recording in recordings:
+        scan = CorrectedScan(recording, calibration, options)
+        reader = ScanReader(scan.sample_period)
+        _read(scan, reader)
+        scans.append(reader.columns())
+        accounts.append(scan.account)
     return scans, accounts
+
+
+def _read(scan: CorrectedScan, reader: ScanReader | SphereScanReader) -> None:
+    for block, points in scan.steps():
+        if isinstance(block, AxisBlock):
+            reader.add_axes(block)
+        if points is not None:
+            reader.add(points)
+    _check_points(scan)
 
 
 def alignment_of(
@@ -118,18 +124,14 @@ def alignment_of(
     geometry: Geometry,
     progress: Progress = no_progress,
 ) -> tuple[Alignment, Account]:
-    """Find spindle centre and lean of the beam from a scan of a sphere of ``radius`` [m].
+    """Estimate spindle centre and beam direction from a scan of a sphere of ``radius`` [m].
 
-    Also return where every sample of the scan has gone.
+    Also return the account of the samples of the scan.
     """
     reader = SphereScanReader()
-    with CorrectedScan(path, calibration, _PLAIN, progress=progress) as scan:
-        for block, points in scan.steps():
-            if isinstance(block, AxisBlock):
-                reader.add_axes(block)
-            if points is not None:
-                reader.add(points)
-        _check_points(scan)
+    with Recording(path, progress) as recording:
+        scan = CorrectedScan(recording, calibration, _UNCORRECTED_LAG)
+        _read(scan, reader)
         return align_on_sphere(reader.scan(), radius, geometry), scan.account
 
 
@@ -139,5 +141,5 @@ def _check_points(scan: CorrectedScan) -> None:
             f"{str(scan.path)!r} gives no surface point: of {scan.account.distance.received} "
             f"readings {counts_text(scan.account.distance.counted)}, of "
             f"{scan.account.axes.received} axis samples {counts_text(scan.account.axes.counted)}; "
-            "look at it with 'omsm inspect'"
+            "check the bag with 'omsm inspect'"
         )

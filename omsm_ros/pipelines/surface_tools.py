@@ -1,4 +1,4 @@
-"""What a nominal surface asks of the probe and of the axes."""
+"""Evaluate slopes and limits of a nominal surface, and compute offsets of the next cut."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from omsm_ros.units import RPM_HZ
 
 FIGURE = "surface.png"
 _ACROSS = 401
-# At the rim a spiral is fastest; four turns of it show what the axes must do.
+# A spiral is fastest at the rim, so four turns there determine the demands on the axes.
 _TURNS, _SAMPLES_PER_TURN = 4, 2000
 _BAND = "calibrated band"
 
@@ -49,9 +49,9 @@ def show_surface(
 ) -> dict[str, Any]:
     """Return extent, steepest slope and limits of a surface over a disc; draw it into ``out``.
 
-    probe_angle: to the normal, at which the probe still reads [rad]; None: not known
+    probe_angle: largest angle to the normal at which the probe reads [rad]; None: unknown
 
-    Raises DataError where the surface has no height within the disc.
+    Raises DataError if the surface has no height somewhere on the disc.
     """
     x, y, height, steep = _over_disc(surface, scan.radius)
     place = int(np.argmax(steep))
@@ -61,7 +61,7 @@ def show_surface(
     if probe_angle is None:
         missing.append("angle of the probe to the surface")
     if out is not None:
-        # Here, because drawing takes longer to load than all else takes.
+        # Imported on demand, because loading the figures takes longer than the evaluation.
         from omsm_ros.report.measurement.figures import deviation_map
         from omsm_ros.report.style import png
 
@@ -96,7 +96,7 @@ def _over_disc(
     height = surface.height(x, y)
     if not np.all(np.isfinite(height)):
         raise DataError(
-            f"the surface has no height on {int(np.sum(~np.isfinite(height)))} of {len(x)} places "
+            f"the surface has no height at {int(np.sum(~np.isfinite(height)))} of {len(x)} points "
             f"of a disc of radius {radius!r} m; give a smaller radius, or check its parameters"
         )
     return x, y, height, np.hypot(*gradient_of(surface, x, y))
@@ -110,15 +110,13 @@ def _path(surface: Surface, scan: Scan) -> ScanPath:
     return ScanPath(z=axes.z, sample_period=period, x=axes.x, c=axes.c)
 
 
-# From a measurement to the table of offsets for the next cut.
-
 COMPENSATION, PATH = "compensation.csv", "compensation.nc"
-# Of its standard uncertainty: an offset beyond it is there at 95 %.
-_SURE = 2.0
-# Of the area; with less of it sure, the cut follows the noise of the measurement.
+# Coverage factor beyond which an offset is significant, at 95 %.
+_COVERAGE = 2.0
+# With a smaller share of the area significant, the cut follows the noise of the measurement.
 _LEAST_SIGNIFICANT_SHARE = 0.5
-# Of the rms before; a cut that leaves more is hardly worth it.
-_MOST_LEFT = 0.9
+# A cut that leaves a larger share of the rms is not worth while.
+_LARGEST_REMAINDER = 0.9
 _HEAD = "x_m,y_m,offset_m,uncertainty_m\n"
 
 
@@ -131,12 +129,13 @@ def compensate_form(
     aperture: Aperture | None = None,
     spiral: tuple[float, int] | None = None,
 ) -> dict[str, Any]:
-    """Write compensation.csv into ``out``: what to add to the height of the next cut.
+    """Write compensation.csv into ``out``: offsets to add to the height of the next cut.
 
-    low_pass: wavelength of which half is compensated [m]; the others as for ``omsm form``
-    spiral: feed a turn [m] and places of each of the next cut, for compensation.nc; None: without
+    asked, aperture: as for ``omsm form``
+    low_pass: cutoff wavelength, of which half is compensated [m]
+    spiral: feed per turn [m] and points per turn of the next cut, for compensation.nc; None: none
 
-    Raises DataError as ``omsm form`` does, and for a wavelength finer than the points resolve.
+    Raises DataError as ``omsm form`` does, and for a wavelength that the points do not resolve.
     """
     form = measured.form(surface, asked, aperture)
     found = compensation(form.map, surface, low_pass)
@@ -146,7 +145,7 @@ def compensate_form(
     lines = (",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True))
     save_text(out / COMPENSATION, _HEAD + "\n".join(lines) + "\n")
     path = {} if spiral is None else _along(spiral_offsets(found, *spiral), out)
-    sure = np.abs(found.offset[known]) > _SURE * found.uncertainty[known]
+    sure = np.abs(found.offset[known]) > _COVERAGE * found.uncertainty[known]
     return {
         "file": COMPENSATION,
         **path,
@@ -171,17 +170,17 @@ def _along(path: ToolPath, out: Path) -> dict[str, Any]:
 
 
 def _warnings(sure: float, before: float, after: float) -> list[str]:
-    """Return what speaks against the cut."""
+    """Return warnings against the cut."""
     found = []
     if sure < _LEAST_SIGNIFICANT_SHARE:
         found.append(
             f"on {percent(1 - sure)} of the area the offset is less than twice its uncertainty: a "
-            "cut would put errors of the measurement onto the part; measure with less, hold "
-            "freedoms (--fit piston,tip,tilt), or take a longer --low-pass"
+            "cut would transfer measurement errors to the part; measure more accurately, fit fewer "
+            "degrees of freedom (--fit piston,tip,tilt), or give a longer --low-pass"
         )
-    if after > _MOST_LEFT * before:
+    if after > _LARGEST_REMAINDER * before:
         found.append(
-            f"the cut would leave {quantity(after, 'm')} rms of {quantity(before, 'm')}: the rest "
-            "is finer than --low-pass"
+            f"the cut would leave {quantity(after, 'm')} of {quantity(before, 'm')} rms, which is "
+            "shorter than --low-pass"
         )
     return found

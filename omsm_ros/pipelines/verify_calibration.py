@@ -1,8 +1,8 @@
-"""Does a calibration hold on a free path? The paper's Fig. 9 from a bag."""
+"""Verify a calibration on a free path, find counter offsets, and predict errors of a motion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,12 +20,10 @@ from omsm_ros.core.streams.blocks import AxisBlock, Block, DistanceBlock, FloatA
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import CalibrationError, DataError
-from omsm_ros.io import bags
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.linear_algebra import least_squares
-from omsm_ros.pipelines.identify import motion_of_bag
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import path_in, read_blocks
+from omsm_ros.pipelines.recording import SCAN_TOPICS, Recording
 from omsm_ros.quantities import POSITION, SAMPLE_PERIOD
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -37,12 +35,13 @@ def path_check_of(
     trigger: CommonTrigger = EQUAL_COUNTS,
     by_stamps: bool = False,
 ) -> PathCheck:
-    """Return the paper's Fig. 9: errors and phase lags of a free path on a fixed target.
+    """Return errors and phase lags of a free path on a fixed target (the paper's Fig. 9).
 
     trigger: what is stated of the counters of axes and distance
     by_stamps: join both by their stamps, not by their counters
     """
-    record = motion_of_bag(path, trigger=trigger, by_stamps=by_stamps, progress=progress)
+    with Recording(path, progress) as recording:
+        record = recording.motion(trigger=trigger, by_stamps=by_stamps)
     check_usable(record)
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
     distance = _bridged(record)
@@ -57,47 +56,52 @@ def path_check_of(
 
 
 def _check_follows(predicted: FloatArray, seen: FloatArray) -> None:
-    """Raise DataError unless the probe sees the motion: before a part it sees the surface.
+    """Raise DataError unless the probe's readings follow the motion, as on a fixed target.
 
-    predicted: where the probe is, by the model;  seen: by its own readings, both (n,) [m]
+    predicted: position of the probe by the model;  seen: by its readings, both (n,) [m]
     """
     columns = np.column_stack([predicted - np.mean(predicted)])
     gain = float(least_squares(columns, seen - np.mean(seen))[0])
     check_gain(gain)
     if gain < 0:
         raise DataError(
-            "the distance goes the other way with Z than in the step test of the calibration; turn "
-            "its sign, in the driver or the map"
+            "the distance changes with Z in the other direction than in the calibration's step "
+            "test; invert its sign in the driver or the map"
         )
 
 
 def _bridged(record: MotionRecord) -> FloatArray:
-    """Return the distance, dropouts bridged by lines: a Hilbert transform has no use for gaps."""
+    """Return the distance with dropouts interpolated, for the Hilbert transform."""
     index = np.arange(len(record))
     return np.interp(index, index[record.ok], record.distance[record.ok])
 
 
-# The offset of two trigger counters, established by the motion in a bag.
-
-# As far as stamps may be off: a link that delivers late, and a clock that still learns [s].
-_STAMPS_S = 0.25
-# A session of an hour at 1 kHz; longer ones say no more.
+# Largest error of the stamps [s]: a link that delivers late, a clock that is still adjusting.
+_STAMP_ERROR_S = 0.25
+# Bounds memory: an hour at 1 kHz.
 _MOST_SAMPLES = 4_000_000
 
 
 def established_offset(
     path: AnyBag, calibration: Calibration, progress: Progress = no_progress
 ) -> CounterOffset:
-    """Return the offset that lets the distance of a bag answer to its Z, before a fixed target.
+    """Return the counter offset for which the distance follows Z, on a fixed target.
 
-    calibration: its lag is what the distance comes late by anyway
+    calibration: the distance is expected to follow by its lag
 
-    The stamps say where to search, a quarter of a second to either side. Raises DataError where
-    the motion does not say which offset it is.
+    The search covers a quarter of a second around the offset of the stamps. Raises DataError if
+    the motion does not determine the offset.
     """
-    topics = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
-    blocks = read_blocks(path, topics, progress)
-    axes, distance = ([b for b in blocks[topic] if len(b)] for topic in topics)
+    with Recording(path, progress) as recording:
+        blocks = recording.blocks(*SCAN_TOPICS)
+    return offset_in(path, blocks, calibration)
+
+
+def offset_in(
+    path: AnyBag, blocks: Mapping[str, Sequence[Block]], calibration: Calibration
+) -> CounterOffset:
+    """Return the counter offset in ``blocks``, by topic, of the bag ``path``."""
+    axes, distance = ([b for b in blocks[topic] if len(b)] for topic in SCAN_TOPICS)
     if not axes or not distance:
         raise DataError(f"{str(path)!r} lacks samples of axes or distance; record a motion")
     period = float(axes[0].sample_period)
@@ -119,7 +123,7 @@ def established_offset(
         z,
         d,
         np.isfinite(d),
-        most=min(round(_STAMPS_S / period), both // 8),
+        most=min(round(_STAMP_ERROR_S / period), both // 8),
         lag=calibration.dynamics.low_frequency_delay / period,
         lag_uncertainty=calibration.low_frequency_delay_uncertainty / period,
     )
@@ -140,12 +144,12 @@ def _by_stamps(axes: Sequence[Block], distance: Sequence[Block], period: float) 
 
 
 def _column(blocks: Sequence[Block], first: int, values: Sequence[FloatArray]) -> FloatArray:
-    """Return the values by count from ``first`` on (n,), NaN where there is none."""
+    """Return the values by count from ``first`` on (n,), NaN for missing samples."""
     length = max(b.end for b in blocks) - first
     if not 0 < length <= _MOST_SAMPLES:
         raise DataError(
             f"counters of axes and distance span {length} samples, expected 1 to {_MOST_SAMPLES}: "
-            "two recordings in one, or streams of different times; use one motion"
+            "the bag holds two recordings, or streams of different times; use one motion"
         )
     found = np.full(length, np.nan)
     for block, column in zip(blocks, values, strict=True):
@@ -155,9 +159,6 @@ def _column(blocks: Sequence[Block], first: int, values: Sequence[FloatArray]) -
     return found
 
 
-# What will a motion cost? The prediction for a bag or for positions.
-
-
 def predict_from(
     calibration: Calibration | None, bag: str, z: FloatArray, sample_period: float
 ) -> Prediction:
@@ -165,7 +166,8 @@ def predict_from(
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
-        return predict_error(calibration, path_in(bag))
+        with Recording(bag) as recording:
+            return predict_error(calibration, recording.scan_path())
     SAMPLE_PERIOD.checked(sample_period, name="sample_period")
     positions = POSITION.checked_all(np.asarray(z, np.float64), name="z")
     return predict_error(calibration, ScanPath(z=positions, sample_period=sample_period))

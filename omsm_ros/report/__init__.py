@@ -1,9 +1,9 @@
-"""A measurement for people: figures and one self-contained HTML page."""
+"""Reports: figures and self-contained HTML pages of calibrations, measurements and studies."""
 
 import logging
 import os
 
-# Here before matplotlib loads: it says on stderr that there is no home to keep its list of fonts
-# in, and ends on a backend that it does not know, though figures are drawn without any.
+# Set before matplotlib loads: otherwise it warns on stderr about a missing home folder, and fails
+# on an unknown backend although figures are drawn without one.
 logging.getLogger("matplotlib").setLevel(logging.ERROR)
 os.environ["MPLBACKEND"] = "agg"

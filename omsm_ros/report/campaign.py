@@ -1,4 +1,4 @@
-"""The page of a campaign: what stands out, what drifts, and every measurement in a table."""
+"""The page of a campaign: outliers, drift, and a table of all measurements."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from omsm_ros.report.tables import part
 from omsm_ros.report.verdict import verdict_on_measurement
 from omsm_ros.units import DAY_S, MICROSECOND_S, NANOMETRE_M, NANOSECONDS_PER_S
 
-# What three digits do not show is no finding, however regular it is.
-_ALIKE = 0.005
+# Relative differences that three digits do not show are not reported.
+_VISIBLE_CHANGE = 0.005
 
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """A number that each measurement has.
+    """A quantity of each measurement.
 
-    place: where its summary holds it;  unit: of it;  judged: whether it may stand out and drift
+    place: path to its value in the summary;  judged: True to test it for outliers and drift
     """
 
     name: str
@@ -37,7 +37,7 @@ class Series:
 
     @property
     def drawn(self) -> tuple[float, str]:
-        """What one unit on the picture is in the unit of the summary, and its name."""
+        """Unit of the figure in units of the summary, and its name."""
         return {"m": (NANOMETRE_M, "nm"), "s": (DAY_S, "d")}.get(self.unit, (1.0, self.unit))
 
     def formatted(self, value: float) -> str:
@@ -53,16 +53,16 @@ SERIES = (
     Series("Standard uncertainty, median", ("uncertainty", "median")),
     Series("Scatter beyond what is stated, rms", ("uncertainty_budget", "scan_scatter")),
     TEMPERATURE,
-    # It grows by a day a day.
+    # The age always increases, so it is not tested.
     Series("Age of the calibration", ("conditions", "calibration_age"), "s", judged=False),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class CampaignEntry:
-    """One bag of a campaign: its name, state, time [ns], link, and what its summary says.
+    """One bag of a campaign: name, state, time [ns], link to its report, and summary.
 
-    said: why there is no summary, if there is none
+    said: why there is no summary; empty if there is one
     """
 
     name: str
@@ -90,7 +90,7 @@ def render(title: str, measurements: Sequence[CampaignEntry], calibration: Calib
 
 @dataclass(frozen=True, slots=True)
 class JudgedSeries:
-    """A series over all measurements: values (n,), which stand out (n,), how it drifts."""
+    """A series over all measurements: values (n,), outliers (n,) and drift."""
 
     series: Series
     values: FloatArray
@@ -99,7 +99,7 @@ class JudgedSeries:
 
 
 def judge(measurements: Sequence[CampaignEntry]) -> list[JudgedSeries]:
-    """Look for outliers and drift in each series that any measurement has."""
+    """Test each series that any measurement has for outliers and drift."""
     times = _times(measurements)
     found = []
     for series in SERIES:
@@ -112,41 +112,41 @@ def judge(measurements: Sequence[CampaignEntry]) -> list[JudgedSeries]:
 
 
 def _differs(values: FloatArray, usual: float) -> BoolArray:
-    """Return where values (n,) read otherwise than the usual one, at three digits."""
-    return np.asarray(np.abs(values - usual) > _ALIKE * abs(usual))
+    """Return which values (n,) differ from ``usual`` at three digits."""
+    return np.asarray(np.abs(values - usual) > _VISIBLE_CHANGE * abs(usual))
 
 
 def _seen(slope: LinearTrend | None, over: FloatArray, values: FloatArray) -> LinearTrend | None:
-    """Return a trend whose change over all measurements could be read, None for any other."""
+    """Return the trend if its change over all measurements is visible at three digits."""
     if slope is None:
         return None
     change = slope.slope * np.ptp(over[np.isfinite(over)])
-    return slope if abs(change) > _ALIKE * abs(np.nanmedian(values)) else None
+    return slope if abs(change) > _VISIBLE_CHANGE * abs(np.nanmedian(values)) else None
 
 
 def remarks(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries]) -> list[str]:
-    """Say what failed, what stands out and what drifts, each in a sentence."""
+    """Return failures, outliers and drifts, each as a sentence."""
     found = [f"{m.name}: {m.state}, {m.said}" for m in measurements if m.state != "done"]
     for one in judged:
         for i in np.flatnonzero(one.outlying):
             usual = one.series.formatted(float(np.nanmedian(one.values)))
             value = one.series.formatted(float(one.values[i]))
             found.append(
-                f"{measurements[i].name} stands out: {_low(one.series.name)} is {value}, where "
-                f"{usual} is usual"
+                f"{measurements[i].name} is an outlier: {_low(one.series.name)} is {value}, the "
+                f"median is {usual}"
             )
         if one.drift is not None and one.drift.significant:
             unit = "K" if one.series is TEMPERATURE else one.series.unit
             low, high = (quantity(s * DAY_S, unit) for s in (one.drift.low, one.drift.high))
-            found.append(f"{one.series.name} drifts by {low} to {high} a day (95 %)")
+            found.append(f"{one.series.name} drifts by {low} to {high} per day (95 %)")
     found += _temperature_correlation(judged)
     if sum(m.state == "done" for m in measurements) < FEWEST:
-        found.append(f"outliers and drift: not evaluated, of fewer than {FEWEST} measurements")
+        found.append(f"outliers and drift: not evaluated, fewer than {FEWEST} measurements")
     return found
 
 
 def _temperature_correlation(judged: Sequence[JudgedSeries]) -> list[str]:
-    """Say which figures go with the temperature, each in a sentence."""
+    """Return correlations with the temperature, each as a sentence."""
     warm = [one.values for one in judged if one.series is TEMPERATURE]
     found = []
     for one in judged:
@@ -156,7 +156,7 @@ def _temperature_correlation(judged: Sequence[JudgedSeries]) -> list[str]:
         if slope is not None and slope.significant:
             low, high = (quantity(s, one.series.unit) for s in (slope.low, slope.high))
             found.append(
-                f"{one.series.name} goes with the temperature, {low} to {high} a kelvin (95 %)"
+                f"{one.series.name} depends on the temperature, {low} to {high} per kelvin (95 %)"
             )
     return found
 
@@ -171,7 +171,7 @@ def _value(measurement: CampaignEntry, series: Series) -> float:
 
 
 def _times(measurements: Sequence[CampaignEntry]) -> FloatArray:
-    """Return the time of each recording [s], NaN where it has none."""
+    """Return the time of each recording [s], NaN if unknown."""
     unknown = np.nan
     return np.array(
         [
@@ -214,7 +214,7 @@ def _row(
 
 
 def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries]) -> bytes:
-    """Return each series over time, or over the order of names where no time is known."""
+    """Draw each series over time, or over the order of names if times are unknown."""
     times = _times(measurements)
     timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
     x = (times - np.nanmin(times)) / DAY_S if timed else np.arange(len(measurements))
@@ -226,7 +226,7 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
         panel.plot(x[usual], values[usual], ".", color=style.AFTER, markersize=5)
         panel.plot(x[one.outlying], values[one.outlying], "o", color=style.BEFORE)
         if one.series is not TEMPERATURE:
-            # A twentieth more than the largest, so that its dot is whole.
+            # 5 % above the largest value, so that its dot is not clipped.
             panel.set_ylim(
                 min(0.0, float(np.nanmin(values))), 1.05 * (float(np.nanmax(values)) or 1.0)
             )
@@ -237,13 +237,11 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
     return style.png(made, dpi=120)
 
 
-# Lag, static gain and form of each machine over months.
-
 _COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 class HistoryLike(Protocol):
-    """A machine and its rows of the catalogue."""
+    """A machine with its calibrations and measurements in the catalogue."""
 
     machine: str
     calibrations: list[dict[str, Any]]
@@ -251,7 +249,10 @@ class HistoryLike(Protocol):
 
 
 def draw(machines: Sequence[HistoryLike]) -> bytes:
-    """Return a figure (PNG) with one colour a machine; rejected calibrations as crosses."""
+    """Draw lag, static gain and form over time (PNG), one colour per machine.
+
+    Rejected calibrations are crosses.
+    """
     made, axes = style.figure(10.0, 7.0, rows=3)
     lag, gain, form = axes[:, 0]
     for i, machine in enumerate(machines):
@@ -262,7 +263,7 @@ def draw(machines: Sequence[HistoryLike]) -> bytes:
             _points(gain, rows, "static_gain", "static_gain_uncertainty", 1.0, colour, mark)
         _points(form, machine.measurements, "deviation_rms", "", NANOMETRE_M, colour, ".")
         lag.plot([], [], "o", color=colour, label=style.named(machine.machine) or "not named")
-    style.label(lag, y="µs", title="Lag of slow motion, k = 2")
+    style.label(lag, y="µs", title="Low-frequency delay, k = 2")
     style.label(gain, title="Static gain, k = 2")
     style.label(form, y="nm", title="Deviation from nominal, rms by area", x="recorded (UTC)")
     for panel in (lag, gain, form):

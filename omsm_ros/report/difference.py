@@ -1,4 +1,4 @@
-"""The HTML page of a comparison: verdict first, nothing fetched from anywhere."""
+"""The report of a comparison of two measurements: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -21,16 +21,15 @@ from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
-# Figures of a comparison: profiles of both and of their difference, E_n of the terms.
-
-# Of the aperture: the half width of a profile's band in places, and the places of a stretch.
-_HALF_WIDTH_PLACES, _STRETCH_PLACES = 1.5, 1.5
-_MOST_DIGITS = 5000
+# Half width of a profile's band, and length of its segments, in grid spacings.
+_HALF_WIDTH_CELLS, _SEGMENT_CELLS = 1.5, 1.5
+# Numbers on an axis have at most four digits.
+_LARGEST_NUMBER = 5000
 _LINES = {"profile_x": (0.0, "along x", "x"), "profile_y": (np.pi / 2, "along y", "y")}
 
 
 def profiles(found: Comparison) -> dict[str, Figure]:
-    """Draw the profiles along x and y through the middle, and the mean over rings, by name."""
+    """Draw the profiles along x and y through the centre, and the mean over rings, by name."""
     matched, agreement = found.matched, found.agreement
     side = matched.grid.dx
     x0, y0 = ((float(v.min()) + float(v.max())) / 2 for v in (matched.x, matched.y))
@@ -43,7 +42,7 @@ def profiles(found: Comparison) -> dict[str, Figure]:
         def line(values: FloatArray, angle: float = angle) -> Profile:
             return line_profile(
                 x, y, values, angle=angle,
-                half_width=_HALF_WIDTH_PLACES * side, spacing=_STRETCH_PLACES * side,
+                half_width=_HALF_WIDTH_CELLS * side, spacing=_SEGMENT_CELLS * side,
             )  # fmt: skip
 
         cuts = [line(values) for values in (a, b, matched.difference)]
@@ -69,7 +68,7 @@ def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position
         bound = COVERAGE_FACTOR * band.value / NANOMETRE_M
         lower.fill_between(
             band.position / MILLIMETRE_M, -bound, bound, color=style.AFTER, alpha=0.18,
-            linewidth=0, label="±U of a place, k = 2",
+            linewidth=0, label="±U of a point, k = 2",
         )  # fmt: skip
     style.legend_above(upper)
     style.legend_above(lower)
@@ -79,10 +78,10 @@ def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position
 
 
 def _unit(cuts: Sequence[Profile]) -> tuple[float, str]:
-    """Return the unit in which their heights have no more than four digits, and its name."""
+    """Return the unit in which the heights have at most four digits, and its name."""
     largest = max(float(np.nanmax(np.abs(cut.value), initial=0.0)) for cut in cuts)
     units = ((NANOMETRE_M, "nm"), (MICROMETRE_M, "µm"), (MILLIMETRE_M, "mm"))
-    return next((u for u in units if largest < _MOST_DIGITS * u[0]), units[-1])
+    return next((u for u in units if largest < _LARGEST_NUMBER * u[0]), units[-1])
 
 
 def _line(axes: Axes, drawn: Profile, unit: float, **look: str) -> None:
@@ -110,15 +109,15 @@ def terms(numbers: Sequence[ComparedTerm]) -> Figure:
 _VERDICTS = {
     "agree": ("good", "The two measurements agree"),
     "differ": ("bad", "The two measurements differ"),
-    "cannot tell": ("unknown", "Nobody can tell whether they agree"),
+    "cannot tell": ("unknown", "Agreement not decided"),
 }
 _MOST_IN_NANOMETRES_M = 5e-6
 CAPTIONS = {
-    "profile_x": "Through the middle: both measurements less the fitted freedoms, and A − B.",
-    "profile_y": "Through the middle: both measurements less the fitted freedoms, and A − B.",
-    "profile_radius": "What is the same all around, such as rings; drift of a spiral scan is here.",
-    "terms": "Difference over its expanded uncertainty, which holds for all terms together "
-    "with 95 %; beyond ±1 they disagree.",
+    "profile_x": "Through the centre: both measurements after removal of the fit, and A − B.",
+    "profile_y": "Through the centre: both measurements after removal of the fit, and A − B.",
+    "profile_radius": "Mean over each ring: symmetric form, and drift of spiral scans.",
+    "terms": "Difference divided by its expanded uncertainty (95 % for all terms together); beyond "
+    "±1 the measurements disagree.",
 }
 
 
@@ -149,7 +148,7 @@ def render(title: str, date: str, facts: Mapping[str, Any], found: Comparison) -
 
 
 def map_of(found: Comparison) -> EmbeddedMap:
-    """Return maps of the difference, of E_n and of both measurements less the fitted freedoms."""
+    """Return maps of the difference, of E_n, and of both measurements after removal of the fit."""
     matched, agreement = found.matched, found.agreement
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
 
@@ -166,7 +165,7 @@ def map_of(found: Comparison) -> EmbeddedMap:
 
 
 def headlines(facts: Mapping[str, Any]) -> list[Headline]:
-    """Return the numbers that a reader looks for first."""
+    """Return the main results."""
     difference = facts["difference"]
     spread = difference["uncertainty"]
     found = [
@@ -176,7 +175,7 @@ def headlines(facts: Mapping[str, Any]) -> list[Headline]:
             f"peak to valley {quantity(difference['peak_to_valley'], 'm')}",
         ),
         Headline(
-            "Expanded uncertainty of a place",
+            "Expanded uncertainty of a point",
             "not evaluated" if spread is None else quantity(COVERAGE_FACTOR * spread, "m"),
             "k = 2, rms over the area",
         ),
@@ -185,11 +184,11 @@ def headlines(facts: Mapping[str, Any]) -> list[Headline]:
         text = f"probability of such a difference {probability(facts['probability'])}"
         found.append(Headline("|E_n| < 1", f"{percent(facts['within'])} of the area", text))
     text = f"{percent(difference['shared_area'])} of the smaller area"
-    return [*found, Headline("Places compared", count(difference["places"]), text)]
+    return [*found, Headline("Points compared", count(difference["places"]), text)]
 
 
 def records(facts: Mapping[str, Any]) -> list[Table]:
-    """Return E_n, terms, what each brought, and how they were matched."""
+    """Return E_n, Zernike terms, both measurements, and how they were matched."""
     return [_numbers(facts), _terms(facts), _sides(facts), _matching(facts)]
 
 
@@ -205,7 +204,9 @@ def _numbers(facts: Mapping[str, Any]) -> Table:
         for name, n in facts["e_n"].items()
     ]
     return Table(
-        "Figures of both; U: 95 % for all together", ("A", "B", "U of the difference", "E_n"), rows
+        "Figures of both measurements; U: 95 % for all figures together",
+        ("A", "B", "U of the difference", "E_n"),
+        rows,
     )
 
 
@@ -220,7 +221,7 @@ def _terms(facts: Mapping[str, Any]) -> Table:
         )
         for t in zernike["terms"]
     ]
-    return Table("Zernike terms of A − B, one at the rim", ("A − B", "U, all terms", "E_n"), rows)
+    return Table("Zernike terms of A − B, 1 at the rim", ("A − B", "U, all terms", "E_n"), rows)
 
 
 def _sides(facts: Mapping[str, Any]) -> Table:
@@ -229,19 +230,19 @@ def _sides(facts: Mapping[str, Any]) -> Table:
     rows.append(("points", count(a["points"]), count(b["points"])))
     for key, name in (
         ("scatter", "scatter of a point about its neighbours"),
-        ("interpolation", "interpolation, rms, at most"),
-        ("cell", "cell of the local fits"),
+        ("interpolation", "largest interpolation error, rms"),
+        ("cell", "cell size of the local fits"),
     ):
         rows.append((name, quantity(a[key], "m"), quantity(b[key], "m")))
     sources = dict.fromkeys([*(a["sources"] or {}), *(b["sources"] or {})])
     for source in sources:
         sizes = ((side["sources"] or {}).get(source) for side in (a, b))
-        name = f"{source.replace('_', ' ')}, on all together, rms"
+        name = f"{source.replace('_', ' ')}, common to all points, rms"
         rows.append((name, *(quantity(size, "m") for size in sizes)))
-    rows.append(("drift known by", a["drift_from"], b["drift_from"]))
+    rows.append(("basis of the drift", a["drift_from"], b["drift_from"]))
     notes = ("; ".join(side.get("notes") or ()) for side in (a, b))
     rows.append(("notes", *(note or NOTHING for note in notes)))
-    return Table("What each brought, k = 1", ("A", "B"), rows)
+    return Table("Both measurements, uncertainties k = 1", ("A", "B"), rows)
 
 
 _UNITS = {"piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad"}
@@ -259,9 +260,12 @@ def _matching(facts: Mapping[str, Any]) -> Table:
     refused = facts["registration"]["not_determined"]
     rows += [(f"not moved in {name}", str(why)) for name, why in refused.items()]
     rows += [
-        ("resampled by", facts["resampling"]["method"]),
-        ("places", quantity(facts["resampling"]["spacing"], "m")),
-        ("one and the same error in both", ", ".join(facts["common_errors"]) or "none"),
-        ("errors of unknown form correlated over", quantity(facts["correlation_length"], "m")),
+        ("resampling", facts["resampling"]["method"]),
+        ("grid spacing", quantity(facts["resampling"]["spacing"], "m")),
+        ("errors common to both", ", ".join(facts["common_errors"]) or "none"),
+        (
+            "correlation length of errors of unknown form",
+            quantity(facts["correlation_length"], "m"),
+        ),
     ]
     return Table("Matching", (), rows)

@@ -1,4 +1,4 @@
-"""One page an experiment: the paper's figures in one column, ours in the next."""
+"""Report of one of the paper's experiments: results of the paper and of the twin, with figures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from omsm_ros.units import DEGREE_RAD, NANOMETRE_M
 
 @dataclass(frozen=True)
 class Compared:
-    """A figure as the paper has it and as the twin gives it, ready to be read; and a remark."""
+    """A result of the paper and of the twin, as text, with a remark."""
 
     name: str
     paper: str
@@ -29,7 +29,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class ExperimentPage:
-    """captions, figures: by name, PNG files;  narrow: those that stand three in a line"""
+    """captions, figures: captions and PNG files by name;  narrow: figures placed three in a row"""
 
     title: str
     summary: str
@@ -48,21 +48,19 @@ def render(page: ExperimentPage) -> str:
         StudyPage(
             title=page.title,
             subtitle="on the digital twin",
-            verdict=PageVerdict("unknown", "Side by side", (page.summary,)),
+            verdict=PageVerdict("unknown", "Result", (page.summary,)),
             sections=(
-                Section("The paper's figures beside ours", tables=(comparison_table,)),
+                Section("Comparison with the paper", tables=(comparison_table,)),
                 Section("Measured", tuple(page.figures), page.tables),
             ),
             captions=page.captions,
             figures=page.figures,
             narrow=page.narrow,
             footer="Light: Advanced Manufacturing 2025, doi 10.37188/lam.2025.078. The twin has "
-            "the paper's Eq. 12 with the s that its print lacks; its truth is known.",
+            "the dynamics of the paper's Eq. 12, corrected for a missing s.",
         )
     )
 
-
-# Figures of the paper's experiments on the twin.
 
 _WIDTH_IN = 9.2
 

@@ -1,4 +1,4 @@
-"""What is a page made of? Headlines, sections of figures and tables, and a line of its issue."""
+"""Parts of a page: headlines, sections of figures and tables, and the line of issue."""
 
 from __future__ import annotations
 
@@ -14,18 +14,16 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 
-# A page from its template: text from outside escaped, numbers set as in print.
-
 _SPACE = "\N{NARROW NO-BREAK SPACE}"
-# A sign, not a hyphen: not behind a letter or a digit, so neither 1e-9 nor a date.
+# A minus sign, not a hyphen: not after a letter or a digit, as in 1e-9 or a date.
 _MINUS = re.compile(r"(?<![\w.\-])-(?=\d)")
 _UNITS = r"(?:[nµmkM]?(?:m|s|Hz|rad|g|N/m|N·s/m)(?:/s²?)?|ppm|%|°|rpm|·)"
-# "12.5 nm", "254 000"
+# Spaces that must not break, as in "12.5 nm" and "254 000".
 _JOINED = re.compile(rf"(?<=\d) (?=(?:{_UNITS}|\d{{3}})(?![\w/]))")
 
 
 def fill(template: str, **content: object) -> str:
-    """Return the template of that name with ``content`` in it; raise for a name left open."""
+    """Return the template filled with ``content``, texts escaped; raise for an undefined name."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("omsm_ros.report"),
         autoescape=True,
@@ -38,16 +36,16 @@ def fill(template: str, **content: object) -> str:
 
 
 def check_places(figures: Iterable[str], places: Iterable[str]) -> None:
-    """Raise ConfigurationError for a figure whose name is none of ``places`` on a page."""
+    """Raise ConfigurationError for a figure whose name is not in ``places``."""
     unknown = sorted(set(figures) - set(places))
     if unknown:
         raise ConfigurationError(
-            f"figures {unknown!r} have no place on the page, expected one of {[*places]}"
+            f"figures {unknown!r} are unknown on this page, expected one of {[*places]}"
         )
 
 
 def picture(png: bytes) -> str:
-    """Return a PNG file as text for the address of an image."""
+    """Return a PNG file as base64 text."""
     return b64encode(png).decode()
 
 
@@ -58,7 +56,7 @@ def typeset(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Headline:
-    """A number that a reader looks for first."""
+    """One main result at the top of a page."""
 
     name: str
     value: str
@@ -67,7 +65,7 @@ class Headline:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """Figures, by their names, then tables; ``note`` is for the reader."""
+    """A section of a page: figures, by their names, then tables, then a ``note``."""
 
     title: str
     figures: tuple[str, ...] = ()
@@ -76,10 +74,7 @@ class Section:
 
 
 def present(sections: Sequence[Section], figures: Mapping[str, bytes]) -> list[Section]:
-    """Return ``sections`` with the figures that there are and tables that have rows.
-
-    Those that have neither are left out.
-    """
+    """Return ``sections`` with available figures and non-empty tables, without empty sections."""
     cut = [
         Section(
             section.title,
@@ -94,9 +89,9 @@ def present(sections: Sequence[Section], figures: Mapping[str, bytes]) -> list[S
 
 @dataclass(frozen=True, kw_only=True)
 class IssuedPage:
-    """What pages have that are issued to be filed.
+    """Common parts of certificates and model pages.
 
-    date: of issue, as it is to be printed;  source: the recording, for a reader
+    date: of issue, as printed;  source: name of the recording
     version: of the software;  figures: PNG files by the names in ``captions``
 
     Raises ConfigurationError for a figure of another name.
@@ -116,14 +111,11 @@ class IssuedPage:
         return " · ".join(p for p in (self.source, f"issued {self.date}", identity) if p)
 
 
-# A page of a study: verdict, then sections of figures and tables.
-
-
 @dataclass(frozen=True, slots=True)
 class StudyPage:
-    """captions, figures: PNG files and what is to be read under them, by name
+    """A page of a study: verdict, then sections of figures and tables.
 
-    narrow: of the figures, those that stand three in a line
+    captions, figures: captions and PNG files by name;  narrow: figures placed three in a row
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""Figures of the probe's dynamics: Bode plot and step response."""
+"""Figures of the identified dynamics: Bode plot and step response."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from omsm_ros.report import style
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLISECOND_S, NANOMETRE_M
 
 _LOWEST_HZ = 0.1
-# Of the logarithm of a gain: where nothing is known the band leaves the picture all the same.
+# Limits the half width of the band in log gain, so that exp() does not overflow.
 _WIDEST = 100.0
 _NM_PER_UM = MICROMETRE_M / NANOMETRE_M
 _SMALLEST_SHOWN_NM_PER_UM = 1e-4
 
 
 class HasResponse(Protocol):
-    """Whatever can be asked for its response: a transfer function, the truth of the twin."""
+    """A system with a frequency response: a transfer function, the true response of the twin."""
 
     def response(self, frequency: FloatArray) -> ComplexArray:
         """Return G at ``frequency`` (n,) [Hz]."""
@@ -32,14 +32,14 @@ class HasResponse(Protocol):
 
 
 def frequencies(identified: Calibration) -> FloatArray:
-    """Return frequencies of a Bode plot [Hz]: up to Nyquist's, for the data say nothing beyond."""
+    """Return frequencies of a Bode plot [Hz], up to the Nyquist frequency of the data."""
     return np.geomspace(_LOWEST_HZ, 0.5 / identified.sample_period, 600)
 
 
 def bode(identified: Calibration, true: HasResponse | None, sample_period: float) -> Figure:
     """Draw gain, phase, and the error of a motion before and after the correction.
 
-    true: the twin's G_m, drawn where known
+    true: the twin's G_m, None if unknown
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
     """
     if not (np.isfinite(sample_period) and sample_period > 0):
@@ -74,10 +74,10 @@ def draw_gain(
     axes.set_ylim(low - room, high + room)
     if identified.valid_up_to < frequency[-1]:
         axes.annotate(
-            "not trusted", (1, 1), (-4, -4), "axes fraction", "offset points", ha="right",
+            "not valid", (1, 1), (-4, -4), "axes fraction", "offset points", ha="right",
             va="top", fontsize=style.TEXT_PT - 1, color=style.MUTED,
         )  # fmt: skip
-    # The curve starts at 1; the legend goes to the emptier side of it.
+    # The curve starts at 1, so the legend goes to the side with less of the curve.
     style.legend(axes, loc="upper left" if high - 1 > 1 - low else "lower left")
     style.label(axes, y="gain [1]", title=title)
 
@@ -162,12 +162,12 @@ def step_response(
     probe: FloatArray,
     predicted: FloatArray | None = None,
 ) -> Figure:
-    """Draw one of the steepest moves, an edge of a step test, and how far the probe is from it.
+    """Draw the steepest edge of a step test, the probe's motion, and their difference.
 
     Each array is of shape (n,), positions in [m].
 
     time: [s];  encoder: position of the axis
-    probe: motion the probe saw, -distance / static gain on a fixed target, in any offset
+    probe: motion by the probe, -distance / static gain on a fixed target, with any offset
     predicted: encoder through the identified G_m
     """
     given = [part for part in (time, encoder, probe, predicted) if part is not None]

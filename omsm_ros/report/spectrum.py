@@ -1,4 +1,4 @@
-"""The page of ``omsm spectrum``."""
+"""The report of ``omsm spectrum``: figures and page."""
 
 from __future__ import annotations
 
@@ -30,9 +30,7 @@ from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
-# Spectra of scans, their lines in the colour of their kind.
-
-# Okabe and Ito, apart for every kind of sight.
+# Colours of Okabe and Ito, distinct for all colour vision.
 COLOURS = {
     PART: "#009E73",
     VIBRATION: "#D55E00",
@@ -46,7 +44,7 @@ _MOST_NAMED = 8
 
 
 def over_time(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure:
-    """Draw the amplitude spectral density of each scan over time, its lines named."""
+    """Draw the amplitude spectral density of each scan over time, with its lines."""
     made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
     for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
         signal = studied.signal
@@ -60,7 +58,7 @@ def over_time(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figur
 
 
 def over_path(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure | None:
-    """Draw the density along the path over wavelength; None where no scan moves over the part."""
+    """Draw the density along the path over wavelength; None if no scan moves over the part."""
     moving = [(s, n) for s, n in scans if PATH in s.coordinates]
     if not moving:
         return None
@@ -89,7 +87,7 @@ def _curve(axes: Axes, spectrum: Density, unit: float, *, over: bool = False) ->
 def _marks(
     axes: Axes, named: Sequence[NamedLine], coordinate: str, unit: float, extent: float
 ) -> None:
-    """Mark the lines: amplitude a stands a²/2 high in one resolution."""
+    """Mark the lines at the height a²/2 over one frequency resolution, for amplitude a."""
     for row in named:
         if coordinate not in row.line.possible:
             continue
@@ -109,7 +107,7 @@ def _kinds(axes: Axes, named: Sequence[NamedLine]) -> None:
 
 
 def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) -> Figure:
-    """Draw the density of the path's own motion against the calibrated band (Fig. 7c)."""
+    """Draw the density of the motion of Z and the calibrated band (Fig. 7c)."""
     made, axes = style.figure(_WIDTH_IN, 3.0)
     one = axes[0, 0]
     style.logarithmic(one.xaxis)
@@ -118,7 +116,7 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
     for k, (name, spectrum) in enumerate(spectra):
         frequency, level = smoothed(spectrum)
         colour = list(COLOURS.values())[k % len(COLOURS)]
-        # A Z that stands still has no density, and no logarithm.
+        # A stationary Z has zero density, which has no logarithm.
         if np.any(level > 0):
             heights, shown = np.sqrt(level) / NANOMETRE_M, style.named(name)
             one.plot(frequency, heights, linewidth=0.9, color=colour, label=shown)
@@ -132,9 +130,9 @@ def motion(spectra: Sequence[tuple[str, Density]], valid_up_to: float | None) ->
 
 
 def evidence(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure | None:
-    """Draw every line of every scan at its frequency in time: what stays is no texture.
+    """Draw every line of every scan at its frequency in time; None without such a line.
 
-    None where there is no such line.
+    A line at the same frequency in scans of different speed is not texture.
     """
     if not any(TIME in row.line.possible for _, named in scans for row in named):
         return None
@@ -149,25 +147,25 @@ def evidence(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure
                 )
     style.logarithmic(one.xaxis, every=(1.0, 2.0, 5.0))
     low, high = one.get_xlim()
-    # Lines near one another would leave no number between them.
+    # A decade at least, so that the axis has numbers.
     one.set_xlim(min(low, high / 10), high)
     one.set_yticks(range(len(scans)), [style.named(s.signal.name) for s, _ in scans])
     one.invert_yaxis()
-    style.label(one, x="frequency in time [Hz]", title="The same frequency, or not")
+    style.label(one, x="frequency in time [Hz]", title="Lines of all scans")
     return made
 
 
 CAPTIONS = {
-    "time": "Spectral density over time; each dot is a line, as high as it stands out.",
-    "path": "The same along the path: what is on the part has its wavelength here in every scan.",
-    "evidence": "Lines that stay where they are at another speed are not on the part.",
-    "motion": "The path's own motion. Grey: beyond what the calibration knows.",
+    "time": "Spectral density over time; dots: lines at their amplitude.",
+    "path": "Spectral density along the path: texture has the same wavelength in every scan.",
+    "evidence": "Lines at the same frequency at different speeds are not on the part.",
+    "motion": "Spectral density of the motion of Z. Grey: above the calibrated band.",
 }
 
 
 @dataclass(frozen=True)
 class SpectrumPage:
-    """summary: of ``spectrum.json``;  figures: PNG files by the names in :data:`CAPTIONS`"""
+    """summary: content of ``spectrum.json``;  figures: PNG files by names of :data:`CAPTIONS`"""
 
     summary: Mapping[str, Any]
     figures: Mapping[str, bytes]
@@ -214,11 +212,11 @@ def _verdict(summary: Mapping[str, Any]) -> PageVerdict:
     counts = summary["counts"]
     found = tuple(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
     if not found:
-        return PageVerdict("good", "No line beyond 3 σ", ("nothing but noise",))
+        return PageVerdict("good", "No line above 3 σ", ("noise only",))
     if counts[UNDECIDED]:
         wanted = sorted({p["needs"] for s in summary["scans"] for p in s["peaks"] if p["needs"]})
-        return PageVerdict("unknown", "Not all decided", (*found, *wanted))
-    return PageVerdict("good", "All lines named", found)
+        return PageVerdict("unknown", "Some lines of unknown source", (*found, *wanted))
+    return PageVerdict("good", "Source of every line identified", found)
 
 
 def _peak_table(scan: Mapping[str, Any]) -> Table:
@@ -234,8 +232,8 @@ def _peak_table(scan: Mapping[str, Any]) -> Table:
         )
         for peak in scan["peaks"]
     ]
-    columns = ("seen at", "wavelength", "amplitude", "σ", "truly", "because")
-    return Table(scan["name"], columns, rows, prose="because")
+    columns = ("apparent frequency", "wavelength", "amplitude", "σ", "true value", "evidence")
+    return Table(scan["name"], columns, rows, prose="evidence")
 
 
 def _true(peak: Mapping[str, Any]) -> str:
@@ -243,7 +241,7 @@ def _true(peak: Mapping[str, Any]) -> str:
         return quantity(peak["true_frequency"], "Hz", 5)
     if peak["true_wavelength"]:
         return quantity(peak["true_wavelength"], "m", 4)
-    return f"{peak['order']} a turn" if peak["order"] else ""
+    return f"{peak['order']} per turn" if peak["order"] else ""
 
 
 def _acceleration_table(scans: Sequence[Mapping[str, Any]]) -> Table:
@@ -278,8 +276,8 @@ def _scan_table(scans: Sequence[Mapping[str, Any]]) -> Table:
         for scan in scans
     ]
     columns = (
-        *("points", "duration", "spindle", "path", "form removed, rms", "left, rms"),
-        *("σ of an amplitude", "motion beyond the band"),
+        *("points", "duration", "spindle", "path", "form removed, rms", "residual, rms"),
+        *("σ of an amplitude", "motion outside the band"),
     )
     return Table("", columns, rows)
 
@@ -311,5 +309,5 @@ def _stop_table(scans: Sequence[Mapping[str, Any]]) -> Table:
         for scan in scans
         if (stop := scan["band_stop"])
     ]
-    columns = ("bands", "rms before", "rms after", "removed", "phase", "rings at the ends")
+    columns = ("bands", "rms before", "rms after", "removed", "phase", "settling at the ends")
     return Table("", columns, rows)

@@ -1,4 +1,4 @@
-"""One look for all figures: quiet axes, colours that everybody can distinguish, no global state."""
+"""Common style of all figures, with colours for all colour vision, without global state."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import printable
 
-# Okabe and Ito's blue and vermillion differ in hue and lightness for every kind of sight.
+# Blue and vermillion of Okabe and Ito differ in hue and lightness for all colour vision.
 BEFORE = "#D55E00"
 AFTER = "#0072B2"
 TRUTH = "#1F2933"
@@ -27,8 +27,7 @@ FAINT = "#D9DEE3"
 MISSING = "#ECEFF2"
 MAP_COLOURS = "viridis"
 
-# Room beside the axes [inch] for their numbers and names: found for each figure anew, it would
-# take longer than drawing.
+# Margins of the axes [inch]: a layout computed for each figure would take longer than drawing.
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.78, 0.14, 0.46, 0.34
 _BETWEEN_ROWS_IN, _BETWEEN_SHARED_ROWS_IN, _BETWEEN_COLUMNS_IN = 0.78, 0.32, 0.84
 _NAME_LEFT_OF_AXES_IN = 0.58
@@ -36,12 +35,12 @@ _NAME_LEFT_OF_AXES_IN = 0.58
 TEXT_PT = 8.5
 TITLE_PT = 10.0
 FIGURE_DPI = 180
-# Level 4 is twice as fast as the usual 6, and the file a few per cent larger.
+# Level 4 is twice as fast as the default 6, and files are a few per cent larger.
 FAST_PNG = {"compress_level": 4}
 
 
 def empty(width: float, height: float) -> Figure:
-    """Return a figure of ``width`` × ``height`` [inch] that no window will ever show."""
+    """Return a figure of ``width`` × ``height`` [inch] without a window."""
     made = Figure(figsize=(width, height), facecolor="white")
     FigureCanvasAgg(made)
     return made
@@ -85,11 +84,11 @@ def quiet(axes: Axes) -> None:
 
 
 def logarithmic(axis: XAxis | YAxis, *, every: Sequence[float] = (1.0,)) -> None:
-    """Make an axis logarithmic, its numbers written as people read them: 0.1, 1, 10.
+    """Make an axis logarithmic, with numbers 0.1, 1, 10.
 
-    every: the multiples of each power of ten that get a tick and a number
+    every: multiples of each power of ten that get a tick and a number
 
-    Powers as 10⁻¹ would need matplotlib's formula language, which takes longer to load than the
+    Numbers such as 10⁻¹ would need matplotlib's mathtext, which takes longer to load than the
     figure to draw.
     """
     scale = axis.axes.set_xscale if isinstance(axis, XAxis) else axis.axes.set_yscale

@@ -1,4 +1,4 @@
-"""The numbers of a report as rows of text, with their units."""
+"""Tables of a report: numbers as text, with their units."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
 _OPEN = "not evaluated"
 _FIGURE_NAMES = {
     "peak_to_valley": "peak to valley",
-    "rms": "rms, every point alike",
-    "rms_area_weighted": "rms, every area alike",
+    "rms": "rms over the points",
+    "rms_area_weighted": "rms over the area",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """``rows`` of a label and one text a column; ``columns`` may be empty for no heading.
+    """A table: ``rows`` of a label and one text per column; no heading without ``columns``.
 
-    prose: the column that holds sentences rather than figures, empty for none
+    prose: the column that holds sentences instead of numbers, empty for none
     """
 
     title: str
@@ -32,7 +32,7 @@ class Table:
 
 
 def part(mapping: Mapping[str, Any], *path: str) -> Any:
-    """Return what lies at ``path`` in nested mappings, None where it is missing."""
+    """Return the value at ``path`` in nested mappings, None if it is missing."""
     found: Any = mapping
     for key in path:
         found = found.get(key) if isinstance(found, Mapping) else None
@@ -40,7 +40,7 @@ def part(mapping: Mapping[str, Any], *path: str) -> Any:
 
 
 def error_table(summary: Mapping[str, object]) -> Table:
-    """Return the deviation and dynamic error, before and after the correction."""
+    """Return deviation and dynamic error before and after the correction."""
     rows = []
     for key, name in _FIGURE_NAMES.items():
         both = [part(summary, "deviation", side, key) for side in ("raw", "corrected")]
@@ -51,7 +51,7 @@ def error_table(summary: Mapping[str, object]) -> Table:
         rows.append((label, *(quantity(v, "m") for v in both)))
     for key in ("rms_before_fit", "rms"):
         value = part(summary, "form", "deviation", key)
-        label = {"rms_before_fit": "as it sits", "rms": "registered"}[key]
+        label = {"rms_before_fit": "before the fit", "rms": "registered"}[key]
         found = () if value is None else (measured(value["value"], value["uncertainty"], "m"),)
         rows += [(f"deviation from nominal along the normal, rms, {label}", "", *found)]
     for key in ("median", "largest"):
@@ -62,14 +62,14 @@ def error_table(summary: Mapping[str, object]) -> Table:
 
 
 def budget_table(summary: Mapping[str, object]) -> Table:
-    """Return every source of uncertainty, the largest first, those not evaluated last."""
+    """Return the sources of uncertainty, the largest first, those not evaluated last."""
     rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
     ordered = sorted(rows, key=lambda row: (row["status"] == _OPEN, -(row["height"] or 0.0)))
     return Table(
         "Uncertainty of the heights, k = 1, rms over the scan",
-        ("of the source", "of the heights", "acts", "known by"),
+        ("of the source", "of the heights", "correlation", "basis"),
         [_budget_row(row) for row in ordered],
-        prose="known by",
+        prose="basis",
     )
 
 
@@ -80,42 +80,39 @@ def _budget_row(row: Mapping[str, Any]) -> tuple[str, ...]:
         f"{row['source'].replace('_', ' ')} ({row['says']})",
         _sized(size, unit),
         quantity(row["height"], "m"),
-        "on each point" if row["kind"] == "random" else "on all together",
+        "none" if row["kind"] == "random" else "all points",
         known,
     )
 
 
 def _sized(size: object, unit: str) -> str:
-    """Return a size in its unit; a share or a rate per radian has no prefix."""
+    """Return a size in its unit; a size without a unit has no SI prefix."""
     if unit == "1":
         return plain(size) if size is not None else NOTHING
     return quantity(size, unit)
 
 
 def motion_table(summary: Mapping[str, object]) -> Table:
-    """Return whether the scan was slow enough, and H good enough for it."""
+    """Return the residual error of the motion, its maximum speed, and the filter's error."""
     prediction: Mapping[str, Any] = part(summary, "prediction") or {}
     outside = prediction.get("outside_band_fraction")
     factor = prediction.get("speed_factor")
     rows = [
-        ("left by the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
-        (
-            "motion beyond the trusted band",
-            percent(outside),
-        ),
-        ("could have run faster by", NOTHING if factor is None else f"{plain(factor)} ×"),
-        ("the limit that binds then", str(prediction.get("binding") or NOTHING)),
+        ("residual of the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
+        ("motion outside the valid band", percent(outside)),
+        ("maximum speed", NOTHING if factor is None else f"{plain(factor)} × this scan"),
+        ("limited by", str(prediction.get("binding") or NOTHING)),
         ("limits not evaluated", ", ".join(prediction.get("not_evaluated") or ()) or NOTHING),
         (
             "discretisation, peak to valley",
             quantity(part(summary, "discretisation", "peak_to_valley"), "m"),
         ),
     ]
-    return Table("The motion", (), [row for row in rows if row[1] != NOTHING])
+    return Table("Motion", (), [row for row in rows if row[1] != NOTHING])
 
 
 def sample_table(summary: Mapping[str, object]) -> Table:
-    """Return where every sample of every stream went."""
+    """Return the account of the samples of every stream."""
     streams: Mapping[str, Any] = part(summary, "samples") or {}
     reasons = dict.fromkeys(r for s in streams.values() for r in part(s, "counted") or {})
     rows = [("received", *(count(part(s, "received")) for s in streams.values()))]
@@ -129,46 +126,46 @@ def sample_table(summary: Mapping[str, object]) -> Table:
 
 
 def latency_text(calibration: Calibration) -> str:
-    """Return how much of the lag is latency, and who says so."""
+    """Return the latency in the lag, and its source."""
     latency = calibration.latency
     if latency.share is None:
-        return f"not known ({latency.source})"
+        return f"unknown ({latency.source})"
     return f"{measured(latency.delay_s, latency.uncertainty_s, 's')} ({latency.source})"
 
 
 def calibration_table(calibration: Calibration) -> Table:
-    """Return what was identified and how well."""
+    """Return the identified parameters and the tests of the identification."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
     residual, response = certificate.residual, certificate.response
     gain = measured(calibration.static_gain, certificate.static_gain.uncertainty, digits=6)
     delay = measured(dynamics.low_frequency_delay, response.low_frequency_delay_uncertainty_s, "s")
     rows = [
         ("verdict", certificate.verdict or NOTHING),
-        ("trusted up to", quantity(calibration.valid_up_to, "Hz")),
+        ("valid up to", quantity(calibration.valid_up_to, "Hz")),
         ("static gain, probe per encoder", gain),
-        ("delay of slow motion", delay),
-        ("of it latency of the probe", latency_text(calibration)),
+        ("low-frequency delay", delay),
+        ("latency of the probe in it", latency_text(calibration)),
         ("chi-square per degree of freedom", plain(residual.chi_square)),
         ("residual, rms", quantity(residual.rms_m, "m")),
-        ("whiteness of the residual, p", plain(residual.whiteness_p)),
-        ("its independence of the motion, p", plain(residual.independence_p)),
+        ("residual, test of whiteness, p", plain(residual.whiteness_p)),
+        ("residual, test of independence, p", plain(residual.independence_p)),
         ("edges used", count(residual.edges)),
         ("sample period", quantity(calibration.sample_period, "s")),
     ]
     for number, mode in enumerate(dynamics.modes(), start=1):
         text = f"{quantity(mode.frequency, 'Hz')}, damping {plain(mode.damping)}"
         rows.append((f"mode {number}", text))
-    rows.append(("identity", calibration.id[:16]))
+    rows.append(("id", calibration.id[:16]))
     return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
 
 
 def mapping_table(title: str, values: Mapping[str, object]) -> Table:
-    """Return any mapping of JSON values, one row a key."""
+    """Return a mapping of JSON values, one row per key."""
     return Table(title, (), [(str(key), _json_text(value)) for key, value in values.items()])
 
 
 def remarks_table(calibration: Calibration) -> Table:
-    """Return what the identification has to say about its result."""
+    """Return reasons and warnings of the identification."""
     remarks = [*calibration.certificate.reasons, *calibration.certificate.warnings]
     return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])
 

@@ -1,4 +1,4 @@
-"""May the result be trusted? One word, and every reason against it."""
+"""The verdict on a measurement, with every reason against it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from omsm_ros.errors import text_of
 from omsm_ros.readable import count, percent, quantity
 from omsm_ros.report.tables import part
 
-# A map with more holes than this hides something.
+# With a smaller share of corrected samples the map may miss defects of the surface.
 _LEAST_SHARE_CORRECTED = 0.95
 
 
 @dataclass(frozen=True, slots=True)
 class PageVerdict:
-    """level: "good", "care", "bad" or "unknown";  word: for the reader;  reasons: all of them."""
+    """level: "good", "care", "bad" or "unknown";  word: the verdict as text;  reasons: for it."""
 
     level: str
     word: str
@@ -38,10 +38,10 @@ def verdict_text(calibration: Calibration) -> str:
 def verdict_on_measurement(
     summary: Mapping[str, object], calibration: Calibration | None
 ) -> PageVerdict:
-    """Weigh the calibration's certificate, the account of samples, and the warnings.
+    """Return the verdict from certificate, account of samples, traffic light and warnings.
 
-    Warnings are those of the measurement (``summary["warnings"]``); the certificate's own
-    are about the calibration and do not count once it is accepted.
+    Only warnings of the measurement (``summary["warnings"]``) count; those of an accepted
+    certificate do not.
     """
     certificate = calibration.certificate if calibration else Certificate()
     stated = certificate.verdict
@@ -49,25 +49,25 @@ def verdict_on_measurement(
     if stated == REJECTED:
         against += ["the calibration was rejected", *map(str, certificate.reasons)]
     if against:
-        return PageVerdict("bad", "Not to be trusted", tuple(against))
+        return PageVerdict("bad", "Measurement not valid", tuple(against))
     warnings = [*map(str, part(summary, "warnings") or ())]
     if light := part(summary, "light"):
         return _of_light(light, warnings)
     doubts = [*warnings, *_losses(summary), *_latency(calibration)]
     if calibration is None or not stated:
         missing = "the calibration has no certificate" if calibration else "no calibration is given"
-        return PageVerdict("unknown", "Not judged", (missing, *doubts))
+        return PageVerdict("unknown", "Validity not assessed", (missing, *doubts))
     if doubts:
-        return PageVerdict("care", "Trusted with reservations", tuple(doubts))
+        return PageVerdict("care", "Valid with reservations", tuple(doubts))
     return PageVerdict(
         "good",
-        "Trusted",
+        "Valid",
         (f"calibration {verdict_text(calibration)}", "every sample accounted for"),
     )
 
 
 def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> PageVerdict:
-    """Return the light of the measurement, amber at best where there are warnings."""
+    """Return the verdict by the traffic light; with warnings at most amber."""
     level = {"green": "good", "amber": "care", "red": "bad"}[light["level"]]
     if warnings and level == "good":
         level = "care"
@@ -75,7 +75,7 @@ def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> PageVerdict:
     reasons = [
         f"{r['what']}: {r['remedy']}" if r["remedy"] else r["what"] for r in light["reasons"]
     ]
-    return PageVerdict(level, word, (*warnings, *reasons) or ("every source was looked at",))
+    return PageVerdict(level, word, (*warnings, *reasons) or ("every source was evaluated",))
 
 
 def _streams(summary: Mapping[str, object]) -> Mapping[str, Any]:
@@ -92,13 +92,14 @@ def _accounting(summary: Mapping[str, object]) -> list[str]:
 
 
 def _latency(calibration: Calibration | None) -> list[str]:
-    """Return what to do about a lag of which nobody knows whether X and C share it."""
+    """Return the remedy for a lag of unknown origin, mechanical or latency."""
     if calibration is None or calibration.latency.resolved:
         return []
     lag = calibration.dynamics.low_frequency_delay
+    remedy = text_of("correction.latency_remedy", {})
     return [
-        f"of the lag of {quantity(lag, 's', 4)} any part may be latency of the probe, by "
-        f"which X and C would have to be delayed (lateral_lag in the budget): {text_of('correction.latency_remedy', {})}"
+        f"the share of probe latency in the lag of {quantity(lag, 's', 4)} is unknown; X and C "
+        f"must be delayed by it (lateral_lag in the budget): {remedy}"
     ]
 
 

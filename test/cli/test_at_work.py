@@ -32,7 +32,7 @@ def terminal(monkeypatch):
 
     def made(patience=0.02):
         monkeypatch.setattr(sys, "stderr", Terminal())
-        monkeypatch.setattr(module, "_PATIENCE_S", patience)
+        monkeypatch.setattr(module, "_DELAY_S", patience)
         monkeypatch.setattr(progress, "_TICK_S", 0.01)
         return sys.stderr
 

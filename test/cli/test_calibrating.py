@@ -61,7 +61,7 @@ def test_verify_refuses_what_is_no_free_path(capsys, tmp_path, calibration, smal
     turned = replace(made, distance=replace(made.distance, distance=-made.distance.distance))
     for name, recording, said in (
         ("scan", small_scan, "looks at a fixed target"),
-        ("turned", turned, "turn its sign"),
+        ("turned", turned, "invert its sign"),
     ):
         bag = write(tmp_path / f"{name}.mcap", recording)
         assert cli.main(["verify", str(bag), "--calibration", str(calibration)]) == 2

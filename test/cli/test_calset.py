@@ -70,7 +70,7 @@ def test_a_set_is_made_and_corrected_with(capsys, tmp_path, scan, calibrations):
 @pytest.mark.parametrize(
     ("places", "says"),
     [
-        (("", ""), "has no place"),
+        (("", ""), "states no position"),
         (("@x=0", "@z=1e-3"), "along x and z, expected one axis"),
         (("@x=0", "@x=here"), "position is 'here'"),
         (("@x=0", "@x=0"), "stand at one x"),

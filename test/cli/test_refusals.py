@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import inspect, start
+from omsm_ros.cli import recordings, start
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.pipelines import examine_host
@@ -97,7 +97,7 @@ def test_a_library_that_may_open_no_more_files_is_no_defect(capsys, monkeypatch)
     def fails(*_):
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    monkeypatch.setattr(inspect, "inspect_bag", fails)
+    monkeypatch.setattr(recordings, "inspect_bag", fails)
     assert "too many open files" in refused(capsys, "inspect", "a.mcap")
 
 
@@ -110,7 +110,7 @@ def test_doctor_names_the_limit_of_open_files(capsys, monkeypatch, tmp_path):
     out, err = capsys.readouterr()
     assert (status, err.strip()) == (
         2,
-        "omsm: not ready: open files; each has its remedy above",
+        "omsm: not ready: open files; see the remedies above",
     )
     assert f"NO  open files         a process may hold {most} open" in out
     assert "→ give it more with 'ulimit -n 1024'" in out

@@ -29,7 +29,7 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
     out, err = capsys.readouterr()
     assert "NO  ROS 2" in out
     assert "→ build it" in out
-    assert err.strip() == "omsm: not ready: ROS 2; each has its remedy above"
+    assert err.strip() == "omsm: not ready: ROS 2; see the remedies above"
     assert cli.main(["doctor", "--json"]) == 2
     reported = json.loads(capsys.readouterr().out)
     assert [check["state"] for check in reported["checks"]] == ["fine", "faulty"]
@@ -37,7 +37,10 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
 
 @pytest.mark.parametrize(
     ("option", "says"),
-    [("--radius=2", "beyond the twin's mirror"), ("--feed=1e-7", "40 000 000 samples")],
+    [
+        ("--radius=2", "that of the twin's mirror"),
+        ("--feed=1e-7", "40 000 000 samples"),
+    ],
 )
 def test_a_scan_of_the_twin_that_no_memory_holds_is_refused(capsys, tmp_path, option, says):
     assert cli.main(["twin", "--out", str(tmp_path / "shop"), option]) == 2
@@ -93,6 +96,6 @@ def test_a_standard_output_that_is_full_is_named(options, tmp_path):
         command, shell=True, cwd=tmp_path, capture_output=True, check=False, text=True
     )
     assert done.returncode == 2
-    assert done.stderr.startswith("omsm: standard output takes no more: No space left on device;")
+    assert done.stderr.startswith("omsm: cannot write to standard output: No space left on device;")
     assert done.stderr.count("\n") == 1
     assert (tmp_path / "p" / "steps.csv").exists()

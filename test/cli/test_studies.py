@@ -133,7 +133,7 @@ def test_align_tells_the_noise_by_which_the_points_scatter(capsys, tmp_path, cal
     assert sphere_aligned(tmp_path, calibration, SPHERE_RADIUS_M) == 0
     said = capsys.readouterr().out
     assert "warning" not in said
-    noise = float(re.search(r"of which noise ([\d.]+) nm", said)[1])
+    noise = float(re.search(r"of which ([\d.]+) nm noise", said)[1])
     assert noise == pytest.approx(10.5, rel=0.15)
 
 
@@ -154,7 +154,7 @@ def test_align_warns_programs_too_of_a_form_that_is_no_noise(capsys, tmp_path, c
     bag = write(tmp_path / "s.mcap", replace(scan, distance=distance))
     words = ("--calibration", calibration, "--radius", SPHERE_RADIUS_M, "--out", tmp_path / "g")
     (warning,) = facts(capsys, "align", bag, *words)["warnings"]
-    assert "no sphere of that radius, or its form" in warning
+    assert "not a sphere of that radius, or its form" in warning
 
 
 def test_a_pitch_that_was_measured_elsewhere_is_reported(capsys, tmp_path, scan_bag, calibration):

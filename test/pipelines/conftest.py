@@ -1,28 +1,29 @@
-"""What tests of jobs share."""
+"""Fixtures of the pipeline tests."""
 
 import pytest
 
 from omsm_ros.io import bags
 from omsm_ros.io.tables.table import load_column_map
 from omsm_ros.pipelines.import_recording import import_recording
-from omsm_ros.pipelines.recording import read_blocks
+from omsm_ros.pipelines.recording import Recording
 
 
 class Importer:
-    """Imports files of a folder by a map, and reads what came out."""
+    """Imports files of a folder by a map, and reads the bag made of them."""
 
     def __init__(self, folder):
         self.folder = folder
         self.out = folder / "out.mcap"
 
     def __call__(self, mapping, *files):
-        """What the command reports, of files by name."""
+        """Import the named files; return the report of each."""
         (self.folder / "map.yaml").write_text(mapping, encoding="utf-8")
         mapped, form = load_column_map(self.folder / "map.yaml")
         return import_recording([self.folder / f for f in files], mapped, form, self.out)
 
     def blocks(self, topic=bags.DISTANCE_TOPIC):
-        return read_blocks(self.out, (topic,))[topic]
+        with Recording(self.out) as recording:
+            return recording.blocks(topic)[topic]
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from omsm_ros.pipelines import correct
 from omsm_ros.pipelines.correct import Admission, CorrectedScan, correct_bag
 from omsm_ros.pipelines.inspect_bag import inspect_bag
 from omsm_ros.pipelines.measure import measure
+from omsm_ros.pipelines.recording import Recording
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
@@ -44,7 +45,8 @@ def bag(tmp_path_factory, small_scan_blocks):
 
 
 def points_of(path, calibration, **options):
-    with CorrectedScan(path, calibration, CorrectionOptions(), **options) as scan:
+    with Recording(path) as recording:
+        scan = CorrectedScan(recording, calibration, CorrectionOptions(), **options)
         points = join_points([points for _, points in scan.steps()])
     return points, scan.account
 
@@ -84,10 +86,10 @@ def test_a_stream_recorded_long_before_the_other_loses_nothing(
 def test_samples_that_had_to_be_given_up_are_an_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
-    monkeypatch.setattr(correct, "MAX_PENDING_BLOCKS", 5000)
+    monkeypatch.setattr(correct, "MAX_PENDING_SAMPLES", 5000)
     monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
     path = write(tmp_path / "ahead.mcap", small_scan_blocks, ahead=len(small_scan_blocks))
-    with pytest.raises(BagError, match="waited for their partners in vain"):
+    with pytest.raises(BagError, match="were dropped before their partners came"):
         correct_bag(path, true_calibration, tmp_path / "cloud.ply")
     assert not (tmp_path / "cloud.ply").exists()
 
@@ -95,7 +97,7 @@ def test_samples_that_had_to_be_given_up_are_an_error(
 def test_axes_that_go_on_without_the_probe_are_no_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
-    monkeypatch.setattr(correct, "MAX_PENDING_BLOCKS", 5000)
+    monkeypatch.setattr(correct, "MAX_PENDING_SAMPLES", 5000)
     monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
     path = tmp_path / "stopped.mcap"
     with BagWriter(path, TOPICS) as writer:
@@ -111,7 +113,8 @@ def test_axes_that_go_on_without_the_probe_are_no_error(
 
 def test_every_axis_block_is_handed_on_before_its_points(bag, true_calibration):
     seen = 0
-    with CorrectedScan(bag, true_calibration, CorrectionOptions()) as scan:
+    with Recording(bag) as recording:
+        scan = CorrectedScan(recording, true_calibration, CorrectionOptions())
         for block, points in scan.steps():
             if isinstance(block, AxisBlock):
                 seen = block.first_sample + len(block)

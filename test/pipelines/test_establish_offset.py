@@ -40,9 +40,8 @@ def established(
     monkeypatch: pytest.MonkeyPatch, axes: list[Block], distance: list[Block], period: float
 ) -> int:
     came = {bags.AXES_TOPIC: axes, bags.DISTANCE_TOPIC: distance}
-    monkeypatch.setattr(verify_calibration, "read_blocks", lambda *_: came)
     calibration = replace(unit_calibration(period), covariance=np.zeros((2, 2)))
-    return verify_calibration.established_offset(Path("scan.mcap"), calibration).samples
+    return verify_calibration.offset_in(Path("scan.mcap"), came, calibration).samples
 
 
 @pytest.mark.parametrize("period", [1e-3, 0.1])

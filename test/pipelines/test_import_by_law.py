@@ -16,7 +16,7 @@ from omsm_ros.errors import DataError, FileError
 from omsm_ros.io import bags
 from omsm_ros.io.tables.table import load_column_map
 from omsm_ros.pipelines.import_recording import Origin, RowCounter, import_recording
-from omsm_ros.pipelines.recording import read_blocks
+from omsm_ros.pipelines.recording import Recording
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "inch": 0.0254}
 FEW = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -28,8 +28,8 @@ def imported(folder, mapping, text, name="t.csv"):
     mapped, form = load_column_map(folder / "map.yaml")
     out = folder / "out.mcap"
     import_recording([folder / name], mapped, form, out)
-    with bags.BagReader(out) as bag:
-        return read_blocks(out, [one.role for one in bag.topics()])
+    with Recording(out) as recording:
+        return recording.blocks(*(one.role for one in recording.bag.topics()))
 
 
 @FEW

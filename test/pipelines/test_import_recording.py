@@ -12,7 +12,7 @@ from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.tables.table import TableForm, load_column_map
 from omsm_ros.pipelines.import_recording import import_recording
-from omsm_ros.pipelines.recording import read_blocks
+from omsm_ros.pipelines.recording import Recording
 from omsm_ros.twin.cell import blocks_of
 
 MAP = """
@@ -68,8 +68,15 @@ def test_a_bag_that_exists_is_refused_and_stays(tmp_path):
     assert (tmp_path / "out.mcap").read_bytes() == b"precious"
 
 
+def blocks_in(path):
+    """Return the blocks of a bag by topic, axes first."""
+    with Recording(path) as recording:
+        topics = sorted(topic.role for topic in recording.bag.topics())
+        return recording.blocks(*topics)
+
+
 def samples_of(bag):
-    blocks = read_blocks(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC))
+    blocks = blocks_in(bag)
     return columns(list(zip(*blocks.values(), strict=True))), blocks
 
 
@@ -169,7 +176,7 @@ def test_time_counts_the_samples_though_its_clock_drifts(tmp_path):
     (found,), out = imported(tmp_path, TIMED + 'delimiter: ";"\n', "a.csv")
     assert found.missing == 100
     assert found.sample_period == pytest.approx(0.5e-3 * (1 + 3e-4), rel=1e-6)
-    blocks = read_blocks(out, (bags.DISTANCE_TOPIC,))[bags.DISTANCE_TOPIC]
+    blocks = blocks_in(out)[bags.DISTANCE_TOPIC]
     assert blocks[-1].first_sample == 2100
 
 
@@ -203,7 +210,7 @@ PROBE = "sample_period: 0.001\ncolumns:\n  distance: {name: d, unit: um}\n"
 def distances(tmp_path, text, mapping=PROBE):
     (tmp_path / "a.csv").write_text(text)
     (found,), out = imported(tmp_path, mapping, "a.csv")
-    blocks = read_blocks(out, (bags.DISTANCE_TOPIC,))[bags.DISTANCE_TOPIC]
+    blocks = blocks_in(out)[bags.DISTANCE_TOPIC]
     return found, np.concatenate([b.distance for b in blocks]) * 1e6
 
 
@@ -277,7 +284,7 @@ def test_matlab_and_numpy_tables_by_index(tmp_path):
     for name, column in (("a.mat", "log[1]"), ("a.npy", "[1]")):
         mapping = f"sample_period: 0.001\ncolumns:\n  distance: {{name: '{column}', unit: um}}\n"
         (found,), out = imported(tmp_path, mapping, name)
-        (block,) = read_blocks(out, (bags.DISTANCE_TOPIC,))[bags.DISTANCE_TOPIC]
+        (block,) = blocks_in(out)[bags.DISTANCE_TOPIC]
         assert block.distance == pytest.approx(table[:, 1] * 1e-6)
         assert found.rows == 50
         out.unlink()
@@ -289,7 +296,7 @@ def test_hdf5_by_group_and_channel(tmp_path):
         file["probe/gap"] = np.arange(20.0)
     mapping = "sample_period: 0.001\ncolumns:\n  distance: {name: probe/gap, unit: um}\n"
     imported(tmp_path, mapping, "a.h5")
-    (block,) = read_blocks(tmp_path / "out.mcap", (bags.DISTANCE_TOPIC,))[bags.DISTANCE_TOPIC]
+    (block,) = blocks_in(tmp_path / "out.mcap")[bags.DISTANCE_TOPIC]
     assert block.distance == pytest.approx(np.arange(20) * 1e-6)
 
 

@@ -14,6 +14,7 @@ from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.io import bags, message_mapping
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.pipelines.correct import CorrectedScan
+from omsm_ros.pipelines.recording import Recording
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 OFFSET = 4711
@@ -59,7 +60,8 @@ def record(path, blocks, lengths, seed, lost):
 
 def corrected(path, calibration):
     options = CorrectionOptions(trigger=CommonTrigger(counter_offset=OFFSET))
-    with CorrectedScan(path, calibration, options) as scan:
+    with Recording(path) as recording:
+        scan = CorrectedScan(recording, calibration, options)
         points = join_points([points for _, points in scan.steps()])
     return points, scan.account
 

@@ -14,7 +14,7 @@ from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.nodes.cell_demo_node import _follow, _scan
 from omsm_ros.pipelines import demonstrate as demonstration
 from omsm_ros.pipelines.correct import CorrectedScan
-from omsm_ros.pipelines.identify import settings_of_bag
+from omsm_ros.pipelines.recording import Recording
 
 pytestmark = [pytest.mark.timeout(180), pytest.mark.soak]
 
@@ -86,14 +86,16 @@ def test_a_scan_with_another_averaging_is_refused_live_and_offline(cell):
     bench.move("stop")
     cell.processes.end("recorder")
     calibration = load_calibration(bench.plan.calibration_file)
-    with pytest.raises(CalibrationError, match=said):
-        CorrectedScan(foreign, calibration, CorrectionOptions()).__enter__()
-    assert settings_of_bag(foreign, {})["probe.averaging"] == 8
+    with Recording(foreign) as recording:
+        with pytest.raises(CalibrationError, match=said):
+            CorrectedScan(recording, calibration, CorrectionOptions())
+        assert recording.settings({})["probe.averaging"] == 8
 
     belonging = bench.recorded("belonging.mcap", 4)
     cell.wait("its return", lambda: said not in node.text("corrector", "message"))
     _scan(node, bench.plan, int)
     assert node.value("corrector", "clouds_published") > 0
     cell.processes.end("recorder")
-    with CorrectedScan(belonging, calibration, CorrectionOptions()) as scan:
+    with Recording(belonging) as recording:
+        scan = CorrectedScan(recording, calibration, CorrectionOptions())
         assert scan.reasons == ()

@@ -1,7 +1,6 @@
 """Figures of a measured surface: deviation maps, profiles, dynamic error, and the overview.
 
-Every function returns a matplotlib Figure that belongs to the caller; all arguments are
-SI, all labels carry the unit they are drawn in.
+Every function returns a matplotlib Figure; arguments are in SI units, labels state the unit drawn.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ UNITS_M = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "mm": MILLIMETRE_M}
 
 Limits = tuple[float, float]
 
-# A single outlier must not take the colours of all other pixels.
+# Share of the pixels within the colour range, so that outliers do not set it.
 _SHOWN_SHARE = 0.998
 _BREAK_AT_GAPS = 4
 _LEFT_OF_THE_AXIS = 0.002
 _SMALLEST_SHOWN_M = 1e-3 * NANOMETRE_M
-# Left, bottom, width, height as shares of the figure.
+# Left, bottom, width, height relative to the figure.
 _MAP_PLACE = (0.125, 0.13, 0.66, 0.765)
 _BAR_PLACE = (0.815, 0.19, 0.026, 0.645)
 
@@ -63,8 +62,8 @@ def deviation_map(
     """Draw a deviation or other ``quantity`` (n,) [m] over the workpiece as colours in ``unit``.
 
     unit: "nm", "µm" or "mm"
-    limits: smallest and largest colour [m]; None: see :func:`symmetric_limits`. Give two
-    maps the same limits where they are to be compared.
+    limits: ends of the colour range [m], equal for maps that are compared;
+        None: see :func:`symmetric_limits`
     """
     made = style.empty(4.0, 3.35)
     _draw_map(made, rasterise(x, y, deviation), unit, title, limits, quantity)
@@ -80,7 +79,7 @@ def _draw_map(
     quantity: str = "deviation",
 ) -> None:
     scale = _unit(unit)
-    # Fixed places, so that apertures side by side are of one size.
+    # Fixed positions, so that maps side by side have equal size.
     axes, bar = part.add_axes(_MAP_PLACE), part.add_axes(_BAR_PLACE)
     style.quiet(axes)
     low, high = limits or _symmetric(raster)
@@ -118,10 +117,10 @@ def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
 def profile(
     raw: Profile, corrected: Profile, *, title: str, position: str, true: Profile | None = None
 ) -> Figure:
-    """Draw one profile before and after the correction in µm, and below it what is left in nm.
+    """Draw one profile before and after the correction in µm, and below it that after in nm.
 
     position: name of the horizontal axis, drawn in mm
-    true: the true deviation along the same line, where it is known
+    true: the true deviation along the same line, None if unknown
     """
     made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
@@ -154,9 +153,9 @@ def dynamic_error(
     after: FloatArray | None = None,
     uncertainty: FloatArray | None = None,
 ) -> Figure:
-    """Draw the dynamic error over the scan, each (n,) [m]: before in µm, and what is left in nm.
+    """Draw the dynamic error over the scan, each (n,) [m]: before in µm, and after in nm.
 
-    time: [s];  after: true error that is left, known on the twin only
+    time: [s];  after: true error after the correction, known on the twin only
     uncertainty: standard uncertainty of the height, drawn as ±2u
     """
     left = after is not None or uncertainty is not None
@@ -171,7 +170,7 @@ def dynamic_error(
             at, -bound, bound, color=style.AFTER, alpha=0.18, linewidth=0, label="±2u of a height"
         )
     if after is not None:
-        _draw_envelope(lower, time, after, NANOMETRE_M, style.AFTER, "true error left")
+        _draw_envelope(lower, time, after, NANOMETRE_M, style.AFTER, "true error after")
     if left:
         style.legend_above(lower)
         style.label(lower, y="after [nm]")
@@ -222,7 +221,7 @@ def overview_figure(
     identified: Calibration,
     true: HasResponse | None = None,
 ) -> Figure:
-    """Draw one wide picture of a result: raw map [µm], corrected map [nm], Bode plot.
+    """Draw a result as one wide figure: raw map [µm], corrected map [nm], Bode plot.
 
     raw, corrected: deviations (n,) [m] at x, y [m]
     """
@@ -247,11 +246,9 @@ def _unit(name: str) -> float:
     return UNITS_M[name]
 
 
-# All figures of a scan in one call, by the names the page knows.
-
-# Of the aperture: the width of a profile's band, and the length of its stretches.
+# Width of a profile's band relative to the aperture, and number of its segments across it.
 _BAND_SHARE = 1 / 200
-_STRETCHES = 200
+_SEGMENTS = 200
 
 
 def surface_figures(
@@ -269,7 +266,7 @@ def surface_figures(
     if true_error_left is not None:
         made["error_histogram"] = style.png(
             error_histogram(
-                cloud.dynamic_error, true_error_left, cloud.area, left="after (true error left)"
+                cloud.dynamic_error, true_error_left, cloud.area, left="after (true error)"
             )
         )
     if nominal is None:
@@ -282,7 +279,7 @@ def surface_figures(
 
 
 def levelled(cloud: CloudView, height: FloatArray, nominal: Surface) -> FloatArray:
-    """Return ``height`` (n,) [m] less the nominal surface and its mean over the area."""
+    """Return ``height`` (n,) [m] minus the nominal surface, with zero mean over the area."""
     away = form.deviation(cloud.x, cloud.y, height, nominal)
     return form.level(cloud.x, cloud.y, away, weights=cloud.area)
 
@@ -343,8 +340,8 @@ def _profiles(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, 
     x, y = cloud.x, cloud.y
     size = 2 * float(np.hypot(x, y).max())
     feed = _feed(cloud)
-    # Whole turns: over a part of one the errors of other orders would not average out.
-    spacing = feed * np.ceil(size / _STRETCHES / feed) if feed else size / _STRETCHES
+    # Whole turns, so that errors of other orders average out.
+    spacing = feed * np.ceil(size / _SEGMENTS / feed) if feed else size / _SEGMENTS
     made = {}
     for name, (angle, title, position) in _LINES.items():
         cuts = {
@@ -366,7 +363,7 @@ def _profiles(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, 
 
 
 def _feed(cloud: CloudView) -> float:
-    """Return the radius gained per turn of a spiral [m]; 0 where the cloud makes no turn."""
+    """Return the feed per turn of a spiral [m]; 0 for less than one turn."""
     turns = abs(np.ptp(np.unwrap(np.arctan2(cloud.y, cloud.x)))) / (2 * np.pi)
     return float(np.ptp(np.hypot(cloud.x, cloud.y)) / turns) if turns >= 1 else 0.0
 

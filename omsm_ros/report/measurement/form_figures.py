@@ -1,4 +1,4 @@
-"""Figures of a registered part, from what ``form.json`` and ``curves.json`` say of it."""
+"""Figures of a registered part, from the contents of ``form.json`` and ``curves.json``."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.report import style
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
-# Densities as opticians read them: nm² mm² over waves per millimetre.
+# Unit of spectral densities that is usual in optics: nm² mm² over 1/mm.
 _AREAL_UNIT = NANOMETRE_M**2 * MILLIMETRE_M**2
-# What lies further below the highest is noise of the computation.
+# Densities below this share of the largest are numerical noise.
 _LEAST_SHARE = 1e-9
-# A band of uncertainty that reaches zero ends so far below the least value of a logarithmic axis.
+# Lower end of an uncertainty band that reaches zero, relative to the least value, on a log axis.
 _BELOW = 0.2
 _FULL_WIDTH, _HIGH = 6.1, 3.7
 _BELOW_BARS = 0.2
@@ -27,7 +27,7 @@ _LINES = {"x": "along x", "y": "along y", "diagonal": "along x = y"}
 
 
 def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return PNG files by the names that the page knows; what was not computed has none."""
+    """Return PNG files by the names of the page; parts that were not computed have none."""
     made = {"zernike_terms": zernike_terms(form["zernike"])}
     profiles: Mapping[str, Any] = curves.get("profiles") or {}
     if lines := {name: profiles[name] for name in _LINES if name in profiles}:
@@ -47,7 +47,7 @@ def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
     shown = [t for t in terms if t["n"] > 1 and t["value"] is not None]
     made, axes = style.figure(_FULL_WIDTH, _HIGH)
     ax = axes[0, 0]
-    # Numbers on their side take more room than those of other axes.
+    # Rotated numbers need more space below the axis.
     box = ax.get_position()
     ax.set_position((box.x0, _BELOW_BARS, box.width, box.y1 - _BELOW_BARS))
     values = np.array([t["value"] for t in shown]) / NANOMETRE_M
@@ -64,17 +64,17 @@ def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Draw deviations [nm] over the place [mm] on each line, with ±2u; one panel a line."""
+    """Draw deviations [nm] over the position [mm] on each line, with ±2u; one panel per line."""
     made, axes = style.figure(_FULL_WIDTH, 1.9 * len(lines) + 0.4, rows=len(lines), sharex=True)
     for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
         _draw(ax, curve, MILLIMETRE_M, NANOMETRE_M)
         style.label(ax, y="[nm]", title=f"Registered deviation {_LINES[name]}")
-    style.label(axes[-1, 0], x="place on the line [mm]")
+    style.label(axes[-1, 0], x="position on the line [mm]")
     return made
 
 
 def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Draw deviations [nm] over the radius [mm], the mean of a ring, and around [°], with ±2u."""
+    """Draw deviations [nm] over the radius [mm], mean of each ring, and the angle [°], with ±2u."""
     made, axes = style.figure(_FULL_WIDTH, 2.7 * len(rings) + 0.4, rows=len(rings))
     kinds = {
         "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
@@ -122,7 +122,7 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     x, y = (np.array(areal[name], np.float64) * MILLIMETRE_M for name in ("x", "y"))
     value = np.array(areal["value"], np.float64) / _AREAL_UNIT
     high = float(value.max()) or 1.0
-    # Nine tenths of the blocks in different colours.
+    # The colour range covers nine tenths of the blocks.
     low = max(float(np.quantile(value, 0.1)), high * _LEAST_SHARE)
     made, axes = style.figure(_FULL_WIDTH, _HIGH)
     ax = axes[0, 0]
@@ -148,7 +148,7 @@ def _draw(
 ) -> None:
     """Draw a curve in units of ``along`` and ``unit`` with a band of ±2u.
 
-    floor: below which the band does not go; None: it may be negative
+    floor: lower limit of the band; None: it may be negative
     """
     position, value, spread = (
         np.array(curve[name], np.float64) for name in ("position", "value", "uncertainty")

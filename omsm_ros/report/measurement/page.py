@@ -1,4 +1,4 @@
-"""The HTML page of a measurement: one file, nothing fetched from anywhere."""
+"""The report of a measurement: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -25,21 +25,19 @@ from omsm_ros.report.tables import Table, part
 from omsm_ros.report.verdict import PageVerdict, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
-# What the page says of the part, of what was taken out, of limits, and of where it is from.
-
 _FIGURES = {
-    "robust_peak_to_valley": "peak to valley of 99.5 % of the part",
-    "peak_to_valley": "peak to valley of all of it, less what noise and other errors add",
+    "robust_peak_to_valley": "PV of 99.5 % of the part",
+    "peak_to_valley": "PV of the whole part, noise and other errors subtracted",
     "rms": "rms",
-    "peak_to_valley_best_fit": "peak to valley of what no move of the part explains (best fit)",
+    "peak_to_valley_best_fit": "PV after best-fit alignment",
 }
 _SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
 _OTHER_UNITS = {"Ssk": "", "Sku": ""} | dict.fromkeys(_SLOPES, "rad")
 _SIGNED = ("Ssk",)
 _CONFORMITY = {
-    "holds": ("good", "The part holds its tolerance"),
-    "fails": ("bad", "The part fails its tolerance"),
-    "cannot tell": ("care", "Too uncertain to tell whether the part holds its tolerance"),
+    "holds": ("good", "The part meets its tolerance"),
+    "fails": ("bad", "The part exceeds its tolerance"),
+    "cannot tell": ("care", "Conformity not decided, the uncertainty is too large: tolerance"),
 }
 _POSE_UNITS = {
     "piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad",
@@ -48,7 +46,7 @@ _POSE_UNITS = {
 
 
 def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> PageVerdict | None:
-    """Return the part's deviation, and whether it holds its tolerance; None without a nominal."""
+    """Return deviation and conformity of the part; None without a nominal surface."""
     deviation = part(form, "deviation")
     if deviation:
         words = [
@@ -61,18 +59,18 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
         words = [
             f"peak to valley {quantity(raw['peak_to_valley'], 'm')}",
             f"rms {quantity(raw['rms_area_weighted'], 'm')} by area",
-            "uncertainties of these are not evaluated: fit the part's pose, as --fit auto",
+            "uncertainty not evaluated: fit the part's pose, such as --fit auto",
         ]
     else:
         return None
     held = part(form, "conformity") or part(summary, "form", "conformity")
     if not held:
-        words.append("no tolerance was given (--tolerance), so it is for you to say")
+        words.append("no tolerance given (--tolerance): conformity not assessed")
         return PageVerdict("unknown", "Deviation from nominal", tuple(words))
     level, word = _CONFORMITY[held["verdict"]]
     if level == "good" and part(summary, "light", "level") != "green":
-        # The uncertainty of what nobody looked at is not in it.
-        level, word = "care", f"By what was evaluated, {word[0].lower()}{word[1:]}"
+        # The uncertainty of sources that were not evaluated is not included.
+        level, word = "care", f"By the evaluated sources, {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
     return PageVerdict(
         level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(words)
@@ -82,24 +80,26 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
 def _expanded(figure: Mapping[str, Any]) -> str:
     """Return a figure with its expanded uncertainty, k = 2."""
     text = expanded(figure["value"], figure.get("uncertainty"), "m")
-    larger = "; its uncertainty is larger than the figure itself"
-    return text + larger if text.startswith("at most") else text
+    bound = text.removeprefix("at most ")
+    return text if bound == text else f"< {bound} (k = 2), not resolved"
 
 
 def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
-    """Say how far a form is to be trusted of whose points nothing but themselves is known."""
+    """Return the verdict on a form from points without a summary."""
     missing = tuple(part(form, "removed", "not_evaluated") or ())
     if missing:
         return PageVerdict(
-            "unknown", "By the points alone", (*(f"not evaluated: {m}" for m in missing),)
+            "unknown",
+            "Uncertainty budget incomplete",
+            (*(f"not evaluated: {m}" for m in missing),),
         )
     return PageVerdict(
-        "care", "By the points and their systematic fields", ("no summary lay beside",)
+        "care", "Valid with reservations", ("the measurement has no summary of its samples",)
     )
 
 
 def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return every figure of the deviation by its name, with its expanded uncertainty."""
+    """Return the figures of the deviation by name, with their expanded uncertainty."""
     return [
         (
             figure(name),
@@ -112,25 +112,25 @@ def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def form_table(form: Mapping[str, Any], curves: Mapping[str, Any]) -> Table:
-    """Return all figures of the part's form, and what its spectral densities hold."""
+    """Return all figures of the part's form, and the rms of its spectral densities."""
     rows = figure_rows(form)
     band, inside = (part(curves, "psd", name) for name in ("band", "mean_square_in_band"))
     if band:
         ends = " to ".join(plain(frequency * MILLIMETRE_M) for frequency in band)
-        rows.append((f"rms of points in the band of the density, {ends} 1/mm",
+        rows.append((f"rms in the band of the spectral density, {ends} 1/mm",
                      quantity(math.sqrt(inside), "m")))  # fmt: skip
         whole = math.sqrt(part(curves, "psd", "mean_square"))
-        rows.append(("rms of points under its window", quantity(whole, "m")))
+        rows.append(("rms of the windowed points", quantity(whole, "m")))
     return Table("Figures of the form", (), [row for row in rows if row[1] != NOTHING])
 
 
 def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
-    """Return what is no longer in the deviation: pose, and what the surface does not determine."""
-    title, columns = "Taken out", ("value", "standard uncertainty")
+    """Return the removed pose, and the degrees of freedom that were not fitted."""
+    title, columns = "Removed pose", ("value", "standard uncertainty")
     if not form:
         rows = []
         if part(summary, "deviation", "corrected"):
-            rows = [("piston, the unknown stand-off of the probe", "mean of the area", NOTHING)]
+            rows = [("piston (the probe's stand-off is unknown)", "mean over the area", NOTHING)]
         return Table(title, columns, rows)
     fitted = []
     for name in part(form, "removed", "fitted") or ():
@@ -139,20 +139,19 @@ def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
         fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
-    # Each says in words how well the points determine it.
     reasons = {name: f"held: {why}" for name, why in held.items()}
     reasons |= {name: f"{why}{correlated_moves(form, name)}" for name, why in refused.items()}
     if not reasons:
         return Table(title, columns, fitted)
     rows = [(*row, "") for row in fitted]
-    rows += [(f"not {name}", NOTHING, NOTHING, why) for name, why in reasons.items()]
-    return Table(title, (*columns, "why not"), rows, prose="why not")
+    rows += [(f"{name}, not fitted", NOTHING, NOTHING, why) for name, why in reasons.items()]
+    return Table(title, (*columns, "reason"), rows, prose="reason")
 
 
 def settled(form: Mapping[str, Any], name: str) -> float | None:
-    """Return the standard uncertainty of a freedom, were those that no points determine held.
+    """Return the standard uncertainty of a degree of freedom with the undetermined ones held.
 
-    What they would drag along changes no form; :func:`correlated_moves` names it.
+    Correlated moves of the undetermined ones, see :func:`correlated_moves`, do not change the form.
     """
     shares: Mapping[str, Mapping[str, float]] = part(form, "removed", "pose_uncertainty") or {}
     refused = part(form, "removed", "not_determined") or ()
@@ -162,7 +161,7 @@ def settled(form: Mapping[str, Any], name: str) -> float | None:
 
 
 def correlated_moves(form: Mapping[str, Any], name: str) -> str:
-    """Return what moves with a freedom that the points do not determine, at the same form."""
+    """Return the moves that correlate with an undetermined degree of freedom, at equal form."""
     shares: Mapping[str, float] = part(form, "removed", "pose_uncertainty", name) or {}
     if not shares:
         return ""
@@ -171,11 +170,11 @@ def correlated_moves(form: Mapping[str, Any], name: str) -> str:
     if len(stated) < 2:
         return ""
     own, *others = stated
-    return f"; {own} would go with {', '.join(others)}, at the same form"
+    return f"; {own} correlates with {', '.join(others)}, at equal form"
 
 
 def _rounded(value: Any, spread: float | None, unit: str) -> str:
-    """Return a value to the place of its uncertainty, without that."""
+    """Return a value rounded to the digits of its uncertainty."""
     if not spread or unit == "1/m":
         return _size(value, unit)
     return measured(value, spread, unit).partition(" ±")[0]
@@ -188,7 +187,7 @@ def _size(value: Any, unit: str) -> str:
 
 
 def limits_table(summary: Mapping[str, Any]) -> Table:
-    """Return what bounds the speed of this motion, the tightest first."""
+    """Return the limits of the speed of this motion, the tightest first."""
     limits = sorted(
         part(summary, "prediction", "limits") or (), key=lambda limit: limit["speed_factor"]
     )
@@ -201,7 +200,7 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
         )
         for limit in limits
     ]
-    return Table("Limits of the motion", ("on this scan", "allowed", "may run faster by"), rows)
+    return Table("Limits of the motion", ("on this scan", "allowed", "maximum speed"), rows)
 
 
 def _size_of(value: Any, unit: str) -> str:
@@ -215,18 +214,18 @@ def _temperature(stated: Mapping[str, Any]) -> str:
         quantity(stated.get("mean"), "°C", 4),
         quantity(stated.get("change"), "K", 2, True),
     )
-    return f"{mean}, {change} from the beginning to the end"
+    return f"{mean}, {change} from start to end"
 
 
 def provenance_table(summary: Mapping[str, Any]) -> Table:
-    """Return from which recording and by which calibration a result is."""
+    """Return recording, calibration and files of a result."""
     admission = part(summary, "admission")
     rows = [
         ("recording", str(part(summary, "bag") or NOTHING)),
         ("recorded", date_text_of_stamp(part(summary, "conditions", "recorded_ns"))),
         ("temperature", _temperature(part(summary, "conditions", "temperature") or {})),
         ("calibration", str(part(summary, "calibration") or NOTHING)),
-        ("its age then", days(part(summary, "conditions", "calibration_age"))),
+        ("age of the calibration", days(part(summary, "conditions", "calibration_age"))),
         ("overridden", "yes" if part(admission or {}, "overridden") else "no"),
         ("files", ", ".join(map(str, (part(summary, "files") or {}).values())) or NOTHING),
     ]
@@ -236,7 +235,7 @@ def provenance_table(summary: Mapping[str, Any]) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """What stands below a figure; ``wide`` figures fill half of a line, others a third."""
+    """Caption of a figure; ``wide`` figures fill half a row, others a third."""
 
     text: str
     wide: bool = True
@@ -245,17 +244,19 @@ class Caption:
 MAPS = {
     "raw_map": Caption("Before the correction: encoder plus probe. Scale in micrometres.", False),
     "corrected_map_same_scale": Caption(
-        "After it, in the colours of the map before: what is gone was dynamic error.", False
+        "After the correction, on the scale of the map before.", False
     ),
-    "corrected_map": Caption("After it, enlarged. Scale in nanometres.", False),
+    "corrected_map": Caption("After the correction, enlarged. Scale in nanometres.", False),
     "height_map": Caption("Corrected height; no nominal surface was given.", False),
-    "error_map": Caption("What the correction took away at each point.", False),
+    "error_map": Caption("Dynamic error that the correction removed at each point.", False),
 }
 PROFILES = {
     "profile_x": Caption("Through the centre, mean over a band of 1/200 of the aperture."),
     "profile_y": Caption("Through the centre, mean over a band of 1/200 of the aperture."),
-    "profile_diagonal": Caption("On this line the lag of a part that swings along x shows most."),
-    "profile_radius": Caption("What is the same all around, such as rings left by turning."),
+    "profile_diagonal": Caption(
+        "On this line the error of a lag is largest for a surface that is tilted or curved along x."
+    ),
+    "profile_radius": Caption("Mean over each ring: rotationally symmetric error, such as rings."),
 }
 ERRORS = {
     "dynamic_error": Caption("Before in micrometres, after in nanometres: different scales."),
@@ -263,31 +264,33 @@ ERRORS = {
 }
 DYNAMICS = {
     "bode": Caption(
-        "Gain, phase, and the error that a sinusoidal motion would leave. Grey: beyond the "
-        "frequency up to which the identified response is trusted."
+        "Gain, phase, and the error of a sinusoidal motion. Grey: above the frequency up to which "
+        "the calibration is valid."
     ),
     "step_response": Caption("One edge of the step test, and the residual of the model."),
 }
 FORM = {
     "form_lines": Caption(
-        "Deviation along the normal after the pose was taken out, mean over a band of 1/50 of the "
-        "radius. Shaded: expanded uncertainty (k = 2), with that of the pose."
+        "Deviation along the normal after removal of the pose, mean over a band of 1/50 of the "
+        "radius. Shaded: expanded uncertainty (k = 2), including that of the pose."
     ),
-    "form_rings": Caption("The mean of each ring, and of the outer third around. Shaded: k = 2."),
+    "form_rings": Caption(
+        "Mean of each ring, and mean over the outer third of the radius around. Shaded: k = 2."
+    ),
     "zernike_terms": Caption(
-        "Terms of the deviation, each one at the rim, with their expanded uncertainty (k = 2). "
-        "Grey: no larger than it."
+        "Zernike terms of the deviation, normalised to 1 at the rim, with expanded uncertainty "
+        "(k = 2). Grey: not larger than the uncertainty."
     ),
     "psd_radial": Caption(
-        "Two-sided, of the points under a tapered window; the sum of 2πf S Δf is their mean square "
-        "in this band. Noise is in it, and in the shaded uncertainty (k = 2)."
+        "Two-sided density of the windowed points, including noise; the sum of 2πf S Δf is their "
+        "mean square in this band. Shaded: k = 2."
     ),
     "psd_direction": Caption(
-        "Of waves that run this way, all frequencies; the integral over half a turn is the mean "
-        "square. Shaded: k = 2."
+        "Density over the direction of the waves, for all frequencies; the integral over half a "
+        "turn is the mean square. Shaded: k = 2."
     ),
     "psd_areal": Caption(
-        "The same over both frequencies; its sum times the area of a block is the mean square."
+        "Density over both frequencies; its sum times the area of a block is the mean square."
     ),
 }
 CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
@@ -295,17 +298,17 @@ CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything on the page; what is absent is left out.
+    """Contents of the page; absent parts are left out.
 
-    title: of the page;  date: as it is to be printed
+    title: of the page;  date: as printed
     summary: the content of ``summary.json``: optional ``samples`` (an account as its
         ``as_dict`` gives it), ``dynamic_error_before``, ``dynamic_error_after``,
         ``deviation`` (``raw``, ``corrected``), ``uncertainty`` (``median``, ``largest``),
         ``warnings``, ``settings``, ``versions``; lengths in metres
-    calibration: that was applied, if any
+    calibration: of the correction, if any
     figures: PNG files by the names in :data:`CAPTIONS`
     form: the content of ``form.json``, if the part was registered;  curves: of ``curves.json``
-    map: that a reader can enlarge
+    map: zoomable map
 
     Raises ConfigurationError for a figure of another name.
     """
@@ -349,7 +352,7 @@ def _trust_section(report: Report) -> PageVerdict:
 
 
 def headlines(summary: Mapping[str, Any]) -> list[Headline]:
-    """Return the numbers that a reader looks for first, those that are known."""
+    """Return the main results that are known."""
     found = []
     form = part(summary, "deviation", "corrected")
     if form:
@@ -361,7 +364,7 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
         found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))
     median = part(summary, "uncertainty", "median")
     if median is not None:
-        text = "of a single height, median, k = 2"
+        text = "of one point's height, median, k = 2"
         found.append(Headline("Expanded uncertainty", quantity(2 * median, "m"), text))
     stream = part(summary, "samples", "distance")
     if stream:
@@ -401,7 +404,7 @@ def _records(report: Report) -> list[tables.Table]:
         form_table(report.form, report.curves),
         tables.error_table(summary),
         tables.budget_table(summary),
-        tables.Table("What stands against trust", (), [(reason,) for reason in verdict.reasons]),
+        tables.Table("Reasons for the verdict", (), [(reason,) for reason in verdict.reasons]),
         tables.motion_table(summary),
         limits_table(summary),
         tables.sample_table(summary),
@@ -409,7 +412,9 @@ def _records(report: Report) -> list[tables.Table]:
     if report.calibration is not None:
         found.append(tables.calibration_table(report.calibration))
         found.append(tables.remarks_table(report.calibration))
-        found.append(tables.mapping_table("Settings calibrated for", report.calibration.settings))
+        found.append(
+            tables.mapping_table("Settings of the calibration", report.calibration.settings)
+        )
     settings = part(summary, "settings") or {}
     if report.calibration is None or settings != dict(report.calibration.settings):
         found.append(tables.mapping_table("Settings", settings))

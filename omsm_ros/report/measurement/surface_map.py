@@ -1,4 +1,4 @@
-"""From a cloud of any size to an image: the mean of each pixel, narrow gaps closed."""
+"""Convert a cloud of any size to an image, the mean of each pixel with narrow gaps closed."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 MAX_PIXELS = 400
 _POINTS_PER_PIXEL = 2
-# Beyond any image, and its square still a whole number.
+# A distance [pixels] beyond any image.
 _FAR = 10_000
-# Of the steps from pixel to pixel along rows and columns, those that cross from track to track.
+# Quantile of the steps between filled pixels that is the distance between tracks: along straight
+# tracks half of the steps are one pixel, the others cross to the next track.
 _CROSSING = 0.65
 
 
@@ -34,7 +35,7 @@ _CROSSING = 0.65
 class Raster:
     """Means on square pixels.
 
-    image: (rows along y, columns along x), NaN where no point is near
+    image: (rows along y, columns along x), NaN without a near point
     extent: left, right, bottom, top of the image [m]
     """
 
@@ -45,12 +46,11 @@ class Raster:
 def rasterise(x: FloatArray, y: FloatArray, value: FloatArray) -> Raster:
     """Return the mean of ``value`` at x, y [m], each (n,), on at most 400 × 400 pixels.
 
-    A pixel between two tracks takes the weighted mean of its surroundings; a pixel
-    farther from any point than the tracks are from each other stays NaN, so that
-    dropouts remain to be seen.
+    A pixel between two tracks is the weighted mean of its surroundings. A pixel farther from any
+    point than the distance of the tracks is NaN, so that dropouts stay visible.
     """
     if not len(x) or not np.all(np.isfinite(x) & np.isfinite(y) & np.isfinite(value)):
-        raise DataError("a map needs at least one point, and finite ones only")
+        raise DataError("a map needs one or more points, all of them finite")
     pixels = int(np.clip(np.sqrt(len(x) / _POINTS_PER_PIXEL), 8, MAX_PIXELS))
     pitch = max(np.ptp(x), np.ptp(y)) / pixels or 1.0
     column, columns = _pixel(x, pitch)
@@ -85,8 +85,7 @@ def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
     steps = np.concatenate([_steps(filled), _steps(filled.T)])
     if not len(steps):
         return distances(filled, 2), 1.5
-    # Along straight tracks half of all steps are of one pixel; the rest cross from one to the
-    # next. A hole, however large, is crossed once in a row and counts as one step of many.
+    # A hole of any size is crossed once per row, so it hardly changes the quantile.
     between = float(np.quantile(steps, _CROSSING))
     reach = max(0.55 * between, 1.5)
     return distances(filled, int(np.ceil(reach))), reach
@@ -101,8 +100,8 @@ def _steps(filled: NDArray[np.bool_]) -> IntArray:
 def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
     """Return pixels to the nearest filled one of an image (rows, columns) that has one.
 
-    First along the columns, then the least sum of squares over the columns beside. Exact where
-    it is no more than ``within``, elsewhere never less than the truth.
+    First along the columns, then the least sum of squares over the neighbouring columns. Exact up
+    to ``within``, elsewhere an upper bound.
     """
     rows, columns = filled.shape
     row = np.arange(rows)[:, np.newaxis]
@@ -118,13 +117,13 @@ def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
 
 
 def smoothed(image: FloatArray, sigma: float) -> FloatArray:
-    """Return the image under a Gaussian of ``sigma`` pixels, cut off at four; zero beyond."""
+    """Return the image filtered by a Gaussian of ``sigma`` pixels, cut off at 4 sigma."""
     rows, columns = (_gaussian(size, sigma) for size in image.shape)
     return np.asarray(rows @ image @ columns, np.float64)
 
 
 def _gaussian(size: int, sigma: float) -> FloatArray:
-    """Return the weights (size, size) of each pixel of a line for each other one."""
+    """Return the filter matrix (size, size) of one line of pixels."""
     cut = int(4 * sigma + 0.5)
     weights = np.exp(-0.5 * (np.arange(max(size, cut + 1)) / sigma) ** 2)
     weights[cut + 1 :] = 0.0
@@ -132,18 +131,15 @@ def _gaussian(size: int, sigma: float) -> FloatArray:
     return np.asarray((weights / (2 * weights.sum() - weights[0]))[apart])
 
 
-# The points of a measurement as the figures want them.
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CloudView:
-    """Corrected points in the order they were taken, each array of shape (n,), SI.
+    """Corrected points for figures, in the order of measurement, each array (n,), SI.
 
     time: since the start of the scan [s]
     x, y: position in the workpiece frame [m]
     height: corrected [m] (Eq. 10)
     raw_height: encoder plus probe as read, uncorrected [m] (Eq. 2)
-    dynamic_error: (1 - G_m) X_d [m] (Eq. 5), what the correction took away
+    dynamic_error: (1 - G_m) X_d [m] (Eq. 5), removed by the correction
     uncertainty: standard uncertainty of height [m], k = 1
     """
 
@@ -165,14 +161,11 @@ class CloudView:
 
     @cached_property
     def area(self) -> FloatArray:
-        """The area that each point stands for, (n,), of mean 1."""
+        """Area that each point represents, (n,), of mean 1."""
         return area_weights(self.x, self.y)
 
 
-# Maps as a page embeds them: heights of 16 bits in a PNG, and the script that draws them.
-#
-# The page needs no network and no library; the script may draw whatever else calls its ``set``.
-
+# An embedded map holds heights of 16 bits in a PNG, and a script draws it without a library.
 _STEPS = 65_534
 _ROBUST_PERCENT = (0.25, 99.75)
 _COLOURS = 128
@@ -180,10 +173,10 @@ _COLOURS = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layer:
-    """One map: ``heights`` [m] at x, y [m], each (n,), in ``unit`` "nm" or "µm"; numbers in "1".
+    """One map: ``heights`` [m] at x, y [m], each (n,), drawn in ``unit`` "nm", "µm" or "1".
 
-    symmetric: colours about zero, for deviations; else from the least to the greatest
-    pitch: of the grid on which all points lie [m]; 0: they are scattered
+    symmetric: colour range about zero, for deviations; else from least to largest
+    pitch: spacing of the grid of the points [m]; 0: scattered points
     """
 
     name: str
@@ -211,7 +204,7 @@ def embedded(layers: Sequence[Layer]) -> EmbeddedMap:
         "missing": style.MISSING.lstrip("#"),
         "layers": [_entry(layer) for layer in layers],
     }
-    # Within a script's tags nothing is unescaped, and a name could end them.
+    # A name with "<" could end the script element.
     data = json.dumps(content, separators=(",", ":")).replace("<", r"\u003c")
     return EmbeddedMap(data, tuple(layer.name for layer in layers))
 
@@ -223,7 +216,7 @@ def script() -> str:
 
 
 def policy_of(text: str) -> str:
-    """Return what a content security policy calls this script, and no other."""
+    """Return the source of a content security policy that allows only this script."""
     return f"'sha256-{b64encode(sha256(text.encode()).digest()).decode()}'"
 
 
@@ -250,7 +243,7 @@ def _entry(layer: Layer) -> dict[str, object]:
 
 
 def _on_its_grid(layer: Layer) -> Raster:
-    """Return a pixel for each place of the layer's grid."""
+    """Return a raster with one pixel per grid point of the layer."""
     left, bottom = (float(values.min()) for values in (layer.x, layer.y))
     column, row = (
         np.round((values - least) / layer.pitch).astype(np.int64)
@@ -271,7 +264,7 @@ def _limits(low: float, high: float, symmetric: bool) -> list[float]:
 
 
 def _png(codes: np.ndarray) -> str:
-    """Return a picture whose red and green are the two bytes of each code, first row lowest."""
+    """Return a PNG with the two bytes of each code in red and green, first row lowest."""
     pixels = np.stack([codes >> 8, codes & 255, np.zeros_like(codes)], axis=2).astype(np.uint8)
     content = io.BytesIO()
     imsave(content, pixels, format="png", pil_kwargs=dict(style.FAST_PNG))

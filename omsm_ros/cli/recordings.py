@@ -1,8 +1,9 @@
-"""The command that looks into a bag, and saves what is whole of a damaged one."""
+"""Commands for recordings: inspect, import."""
 
 from __future__ import annotations
 
 import argparse
+from dataclasses import asdict
 from pathlib import Path
 
 from omsm_ros.cli.arguments import add_bags, cell_of
@@ -11,16 +12,17 @@ from omsm_ros.pipelines.inspect_bag import Inspection, inspect_bag
 from omsm_ros.readable import quantity
 
 
-def _declare(sub: argparse.ArgumentParser) -> None:
+def _declare_inspect(sub: argparse.ArgumentParser) -> None:
     add_bags(sub, "bag")
     sub.add_argument(
         "--repair",
         action="store_true",
-        help="copy what is whole of an MCAP bag to <bag>.repaired.mcap; the bag stays as it is",
+        help="copy the intact part of a damaged MCAP bag to <bag>.repaired.mcap; the bag itself "
+        "is not changed",
     )
 
 
-def _act(args: argparse.Namespace) -> Facts:
+def _inspect(args: argparse.Namespace) -> Facts:
     if args.repair:
         return _repaired(args.bag)
     with progress_bar("reading", args.json) as progress:
@@ -29,7 +31,7 @@ def _act(args: argparse.Namespace) -> Facts:
 
 
 def _repaired(bag: Path) -> Facts:
-    from omsm_ros.io.bag_repair import repair  # seldom needed, slow to load
+    from omsm_ros.io.bag_repair import repair  # rarely used and slow to load
 
     made = repair(bag)
     return {
@@ -41,7 +43,7 @@ def _repaired(bag: Path) -> Facts:
     }
 
 
-def _show(facts: Facts) -> None:
+def _show_inspect(facts: Facts) -> None:
     if "repaired" in facts:
         saved = [(topic, f"{count} messages saved") for topic, count in facts["messages"].items()]
         lost = [("lost", text) for text in facts["lost"]] or [("lost", "nothing")]
@@ -60,7 +62,7 @@ def _show(facts: Facts) -> None:
 
 
 def _vibration(found: Facts | None) -> list[tuple[str, str]]:
-    """Largest levels by band, as the vibration monitor told them."""
+    """Return rows of the largest levels by band, as the vibration monitor reported them."""
     if found is None:
         return []
     rows = []
@@ -74,4 +76,44 @@ def _vibration(found: Facts | None) -> list[tuple[str, str]]:
     return [("vibration", f"on a height at most {said}; {raised}"), *rows]
 
 
-COMMANDS = (CliCommand("inspect", _declare, _act, _show),)
+def _declare_import(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("files", type=Path, nargs="+", metavar="FILE")
+    sub.add_argument(
+        "--map", type=Path, required=True, metavar="MAP.yaml", help="columns, units, signs, period"
+    )
+    sub.add_argument("--out", type=Path, required=True, metavar="BAG.mcap")
+
+
+def _import(args: argparse.Namespace) -> Facts:
+    # Imported on demand, because 'inspect' does not need the readers of foreign tables.
+    from omsm_ros.io.tables.table import load_column_map
+    from omsm_ros.pipelines.import_recording import import_recording
+
+    mapped, form = load_column_map(args.map)
+    with progress_bar("importing", args.json, " samples") as progress:
+        found = import_recording(args.files, mapped, form, args.out, progress)
+    return {"bag": str(args.out), "files": [asdict(file) for file in found]}
+
+
+def _show_import(facts: Facts) -> None:
+    for file in facts["files"]:
+        kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
+        say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
+        for count, meaning in (
+            ("missing", "missing trigger numbers"),
+            ("invalid", "invalid probe readings"),
+            ("lost", "rows with an axis that is not a number"),
+            ("repeated_names", "repeated header lines"),
+            ("passed_over", "messages without any of the columns"),
+        ):
+            if file[count]:
+                say(f"    {meaning}: {file[count]}")
+    if any(file["own_clock"] for file in facts["files"]):
+        say("probe and axes have separate clocks: identify and correct with --by-stamps")
+    table([written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")])
+
+
+COMMANDS = (
+    CliCommand("inspect", _declare_inspect, _inspect, _show_inspect),
+    CliCommand("import", _declare_import, _import, _show_import),
+)
