@@ -19,7 +19,7 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
-from omsm_ros import __version__, messages, quantities
+from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
 from omsm_ros.cli.arguments import OneLineParser, number
 from omsm_ros.cli.command import say, say_lines, table, written
@@ -285,14 +285,6 @@ def _demo(args: argparse.Namespace) -> int:
 @written_for(COMMAND)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    audience = messages.AUDIENCE.set(messages.COMMAND)
-    try:
-        return _main(arguments)
-    finally:
-        messages.AUDIENCE.reset(audience)
-
-
-def _main(arguments: Sequence[str] | None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     _make_writable()
     if not given:

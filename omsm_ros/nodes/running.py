@@ -24,7 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from omsm_ros import messages, quantities
+from omsm_ros import quantities
 from omsm_ros.errors import (
     DEBUG,
     ConfigurationError,
@@ -57,7 +57,6 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
     internal error.
     """
     node = None
-    messages.AUDIENCE.set(messages.NODE)
     try:
         with exit_on_signal_while_loading(ENDING):
             _init()
