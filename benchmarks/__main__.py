@@ -1,9 +1,9 @@
 """All benchmarks, one table, ``out/bench.json``: ``python -m benchmarks [--full] [part …]``.
 
-Without ``--full`` there are fewer runs of each study, so wider bars; each line says how many.
-Parts that judge results share the processors; those that take times follow, one after the other.
+Without ``--full`` each study has fewer runs and wider limits; each line states the number of runs.
+Parts that evaluate results run in parallel; parts that measure times follow, one after the other.
 
-Ends with exit status 1 if a bar is not cleared. Ended by a signal, it ends all that it has started.
+The exit status is 1 if a limit is exceeded. On a signal, all processes started are ended.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def main() -> int:
             found += rows
             print(f"      {part}: {wall:.0f} s, {processor:.0f} s of processor time", flush=True)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    # JSON has no NaN: what could not be had is null.
+    # JSON has no NaN: missing values are null.
     plain = [{k: None if v != v else v for k, v in row.items()} for row in found]
     args.out.write_text(json.dumps(plain, indent=1) + "\n")
     failed = [row["name"] for row in found if row["holds"] is False]

@@ -1,4 +1,4 @@
-"""How far from the truth is what was identified, and is that as far as it is said to be?"""
+"""Compare errors of identified responses with their stated uncertainties."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 def mode_errors(
     found: Sequence[Calibration], truth: TransferFunction, index: int
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Relative errors of frequency and damping of the nearest mode, each (runs,), and stated."""
+    """Return relative errors of the nearest mode's frequency and damping, and those stated.
+
+    Each is (runs,).
+    """
     mode, errors = truth.modes()[index], []
     known = [
         min(
@@ -39,8 +42,8 @@ def mode_errors(
 class MassErrors(NamedTuple):
     """Errors of m2, k1, k2, c1, c2 per m1, (runs where they were recognised, 5).
 
-    over_stated: over what the certificate states, which holds what a step test could hide too
-    over_noise: of a fit that knows of noise alone, over what noise does to it
+    over_stated: over the stated uncertainty, which includes undetected model errors
+    over_noise: of a fit that accounts for noise only, over its own uncertainty
     """
 
     over_stated: FloatArray
@@ -48,7 +51,7 @@ class MassErrors(NamedTuple):
 
 
 def mass_errors(found: Sequence[Calibration], truth: TwoMass, *, collocated: bool) -> MassErrors:
-    """Compare what is read off ``found`` with the machine."""
+    """Compare the two-mass models of ``found`` with the true one."""
     exact = np.log([getattr(truth, name) / truth.m1 for name in FITTED])
     stated, noise = [], []
     for calibration in found:
@@ -74,25 +77,25 @@ def mass_errors(found: Sequence[Calibration], truth: TwoMass, *, collocated: boo
 
 
 def worst(errors: tuple[FloatArray, FloatArray]) -> float:
-    """Greatest error, whatever is stated."""
+    """Return the largest error."""
     return float(np.max(np.abs(errors[0])))
 
 
 def over_stated(errors: tuple[FloatArray, FloatArray]) -> float:
-    """Greatest error over its standard uncertainty."""
+    """Return the largest error over its standard uncertainty."""
     return float(np.max(np.abs(errors[0]) / errors[1]))
 
 
 def rejected(found: Sequence[Calibration]) -> BoolArray:
-    """By the certificate, (runs,)."""
+    """Return which calibrations their certificates reject, (runs,)."""
     return np.array([c.certificate.verdict == REJECTED for c in found])
 
 
 def coverage(name: str, held: BoolArray, accepted: BoolArray) -> Row:
-    """Share of the accepted runs whose 95 % interval ``held`` (runs,) the truth.
+    """Return the share of accepted runs whose 95 % interval ``held`` (runs,) the true value.
 
-    A run that was rejected tells nothing here: it counts apart. The bar is what chance leaves
-    of 95 % over so many runs, two of its standard deviations either way.
+    Rejected runs are counted separately. The limits are 95 % ± two standard deviations of the
+    share over this number of runs.
     """
     runs = int(np.sum(accepted))
     if not runs:
@@ -103,21 +106,21 @@ def coverage(name: str, held: BoolArray, accepted: BoolArray) -> Row:
 
 
 def inside(name: str, found: Sequence[Calibration], off: FloatArray, stated: FloatArray) -> Row:
-    """Share of the accepted runs whose 95 % interval holds the truth."""
+    """Return the share of accepted runs whose 95 % interval contains the true value."""
     held = np.abs(off) < COVERAGE_FACTOR * stated
     return coverage(f"inside 95 %: {name}", held, ~rejected(found))
 
 
 def band_held(name: str, found: Sequence[Calibration], truth: TransferFunction) -> list[Row]:
-    """Least share over frequency of accepted runs whose 95 % band holds the truth; rejections.
+    """Return the least share over frequency of accepted runs whose 95 % band holds the truth.
 
-    Of rejected runs the same share is shown: their band is not to be used, but may be right.
+    Also return the share of rejected runs, and for information how often their bands hold.
     """
     held, refused = _held(found, truth), rejected(found)
     runs = int(np.sum(~refused))
     rows = [shown(f"rejected, {name}", 100 * float(np.mean(refused)), "%", runs=len(found))]
     if runs:
-        # The least of ten shares is lower than each of them by chance alone.
+        # The least of ten shares is expected to be lower than each of them.
         bar = round(95 - 3.5 * _scatter(runs), 1)
         value = 100 * float(np.min(np.mean(held[~refused], axis=0)))
         rows.append(at_least(f"band held where accepted, {name}", value, "%", bar, runs=runs))
@@ -129,12 +132,12 @@ def band_held(name: str, found: Sequence[Calibration], truth: TransferFunction) 
 
 
 def _scatter(runs: int) -> float:
-    """Standard deviation [%] of a share of so many runs, each 95 % likely."""
+    """Return the standard deviation [%] of a share of ``runs`` trials of probability 95 %."""
     return float(100 * np.sqrt(0.95 * 0.05 / runs))
 
 
 def _held(found: Sequence[Calibration], truth: TransferFunction) -> BoolArray:
-    """Whether the band holds the truth, (runs, 10): gain and phase at five frequencies each."""
+    """Return whether the band holds the truth, (runs, 10): gain and phase at five frequencies."""
     held = []
     for calibration in found:
         lines = calibration.valid_up_to * np.array([0.1, 0.3, 0.6, 0.9, 1.0])

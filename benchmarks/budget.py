@@ -1,9 +1,9 @@
-"""Are the stated uncertainties of PV, RMS and Zernike terms those of repeated scans?
+"""Compare stated uncertainties of PV, rms and Zernike terms with the errors of repeated scans.
 
-Every scan is of another part on another machine: each source, the part's pose among them, is drawn
-from what is stated of it, and the calibration comes from a step test of its own. The truth is the
-figure error of the part, less the freedoms that were fitted. It is of 0.1 to 1 µm: PV and rms that
-are less than the errors of the machine are held nearly always, as neither can be less than zero.
+Every scan is of another part on another machine: each source, including the part's pose, is drawn
+from its stated distribution, and the calibration comes from a separate step test. The true value
+is the figure error of the part after removal of the fit. It is 0.1 to 1 µm: for smaller values PV
+and rms, which cannot be negative, would nearly always lie within their uncertainty.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from omsm_ros.twin.scenario import Scenario, planned_test_of, spiral_of
 from omsm_ros.units import NANOMETRE_M
 
 TERMS, PLACES = 15, 40_000
-# Eight turns to a ring of the part's ripple: what no turn resolves, no scan tells. Of each turn
-# every fifth point, for a twelfth of the time.
+# Eight turns per ring of the part's ripple, so that the scan resolves it; every fifth point, which
+# takes a twelfth of the time.
 FEED_M, EVERY = 2e-4, 5
-# Each is calibrated once and measures several parts: a planned test takes longer than a scan.
+# Each machine is calibrated once and measures several parts, as a step test takes longer.
 MACHINES = 20
 NONE = ScanFields((), np.empty((0, 0)), 1)
 FITS = (("piston",), ("piston", "tip", "tilt"))
@@ -52,18 +52,18 @@ FITS = (("piston",), ("piston", "tip", "tilt"))
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """A corrected scan, the form that it tells, and the true one."""
+    """The measured form of a corrected scan, and the true form."""
 
     measured: FormResult
     true: FormResult
 
 
 def scans(seed: int, feed: float = FEED_M) -> list[Scan]:
-    """Calibrate, scan, correct and judge one machine and part, by each of ``FITS``."""
+    """Calibrate, scan, correct and evaluate one machine and part, for each of ``FITS``."""
     machine = seed % MACHINES
     scenario, errors = Scenario(seed=seed, feed_per_turn=feed), drawn(machine, seed)
     part = _part(seed)
-    # Another seed than the part's: its noise has nothing to do with it.
+    # Another seed than the part's, so that noise and part are independent.
     cell = Cell(seed=seed + 1, disturbances=errors.scan)
     made = record(cell, spiral_of(scenario), part)
     points, fields = _corrected(_calibrated(machine), made)
@@ -84,9 +84,9 @@ def _judged(
 
 
 def _everywhere(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return places x, y [m] all over a disc, evenly (H. Vogel, Math. Biosci. 44, 179).
+    """Return points x, y [m] evenly over a disc (H. Vogel, Math. Biosci. 44, 179).
 
-    A scan tells of the part what lies between its turns, too, or says how badly it knows that.
+    The stated uncertainty of a scan covers the surface between its turns, too.
     """
     k = np.arange(PLACES) + 0.5
     angle = np.pi * (3 - np.sqrt(5)) * k
@@ -108,10 +108,7 @@ def _part(seed: int) -> FigureError:
 
 @lru_cache(MACHINES)
 def _calibrated(machine: int) -> Calibration:
-    """From a planned step test of this machine on a quiet day, its latency known as stated.
-
-    What drift and a bent scale of the probe do to a step test is a matter of its certificate.
-    """
+    """Calibrate this machine by a planned step test without drift, with a declared latency."""
     test = planned_test_of(Scenario(seed=1000 + machine), drawn(machine, 0).quiet)
     made = identify(test.motion_record(), settings={"priors": PRIORS}).calibration
     lag = made.dynamics.low_frequency_delay
@@ -123,7 +120,7 @@ def _calibrated(machine: int) -> Calibration:
 
 def _corrected(calibration: Calibration, made: Recording) -> tuple[SurfacePoints, ScanFields]:
     sources = replace(ErrorSources.of(calibration), **stated().point_uncertainties())
-    # The pitch is declared for its arm, which no correction of the points uses.
+    # The arm declares the pitch error; no correction uses it.
     geometry = Geometry(abbe_arm=ABBE_ARM_M)
     options = CorrectionOptions(sources=sources, accept_other_rate=True, geometry=geometry)
     corrector = Corrector(calibration, options)
@@ -142,7 +139,7 @@ def _form(portion: PointBatch, fitted: Sequence[str], fields: ScanFields) -> For
 
 
 def deviations(scan: Scan) -> dict[str, tuple[float, float]]:
-    """By figure, its error and its stated standard uncertainty [m]."""
+    """Return error and stated standard uncertainty of each figure [m]."""
     found: dict[str, tuple[float, float]] = {}
     for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
         stated_figure, true = scan.measured.deviation[name], scan.true.deviation[name]
@@ -155,7 +152,7 @@ def deviations(scan: Scan) -> dict[str, tuple[float, float]]:
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Coverage at k = 2, and the rms error over the rms of what is stated."""
+    """Yield coverage at k = 2, and rms error over rms stated uncertainty."""
     runs = 200 if full else 6
     bars = (92.0, 98.0) if full else (60.0, 100.0)
     by_fit: list[dict[str, list[tuple[float, float]]]] = [{} for _ in FITS]

@@ -1,4 +1,4 @@
-"""A campaign on two Dask workers: as one process does it, faster, and whatever is killed."""
+"""Run a campaign on two Dask workers: equal to one process, faster, also with killed workers."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _HALVES = "first", "second"
 
 @contextmanager
 def _cluster() -> Iterator[Any]:
-    """Two workers of this host, set as docs/campaigns.md says."""
+    """Start two workers on this host, configured as in docs/campaigns.md."""
     import dask
     from distributed import LocalCluster
 
@@ -47,9 +47,9 @@ def _cluster() -> Iterator[Any]:
 
 
 def _clouds(out: Path) -> dict[str, str]:
-    """What was measured, bag by bag: digests of the clouds.
+    """Return digests of the clouds by bag.
 
-    Not of what the process of a killed worker still writes, in a folder that nobody else reads.
+    Folders ``*.part``, which the process of a killed worker may still write, are left out.
     """
     return {
         str(path.parent.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
@@ -69,13 +69,13 @@ def _timed(work: Callable[[], list[Entry]]) -> float:
 
 
 def _rate_alone(folder: Path, half: str) -> float:
-    """Correct half of the bags by one process after the other; return how long it took [s]."""
+    """Correct half of the bags in one process after the other; return the time [s]."""
     places = folder / "bags" / half, folder / "cal.json", folder / "alone" / half
     return _timed(lambda: run_campaign(*places, _OPTIONS, jobs=1))
 
 
 def _killed_now_and_then(folder: Path, out: Path, bags: int) -> int:
-    """Correct all bags while workers are killed at random; how many were."""
+    """Correct all bags while workers are killed at random; return the number of kills."""
     chance = random.Random(1)
     at = set(chance.sample(range(1, bags - 1), max(2, bags // 10)))
     killed = 0
@@ -99,7 +99,7 @@ def _killed_now_and_then(folder: Path, out: Path, bags: int) -> int:
 
 
 def _continued(folder: Path, out: Path, bags: int) -> int:
-    """Kill the whole campaign halfway and start it again; how many bags were corrected twice."""
+    """Kill the campaign halfway and start it again; return how many bags were corrected twice."""
     command = [sys.executable, "-m", "omsm_ros.cli", "batch", str(folder / "bags"), "--out", out]
     command += ["--calibration", folder / "cal.json", "--jobs", "2", "--json", "--", *_OPTIONS]
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
@@ -117,7 +117,7 @@ def _continued(folder: Path, out: Path, bags: int) -> int:
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """One process, two workers, two workers of which some are killed, and a new start."""
+    """Yield figures of one process, of two workers, of killed workers, and of a restart."""
     bags = _ALL_BAGS if full else _BAGS
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -126,8 +126,8 @@ def rows(full: bool) -> Iterator[Row]:
             half = folder / "bags" / _HALVES[2 * number // bags]
             half.mkdir(parents=True, exist_ok=True)
             write_spiral(half / f"{number:03d}.mcap", POINTS, seed=number)
-        # One process does half of the bags before the two workers and half after them: a host that
-        # slows down meanwhile does not speak for either.
+        # One process does half of the bags before the two workers and half after them, so that a
+        # host that slows down meanwhile affects both alike.
         alone = _rate_alone(folder, _HALVES[0])
         with _cluster() as cluster:
             shared = _timed(

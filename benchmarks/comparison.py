@@ -1,4 +1,4 @@
-"""Do two scans of one part agree, and does one with 20 nm more astigmatism differ?
+"""Test that two scans of one part agree, and that one with 20 nm more astigmatism differs.
 
 Scans at 30 and 45 rpm and different feeds, each with its own drift, on a calibration identified
 from a step test; the mirror to its full radius with ``--full``, else its inner half.
@@ -36,7 +36,7 @@ _AGREES, _DIFFERS = "agree", "differ"
 
 
 def _calibration() -> Calibration:
-    """Whose latency is known: else a lag of either kind hides tens of nanometres of astigmatism."""
+    """Return a calibration with known latency; otherwise a lag hides 10s of nm of astigmatism."""
     made = identified_calibration()
     lag = made.dynamics.low_frequency_delay
     return with_latency(made, declared_latency(lag, 0.0, 2e-6, "the twin's probe is prompt"))
@@ -59,7 +59,7 @@ def scanned(folder: Path, part: FigureError, way: tuple[float, float], seed: int
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Verdicts and numbers E_n of pairs of scans."""
+    """Yield verdicts and E_n numbers of pairs of scans."""
     runs = 10 if full else 3
     radius = PAPER_MIRROR_RADIUS_M if full else PAPER_MIRROR_RADIUS_M / 2
     alike, added, numbers = [], [], []

@@ -73,7 +73,7 @@ _PLACES = {
 
 
 class Case(NamedTuple):
-    """A recording, and the response that is true of it."""
+    """A recording, and its true response."""
 
     name: str
     motion: MotionRecord
@@ -81,7 +81,7 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Verdict, its first words, and error of the response on the paper's scan [m]."""
+    """First words of the verdict, and error of the response on the paper's scan [m]."""
 
     verdict: str
     error: float
@@ -133,14 +133,14 @@ def changed(value: Any, factor: float) -> Any:
 
 @contextmanager
 def set_to(name: str, value: Any) -> Iterator[None]:
-    """Let a constant be ``value`` in every module that has taken it from its own."""
+    """Set a constant to ``value`` in its module and in every module that imported it."""
     before = getattr(sys.modules[_PLACES[name]], name)
     modules = [
         module
         for path, module in sorted(sys.modules.items())
         if path.startswith("omsm_ros.core")
         and getattr(module, name, None) is before
-        # A private name belongs to one module; another's of the same name is another constant.
+        # A private name of another module is another constant.
         and (not name.startswith("_") or path == _PLACES[name])
     ]
     for module in modules:

@@ -1,4 +1,4 @@
-"""How accurate and how honest is the correction?"""
+"""Measure errors of the correction, and compare them with the stated uncertainties."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ SOURCES = ErrorSources(
 
 
 def true_calibration(relative: float = 1e-3) -> Calibration:
-    """The plant's own dynamics, each parameter but G(0) known to ``relative``."""
+    """Return the plant's dynamics, each parameter except G(0) known to ``relative``."""
     g = Plant().dynamics
     deviations = relative * abs(np.concatenate([g.numerator, g.denominator[1:], [0.0]]))
     deviations[0] = 0.0
@@ -54,13 +54,13 @@ def true_calibration(relative: float = 1e-3) -> Calibration:
 
 
 def identified_calibration(seed: int = 1) -> Calibration:
-    """What the paper's step test, run on the twin, supports."""
+    """Identify from the paper's step test on the twin."""
     test = step_test_of(Scenario(seed=seed))
     return identify(assemble([test.axes], [test.distance])).calibration
 
 
 def scan(spindle_speed: float = 30.0, seed: int = 2, cell: Cell | None = None) -> Recording:
-    """The paper's mirror at its feed of 0.1 mm a turn."""
+    """Record a scan of the paper's mirror at its feed of 0.1 mm per turn."""
     spiral = Spiral(PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, 1e-4, spindle_speed)
     return record(replace(cell or Cell(), seed=seed), spiral, PAPER_MIRROR)
 
@@ -68,7 +68,7 @@ def scan(spindle_speed: float = 30.0, seed: int = 2, cell: Cell | None = None) -
 def corrected(
     calibration: Calibration, axes: AxisBlock, distance: DistanceBlock, **options: object
 ) -> SurfacePoints:
-    """All points of one recording."""
+    """Return all points of one recording."""
     corrector = Corrector(calibration, CorrectionOptions(sources=SOURCES, **options))  # type: ignore[arg-type]
     corrector.push_axes(axes)
     corrector.push_distance(distance)
@@ -80,7 +80,7 @@ def _motion_error(made: Recording, points: SurfacePoints) -> np.ndarray:
 
 
 def accuracy_with_the_true_dynamics() -> list[Row]:
-    """The filter alone: what is left is the encoder's noise and the probe's."""
+    """Return errors with the true dynamics: noise of encoder and probe only."""
     made = scan()
     points = corrected(true_calibration(), made.axes, made.distance)
     error = _motion_error(made, points)
@@ -95,7 +95,7 @@ def accuracy_with_the_true_dynamics() -> list[Row]:
 
 
 def accuracy_with_identified_dynamics() -> list[Row]:
-    """Step test, identification, scan: the whole chain at two speeds."""
+    """Return errors of step test, identification and scan at two speeds."""
     calibration = identified_calibration()
     slow, fast = scan(), scan(spindle_speed=120.0)
     points = corrected(calibration, slow.axes, slow.distance)
@@ -119,14 +119,14 @@ def accuracy_with_identified_dynamics() -> list[Row]:
 
 
 def _over_area(points: SurfacePoints, values: np.ndarray) -> float:
-    """Standard deviation of ``values`` (n,) over the surface: a point stands for its radius."""
+    """Return the standard deviation of ``values`` (n,) over the area, weighted by radius."""
     weight = np.hypot(points.x, points.y)
     mean = np.average(values, weights=weight)
     return float(np.sqrt(np.average((values - mean) ** 2, weights=weight)))
 
 
 def discretisation() -> list[Row]:
-    """The default method on the paper's path; the bilinear transform as its peer."""
+    """Return errors of the default discretisation and of the bilinear transform."""
     z = scan(cell=Cell(encoder_noise=0.0)).axes.z
     dynamics = Plant().dynamics
     ours, peer = discretise(dynamics, 1e-3), bilinear(dynamics, 1e-3)
@@ -144,7 +144,7 @@ def discretisation() -> list[Row]:
 
 
 def fast_path(samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Z and distance [m] that excite every parameter within the trusted band."""
+    """Return Z and distance [m] that excite every parameter within the valid band."""
     time = np.arange(samples) * 1e-3
     z = 0.4e-3 * np.sin(2 * np.pi * 6 * time) + 0.05e-3 * np.cos(2 * np.pi * 31 * time)
     return z, 40e-6 * np.cos(2 * np.pi * 2 * time)
@@ -160,7 +160,7 @@ def blocks_of(z: np.ndarray, reading: np.ndarray) -> tuple[AxisBlock, DistanceBl
 
 
 def honesty(runs: int = 3000) -> list[Row]:
-    """Stated uncertainty against Monte Carlo of dynamics, gain and all noise."""
+    """Compare the stated uncertainty with Monte Carlo of dynamics, gain and all noise."""
     calibration, skip = true_calibration(relative=2e-3), 200
     z, reading = fast_path(1200)
     points = corrected(calibration, *blocks_of(z, reading))
@@ -211,7 +211,7 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
 
 
 def lateral_lag() -> list[Row]:
-    """A probe 0.34 ms late, found by turning the spindle the other way."""
+    """Return the error of a latency of 0.34 ms from scans of opposite spindle directions."""
     latency = 0.34e-3
     prompt = TransferFunction(np.ones(1), np.array([1.0, 1 / (2 * np.pi * 5000)]))
     late = Disturbances(probe=ProbeErrors(latency_s=latency))
@@ -238,7 +238,7 @@ def lateral_lag() -> list[Row]:
 
 
 def _surface_rms(points: SurfacePoints) -> float:
-    """Height against the true surface where the point lies [m]."""
+    """Return the standard deviation of heights from the true surface [m]."""
     return float(np.std(points.height - PAPER_MIRROR.height(points.x, points.y)))
 
 
@@ -252,7 +252,7 @@ STUDIES: tuple[Callable[[], list[Row]], ...] = (
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """All studies, one after the other; they are quick."""
+    """Yield the rows of all studies."""
     del full
     for study in STUDIES:
         yield from study()

@@ -1,9 +1,8 @@
-"""How well could anybody know the response, who knows its true structure?
+"""Cramér-Rao bound of the response for a known structure.
 
-The bound of Cramér and Rao from the truth alone, with no part of the package in it: Fisher's
-information of the true coefficients, the gain, an offset and a drift, in white noise. No
-unbiased method has a smaller error. A method that does not know the structure has to find it,
-and pays for it.
+It follows from the true system alone: the Fisher information of the true coefficients, the gain,
+an offset and a drift, in white noise. No unbiased method has a smaller error; a method that must
+find the structure has a larger one.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ import numpy as np
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 
-# Unit of s in the columns, which are alike in size then [rad/s].
+# Unit of s that makes the columns similar in size [rad/s].
 _RATE = 1e3
 
 
@@ -25,10 +24,10 @@ def response_bounds(
     noise: float,
     frequency: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Least standard deviations of relative gain [1] and phase [rad] at ``frequency`` (f,) [Hz].
+    """Return bounds of relative gain [1] and phase [rad] at ``frequency`` (f,) [Hz], k = 1.
 
-    truth: with G(0) = 1;  gain: of the probe per travel at rest
-    input_: (n,) [m] without noise, which ends where it began, so that its period closes
+    truth: with G(0) = 1;  gain: static gain of the probe
+    input_: (n,) [m] without noise, which ends where it began, so that it is periodic
     noise: standard deviation of a reading [m]
     """
     s = 2j * np.pi * np.fft.rfftfreq(len(input_), sample_period)
@@ -50,7 +49,7 @@ def response_bounds(
 
 
 def _logarithmic_derivatives(truth: TransferFunction, s: np.ndarray) -> np.ndarray:
-    """d ln G / d(numerator[1:], denominator[1:], delay where there is one), (p, f), scaled."""
+    """Return d ln G / d(numerator[1:], denominator[1:], delay if any), (p, f), scaled."""
     powers = (s / _RATE) ** np.arange(1, len(truth.denominator))[:, np.newaxis]
     top = np.polyval(truth.numerator[::-1], s)
     bottom = np.polyval(truth.denominator[::-1], s)

@@ -1,11 +1,11 @@
-"""A disturbed machine's step test: is what is accepted true within its band?
+"""Identify from step tests of disturbed machines, and compare with the true response.
 
-Every disturbance of the twin's catalogue that a step test can meet, of medium size; with
-``--full`` small and large too, ten tests each, and a random sample of pairs. A calibration may be
-accepted, accepted with reservations (what was found is modelled or held by a wider band), or
-rejected with the cause; it must not be accepted with a response more than three stated standard
-uncertainties from the truth where that costs more than five nanometres on the paper's scan. With
-``--full`` the table goes to docs/disturbances.md.
+Every disturbance of the twin's catalogue that affects a step test, of medium size; with ``--full``
+also small and large ones, ten tests each, and random pairs. A calibration may be accepted, accepted
+with reservations (the disturbance is modelled, or covered by a wider band), or rejected with the
+cause. It must not be accepted if the response is off by more than three stated standard
+uncertainties and by more than five nanometres on the paper's scan. With ``--full`` the table goes
+to docs/disturbances.md.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ from omsm_ros.units import NANOMETRE_M
 _FIRST_SEED = 9000
 _STAND_OFF = -49e-6
 _GREATEST_ERROR_M, _GREATEST_SIGMAS = 5 * NANOMETRE_M, 3.0
-# These move the part, which a step test on a mirror does not look at.
+# Disturbances of the part, which a step test on a mirror does not see.
 _OF_THE_PART = ("part", "spindle", "vibration, 11 times a turn")
-# Of the thousands of pairs there are; an hour on one processor.
+# A sample of thousands of pairs; it takes an hour on one processor.
 _PAIRS, _SEED = 500, 5
 _SEEDS = 10
-# Pairs whose response is off by more of what is stated are shown one by one.
+# Pairs whose response is off by more stated uncertainties are listed.
 _NOTABLE_SIGMAS = 2.0
 _TABLE = Path(__file__).parent.parent / "docs" / "disturbances.md"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One calibration against the truth.
+    """Result of one calibration compared with the true response.
 
     verdict: first words of it, or of the error;  why: its reasons and reservations
     error: on the paper's scan [m];  sigmas: largest error of the response over stated, in its band
@@ -66,18 +66,18 @@ class Outcome:
 
     @property
     def accepted(self) -> bool:
-        """With reservations or without."""
+        """Whether it was accepted, with or without reservations."""
         return self.verdict.startswith("accepted")
 
     @property
     def wrong(self) -> bool:
-        """Accepted, and farther from the truth than it says, by what matters."""
+        """Whether it was accepted although the error is significant and relevant."""
         far = self.sigmas > _GREATEST_SIGMAS and self.error > _GREATEST_ERROR_M
         return self.accepted and far
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Accepted though wrong, and benign tests rejected; the table is written on the way."""
+    """Yield wrongly accepted and wrongly rejected tests; write the table if ``full``."""
     clean = [outcome("clean", NOTHING, seed) for seed in range(100 if full else 10)]
     alarms = [o for o in clean if o.verdict != ACCEPTED]
     yield at_most("false alarms on clean tests", _percent(alarms, clean), "%", 2, runs=len(clean))

@@ -1,7 +1,7 @@
-"""Machines with all errors at once, each drawn from what is stated of it.
+"""Machines with all errors at once, each drawn from its stated distribution.
 
-The truth of a size that is stated as a standard uncertainty is normal with it. What has one law in
-the twin and is stated as an unknown curve is drawn with the rms of what is stated.
+A size that is stated as a standard uncertainty is drawn from a normal distribution. An error that
+is stated as an unknown curve, but has one law in the twin, is drawn with the stated rms.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from omsm_ros.units import PPM
 
 LATENCY_S, LATENCY_UNCERTAINTY_S = 50e-6, 2e-6
 ABBE_ARM_M, _EXPOSURE_S = 0.05, 20e-6
-# The middle half of the paper's mirror is that deep.
+# Depth of the middle half of the paper's mirror.
 _Z_TRAVEL_M = 1e-3
 _OMEGA_RAD_S = np.pi
 _C_LATCH_S = 10e-6
@@ -39,7 +39,7 @@ _C_LATCH_S = 10e-6
 SIZES: dict[str, tuple[float, dict[str, float]]] = {
     "tilt": (1e-6, {}),
     "decentre": (0.1e-6, {}),
-    # The part's own, and C latched late.
+    # The part's clocking, and the late latch of C.
     "clocking": (float(np.hypot(50e-6, _C_LATCH_S * _OMEGA_RAD_S)), {}),
     "centre_x": (0.05e-6, {}),
     "centre_y": (0.05e-6, {}),
@@ -67,11 +67,11 @@ SIZES: dict[str, tuple[float, dict[str, float]]] = {
 
 
 PRIORS = {CREEP: 1e-5, MODE: 1e-5}
-"""What is said of the structure: without it, a step test leaves open ten times as much."""
+"""Prior knowledge of the structure, which reduces the undetected model error tenfold."""
 
 
 def stated() -> MachineSources:
-    """What is said of the machines from which each scan's is drawn."""
+    """Return the stated sources from which each machine is drawn."""
     return MachineSources(
         tuple(
             StatedSource(source=name, value=size, reason="drawn from this", parameters=parameters)
@@ -84,7 +84,7 @@ def stated() -> MachineSources:
 class Drawn:
     """One machine and part.
 
-    quiet: in the step test, on a quiet day;  scan: in the scan
+    quiet: disturbances of the step test, without drift;  scan: of the scan
     """
 
     quiet: Disturbances
@@ -92,9 +92,9 @@ class Drawn:
 
 
 def drawn(machine: int, seed: int) -> Drawn:
-    """Return a machine and a part, drawn from what is stated.
+    """Return a machine and a part, drawn from the stated sources.
 
-    machine: seed of what step test and scan share;  seed: of all else
+    machine: seed of the errors that step test and scan share;  seed: of all others
     """
     quiet, draw = _of_both(_Draw(1_000_000 + machine)), _Draw(seed)
     probe = replace(
@@ -125,7 +125,7 @@ def drawn(machine: int, seed: int) -> Drawn:
 
 
 class _Draw:
-    """Sizes by what is stated of them."""
+    """Draw sizes from their stated distributions."""
 
     def __init__(self, seed: int) -> None:
         self._random = np.random.default_rng(1000 + seed)
@@ -137,7 +137,7 @@ class _Draw:
         return self.normal(SIZES[name][0])
 
     def wave_size(self, name: str) -> float:
-        """Amplitude of one wave, whose rms is stated as that of both phases."""
+        """Return the amplitude of one wave, whose stated rms is that of both phases."""
         return float(np.sqrt(2.0)) * self.size(name)
 
     def harmonic(self, name: str) -> Harmonic:
@@ -150,11 +150,11 @@ class _Draw:
 
 
 def _of_both(draw: _Draw) -> Disturbances:
-    """What step test and scan share: told by the certificate, or held by what it leaves open."""
+    """Draw the errors that step test and scan share."""
     return Disturbances(
         servo_bandwidth_hz=float(np.exp(np.log(100.0) + draw.normal(0.2))),
         probe=ProbeErrors(
-            # With half of the exposure it is what is stated.
+            # Latency and half of the exposure together are the stated latency.
             latency_s=LATENCY_S - _EXPOSURE_S / 2 + draw.normal(LATENCY_UNCERTAINTY_S),
             exposure_s=_EXPOSURE_S,
         ),

@@ -1,4 +1,4 @@
-"""How the benchmarks end that are asked to: with all that they have started, and its files."""
+"""End the benchmarks on a signal, with all processes and files that they created."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from typing import NoReturn
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _PR_SET_CHILD_SUBREAPER = 36  # of <linux/prctl.h>
 _PATIENCE_S = 5.0
-# Ends by itself, and clears away, when those that it serves have ended.
+# It cleans up and ends by itself when the processes that it serves have ended.
 _TRACKER = b"multiprocessing.resource_tracker"
 
 
 @contextmanager
 def nothing_left() -> Iterator[None]:
-    """End every process below this one when a signal asks to end; then 128 + its number.
+    """On a signal, end every descendant process and exit with 128 + its number.
 
-    Workers start clusters, nodes and commands of their own, some in sessions of their own: whoever
-    has lost its parent becomes a child of this process, so none is missed. What all of them write
-    into temporary folders goes with them.
+    Workers start clusters, nodes and commands, some in sessions of their own. An orphan becomes a
+    child of this process, so none is missed. Temporary folders are removed at the end.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
@@ -52,7 +51,7 @@ def _end(number: int, _: object) -> NoReturn:
 
 
 def _below(ancestor: int) -> list[int]:
-    """Return the processes that this one has started, and those that they have, still running."""
+    """Return the running descendants of a process."""
     children: dict[int, list[int]] = {}
     for entry in Path("/proc").glob("[0-9]*/stat"):
         try:

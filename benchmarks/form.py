@@ -1,8 +1,8 @@
-"""From points to a form: is the pose what it is said to be, and are the terms?
+"""Compare fitted pose and Zernike terms with the true ones and with other programs.
 
 The twin's own model of a posed part (fixed-point iteration) makes the points; noise is 10 nm, the
-scan the paper's spiral. The peer for Zernike terms is the least squares of the whole design matrix,
-which is what prysm's ``lstsq`` solves; prysm's own where it can be imported.
+scan the paper's spiral. The peer for Zernike terms is a least-squares fit with the whole design
+matrix, as prysm's ``lstsq`` solves it, and prysm itself if it is installed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ MAPS = Path(__file__).parents[2] / "shared" / "data" / "surfaces"
 
 @dataclass(frozen=True)
 class Part:
-    """A nominal surface and what the part has beyond it."""
+    """A nominal surface and its form error."""
 
     nominal: Surface
     error: Surface
@@ -66,7 +66,7 @@ class Part:
 
 
 def spiral(points: int) -> tuple[FloatArray, FloatArray]:
-    """The paper's: 127 turns from the rim to the centre."""
+    """Return points of the paper's spiral, 127 turns from the rim to the centre."""
     r, angle = np.linspace(RADIUS, 0, points), np.linspace(0, 254 * np.pi, points)
     return r * np.cos(angle), r * np.sin(angle)
 
@@ -74,7 +74,7 @@ def spiral(points: int) -> tuple[FloatArray, FloatArray]:
 def measured(
     part: Surface, pose: Pose, seed: int, dust: float = 0.0, points: int = POINTS
 ) -> PointBatch:
-    """Points of a part in a pose."""
+    """Return points of a part in a pose."""
     x, y = spiral(points)
     rng = np.random.default_rng(seed)
     sits = PartPose(
@@ -87,12 +87,12 @@ def measured(
 
 
 def judged(nominal: Surface, portion: PointBatch, *asked: str) -> FormResult:
-    """The form of these points."""
+    """Return the form of these points."""
     return analyse_form(nominal, lambda: [portion], asked or ("auto",), aperture=Aperture(RADIUS))
 
 
 def poses(seed: int) -> Iterator[Pose]:
-    """0.5 mm, 0.5°, and all six at once, signs and sizes by chance."""
+    """Yield poses of 0.5 mm, of 0.5°, and of all six at once, with random signs and sizes."""
     sign = np.random.default_rng(seed).uniform(-1, 1, 6)
     yield Pose(x=SHIFT * sign[0], y=SHIFT * sign[1])
     yield Pose(tip=TURN * sign[3], tilt=TURN * sign[4])
@@ -129,13 +129,13 @@ def _poses(runs: int) -> list[Row]:
                 spread = registration.uncertainty(name)
                 off = registration.placement.value(name) - getattr(pose, name)
                 held.append(spread is not None and abs(off) <= 2 * spread)
-            # Beside the same noise on a part that sits straight.
+            # Compared with the same noise on a part in the nominal pose.
             place = found.map.x, found.map.y
             there, height = straight.height(*place), found.zernike.height(*place)
             added.append(float(np.ptp(height - there)))
     total = 3 * runs
     return [
-        at_least("freedoms of the pose within k = 2", 100 * np.mean(held), "%", 93.0, runs=total),
+        at_least("pose parameters within k = 2", 100 * np.mean(held), "%", 93.0, runs=total),
         at_most(
             "form added by pose errors, PV", np.max(added) / NANOMETRE_M, "nm", 5.0, runs=total
         ),
@@ -180,7 +180,7 @@ def _terms(runs: int) -> list[Row]:
 
 
 def _compared_with(name: str, value: float, unit: str, limit: float, runs: int) -> Row:
-    """What a free pose takes of the form, for whoever reads the others: nothing can tell it."""
+    """Show the form that a free pose absorbs, without a limit: it is not identifiable."""
     del limit
     return shown(name, value, unit, runs=runs)
 
@@ -201,7 +201,7 @@ def _dust(runs: int) -> list[Row]:
 
 
 def _surfaces() -> list[Row]:
-    """What each surface determines, found by the program."""
+    """Return how often the program finds the undetermined degrees of freedom of a surface."""
     freeform = ZernikeSurface(RADIUS, (0, 0, 0, 0, 1e-5, 0, 4e-6, 0, 0, 3e-6))
     polynomial = XYPolynomial(RADIUS, (XYTerm(3, 0, 2e-5), XYTerm(1, 2, -3e-5)))
     known = {
@@ -220,7 +220,7 @@ def _surfaces() -> list[Row]:
         right.append(set(found.registration.dofs.refused) == refused)
         added.append(_smooth_extent(found))
     return [
-        at_least("surfaces whose freedoms were found", sum(right), "1", len(known)),
+        at_least("surfaces with correct undetermined DOFs", sum(right), "1", len(known)),
         at_most("form added on any of them, PV", max(added) / NANOMETRE_M, "nm", 5.0),
     ]
 
@@ -247,7 +247,7 @@ def _map() -> list[Row]:
 
 
 def _zernike_speed() -> list[Row]:
-    """Processor time, for the machine is not ours alone; both on one core."""
+    """Return processor times on one core, which other load does not affect."""
     x, y = spiral(PAPER_POINTS)
     value = low_order_error(1).height(x, y) + np.random.default_rng(1).normal(0, NOISE, len(x))
     terms, disc = first_terms(37), Aperture(RADIUS)

@@ -1,7 +1,7 @@
-"""Motions that never rest: is what they identify as good as it is said to be?
+"""Identify from continuous motions, and compare with the true response of the twin.
 
-On the twin, whose truth is known: the paper's chirp, a faster one, and several sines at once,
-also as a part cut out of the middle, which starts and ends in full swing.
+The motions are the paper's chirp, a faster one, and several sines at once, also cut out of the
+middle, so that they start and end in motion.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _CASES: tuple[tuple[str, Motion, Plant, slice, float], ...] = (
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Least share over frequency of runs whose band holds the truth, and how far it is trusted."""
+    """Yield the least share of bands that hold the truth, and how far the band is valid."""
     runs = 100 if full else 4
     for name, motion, plant, part, reaches in _CASES:
         found = [
@@ -46,7 +46,7 @@ def rows(full: bool) -> Iterator[Row]:
         yield from band_held(name, found, plant.dynamics)
         trusted = max(c.valid_up_to for c in found) / reaches
         yield at_most(
-            f"trusted up to, over its highest frequency, {name}", trusted, "", 1.3, runs=runs
+            f"valid up to, over its highest frequency, {name}", trusted, "", 1.3, runs=runs
         )
 
 

@@ -1,8 +1,8 @@
-"""Is what a step test states of a scan what is found when the test is repeated?
+"""Compare the stated uncertainty of the dynamics with the scatter of repeated step tests.
 
-Each test is of the same machine with noise of its own; each calibration corrects the same motion
-without noise, so that all of the error is of the dynamics. ``dynamics`` of the budget is what it is
-said to scatter by; ``undetected_error`` bounds what no test of this machine would show, and is apart.
+Each test is of the same machine with other noise. Each calibration corrects the same motion without
+noise, so that the whole error is that of the dynamics. ``dynamics`` of the budget is its stated
+scatter; ``undetected_error`` bounds model errors that no test of this machine shows.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant
 from omsm_ros.units import NANOMETRE_M
 
-# A fifth of the paper's turns: the motion of each is the same but for its size.
+# A fifth of the paper's turns, whose motions differ in amplitude only.
 FEED_M = 5e-4
-# Samples in which a start would still be felt.
+# Number of samples in which the filter's start decays.
 _SETTLED = 200
 
 
 @dataclass(frozen=True, eq=False)
 class KnownMotion:
-    """z of the encoder and what the probe truly makes of it, each (n,) [m]."""
+    """z of the encoder and the true motion of the probe, each (n,) [m]."""
 
     z: FloatArray
     seen: FloatArray
@@ -43,7 +43,7 @@ class KnownMotion:
 
 @dataclass(frozen=True)
 class Found:
-    """Errors of one calibration on a motion, rms [m], and what is stated of them."""
+    """Error of one calibration on a motion, rms [m], and its stated uncertainties."""
 
     error: float
     dynamics: float
@@ -54,7 +54,7 @@ def rows(full: bool) -> Iterator[Row]:
     """Yield the rms of error over stated uncertainty of the corrected motion, over all tests."""
     runs = 100 if full else 10
     calibrations = [identified_calibration(seed) for seed in range(1, runs + 1)]
-    # The rms of as many normal errors scatters by this: a scan looks at one direction of them.
+    # Relative standard deviation of the rms of as many normal errors.
     chance = 1 / np.sqrt(2 * runs)
     for name, motion, barred in (("paper's scan", _scan(), True), ("6 and 31 Hz", _fast(), False)):
         found = [_judged(each, motion) for each in calibrations]
@@ -67,7 +67,7 @@ def rows(full: bool) -> Iterator[Row]:
             yield between(f"{label}, rms", rms, "1", *bars, peer=stated, runs=runs)
         else:
             yield shown(f"{label}, rms", rms, "1", stated, runs)
-        yield at_most(f"{label}, with what could hide: worst", max(held), "1", 3.0, runs=runs)
+        yield at_most(f"{label} with undetected error: worst", max(held), "1", 3.0, runs=runs)
 
 
 def _scan() -> KnownMotion:

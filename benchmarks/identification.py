@@ -1,7 +1,6 @@
-"""How accurate and how honest is the identification? Each study returns rows.
+"""Compare identified responses with the true one of the twin, and with their uncertainties.
 
-All on the twin, whose truth is known: the default step test at 1 kHz, 10 nm of noise and
-10 nm of resolution, unless a row says otherwise.
+The default step test at 1 kHz, 10 nm of noise and 10 nm of resolution, unless a row says otherwise.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _DEFAULT = StepTest()
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Every study, as it gets done; few runs of each unless ``full``."""
+    """Yield the rows of every study; few runs of each unless ``full``."""
     yield from accuracy(200 if full else 30)
     yield from coloured(100 if full else 10)
     yield from sharp_edges(10 if full else 3)
@@ -50,7 +49,7 @@ def rows(full: bool) -> Iterator[Row]:
 def record_once(
     seed: int, motion: Motion = _DEFAULT, plant: Plant | None = None, period: float = 1e-3
 ) -> MotionRecord:
-    """One recording of the twin, paired."""
+    """Return one recording of the twin, paired."""
     cell = Cell(plant=plant or Plant(), seed=seed, sample_period=period)
     made = record(cell, motion, Flat(), stand_off=_STAND_OFF)
     return assemble([made.axes], [made.distance])
@@ -71,7 +70,7 @@ class Runs:
     rejected: BoolArray
 
     def coverage(self, further: str = "") -> list[Row]:
-        """Share of accepted runs whose 95 % band holds the truth, a row a frequency."""
+        """Return the share of accepted runs whose 95 % band holds the truth, by frequency."""
         return [
             coverage(
                 f"{what} coverage at {f:g} Hz{further}",
@@ -86,13 +85,13 @@ class Runs:
         ]
 
     def rejections(self, of_what: str) -> Row:
-        """Share of runs that the certificate rejects."""
+        """Return the share of runs that the certificate rejects."""
         value, runs = 100 * float(np.mean(self.rejected)), len(self.rejected)
         return shown(f"rejected, {of_what}", value, "%", runs=runs)
 
 
 def monte_carlo(seeds: range, make: Callable[[int], MotionRecord], truth: TransferFunction) -> Runs:
-    """Identify one recording a seed."""
+    """Identify one recording per seed."""
     calibrations = [identify(make(seed)).calibration for seed in seeds]
     stated = [response_band(c.dynamics, scatter(c), FREQUENCIES) for c in calibrations]
     return Runs(
@@ -105,9 +104,9 @@ def monte_carlo(seeds: range, make: Callable[[int], MotionRecord], truth: Transf
 
 
 def scatter(calibration: Calibration) -> FloatArray:
-    """Covariance of what makes repeated tests differ: noise, and motion between samples.
+    """Return the covariance of repeated tests: noise, and motion between samples.
 
-    That of the calibration also holds what no test has shown, and repeated tests do not either.
+    The calibration's covariance also includes undetected model errors, which repeated tests share.
     """
     shape = calibration.covariance.shape
     noise = np.reshape(np.asarray(calibration.certificate.noise_covariance), shape)
@@ -124,12 +123,12 @@ def _log_ratio(calibration: Calibration, truth: TransferFunction) -> ComplexArra
 
 
 def rms(values: FloatArray | ComplexArray) -> FloatArray:
-    """Root mean square over the runs, the first axis."""
+    """Return the root mean square over the runs, the first axis."""
     return np.asarray(np.sqrt(np.mean(np.abs(values) ** 2, axis=0)))
 
 
 def bounds() -> tuple[FloatArray, FloatArray]:
-    """Cramér-Rao bounds of relative gain and phase at FREQUENCIES, the true structure known."""
+    """Return Cramér-Rao bounds of relative gain and phase at FREQUENCIES for known structure."""
     cell = Cell()
     moved = respond(Plant(), _DEFAULT, round(_DEFAULT.duration / cell.sample_period), 1e-3)
     # Rounding to the resolution is noise too; the encoder's comes in through G, near 1.
@@ -141,7 +140,7 @@ def bounds() -> tuple[FloatArray, FloatArray]:
 
 
 def accuracy(runs: int) -> list[Row]:
-    """Errors of the default step test over their bound, and how often the band holds."""
+    """Return errors of the default step test over their bound, and the coverage of the band."""
     found = monte_carlo(seeds(runs), record_once, Plant().dynamics)
     gain, phase = found.error.real, found.error.imag
     gain_bound, phase_bound = bounds()
@@ -170,10 +169,10 @@ def accuracy(runs: int) -> list[Row]:
 
 
 def coloured(runs: int) -> list[Row]:
-    """Autoregressive noise, drift of 100 nm/min, 5 % dropouts and 40 nm of backlash.
+    """Return coverage with coloured noise, drift of 100 nm/min, 5 % dropouts, 40 nm backlash.
 
-    The steps are of unequal size: with equal ones a play only shifts all plateaus of one
-    direction, and hides from whoever looks at one direction alone.
+    The steps have unequal sizes: with equal ones backlash only shifts all plateaus of one direction
+    and cannot be detected.
     """
 
     def spoiled(seed: int) -> MotionRecord:
@@ -191,7 +190,7 @@ def coloured(runs: int) -> list[Row]:
 
 
 def unequal_steps() -> StepPlan:
-    """The default step test with steps of 3.9 to 15.7 µm, in another order on the way down."""
+    """Return the default step test with steps of 3.9 to 15.7 µm, in another order downwards."""
     plan = plan_steps(sample_period=1e-3)
     sizes = np.linspace(0.4, 1.6, len(plan.starts) // 2) * _DEFAULT.step
     order = np.argsort((np.arange(len(sizes)) * 0.618) % 1.0)
@@ -200,7 +199,7 @@ def unequal_steps() -> StepPlan:
 
 
 def played(z: FloatArray, backlash: float) -> FloatArray:
-    """What a play of ``backlash`` [m] withholds of the motion ``z`` (n,)."""
+    """Return the part of the motion ``z`` (n,) [m] that ``backlash`` [m] suppresses."""
     position, withheld = z[0], np.empty(len(z))
     for k, value in enumerate(z):
         position = min(max(position, value - backlash / 2), value + backlash / 2)
@@ -209,7 +208,7 @@ def played(z: FloatArray, backlash: float) -> FloatArray:
 
 
 def sharp_edges(runs: int) -> list[Row]:
-    """Edges locked to the sampling: the certificate rejects, and the band holds the truth."""
+    """Return coverage for edges synchronous with the sampling, which should be rejected."""
     table = []
     for servo in (200.0, 100.0, 50.0):
         plant = Plant(servo_bandwidth=servo)
@@ -222,5 +221,5 @@ def sharp_edges(runs: int) -> list[Row]:
 
 
 def seeds(runs: int) -> range:
-    """Those of one study."""
+    """Return the seeds of one study."""
     return range(FIRST_SEED, FIRST_SEED + runs)

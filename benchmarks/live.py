@@ -103,7 +103,7 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
 
 
 def _publish(node: Any, publishers: Any, turn: list[Any], rate: float, blocks: int) -> int:
-    """Publish so many pairs of blocks on time, and return the number of samples."""
+    """Publish pairs of blocks on time; return the number of samples."""
     import rclpy
 
     size, start = len(turn[0][0].z), time.monotonic()
@@ -127,7 +127,7 @@ def _received(node: Any) -> float:
 
 
 def _account(node: Any, sent: int) -> dict[str, float]:
-    """Return what the corrector's diagnostics say of ``sent`` samples."""
+    """Return the corrector's diagnostics after ``sent`` samples."""
     corrected = node.value("corrector", "distance_corrected")
     settling = node.value("corrector", "distance_settling")
     latencies = {key: float(node.text("corrector", key)) for key in ("latency_p99_ms",)}
@@ -141,7 +141,7 @@ def _processor_time(pid: int) -> float:
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """1 kHz, 70 kHz and the highest rate without loss; a fifth of the time unless ``full``."""
+    """Yield figures at 1 kHz, 70 kHz and the highest rate without loss; shorter unless ``full``."""
     slow_s, fast_s, each_s = (60.0, 300.0, 10.0) if full else (15.0, 60.0, 5.0)
     slow = feed(1e3, 100, slow_s)
     lost = slow["lost"] + slow["uncorrected"]

@@ -86,9 +86,9 @@ def _lines(rng: np.random.Generator, circles: bool) -> list[TrueLine]:
         lines.append(TrueLine(VIBRATION, "t", float(rng.uniform(12, 390)), size()))
     for _ in range(int(rng.integers(1, 3))):
         lines.append(TrueLine(VIBRATION, "t", float(rng.uniform(640, 1900)), size()))
-    if rng.uniform() < 0.3:  # folds to where drift is
+    if rng.uniform() < 0.3:  # aliased to the frequencies of drift
         lines.append(TrueLine(VIBRATION, "t", 1000 + float(rng.uniform(0.6, 3)), size()))
-    if rng.uniform() < 0.3:  # two that are close together
+    if rng.uniform() < 0.3:  # two lines close together
         near = lines[-1]
         lines.append(TrueLine(VIBRATION, "t", near.frequency + 0.2, near.amplitude))
     if not circles:

@@ -36,7 +36,7 @@ _RUNS = 5
 
 
 def write_spiral(path: Path, samples: int, block: int = _BLOCK, seed: int = 0) -> None:
-    """A spiral-like motion of ``samples``, cheap to make, from one driver of both streams."""
+    """Write a spiral-like motion of ``samples``, from one driver of both streams."""
     noise = np.random.default_rng(seed).normal(0.0, 1e-8, block)
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first in range(0, samples, block):
@@ -46,7 +46,7 @@ def write_spiral(path: Path, samples: int, block: int = _BLOCK, seed: int = 0) -
 
 
 def write_two_drivers(path: Path, samples: int, seed: int = 0) -> None:
-    """The same motion as drivers of axes and probe send it side by side.
+    """Write the same motion as sent by separate drivers of axes and probe.
 
     Each cuts its own blocks, counts from its own start (the probe's count and TWO_DRIVERS_OFFSET
     are the axes'), stamps with a clock that scatters by 20 µs, and delivers up to 20 ms late.
@@ -118,7 +118,7 @@ def save_paper_calibration(path: Path) -> None:
 
 
 class Used(NamedTuple):
-    """What a finished process took: wall clock and processor [s], peak memory [GiB]."""
+    """Resources of a finished process: wall clock and processor [s], peak memory [GiB]."""
 
     wall: float
     cpu: float
@@ -126,7 +126,7 @@ class Used(NamedTuple):
 
 
 def _correct(folder: Path, bag: str, *options: str, report: bool = False) -> Used:
-    """``omsm correct`` on a bag, as a process of its own."""
+    """Run ``omsm correct`` on a bag in a process of its own."""
     command = [sys.executable, "-m", "omsm_ros.cli", "correct", str(folder / bag)]
     command += ["--calibration", str(folder / "cal.json"), "--out", str(folder / "result")]
     command += [*options, *([] if report else ["--no-report"])]

@@ -1,6 +1,6 @@
-"""What is read off plants other than the paper's: modes, a delay, masses and springs.
+"""Identify plants other than the paper's: modes, a delay, masses and springs.
 
-Each from the default step test, unless a row says otherwise.
+The motion is the default step test, unless a row says otherwise.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LONE_MODE = TransferFunction.from_ascending([1.0], [1.0, 0.04 / _OMEGA, _OMEGA**
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Every study, as it gets done; few runs of each unless ``full``."""
+    """Yield the rows of every study; few runs of each unless ``full``."""
     runs = 20 if full else 3
     yield from modes_and_delay(runs, 3 if full else 1)
     yield from wrong_orders(3 * runs)
@@ -40,7 +40,7 @@ def rows(full: bool) -> Iterator[Row]:
 
 
 def modes_and_delay(runs: int, fast_runs: int) -> list[Row]:
-    """A lone mode, a delay, and the pole pair of Eq. 12 at 10 kHz (seventeen seconds a run)."""
+    """Return errors of a single mode, a delay, and the pole pair of Eq. 12 at 10 kHz."""
     late = TransferFunction(np.ones(1), np.ones(1), 0.7e-3)
     lone, delayed = identified(LONE_MODE, runs), identified(late, runs)
     sharp = StepTest(rise=0.0)
@@ -65,7 +65,7 @@ def modes_and_delay(runs: int, fast_runs: int) -> list[Row]:
 
 
 def wrong_orders(runs: int) -> list[Row]:
-    """An order asked for that the plant does not have: rejected, or the band holds the truth."""
+    """Return coverage for wrong orders: rejected, or the band holds the truth."""
     first_order = TransferFunction.from_ascending([1.0], [1.0, 3e-3])
     table = []
     for order, truth, name in (
@@ -79,7 +79,7 @@ def wrong_orders(runs: int) -> list[Row]:
 
 
 def two_masses(runs: int) -> list[Row]:
-    """Modes, and masses, springs and dampers: scatter over repeated recordings over stated."""
+    """Return errors of modes, masses, springs and dampers over their stated uncertainty."""
     table = []
     for name in ("non-collocated", "collocated"):
         truth = MACHINE.collocated() if name == "collocated" else MACHINE.non_collocated()
@@ -103,7 +103,7 @@ def two_masses(runs: int) -> list[Row]:
 
 
 def identified(truth: TransferFunction, runs: int, order: int = 0) -> list[Calibration]:
-    """Of one recording a seed."""
+    """Return the calibrations of one recording per seed."""
     return [
         identify(record_once(s, plant=Plant(truth)), order=order).calibration for s in seeds(runs)
     ]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from benchmarks.row import Row, failed
 
-# The long ones first: the processors are then busy to the end.
+# The longest parts first, so that all processors are busy to the end.
 RESULTS = (
     *("other_plants", "identification", "disturbed", "honesty", "selfcal", "budget"),
     *("spectra", "comparison", "correction", "free_path", "adjustment"),
@@ -23,7 +23,7 @@ PARTS = (*RESULTS, *TIMES)
 
 
 class Measured(NamedTuple):
-    """The rows of a part, and the seconds that it took: of the clock, of the processor."""
+    """The rows of a part, with its wall-clock and processor time [s]."""
 
     part: str
     rows: list[Row]
@@ -32,32 +32,32 @@ class Measured(NamedTuple):
 
 
 def _processor_time() -> float:
-    """Seconds that this process and those it waited for have taken."""
+    """Return the processor time of this process and its ended children [s]."""
     took = os.times()
     return took.user + took.system + took.children_user + took.children_system
 
 
 def measure(part: str, full: bool) -> Measured:
-    """All rows of one part; where it fails, a bar that is not cleared, after those before it."""
+    """Return all rows of one part; if it fails, the rows so far and a failed one."""
     begin, used = time.monotonic(), _processor_time()
     rows: list[Row] = []
     try:
         for row in importlib.import_module(f"benchmarks.{part}").rows(full):
             rows.append(row)
-    except Exception as err:  # of many parts, the others are still worth having
+    except Exception as err:  # the other parts continue
         traceback.print_exc()
         rows.append(failed(f"{part}, to its end", f"{type(err).__name__}: {err}"))
     return Measured(part, rows, time.monotonic() - begin, _processor_time() - used)
 
 
 def measured(parts: list[str], full: bool) -> Iterator[Measured]:
-    """Every part, as it gets done."""
+    """Yield every part as it is done."""
     together = [part for part in RESULTS if part in parts]
     with _processes(len(os.sched_getaffinity(0))) as pool:
         for done in as_completed([pool.submit(measure, part, full) for part in together]):
             yield done.result()
     for part in [part for part in TIMES if part in parts]:
-        # By itself, for the peak memory that a child reports is never below its parent's.
+        # In a process of its own, because a child's peak memory is never below its parent's.
         with _processes(1) as alone:
             yield alone.submit(measure, part, full).result()
 

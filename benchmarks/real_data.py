@@ -71,7 +71,7 @@ def accounted_for(seen: FloatArray, predicted: FloatArray) -> float:
 
 
 def ours(command: FloatArray, seen: FloatArray, order: int, period: float) -> StateSpace:
-    """What ``omsm identify RECORD.csv --hold zero-order`` finds in a table, 0 = free order."""
+    """Run ``omsm identify RECORD.csv --hold zero-order`` on a table, 0 = free order."""
     with tempfile.TemporaryDirectory() as folder:
         table, out = Path(folder, "record.csv"), Path(folder, "model.json")
         both = np.column_stack([command, seen])
@@ -80,20 +80,20 @@ def ours(command: FloatArray, seen: FloatArray, order: int, period: float) -> St
         arguments += ["--hold", "zero-order", "--out", out, "--json"]
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             cli.main(["identify", str(table), *(str(a) for a in arguments)])
-        # One that is rejected is kept beside the place of a good one.
+        # A rejected model has another file name.
         (path,) = Path(folder).glob("model*.json")
         model = json.loads(path.read_text())["discrete"]
     late = [0.0] * model["delay_samples"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", signal.BadCoefficients)
         a, b, c, d = signal.tf2ss(late + model["numerator"], model["denominator"] + late)
-    # One state more, which stays: the working point.
+    # One more constant state for the operating point.
     constant = linalg.block_diag(a, 1.0)
     return constant, np.vstack([b, [[0.0]]]), np.hstack([c, [[1.0]]]), d
 
 
 def score(method: Method, record: Record, order: int) -> float:
-    """Free run of a peer's state-space model, its initial state fitted to the first half."""
+    """Simulate a peer's state-space model, its initial state fitted to the first half."""
     half = record.half
     a, b, c, d = method(record.command[:half], record.seen[:half], order)
     driven = _simulate(a, b, c, d, record.command)
@@ -270,7 +270,7 @@ def table() -> list[dict[str, object]]:
 
 
 def rows(full: bool) -> list[Row]:
-    """The order that we choose ourselves against the best peer at its best order."""
+    """Yield scores of the automatically chosen order and of the best peer at its best order."""
     del full  # it takes two minutes
     if not DATA.is_dir():
         print(f"real data: skipped, {DATA} is absent")
@@ -308,7 +308,7 @@ def _row(record: str, order: int, method: str, value: float, seconds: float) -> 
 
 
 def _cell(score: float, seconds: float) -> str:
-    """A free run that leaves the data behind altogether is only said to diverge."""
+    """Return a score as text; "diverged" below the limit."""
     shown = f"{score:.2f}" if score > _DIVERGED else "diverges"
     return f"{shown} ({seconds:.2f})"
 

@@ -63,17 +63,17 @@ def between(
 def shown(
     name: str, value: float, unit: str, peer: float | str | None = None, runs: int | None = None
 ) -> Row:
-    """A figure without a bar, for whoever reads the others beside it."""
+    """Return a figure without a limit, for information."""
     return _row(name, value, unit, runs, peer, "", None)
 
 
 def not_compared(name: str, unit: str, bar: str, why: str) -> Row:
-    """A figure that could not be had here."""
+    """Return a figure that could not be measured here."""
     return _row(name, float("nan"), unit, None, why, bar, None)
 
 
 def failed(name: str, why: str) -> Row:
-    """What should have been measured, and was not."""
+    """Return a failed row for a part that raised an error."""
     return _row(name, float("nan"), "", None, why, "runs", False)
 
 
@@ -86,6 +86,6 @@ def _row(
     bar: str,
     holds: bool | None,
 ) -> Row:
-    # Plain Python, for the table becomes JSON.
+    # Plain Python types, because the table becomes JSON.
     plain = None if holds is None else bool(holds)
     return Row(name=name, value=float(value), unit=unit, runs=runs, peer=peer, bar=bar, holds=plain)

@@ -1,4 +1,4 @@
-"""Does the part tell the dynamics, and as well as is said?"""
+"""Compare self-calibration on scans of a part with the true dynamics and stated uncertainties."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SMALL_NM = 5.0
 WORSE = Disturbances(
     machine=MachineErrors(drift=Drift(ramp_m_per_s=1e-9)),
     vibration=(
-        # The same at the same C in every scan, as an error of the spindle is.
+        # Repeats with C in every scan, as a spindle error does.
         VibrationLine(amplitude_m=25 * NANOMETRE_M, per_turn=2.0, phase_rad=0.3),
         VibrationLine(amplitude_m=20 * NANOMETRE_M, frequency_hz=680.0),
     ),
@@ -68,7 +68,7 @@ def _pair(seed: int, errors: Disturbances, known: Calibration) -> list[ScanColum
 
 
 def _error_left(known: Calibration, share: float) -> float:
-    """PV of the heights of a scan without noise against the surface [nm]."""
+    """Return the PV error of the heights of a scan without noise [nm]."""
     quiet = Probe(noise=0.0, resolution=0.0)
     made = _scan(30.0, 1, _late(share), probe=quiet, encoder_noise=0.0)
     points = _points(made, known)
@@ -103,7 +103,7 @@ def _without_a_step_test(runs: int) -> list[float]:
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Yield the figures: error left, and how often the latency lies where it is said to."""
+    """Yield the residual errors, and the coverage of the latency."""
     runs = 100 if full else 1
     errors, inside = _with_a_step_test(runs)
     yield from _judged("selfcal, step test + 30, 60 rpm", errors, inside, 93.0)

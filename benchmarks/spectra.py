@@ -1,4 +1,4 @@
-"""Is every line of a scan named rightly? Random mixtures; a measured record of vibration."""
+"""Classify the lines of random mixtures and of a measured vibration, and compare with the truth."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from omsm_ros.core.ripple.source_hypotheses import (
 _FIRST_SEED = 4000
 _RECORDS = Path(__file__).parents[2] / "shared/data/vibration/pyxis_linear_stage"
 _COORDINATE = {"t": "time", "s": "path", "r": "radius", "c": "turn"}
-# Local: amplitude over the standard deviation of a sine's or cosine's.
+# Amplitude over the standard deviation of that of a sine or cosine.
 _CERTAIN = 8.0
 
 
 def rows(full: bool) -> Iterator[Row]:
-    """Shares of lines named rightly, and how far predicted images are off."""
+    """Yield shares of correctly classified lines, and errors of predicted aliases."""
     runs = 100 if full else 12
     yield from _mixtures(runs)
     yield from _measured()
@@ -47,14 +47,14 @@ def _mixtures(runs: int) -> Iterator[Row]:
         counted += judged(mixture(seed))
     peaks = counted["right"] + counted["wrong"] + counted["undecided"]
     yield at_least(
-        "lines above 3 σ named rightly", 100 * counted["right"] / peaks, "%", 95, runs=runs
+        "lines above 3 σ classified correctly", 100 * counted["right"] / peaks, "%", 95, runs=runs
     )
     yield at_most(
-        "aliased vibrations called on the part", counted["folded on the part"], "", 0, runs=runs
+        "aliased vibrations classified as part", counted["aliased as part"], "", 0, runs=runs
     )
     yield shown("lines above 3 σ", peaks, "", runs=runs)
     yield shown("of them undecided", 100 * counted["undecided"] / peaks, "%", runs=runs)
-    yield shown("of them named wrongly", 100 * counted["wrong"] / peaks, "%", runs=runs)
+    yield shown("of them classified wrongly", 100 * counted["wrong"] / peaks, "%", runs=runs)
     yield shown("of them no line at all", 100 * counted["none"] / peaks, "%", runs=runs)
     seen = counted["found"] + counted["missed"]
     yield at_least(
@@ -64,7 +64,7 @@ def _mixtures(runs: int) -> Iterator[Row]:
 
 
 def judged(made: Mixture) -> Counter[str]:
-    """Count what the guard says of a mixture against what is true."""
+    """Count the guard's classifications of a mixture against the true ones."""
     studied = analyse_scans([_as_signal(scan) for scan in made.scans])
     counted: Counter[str] = Counter()
     for scan, own, named in zip(made.scans, studied, name_lines(studied), strict=True):
@@ -74,7 +74,7 @@ def judged(made: Mixture) -> Counter[str]:
             right = row.kind in expected
             counted["right" if right else "undecided" if row.kind == UNDECIDED else "wrong"] += 1
             counted["none"] += true is None
-            counted["folded on the part"] += row.kind == PART and ALIASED in expected
+            counted["aliased as part"] += row.kind == PART and ALIASED in expected
         for line in made.lines:
             if (
                 _expected(line, scan)
@@ -99,7 +99,7 @@ def _as_signal(scan: MadeScan):  # type: ignore[no-untyped-def]
 
 
 def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
-    """The right names of a line; none where it cannot be seen."""
+    """Return the correct classes of a line; none if it is not observable."""
     place = scan.place[line.over]
     span = float(np.ptp(place))
     if line.frequency * span < 6:
@@ -113,14 +113,14 @@ def _expected(line: TrueLine, scan: MadeScan) -> set[str]:
             return set()
         return {ALIASED} if in_time > scan.rate / 2 else {VIBRATION}
     if in_time > scan.rate / 2:
-        # Uneven steps along the path have no image; the wave is seen at its own length.
+        # Uneven steps along the path have no alias; the wave appears at its own length.
         steady = np.ptp(np.diff(place)) < 1e-9 * np.ptp(place)
         return {ARTEFACT} if steady else {PART}
     return {PART}
 
 
 def _is(line: TrueLine, scan: MadeScan, own: StudiedScan, row: NamedLine) -> bool:
-    """True if a row is at the place of a true line, within two resolutions."""
+    """Return True if a row is at a true line, within two resolutions."""
     name = _COORDINATE[line.over]
     coordinate = own.coordinates.get(name)
     if coordinate is None:
@@ -138,7 +138,7 @@ def _is(line: TrueLine, scan: MadeScan, own: StudiedScan, row: NamedLine) -> boo
 def _true_line(
     lines: list[TrueLine], scan: MadeScan, own: StudiedScan, row: NamedLine
 ) -> TrueLine | None:
-    """The true line at a row's place; of several the one of the row's own size."""
+    """Return the true line at a row; of several the one of similar amplitude."""
     near = [line for line in lines if _is(line, scan, own, row)]
     return min(near, key=lambda line: abs(line.amplitude - row.line.amplitude), default=None)
 
@@ -166,7 +166,7 @@ def _measured() -> Iterator[Row]:
 
 
 def image_errors(counts: np.ndarray, rate: float, every: int) -> Iterator[tuple[int, float]]:
-    """How far from its predicted place each folded peak is found, in bins; by axis."""
+    """Yield the axis of each aliased peak, and its distance from the predicted place in bins."""
     slow = rate / every
     for axis in range(counts.shape[1]):
         values = counts[:, axis]
@@ -174,7 +174,7 @@ def image_errors(counts: np.ndarray, rate: float, every: int) -> Iterator[tuple[
         aliased = acceleration_lines(every / rate, {"z": values[::every]})
         resolution = rate / len(values)
         for line in whole.lines:
-            # Weak lines may drown in what else folds onto them.
+            # Weak lines may be hidden by others that are aliased onto them.
             floor = _noise_of(values[::every], aliased)
             if line.acceleration < 4 * floor:
                 continue
@@ -189,7 +189,7 @@ def image_errors(counts: np.ndarray, rate: float, every: int) -> Iterator[tuple[
 
 
 def _seen_near(values: np.ndarray, period: float, place: float) -> float:
-    """Where the spectrum is largest within three bins of ``place`` [Hz]."""
+    """Return the frequency of the largest value within three bins of ``place`` [Hz]."""
     padded = 16 * len(values)
     frequency = np.fft.rfftfreq(padded, period)
     power = abs(np.fft.rfft(values - values.mean(), padded))
@@ -203,6 +203,6 @@ def _noise_of(values: np.ndarray, found) -> float:  # type: ignore[no-untyped-de
 
 
 def _crowded(whole, frequency: float, slow: float, place: float, resolution: float) -> bool:  # type: ignore[no-untyped-def]
-    """True if another line folds to within two bins: their images cannot be told apart."""
+    """Return True if another line is aliased to within two bins, so that both merge."""
     others = [f.frequency for f in whole.lines if f.frequency != frequency]
     return any(abs(float(aliased_frequency(f, slow)) - place) < 2 * resolution for f in others)

@@ -1,4 +1,4 @@
-"""The yardsticks themselves: a bound that is one, and shares that count what they say."""
+"""Tests of the benchmarks: the bound and the shares."""
 
 import ast
 import json
@@ -24,7 +24,7 @@ TRUTH = TransferFunction.from_ascending([1.0, 1e-3], [1.0, 3e-3, 1e-5])
 
 
 def moved(truth, input_):
-    """Steady output to a periodic input, without its mean."""
+    """Return the steady output to a periodic input, without its mean."""
     frequency = np.fft.rfftfreq(len(input_), PERIOD)
     return np.fft.irfft(np.fft.rfft(input_ - np.mean(input_)) * truth.response(frequency))
 
@@ -38,7 +38,7 @@ def to_and_fro(samples=2000):
 
 @pytest.mark.parametrize("delay", [0.0, 4e-4])
 def test_the_bound_is_the_scatter_of_an_efficient_estimate(delay):
-    """A linear fit about the truth, its derivatives by finite differences, over 2000 draws."""
+    """Compare with a linear fit about the truth, by finite differences, over 2000 draws."""
     truth, input_ = TransferFunction(TRUTH.numerator, TRUTH.denominator, delay), to_and_fro()
     frequency = np.array([2.0, 20.0])
     values = np.array([1e-3, 3e-3, 1e-5, delay, GAIN])[[0, 1, 2, 4] if not delay else slice(None)]
@@ -63,7 +63,7 @@ def test_the_bound_is_the_scatter_of_an_efficient_estimate(delay):
     off = np.linalg.lstsq(every / scale, noise, rcond=None)[0] / scale[:, np.newaxis]
     errors = np.array(responses).T @ off[: len(values)]
     gain, phase = response_bounds(truth, GAIN, input_, PERIOD, NOISE, frequency)
-    # 2000 draws tell a standard deviation to 1.6 %.
+    # 2000 draws give a standard deviation to 1.6 %.
     np.testing.assert_allclose(np.std(errors.real, axis=1), gain, rtol=0.06)
     np.testing.assert_allclose(np.std(errors.imag, axis=1), phase, rtol=0.06)
 
@@ -93,7 +93,7 @@ def test_rejected_runs_do_not_count_as_covered():
 
 @pytest.mark.parametrize(("held", "holds"), [(19, True), (18, True), (17, False)])
 def test_the_bar_of_a_share_is_what_chance_leaves_of_it(held, holds):
-    """Of 20 runs at 95 %, 19 are expected and 18 common; 17 or fewer are within 8 %."""
+    """With 20 runs at 95 %, 19 are expected; 17 or fewer have a probability of 8 %."""
     assert coverage("x", np.arange(20) < held, np.ones(20, bool))["holds"] is holds
 
 
@@ -137,7 +137,7 @@ def test_a_part_that_fails_costs_its_own_figures_alone(monkeypatch, capsys):
 
 @pytest.mark.parametrize("part", PARTS)
 def test_every_part_has_rows(part):
-    """Not imported here: some parts need the peers that `make bench` installs."""
+    """The files are parsed, as some parts need packages that `make bench` installs."""
     tree = ast.parse(Path(parts_file).with_name(f"{part}.py").read_text(encoding="utf-8"))
     (rows,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "rows"]
     assert [argument.arg for argument in rows.args.args] == ["full"]

@@ -1,4 +1,4 @@
-"""The benchmarks end with all that they have started, when a signal asks them to."""
+"""On a signal the benchmarks end with all processes that they started."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-# A worker, its child in a session of its own, and a grandchild that has lost its parent.
+# A worker, its child in a session of its own, and an orphaned grandchild.
 FAMILY = """
 import subprocess, sys, tempfile, time
 from benchmarks.ending import nothing_left

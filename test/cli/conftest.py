@@ -1,4 +1,4 @@
-"""The true calibration as a file."""
+"""The true calibration as a file fixture."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What a terminal sees of a command that takes long."""
+"""Elapsed time of long commands on a terminal."""
 
 import io
 import sys
@@ -28,7 +28,7 @@ class Terminal(io.StringIO):
 
 @pytest.fixture
 def terminal(monkeypatch):
-    """A terminal as stderr, once it is asked for: pytest puts its own there before each test."""
+    """Return a function that sets a terminal as stderr, as pytest resets it before each test."""
 
     def made(patience=0.02):
         monkeypatch.setattr(sys, "stderr", Terminal())

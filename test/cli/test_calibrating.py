@@ -21,11 +21,11 @@ def test_plan_writes_what_the_machine_can_run(capsys, tmp_path):
     found = facts(capsys, "plan", "steps", "--out", tmp_path, "--count", 5)
     assert found["edges"] == 10
     table = np.loadtxt(tmp_path / "steps.csv", delimiter=",", skiprows=1)
-    # Two heights tell what is not linear: three steps of 9.8 µm and two of 3 µm between them.
+    # Two step heights detect nonlinearity: three steps of 9.8 µm and two of 3 µm between them.
     assert found["heights"] == pytest.approx([9.8e-6, 3e-6])
     assert np.ptp(table[:, 1]) == pytest.approx(3 * 9.8e-6 + 2 * 3e-6)
     assert found["travel"] == pytest.approx(np.ptp(table[:, 1]))
-    # Ten samples or more on every edge: nothing happens between two samples.
+    # Every edge has ten samples or more, so that no motion falls between two samples.
     assert np.abs(np.diff(table[:, 1])).max() < 9.8e-6 / 5
     assert "G21" in (tmp_path / "steps.nc").read_text()
 
@@ -56,7 +56,7 @@ def test_verify_on_a_chirp(capsys, tmp_path, calibration):
 
 
 def test_verify_refuses_what_is_no_free_path(capsys, tmp_path, calibration, small_scan):
-    """Before a part the probe sees its surface, not the motion of Z."""
+    """Facing a part, the probe follows its surface instead of the motion of Z."""
     made = record(Cell(), Chirp(duration=5.0), Flat())
     turned = replace(made, distance=replace(made.distance, distance=-made.distance.distance))
     for name, recording, said in (
@@ -70,7 +70,7 @@ def test_verify_refuses_what_is_no_free_path(capsys, tmp_path, calibration, smal
 
 @pytest.mark.parametrize("ahead", [0, 37])
 def test_verify_finds_the_offset_of_two_counters(capsys, tmp_path, calibration, ahead):
-    """The probe's counter is ``ahead``: without the offset, nothing is paired rightly."""
+    """With the probe's counter ``ahead``, no sample is paired correctly without the offset."""
     path = tmp_path / "chirp.mcap"
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(record(Cell(), Chirp(duration=10.0), Flat()), 100):

@@ -1,4 +1,4 @@
-"""``omsm calset``, and a scan corrected with what it makes; a budget stated in a file."""
+"""``omsm calset``, a scan corrected with its set, and a budget stated in a file."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_what_makes_no_set_is_refused_on_one_line(capsys, tmp_path, calibrations
 
 
 def test_sources_of_no_name_are_refused(capsys, tmp_path, scan, calibrations):
-    """A variable of the shell that is not set: what the machine leaves open would go without."""
+    """An unset shell variable as sources is refused, as the budget would omit them."""
     words = ["correct", scan, "--calibration", calibrations[0], "--out", tmp_path / "r"]
     assert cli.main([*map(str, words), "--sources", ""]) == 2
     assert capsys.readouterr().err == "omsm: no sources at ''; check the path\n"

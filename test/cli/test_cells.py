@@ -1,4 +1,4 @@
-"""Commands read the bag of a second cell, by its namespace or the names of its topics."""
+"""Commands read the bag of a second cell, selected by namespace or topic names."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
 @pytest.fixture(scope="module")
 def second(tmp_path_factory, small_scan_blocks):
-    """A bag of another cell, whose probe's topic has a name of its own."""
+    """Write a bag of another cell with another name of the probe's topic."""
     path = tmp_path_factory.mktemp("cells") / "second.mcap"
     names = {bags.AXES_TOPIC: "/cell2/axes", bags.DISTANCE_TOPIC: "/cell2/confocal"}
     with BagWriter(path, TOPICS, names) as bag:
@@ -51,7 +51,7 @@ def test_a_second_cell_is_inspected_and_corrected(
     assert summary["bag"] == str(second)
 
 
-# Every command that reads a bag, as far as it needs to begin to.
+# Every command that reads a bag, with the arguments that it needs to start.
 OF_A_BAG = {
     "inspect": [],
     "correct": ["--calibration", "CAL", "--out", "OUT"],
@@ -80,7 +80,7 @@ def test_every_command_of_a_bag_looks_for_the_cell_that_is_asked_for(
     asked = of_a_bag(command, second, tmp_path)
     status = cli.main([*asked, "--namespace", "/cell3"])
     reported = capsys.readouterr()
-    if command == "inspect":  # shows what there is of the cell: nothing
+    if command == "inspect":  # it lists the cell's topics, of which there are none
         assert status == 0
         assert "nothing on '/cell3/axes'" in reported.out
     else:

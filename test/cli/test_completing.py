@@ -1,4 +1,4 @@
-"""The script for the shell completes what `omsm` understands, as bash itself does it."""
+"""The completion script completes commands and options in bash."""
 
 import shutil
 import subprocess

@@ -1,4 +1,4 @@
-"""A command that is asked to end: by a batch system, a service, or a terminal that is closed."""
+"""Commands end on signals of a batch system, a service, or a closed terminal."""
 
 import signal
 import subprocess
@@ -11,10 +11,10 @@ from omsm_ros import cli
 
 @pytest.mark.parametrize("asked", ["SIGTERM", "SIGHUP"])
 def test_a_command_that_is_asked_to_end_leaves_no_unfinished_file(tmp_path, asked):
-    """And ends by that signal, as who has started it expects."""
+    """The process ends by that signal, as its parent expects."""
     block = (
         "import os, signal, sys\n"
-        f"signal.signal(signal.{asked}, signal.SIG_DFL)\n"  # whoever runs the tests below nohup
+        f"signal.signal(signal.{asked}, signal.SIG_DFL)\n"  # also if the tests run under nohup
         "replaced = os.replace\n"
         "def asked(part, target):\n"
         f"    os.kill(os.getpid(), signal.{asked})\n"
@@ -33,7 +33,7 @@ def test_a_command_that_is_asked_to_end_leaves_no_unfinished_file(tmp_path, aske
 
 
 def test_what_is_ignored_stays_ignored(tmp_path):
-    """SIGHUP below nohup."""
+    """SIGHUP is ignored under nohup."""
     block = (
         "import os, signal, sys\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"

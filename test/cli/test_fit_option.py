@@ -1,4 +1,4 @@
-"""How a registration and a form are told to people."""
+"""Rows that show a registration and a form."""
 
 import math
 
@@ -9,7 +9,7 @@ from omsm_ros.cli.fit_option import form_rows
 
 @pytest.fixture
 def facts():
-    """A small piece of an off-axis mirror: what clocking does, tip and y do as well."""
+    """On a small off-axis mirror, clocking correlates with tip and y."""
     by_noise, by_clocking = {"tip": 3e-6, "y": 4e-6}, {"tip": 17e-3, "y": 0.9e-3}
     return {
         "pose": {
@@ -38,7 +38,7 @@ def facts():
 
 
 def test_effects_of_an_undetermined_degree_of_freedom_are_reported_separately(facts):
-    """3 and 4 µrad make 5 µrad; the 17 mrad of a turned part are told where the turn is."""
+    """3 and 4 µrad give 5 µrad; the 17 mrad of clocking are stated with the clocking."""
     rows = dict(form_rows(facts))
     assert rows["tip"] == "1.0 µrad ± 5.0 µrad (k = 1)"
     assert rows["y"] == "22.0 µm ± 4.0 µm (k = 1)"

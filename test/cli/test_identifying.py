@@ -1,4 +1,4 @@
-"""``omsm identify`` of tables, and of bags behind a hold."""
+"""``omsm identify`` of tables, and of bags with a hold."""
 
 import json
 from dataclasses import replace
@@ -117,7 +117,7 @@ def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test,
     run(capsys, bag, *arguments, "--out", tmp_path / "model.json", "--json")
     (path,) = tmp_path.glob("model*.json")
     model = json.loads(path.read_text())
-    # The probe counts down when Z rises.
+    # The distance decreases when Z increases.
     gain = sum(model["discrete"]["numerator"]) / sum(model["discrete"]["denominator"])
     assert gain == pytest.approx(-1.0, abs=0.02)
 

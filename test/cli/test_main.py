@@ -141,9 +141,9 @@ def test_a_truncated_bag_is_repaired_into_a_new_file_next_to_it(capsys, folder, 
     assert "cut short" in text
     status, text, _ = run(capsys, "inspect", tmp_path / "cut.repaired.mcap", "--json")
     axes, distance = json.loads(text)["topics"]
-    assert axes["samples"] == pytest.approx(20_000, abs=6000)  # but for the last chunk
+    assert axes["samples"] == pytest.approx(20_000, abs=6000)  # except for the last chunk
     assert abs(axes["samples"] - distance["samples"]) <= 100
-    assert run(capsys, "inspect", cut, "--repair")[0] == 2  # it is there already
+    assert run(capsys, "inspect", cut, "--repair")[0] == 2  # it exists already
 
 
 @pytest.mark.parametrize("command", ["identify", "correct", "inspect"])
@@ -185,7 +185,7 @@ def test_bad_input_is_one_line_and_exit_2(capsys, folder, tmp_path, arguments, n
 
 
 def test_commands_work_without_ros(folder):
-    """A Python that cannot import any ROS package runs the offline commands all the same."""
+    """The offline commands run in a Python that cannot import any ROS package."""
     block = (
         "import sys\n"
         "class NoRos:\n"
@@ -289,7 +289,7 @@ def test_a_wrong_argument_is_one_line_with_a_remedy(capsys, arguments, named):
 
 
 def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_path, step_test):
-    """A target that moves by itself: the residual is far above the noise at rest."""
+    """For a moving target the residual is far above the noise of a stationary segment."""
     import numpy as np
 
     wobble = 2e-6 * np.sin(0.37 * np.arange(len(step_test.axes)))

@@ -1,4 +1,4 @@
-"""Options of ``omsm form`` and ``compensate``, each seen in its effect; closed forms beside."""
+"""Effects of the options of ``omsm form`` and ``compensate``, against closed forms."""
 
 import json
 
@@ -12,13 +12,13 @@ COARSE_M, FINE_M = 2e-3, 0.5e-3
 
 
 def passed(wavelength, cutoff):
-    """Share of a wave that a Gaussian filter passes (ISO 16610-21): half at its cutoff."""
+    """Return the share of a wave that a Gaussian filter passes (ISO 16610-21)."""
     return 2.0 ** -((cutoff / wavelength) ** 2)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A paraboloid with a wave of 20 nm rms across and a finer one of 10 nm along."""
+    """Write a paraboloid with a wave of 20 nm rms across and a finer one of 10 nm along."""
     made = tmp_path_factory.mktemp("part")
     share = (np.arange(POINTS) + 0.5) / POINTS
     r, angle = RADIUS * np.sqrt(share), np.pi * (1 + 5**0.5) * np.arange(POINTS)
@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def facts(capsys, tmp_path, folder):
-    """Runs a command on the part; what it prints as JSON, and its folder."""
+    """Run a command on the part; return its JSON and its folder."""
 
     def run(command, *more):
         out = tmp_path / f"out{len(list(tmp_path.iterdir()))}"
@@ -53,7 +53,7 @@ def roughness(found):
 def test_the_s_filter_takes_shorter_waves_out_of_the_texture(facts):
     cutoffs = (1.0e-3, 1.5e-3)
     left = [roughness(facts("form", "--no-report", "--s-filter", c)[0]) for c in cutoffs]
-    # Of the fine wave a sixteenth at most is left, and nothing of it in squares; at the rim a
+    # At most a sixteenth of the fine wave is left, which is negligible in squares; at the rim a
     # filter has half of its weights.
     expected = passed(COARSE_M, cutoffs[1]) / passed(COARSE_M, cutoffs[0])
     assert left[1] / left[0] == pytest.approx(expected, rel=0.02)

@@ -1,4 +1,4 @@
-"""Options of ``omsm correct`` and its kin, each seen in the points; what it must do by hand."""
+"""Effects of the options of ``omsm correct`` and related commands, against closed forms."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ def bag_of(path, blocks, of_axes=lambda block: block, of_distance=lambda block: 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, small_scan_blocks):
-    """Five seconds of a scan: 5 turns at 2 mm, 2.5 revolutions of C."""
+    """Write five seconds of a scan: 5 turns at 2 mm, 2.5 revolutions of C."""
     made = tmp_path_factory.mktemp("scan")
     bag_of(made / "scan.mcap", small_scan_blocks[:50])
     (made / "mirror.yaml").write_text(MIRROR)
@@ -33,7 +33,7 @@ def folder(tmp_path_factory, small_scan_blocks):
 
 @pytest.fixture
 def corrected(capsys, tmp_path, folder, calibration):
-    """Corrects a bag of the folder; its summary and its points."""
+    """Correct a bag of the folder; return its summary and points."""
 
     def correct(*more, bag="scan.mcap", status=0):
         out = tmp_path / f"out{len(list(tmp_path.iterdir()))}"
@@ -88,7 +88,7 @@ def test_a_measured_pitch_is_taken_off_over_the_arm(corrected, tmp_path):
     pitched = corrected(*geometry, "--pitch", tmp_path / "pitch.csv")[1]
     change = pitched["height"] - flat["height"]
     slope, offset = np.polyfit(flat["height"], change, 1)
-    # The height of the surface is the travel of Z, but for micrometres of the probe.
+    # The height of the surface is the travel of Z, except for micrometres of the probe.
     assert abs(slope) == pytest.approx(arm * per_m, rel=0.02)
     assert np.std(change - slope * flat["height"] - offset) < 0.02 * np.std(change)
     assert "abbe_arm" in corrected("--pitch", tmp_path / "pitch.csv", status=2)
@@ -109,7 +109,7 @@ def test_a_lateral_uncertainty_costs_by_the_slope_of_the_surface(corrected, fold
 
 
 def slipped(summary, samples):
-    """Nothing was corrected, and why is told with the number: a wrong pair is µm of height."""
+    """No sample is corrected and the reason is counted: a wrong pair would be µm of height."""
     account = summary["samples"]["distance"]
     assert account["corrected"] == 0
     assert account["counted"]["slipped"] > 4900
@@ -154,7 +154,7 @@ def test_an_aperture_limits_what_is_fitted_and_a_tolerance_judges_it(corrected, 
     assert counted["read"] == whole["form"]["points"]["read"]
     outside = [n for name, n in counted.items() if name != "read" and "outside" in name]
     assert sum(outside) == pytest.approx(len(cloud) - inside, abs=2)
-    # Of some nanometres, known to some tens: far inside of one, far outside of the other.
+    # Some nanometres, known to some tens: far within one tolerance, far beyond the other.
     for summary, tolerance, holds in ((whole, 1e-6, True), (part, 1e-12, False)):
         held = summary["form"]["conformity"]
         assert held["tolerance"] == tolerance
@@ -242,7 +242,7 @@ def test_identify_puts_counters_together_by_the_offset(capsys, tmp_path, step_te
 
 
 def test_a_motion_is_averaged_over_the_exposure(corrected, folder, small_scan_blocks):
-    """Z swings at 20 Hz: of it sin(π f T)/(π f T) is left, and the path filter follows to 1 %."""
+    """Averaging leaves sin(π f T)/(π f T) of Z at 20 Hz; the path filter follows to 1 %."""
     frequency, amplitude, exposure = 20.0, 1e-6, 5e-3
 
     def swinging(block):

@@ -1,4 +1,4 @@
-"""Options of commands that plan and predict, each seen in its effect; closed forms beside."""
+"""Effects of the options of planning and prediction, against closed forms."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def planned(capsys, tmp_path, *more):
 
 
 def edges_of(time, z):
-    """First instants [s] at which Z moves after a rest, and how long it then moves [s]."""
+    """Return the instants [s] at which Z starts to move, and the durations of the moves [s]."""
     moving = np.abs(np.diff(z)) > 0
     begins = np.flatnonzero(np.diff(moving.astype(int), prepend=0) == 1)
     ends = np.flatnonzero(np.diff(moving.astype(int), append=0) == -1)
@@ -50,7 +50,7 @@ def test_edges_are_a_dwell_apart_but_for_their_dither(capsys, tmp_path, dwell):
     _, time, z = planned(capsys, tmp_path, "--dwell", dwell)
     begins, _ = edges_of(time, z)
     assert len(begins) == 8
-    # Dithered by less than a sample period, and an S-curve begins softly.
+    # Edges are dithered by less than a sample period, and an S-curve starts smoothly.
     np.testing.assert_allclose(np.diff(begins), dwell, atol=2.5e-3)
 
 
@@ -77,7 +77,7 @@ AMPLITUDE_M, FREQUENCY_HZ = 20e-6, 2.0
 
 @pytest.fixture
 def sine(tmp_path):
-    """A planned motion whose derivatives are known."""
+    """Write a planned motion with known derivatives."""
     t = np.arange(0.0, 10.0, 1e-3)
     z = AMPLITUDE_M * np.sin(2 * np.pi * FREQUENCY_HZ * t)
     np.savetxt(tmp_path / "scan.csv", np.stack([t, z], axis=1), "%.12g", ",", header="time_s,z_m",
@@ -94,7 +94,7 @@ def predicted(capsys, sine, calibration, limits="", *more):
 
 
 def test_a_planned_motion_may_be_named_in_capitals(capsys, sine, calibration):
-    """As programs of other systems name what they write."""
+    """Suffixes in capitals are accepted."""
     expected = predicted(capsys, sine, calibration)
     assert predicted(capsys, sine.rename(sine.with_suffix(".CSV")), calibration) == expected
 
@@ -108,7 +108,7 @@ def test_limits_of_the_machine_are_held_against_the_motion(capsys, sine, calibra
     assert limits["Z acceleration"]["value"] == pytest.approx(acceleration, rel=0.02)
     assert limits["Z acceleration"]["allowed"] == 1.0
     assert limits["Z jerk"]["value"] == pytest.approx(acceleration * omega, rel=0.02)
-    # Twice as fast is four times the acceleration: it may run so much faster as the root says.
+    # Acceleration grows with the square of the speed, so the speed factor is the square root.
     tight = predicted(capsys, sine, calibration, text.format(1.44 * acceleration, 100.0))
     assert tight["binding"] == "Z acceleration"
     assert tight["speed_factor"] == pytest.approx(1.2, rel=0.02)
@@ -196,7 +196,7 @@ def test_the_twin_is_made_as_its_options_say(capsys, monkeypatch, tmp_path):
     assert (out, str(disturbances), nothing) == (tmp_path, "bad.yaml", None)
     assert (scenario.spindle_speed, scenario.feed_per_turn) == (45.0, 2e-4)
     assert (scenario.start_radius, scenario.seed, plain.seed) == (1e-3, 7, 7)
-    # One part, two scans; without --part the seed is of the part, too.
+    # Two scans of one part; without --part the seed is that of the part, too.
     r = np.linspace(0, 2e-3, 50)
     error = scenario.part.error(r, r)
     assert np.ptp(error) > 0

@@ -1,4 +1,4 @@
-"""No result takes the place of what was measured, or of what it was made from."""
+"""No result overwrites a recording or an input."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from omsm_ros.errors import ConfigurationError
 
 @pytest.fixture
 def shop(tmp_path, monkeypatch):
-    """Files by their names alone: nobody reads them here."""
+    """Create empty files; no test reads them."""
     monkeypatch.chdir(tmp_path)
     for name in ("steps.mcap", "older.mcap", "run.csv", "cal.json", "geo.yaml", "points.xyz"):
         Path(name).write_text(name)

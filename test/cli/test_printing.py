@@ -1,4 +1,4 @@
-"""What commands print: one line a fact, whatever a file holds."""
+"""Commands print one line per fact, whatever a file contains."""
 
 import ast
 import json
@@ -41,7 +41,7 @@ def test_names_in_files_do_not_steer(capsys, tmp_path, named):
 
 
 def test_commands_print_at_one_place():
-    """Only JSON, which is ASCII, and the line of an error, which is cleaned too, go by it."""
+    """Only JSON, which is ASCII, and error lines, which are cleaned, are printed directly."""
     calls = {}
     for path in Path(cli.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
@@ -51,7 +51,7 @@ def test_commands_print_at_one_place():
 
 
 def test_what_is_written_is_where_the_line_says(capsys, small_scan, calibration, tmp_path):
-    """One way for all commands: names and their folder, or paths."""
+    """All commands state written files alike: names and their folder, or paths."""
     scan = write(tmp_path / "scan.mcap", small_scan)
     nominal = Path(omsm_ros.__file__).parent.parent / "config" / "paper_mirror.yaml"
     result, surface = tmp_path / "result", tmp_path / "look"

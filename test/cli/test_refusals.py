@@ -1,4 +1,4 @@
-"""What a command says of long names, of too few open files, and of a file in the way."""
+"""Error messages for long names, too few open files, and files in the way."""
 
 import errno
 import os
@@ -13,7 +13,7 @@ from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.pipelines import examine_host
 
-# Of parts longer than any name can be: nothing can be made there.
+# Path components longer than any name can be, where nothing can be created.
 LONG = "/".join(["folder" * 50] * 10)
 END = "the_last.name"
 
@@ -68,9 +68,9 @@ def test_a_long_name_is_reported_by_its_beginning_and_its_end(
 
 @contextmanager
 def open_files_at_most(more):
-    """A limit that leaves this process ``more`` files than it holds."""
+    """Limit this process to ``more`` files than it has open."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    # The lowest number that is free is the next to be given.
+    # The next file gets the lowest free number.
     lowest = os.open(os.devnull, os.O_RDONLY)
     os.close(lowest)
     resource.setrlimit(resource.RLIMIT_NOFILE, (lowest + more, hard))
@@ -84,7 +84,7 @@ def test_a_command_that_may_open_no_more_files_says_so(capsys, tmp_path):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, (bags.AXES_TOPIC,)):
         pass
-    assert cli.main(["inspect", str(path)]) in (0, 2)  # all it needs is loaded
+    assert cli.main(["inspect", str(path)]) in (0, 2)  # loads all modules that it needs
     capsys.readouterr()
     with open_files_at_most(0) as most:
         said = refused(capsys, "inspect", path)

@@ -32,14 +32,14 @@ def test_reversal_finds_no_latency_in_a_mechanical_lag(capsys, tmp_path, calibra
     assert found["uncertainty"] < 50e-6
     assert found["latency"] is False
     assert found["points"] == sum(s["axes"]["corrected"] for s in found["samples"]) > 59_900
-    # Those at the ends have no neighbours, those near the axis no place on the part.
+    # Points at the ends have no neighbours, those near the axis no position on the part.
     assert 0.98 * found["points"] < found["used"] < found["points"]
     assert all(s["axes"]["received"] == 30_000 for s in found["samples"])
 
 
 @pytest.fixture(scope="module")
 def late_pair(tmp_path_factory):
-    """Two speeds of one part, the probe 0.1 ms late."""
+    """Write scans of one part at two speeds, with a latency of 0.1 ms."""
     folder = tmp_path_factory.mktemp("late")
     late = Disturbances(probe=ProbeErrors(latency_s=1e-4))
     return [
@@ -56,7 +56,7 @@ def late_pair(tmp_path_factory):
 
 @pytest.fixture
 def sum_of_lags(tmp_path, true_calibration):
-    """What a step test of the late probe says."""
+    """Write the calibration of a step test with the same latency."""
     g = true_calibration.dynamics
     late = TransferFunction(g.numerator, g.denominator, g.delay + 1e-4)
     covariance = np.zeros_like(true_calibration.covariance)
@@ -94,7 +94,7 @@ def test_selfcal_divides_the_lag_and_correct_uses_it(capsys, tmp_path, late_pair
         assert summary["latency"]["source"] == ("several speeds" if used == out else "unresolved")
     noise = np.hypot(10e-9, 10e-9 / np.sqrt(12))
     assert sizes["resolved"][0] < 1.2 * noise
-    # The correction itself made this error, and the budget holds it.
+    # The correction itself causes this error, and the budget includes it.
     assert sizes["unresolved"][0] > 5 * noise
     assert sizes["unresolved"][1]["lateral_lag"] > sizes["unresolved"][0] / 2
 

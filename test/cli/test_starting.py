@@ -60,7 +60,7 @@ def test_bags_of_the_twin_are_what_the_other_commands_take(capsys, tmp_path):
     capsys.readouterr()
     assert cli.main(["correct", facts["scan"], *arguments]) == 0
     summary = json.loads(capsys.readouterr().out)
-    # The part's own figure and the probe's noise: tens of nanometres, where micrometres were.
+    # Form error and probe noise: tens of nanometres instead of micrometres.
     assert summary["deviation"]["corrected"]["rms_area_weighted"] < 40e-9
     assert cli.main(command) == 2
     assert "exists" in capsys.readouterr().err
@@ -68,7 +68,7 @@ def test_bags_of_the_twin_are_what_the_other_commands_take(capsys, tmp_path):
 
 @pytest.mark.soak
 def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
-    """Its step test is the one that is planned for a machine: what it could not show is small."""
+    """Its step test is the planned one, so that the undetected model error is small."""
     assert cli.main(["twin", "--out", str(tmp_path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     calibration = str(tmp_path / "cal.json")
@@ -77,7 +77,7 @@ def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
     assert cli.main(["predict", facts["scan"], "--calibration", calibration, "--json"]) == 0
     prediction = json.loads(capsys.readouterr().out)
     assert prediction["safe"]
-    # The paper's twenty steps leave 1.0 nm, for they hide a slow relaxation.
+    # The paper's twenty steps leave 1.0 nm, as they do not detect a slow relaxation.
     assert prediction["residual"] < 0.7e-9
 
 
@@ -90,7 +90,7 @@ def test_the_exit_status_is_right_without_a_readable_stderr(redirected, tmp_path
 
 @pytest.mark.parametrize("options", ["", "--json"])
 def test_a_standard_output_that_is_full_is_named(options, tmp_path):
-    """As on a disk without room that the answer goes to."""
+    """Standard output is a full disk."""
     command = f"{sys.executable} -m omsm_ros.cli plan steps --out p {options} >/dev/full"
     done = subprocess.run(
         command, shell=True, cwd=tmp_path, capture_output=True, check=False, text=True

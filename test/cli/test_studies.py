@@ -1,4 +1,4 @@
-"""Commands that judge rather than correct: plan, verify, compare, predict, reversal, align."""
+"""Commands for calibrations and scans: plan, verify, compare, predict, reversal, align."""
 
 import json
 import re
@@ -52,7 +52,7 @@ def test_predict_over_a_gap_judges_the_longest_run_and_names_the_rest(
 
 
 def test_predict_judges_at_the_period_of_the_longest_run(capsys, tmp_path, small_scan, calibration):
-    """The last block is of another sample period; it says nothing of those before."""
+    """The last block has another sample period, which does not affect those before."""
     path, made = tmp_path / "two.mcap", list(blocks_of(small_scan, 1000))
     made[-1] = (replace(made[-1][0], sample_period=4e-3), made[-1][1])
     with BagWriter(path, (bags.AXES_TOPIC,)) as bag:
@@ -79,8 +79,8 @@ def test_predict_takes_a_planned_motion(capsys, tmp_path, calibration):
         ("time_s,z_m\n0,a\n1,b\n", "line 2: '0,a' is no row"),
         ("time_s,z_m\n0,1\n1,nan\n", "z_m has no reading in 1 of 2 rows"),
         ("time_s,z_m\n0,1\n1,1\n5,1\n", "even steps"),
-        ("time_s,z_um\n0,1\n1,1\n", "0 columns 'z_m'"),  # another unit than was asked for
-        ("0,1\n1,1\n2,1\n", "0 columns 'time_s'"),  # its first sample was lost
+        ("time_s,z_um\n0,1\n1,1\n", "0 columns 'z_m'"),  # another unit than expected
+        ("0,1\n1,1\n2,1\n", "0 columns 'time_s'"),  # without the header line
         ("time_s,z_m\n0,0,1,5\n0,1,1,5\n", "line 2: '0,0,1,5' is no row"),  # decimal commas
         ("time_s,z_m\n2,1\n1,1\n", "step of time_s is -1.0 s"),
     ],
@@ -202,7 +202,7 @@ def test_correct_refuses_a_foreign_calibration_unless_requested(
 def test_streams_of_different_rates_are_joined_by_their_stamps(
     capsys, tmp_path, small_scan, calibration
 ):
-    """Axes twice as fast, with a counter of their own and 0.3 ms ahead of the probe's clock."""
+    """Write axes of twice the rate, with their own counter, 0.3 ms ahead of the probe's clock."""
     fast = record(Cell(sample_period=0.5e-3), spiral_of(Scenario(start_radius=2e-3)), PAPER_MIRROR)
     ahead_ns = 300_000
     path = tmp_path / "two_clocks.mcap"

@@ -1,4 +1,4 @@
-"""A command takes one core, for what BLAS gains with more it loses by waiting."""
+"""A command uses one core, as BLAS threads on small matrices cost more than they gain."""
 
 import os
 import subprocess

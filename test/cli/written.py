@@ -1,4 +1,4 @@
-"""Recordings as bags, and what a command prints of them."""
+"""Write recordings as bags, and read the facts that a command prints."""
 
 import json
 

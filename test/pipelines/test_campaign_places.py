@@ -1,4 +1,4 @@
-"""Which bags a campaign takes, where each result goes, and what makes it be done again."""
+"""Bags of a campaign, folders of its results, and reasons to correct a bag again."""
 
 import json
 from dataclasses import replace
@@ -14,7 +14,7 @@ from omsm_ros.pipelines.campaign import DONE, Entry, bags_below, load_campaign, 
 
 @pytest.fixture
 def shop(tmp_path, true_calibration):
-    """Bags by their names alone: nobody reads them here."""
+    """Create empty bags; no test reads them."""
     save_calibration(tmp_path / "cal.json", true_calibration)
 
     def made(*names):
@@ -34,7 +34,7 @@ def shop(tmp_path, true_calibration):
 
 @pytest.fixture
 def corrected(monkeypatch, tmp_path):
-    """Each bag becomes a summary with its name; which were corrected, in their order."""
+    """Let the correction write the bag's name; return the corrected bags in order."""
     met = []
 
     def correct(task):
@@ -53,7 +53,7 @@ def run(tmp_path, *options):
 
 
 def results(tmp_path):
-    """What each result says whose it is."""
+    """Return the bag that each result names."""
     out = tmp_path / "out"
     return {
         str(path.parent.relative_to(out)): json.loads(path.read_text())["bag"]

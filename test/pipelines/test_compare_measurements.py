@@ -1,4 +1,4 @@
-"""The command over results of ours and files of others: what it says, what it asks for."""
+"""``omsm difference`` on own results and files of other programs."""
 
 import json
 
@@ -78,7 +78,7 @@ def test_twenty_nanometres_of_astigmatism_differ(results, tmp_path, capsys):
 
 
 def interferometer(results, path, spread=None):
-    """The part's true heights as a map, with the instrument's own piston, tilt and noise."""
+    """Write the part's true heights as a map, with piston, tilt and noise of the instrument."""
     at = np.linspace(-0.9 * RADIUS, 0.9 * RADIUS, 71)
     x, y = (part.ravel() for part in np.meshgrid(at, at))
     part = FigureError(PAPER_MIRROR, RADIUS, seed=3)
@@ -124,7 +124,7 @@ def test_the_nominal_surface_is_taken_off_both(results, tmp_path, capsys):
 
 
 def test_each_may_be_registered_to_the_nominal_surface_first(results, tmp_path, capsys):
-    """Clamped askew by 20 mrad: a paraboloid that is turned is no longer the same over x and y."""
+    """A paraboloid that is clamped with a tilt of 20 mrad has another height over x and y."""
     table = CloudFile(results["fast"] / "cloud.ply").read()
     x, y, height = (table[name].astype(float) for name in ("x", "y", "height"))
     turn = 20e-3
@@ -173,7 +173,7 @@ def test_it_speaks_to_people(results, tmp_path, capsys):
         (["--uncertainty", "-1"], "standard uncertainty"),
         (["--nominal", "missing.yaml"], "no surface at 'missing.yaml'"),
         (["--spacing", "1e-9"], "widen "),
-        (["--spacing", "2e-6"], "expected 40 401 at most"),  # a minute's work
+        (["--spacing", "2e-6"], "expected 40 401 at most"),  # it would take a minute
         (["--register", "auto"], "--register needs the surface"),
         (["--register", "roll"], "roll"),
     ],

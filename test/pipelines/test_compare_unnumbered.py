@@ -1,4 +1,4 @@
-"""Two drifting scans of one part, by a program that does not number its points."""
+"""Two scans of one part with drift, from a program that does not number its points."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def scan(path, seed, rpm, feed, astigmatism=0.0):
 
 @pytest.mark.parametrize(("astigmatism", "verdict"), [(0.0, "agree"), (20e-9, "differ")])
 def test_the_drift_that_is_stated_counts_in_the_order_of_the_file(tmp_path, astigmatism, verdict):
-    """It makes power of 15 nm, which is no difference of the part; astigmatism it does not make."""
+    """Drift causes 15 nm of power, which is no difference of the part, but no astigmatism."""
     a = scan(tmp_path / "a.xyz", 2, 30, 1e-4)
     b = scan(tmp_path / "b.xyz", 102, 45, 8e-5, astigmatism)
     known = {"uncertainty": 1e-10, "units": units_of("mm")}

@@ -1,4 +1,4 @@
-"""One corrective cut, tried: what was too high is cut off, and only what is finer stays."""
+"""A simulated corrective cut removes the form error and leaves only shorter waves."""
 
 import json
 
@@ -16,7 +16,7 @@ FORM = ZernikeSurface(RADIUS, (0, 0, 0, 40e-9, 0, 50e-9, 0, 15e-9, 20e-9))
 
 
 def error(x, y):
-    """Form that a cut can take away, and ripple that it cannot."""
+    """Form that a cut can remove, and ripple that it cannot."""
     return FORM.height(x, y) + 4e-9 * np.sin(2 * np.pi * np.hypot(x, y) / 0.8e-3)
 
 
@@ -55,13 +55,13 @@ def test_one_cut_leaves_what_is_finer_than_the_low_pass(folder, tmp_path, capsys
     assert np.std(before) > 5 * ripple
     assert np.std(after) == pytest.approx(ripple, rel=0.35)
     assert load_surface(folder / "mirror.yaml") == PAPER_MIRROR
-    # The ripple, and what the filter leaves of the form at the rim; before, squares add up.
+    # The ripple and the remainder of the filter at the rim; before the cut, squares add up.
     assert ripple < facts["rms_after"] < 7e-9
     assert facts["rms_before"] == pytest.approx(33e-9, rel=0.1)
 
 
 def test_what_will_be_left_holds_marks_finer_than_the_table(tmp_path, capsys):
-    """Tool marks of a quarter of a cell of the table: no cut takes them away."""
+    """Tool marks of a quarter of a table cell cannot be compensated."""
     r, angle = RADIUS * (1 - np.arange(40_000) / 40_000), np.arange(40_000) * 0.03
     x, y = r * np.cos(angle), r * np.sin(angle)
     marks = 20e-9 * np.cos(2 * np.pi * r / 2.4e-4)
@@ -75,7 +75,7 @@ def test_what_will_be_left_holds_marks_finer_than_the_table(tmp_path, capsys):
 
 
 def test_the_stated_uncertainty_is_that_of_the_offsets(folder, tmp_path):
-    """Against what the filter makes of the form without noise: that of the noise alone."""
+    """Compare with the filtered form without noise: the difference is the filtered noise."""
     compensate(folder, tmp_path, "--low-pass", "0.004")
     table = np.loadtxt(tmp_path / "compensation.csv", delimiter=",", skiprows=1)
     x, y, offset, spread = table[np.hypot(table[:, 0], table[:, 1]) < 0.6 * RADIUS].T
@@ -91,7 +91,7 @@ def test_a_low_pass_finer_than_the_points_is_refused(folder, tmp_path, capsys):
 
 
 def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
-    """Read as the controller would, at the place that the machine's axes put under the tool."""
+    """Interpret the G-code as a controller does, at the point under the tool."""
     assert compensate(folder, tmp_path, "--low-pass", "0.004", "--spiral", "2e-4", "--json") == 0
     facts = json.loads(capsys.readouterr().out)
     lines = (tmp_path / "compensation.nc").read_text().splitlines()
@@ -102,7 +102,7 @@ def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
     part = workpiece_xy(radius, np.zeros(len(radius)), angle)
     before = error(*part)
     inner = radius < 0.65 * RADIUS
-    # Places of the spiral lie the closer together the nearer they are to its centre.
+    # Points of the spiral are closer together near its centre.
     weights = radius[inner]
     rms = []
     for left in (before[inner], (before + offset)[inner]):
@@ -115,7 +115,7 @@ def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
 
 
 def test_offsets_below_their_uncertainty_are_warned_of(folder, tmp_path, capsys):
-    """A shift that form looks like is open by tens of nanometres."""
+    """A shift that cannot be separated from form is uncertain by tens of nanometres."""
     words = ("--low-pass", "0.004", "--fit", "auto", "--json")
     assert compensate(folder, tmp_path, *words) == 0
     facts = json.loads(capsys.readouterr().out)

@@ -1,4 +1,4 @@
-"""When a scan was made, how old its calibration was, and how warm it was: in bag, summary, page."""
+"""Time of a scan, age of its calibration and temperature, in bag, summary and page."""
 
 from dataclasses import replace
 from itertools import islice
@@ -73,7 +73,7 @@ def test_a_date_that_is_none_is_refused(true_calibration, entry):
 
 
 def test_an_implausible_temperature_is_reported(tmp_path, small_scan_blocks, true_calibration):
-    """In kelvin, one of them; the scan itself is as good as ever."""
+    """One temperature is in kelvin; the scan itself is not affected."""
     bag = record(tmp_path / "a.mcap", small_scan_blocks, [293.15, 20.0])
     summary = measure(bag, true_calibration, tmp_path / "out", report=False)
     assert summary["conditions"]["temperature"]["mean"] == 20.0

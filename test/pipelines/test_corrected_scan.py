@@ -1,4 +1,4 @@
-"""The one pass over a bag: all samples, in bounded memory, whatever their order in the file."""
+"""Correction of a bag in one pass: all samples, in bounded memory, in any order in the file."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
 
 def write(path, blocks, ahead=0):
-    """A bag whose axes were recorded ``ahead`` blocks before the distance."""
+    """Write a bag whose axes were recorded ``ahead`` blocks before the distance."""
     with BagWriter(path, TOPICS) as bag:
         for k in range(len(blocks) + ahead):
-            # At the time of its writing, which a reader goes by, not at its own.
+            # Recorded at the time of writing, by which readers order messages.
             stamp = k * 100_000_000
             messages = message_mapping.bag_messages()
             if k < len(blocks):
@@ -87,7 +87,7 @@ def test_samples_that_had_to_be_given_up_are_an_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
     monkeypatch.setattr(correct, "MAX_PENDING_SAMPLES", 5000)
-    monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
+    monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # splits a short bag into several blocks
     path = write(tmp_path / "ahead.mcap", small_scan_blocks, ahead=len(small_scan_blocks))
     with pytest.raises(BagError, match="were dropped before their partners came"):
         correct_bag(path, true_calibration, tmp_path / "cloud.ply")
@@ -98,7 +98,7 @@ def test_axes_that_go_on_without_the_probe_are_no_error(
     tmp_path, small_scan_blocks, true_calibration, monkeypatch
 ):
     monkeypatch.setattr(correct, "MAX_PENDING_SAMPLES", 5000)
-    monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # several blocks of so short a bag
+    monkeypatch.setattr(bags, "_JOINED_BYTES", 1_000_000)  # splits a short bag into several blocks
     path = tmp_path / "stopped.mcap"
     with BagWriter(path, TOPICS) as writer:
         for k, (axes, distance) in enumerate(small_scan_blocks):
@@ -169,7 +169,7 @@ def test_what_is_found_on_the_way_is_what_the_cloud_says(bag, true_calibration, 
 def test_a_probe_whose_counter_is_off_gives_no_points_and_is_reported(
     tmp_path, small_scan_blocks, true_calibration, samples
 ):
-    """The pairs are of different instants: whatever came of them would be no height."""
+    """The pairs are of different instants, so they give no valid height."""
     path = tmp_path / "off.mcap"
     with BagWriter(path, TOPICS) as bag:
         for axes, distance in small_scan_blocks[:20]:
@@ -178,7 +178,7 @@ def test_a_probe_whose_counter_is_off_gives_no_points_and_is_reported(
     summary = measure(path, true_calibration, tmp_path / "out", report=False)
     account = summary["samples"]["distance"]
     assert account["corrected"] == 0
-    assert account["counted"]["slipped"] >= 2000 - samples - 21  # but for what settles
+    assert account["counted"]["slipped"] >= 2000 - samples - 21  # except for the settling samples
     said = summary["warnings"]
     assert any(f"slipped by {samples} samples" in s for s in said)
     assert any(f"slipped by {samples} samples" in s for s in inspect_bag(path).faults)

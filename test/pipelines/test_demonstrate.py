@@ -1,4 +1,4 @@
-"""The demonstration as it is planned, and what it says of the truth."""
+"""Plan of the demonstration, and its comparison with the true values."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_the_folder_of_an_earlier_demonstration_is_cleared(tmp_path):
 
 
 def test_the_truth_holds_the_latency(true_calibration):
-    """Against a probe 0.34 ms late, the plant's own dynamics lead by ω · 0.34 ms."""
+    """Compared with a latency of 0.34 ms, the plant's dynamics lead by ω · 0.34 ms."""
     step = step_test_of(Demonstration(Path()).scenario, CATALOGUE["latency"][2])
     for row in response_errors(true_calibration, true_response(step)):
         assert row["gain_error"] == pytest.approx(0.0, abs=1e-9)

@@ -1,4 +1,4 @@
-"""The offset of two counters in a bag: as it was made, at any rate; or why it is not known."""
+"""The offset of two counters in a bag, at several rates, and errors if it is undetermined."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PATH = np.cumsum(SPEED)
 
 
 def streams(period: float, starts: int = 0) -> tuple[list[Block], list[Block]]:
-    """Both in blocks of 100; the probe's counter is ``starts`` ahead and its stamps know it."""
+    """Return blocks of 100; the probe's counter is ``starts`` ahead, with true stamps."""
     axes: list[Block] = []
     distance: list[Block] = []
     still = np.zeros(100)

@@ -10,7 +10,7 @@ from omsm_ros.pipelines.examine_host import DOUBTFUL, FAULTY, FINE
 
 @pytest.fixture
 def no_ros(monkeypatch):
-    """A computer that has no ROS."""
+    """Hide ROS."""
     find = host.importlib.util.find_spec
     monkeypatch.setattr(
         host.importlib.util, "find_spec", lambda name: None if name == "rclpy" else find(name)

@@ -1,4 +1,4 @@
-"""What other programs get: the same numbers, in their format, with their units."""
+"""Exported files hold the same numbers, in the format and units of other programs."""
 
 import csv
 import json
@@ -66,7 +66,7 @@ def test_a_map_lies_on_the_surface(result, tmp_path, suffix):
     # The cloud keeps x and y in single precision, which on a slope of 0.1 is 0.06 nm.
     assert np.sqrt(np.mean(error**2)) < 2 * done["interpolation_error"] + 0.1e-9
     assert done["interpolation_error"] < 1e-9
-    # What holds heights is the aperture, all of it.
+    # The whole aperture has heights.
     area = len(back) * done["spacing"][0] * done["spacing"][1]
     assert area == pytest.approx(np.pi * 25e-6, rel=0.08)
 
@@ -104,7 +104,7 @@ def test_hdf5_says_its_units(result, tmp_path):
 
 
 def test_pcd_is_read_by_its_own_words(result, tmp_path):
-    """By the header alone, as a reader does that knows nothing of us."""
+    """Read the file by its header, as an independent reader does."""
     export(result, tmp_path / "out.pcd")
     head, _, body = (tmp_path / "out.pcd").read_bytes().partition(b"DATA binary\n")
     words = dict(line.split(b" ", 1) for line in head.splitlines() if not line.startswith(b"#"))
@@ -120,7 +120,7 @@ def test_pcd_is_read_by_its_own_words(result, tmp_path):
 
 
 def test_other_programs_read_what_we_write(result, tmp_path):
-    """Where one is installed."""
+    """Read with an independent library if one is installed."""
     topography = pytest.importorskip("SurfaceTopography", reason="a peer, for x3p")
     export(result, tmp_path / "out.x3p")
     read = topography.open_topography(str(tmp_path / "out.x3p")).topography()

@@ -1,4 +1,4 @@
-"""The catalogue in a real PostgreSQL, started here on loopback where it is installed."""
+"""The catalogue in a real PostgreSQL, started on loopback if it is installed."""
 
 import json
 import os
@@ -20,14 +20,14 @@ pytest.importorskip("psycopg", reason="psycopg is an optional package")
 
 
 def _programs():
-    """Where the newest server of Debian's packages lies, or the one on PATH; None without one."""
+    """Return the folder of the newest server of Debian's packages, or on PATH; None without one."""
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb"))
     name = str(found[-1]) if found else shutil.which("initdb")
     return Path(name).resolve().parent if name else None
 
 
 def _user():
-    """PostgreSQL refuses to run as root: then it runs as nobody."""
+    """Run as user nobody if the tests run as root, which PostgreSQL refuses."""
     if os.geteuid() != 0:
         return []
     if shutil.which("runuser") is None:
@@ -37,7 +37,7 @@ def _user():
 
 @pytest.fixture(scope="module")
 def server():
-    """A server of its own: a port that is free, a folder that goes."""
+    """Start a server on a free port with a temporary folder."""
     programs, user = _programs(), _user()
     if programs is None:
         pytest.skip("PostgreSQL is not installed")
@@ -88,7 +88,7 @@ class Server:
 
     def stop(self):
         command = [*self._user, self._programs / "pg_ctl", "-D", self._data, "-m", "immediate"]
-        # Not running any more is what is wanted, too.
+        # It may have ended already.
         subprocess.run([*command, "stop"], check=False, capture_output=True, cwd=self._data.parent)
 
 
@@ -109,7 +109,7 @@ for i in range(10):
 
 
 def test_two_writers_and_a_server_that_goes_away(server, tmp_path, true_calibration):
-    """One test, for a server takes longer to start than to try."""
+    """One test for all, because starting a server takes long."""
     for writer in "ab":
         for i in range(10):
             result(tmp_path / writer / str(i))

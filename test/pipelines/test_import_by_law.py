@@ -1,4 +1,4 @@
-"""What is imported is the number of the file times its unit, at the count of its row, always."""
+"""An imported value is the number in the file times its unit, at the count of its row."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def imported(folder, mapping, text, name="t.csv"):
 def test_readings_come_out_in_si_at_their_triggers(
     tmp_path_factory, rows, unit, sign, marks, end, quoted
 ):
-    """Numbers of four decimals however they are written; gaps of the trigger are gaps."""
+    """Numbers of four decimals in any notation; gaps of the trigger stay gaps."""
     folder = tmp_path_factory.mktemp("law")
     mark, point = marks[0].replace("\\t", "\t"), marks[1]
     trigger = np.cumsum([step for step, _, _ in rows]) - 1
@@ -67,13 +67,13 @@ def test_readings_come_out_in_si_at_their_triggers(
         f"  distance: {{name: D, unit: {unit}}}\n"
     )
     if max(abs(v) for v in d) * METRES[unit] > 100:
-        return  # farther than any probe looks
+        return  # beyond the range of any probe
     found = imported(folder, mapping, end.join(lines) + end)
     axes, distance = found[bags.AXES_TOPIC], found[bags.DISTANCE_TOPIC]
     for blocks in (axes, distance):
         counts = np.concatenate([b.first_sample + np.arange(len(b)) for b in blocks])
         assert counts.tolist() == trigger.tolist()
-        # One block for each run of numbers that follow each other.
+        # One block for each run of consecutive numbers.
         assert len(blocks) == 1 + int(np.sum(np.diff(trigger) != 1))
     assert np.concatenate([b.z for b in axes]).tolist() == [v * (1e-9 * sign) for v in z]
     assert np.concatenate([b.distance for b in distance]).tolist() == [v * METRES[unit] for v in d]
@@ -101,7 +101,7 @@ def test_what_means_no_reading_is_lost_and_the_others_stay(tmp_path_factory, cel
 
 @pytest.mark.parametrize("kind", [".npy", ".npz", ".mat"])
 def test_arrays_of_any_program_are_the_same_table(tmp_path, kind):
-    """Written by numpy and scipy; to the last bit."""
+    """Files of numpy and scipy are read to the last bit."""
     table = np.column_stack([np.arange(20.0), np.sin(np.arange(20.0)) * 1e-3])
     path, name = tmp_path / f"t{kind}", "t"
     if kind == ".npy":
@@ -120,7 +120,7 @@ def test_arrays_of_any_program_are_the_same_table(tmp_path, kind):
     assert block.first_sample == 0
 
 
-# How rows are counted.
+# Counting of rows.
 
 
 def counter(timed=False, triggered=False, period=1e-3):
@@ -129,7 +129,7 @@ def counter(timed=False, triggered=False, period=1e-3):
 
 
 def cut(table, edges):
-    """The table in pieces, none of them empty, as every reader gives them."""
+    """Return the table in non-empty pieces, as readers do."""
     count = len(table["d"])
     inner = (edge for edge in edges if edge < count)
     return [
@@ -146,14 +146,14 @@ def cut(table, edges):
 def test_rows_are_counted_alike_however_a_file_is_read_in_pieces(
     timed, triggered, steps, edges, start
 ):
-    """By trigger, by time, or one by one; time may begin anywhere, and counts from zero."""
-    # As many even steps first as tell the period: a gap is one among many.
+    """Rows are counted by trigger, by time, or one by one; time may have any origin."""
+    # Enough even steps first to determine the period, before a gap.
     number = np.cumsum([0] + [1] * 20 + steps) + (start if triggered else 0)
     table = {"n": number.astype(float), "t": 5.0 + number * 1e-3, "d": np.zeros(len(number))}
     found = []
     for pieces in (cut(table, edges), cut(table, [])):
         rows = counter(timed, triggered)
-        # Two rows at least tell a period.
+        # Two rows at least determine a period.
         zero, period = rows.begin(table)
         assert period == pytest.approx(1e-3)
         if timed:

@@ -30,7 +30,7 @@ columns:
 
 
 def write_shop_csv(path, recording):
-    """A German control's log: millimetres, degrees, Z towards the part, decimal commas."""
+    """Write the log of a German control: mm, degrees, Z towards the part, decimal commas."""
     axes, gap = recording.axes, recording.distance.distance
     columns = (axes.x * 1e3, -axes.z * 1e3, np.degrees(axes.c), gap * 1e6)
     with path.open("w", encoding="cp1252", newline="\r\n") as file:
@@ -61,7 +61,7 @@ def clouds(folder, calibration, bags):
 
 
 def assert_the_same_cloud(one, other):
-    """To the digits that a change of units costs: 1e-15 of the stroke and of the turns."""
+    """Equal to the rounding of the units: 1e-15 of the stroke and of the turns."""
     (points, summary), (again, summary_again) = one, other
     assert len(points) == len(again)
     for name in ("x", "y", "height", "dynamic_error"):
@@ -80,7 +80,7 @@ def test_a_scan_as_csv_gives_the_cloud_of_its_bag(tmp_path, small_scan, true_cal
 
 @pytest.mark.soak
 def test_axes_at_half_the_rate_join_the_probe_by_their_stamps(tmp_path, small_scan):
-    """Two loggers with rates of their own: the cloud is that of one, but for a spline's share."""
+    """Two loggers of different rates give the cloud of one, except for spline interpolation."""
     time = np.arange(len(small_scan.axes)) * 1e-3
     axes, gap = small_scan.axes, small_scan.distance.distance
     rows = np.column_stack([time, axes.x * 1e3, axes.z * 1e3, np.degrees(axes.c)])[::2]

@@ -30,16 +30,16 @@ columns:
 
 
 def columns(blocks):
-    """All samples of pairs of blocks, as arrays."""
+    """Return all samples of pairs of blocks as arrays."""
     axes = {a: np.concatenate([getattr(b, a) for b, _ in blocks]) for a in "xyzbc"}
     return {**axes, "distance": np.concatenate([d.distance for _, d in blocks])}
 
 
 def write_csv(path, samples, rows=slice(None)):
-    """What a shop's own logger writes: its units, its signs, its order."""
+    """Write a CSV file as a logger of a workshop does, with other units, signs and order."""
     n = np.arange(len(samples["z"]))[rows]
     lines = ["probe,n,X,Z,C,note"]
-    # As many digits as a float has, so that nothing is lost but in the units.
+    # All digits of a float, so that only the units cause rounding.
     d, x = samples["distance"] / 1e-9, samples["x"] * 1e3
     z, c = -samples["z"] * 1e6, np.degrees(samples["c"])
     lines += [f"{float(d[i])!r},{i},{float(x[i])!r},{float(z[i])!r},{float(c[i])!r},ok" for i in n]
@@ -97,7 +97,7 @@ def test_a_step_test_as_csv_gives_the_calibration_of_its_bag(capsys, tmp_path, s
         cli.main(["identify", str(tmp_path / f"{name}.mcap"), "--out", str(out), "--order", "2"])
         calibrations.append(json.loads(out.read_text()))
     one, other = calibrations
-    # Digits lost in the units move the search's end a little: the lag by some 20 ns.
+    # Rounding of the units moves the end of the search a little: the lag by some 20 ns.
     for name in ("numerator", "denominator"):
         assert one[name] == pytest.approx(other[name], rel=1e-4)
     assert one["delay"] == pytest.approx(other["delay"], abs=1e-7)
@@ -221,7 +221,7 @@ def test_decimal_commas(tmp_path):
 
 
 def test_decimal_commas_that_the_map_does_not_tell_are_no_other_number(tmp_path):
-    # "1,25,3,5" has four cells under two names: the third would be taken for the second.
+    # "1,25,3,5" has four cells under two names, so that columns would be shifted.
     with pytest.raises(FileError, match="line 2"):
         distances(tmp_path, "d,e\n1,25,3,5\n2,5,4,5\n")
     with pytest.raises(FileError, match="decimal: ','"):

@@ -40,7 +40,7 @@ RANGE = '  distance: {name: "/probe.range", unit: m}\n'
 
 
 class Cdr:
-    """Little-endian CDR: each number at a multiple of its size, after four bytes of header."""
+    """Write little-endian CDR: numbers aligned to their size, after four bytes of header."""
 
     def __init__(self):
         self.data = bytearray()
@@ -133,7 +133,7 @@ def test_joints_and_a_range_become_axes_and_distance(importer):
     np.testing.assert_allclose(axes.x, x, rtol=1e-15)
     np.testing.assert_allclose(axes.z, z, rtol=1e-15)
     np.testing.assert_allclose(axes.c, c, rtol=1e-15)
-    # A float32 of 20 mm ends at 2 nm: what Range carries, no more.
+    # A float32 of 20 mm resolves 2 nm, the resolution of a Range message.
     np.testing.assert_allclose(distance.distance, 0.02 - z, atol=2e-9)
     assert axes.stamp_ns == distance.stamp_ns == START_NS
     assert axes.sample_period == pytest.approx(1e-3, rel=1e-6)
@@ -246,7 +246,7 @@ def test_what_a_map_of_topics_leaves_unclear_is_asked_for(importer, mapping, sai
 
 
 def test_a_sqlite_bag_without_definitions(importer):
-    """As ros2 bag of Humble wrote it: a folder of metadata.yaml and a database."""
+    """Write a bag as ros2 bag of Humble does: a folder of metadata.yaml and a database."""
     folder = importer.folder / "old"
     folder.mkdir()
     messages = list(ranges(40))

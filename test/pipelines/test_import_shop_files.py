@@ -1,4 +1,4 @@
-"""Text as loggers, controls and spreadsheets write it: read rightly, or refused in one line."""
+"""Text of loggers, controls and spreadsheets is read correctly, or refused in one line."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ DATED = "columns:\n  time: {name: t, unit: date}\n  distance: {name: d, unit: um
 
 @pytest.fixture
 def read(importer):
-    """Distances [µm] of a text under a map."""
+    """Return the distances [µm] of an imported text."""
 
     def distances(text, mapping=PROBE, encoding="utf-8"):
         data = text if isinstance(text, bytes) else text.encode(encoding)
@@ -24,7 +24,7 @@ def read(importer):
 
 
 def refusal(read, *given):
-    """The one line that says what is wrong; no bag appears."""
+    """Return the error line; no bag is written."""
     with pytest.raises(OmsmError) as caught:
         read(*given)
     assert not read.importer.out.exists()
@@ -33,7 +33,7 @@ def refusal(read, *given):
     return said
 
 
-# Read rightly.
+# Read correctly.
 
 
 @pytest.mark.parametrize(
@@ -118,7 +118,7 @@ def test_seconds_since_1970_set_the_clock(read):
 def test_parts_of_a_second_since_1970_set_the_clock_where_they_are_reported(read, unit, scale):
     rows = [f"{round((1763200000.25 + i / 100) * scale)},{i}" for i in range(3)]
     text = "\n".join(["t,d", *rows])
-    # Told otherwise, the date would be lost, or another one made of it.
+    # Another unit would lose or change the date.
     for other in ("unix", unit):
         said = refusal(read, text, DATED.replace("date", other))
         assert f"write unit: unix_{unit}" in said
@@ -178,7 +178,7 @@ def test_a_trigger_that_does_not_count_is_named_with_its_file(read, rows, said):
     ],
 )
 def test_what_would_be_another_number_is_refused(read, text, more, said):
-    if "１" in text:  # digits of another script are digits to Python, and to us
+    if "１" in text:  # Python reads digits of other scripts, too
         assert read(text) == pytest.approx([12.0])
         return
     assert said in refusal(read, text, PROBE + more).replace("\n", " ")
@@ -208,7 +208,7 @@ def test_a_non_text_file_is_reported_with_its_kind(read, data, said):
         (["45982.58,1"], "", "ISO 8601"),
         (["2026-13-41T14:03:05Z,1"], "", "line 2"),
         (["2026-11-21T14:03:05+25:00,1"], "", "ISO 8601"),
-        # 2**64 ns after 2026-11-21: 64 bits of nanoseconds would call it that day.
+        # 2**64 ns after 2026-11-21, which 64-bit nanoseconds would wrap to that day.
         (["2611-06-11T13:37:38.709Z,1"], "", "from 1700-01-01 to 2261-12-31"),
         (["2026-11-21T14:03:05Z,1"], "zone: Z\n", "leave zone out"),
         (["2026-11-21T14:03:05Z,1"] * 3, "", "too coarsely"),
@@ -322,7 +322,7 @@ def test_a_name_that_yaml_reads_otherwise_wants_quotes(read):
 
 
 def test_side_by_side_by_time_though_one_begins_later(importer):
-    """Rows belong together by time, not by their places."""
+    """Rows are paired by time, not by their position."""
     time = np.arange(0, 1, 0.001)
     z = ["t,Z", *(f"{t:.3f},{t}" for t in time)]
     gap = ["t,d", *(f"{t:.3f},{-t}" for t in time[250:])]

@@ -18,7 +18,7 @@ def structured():
 
 
 def written(path):
-    """One record of a logger, in the file's own kind of structure; the name of its field."""
+    """Write one record of a logger as a structure of the format; return the name of its field."""
     if path.suffix == ".npy":
         np.save(path, structured())
         return "gap"
@@ -49,7 +49,7 @@ MAPPING = "sample_period: 0.001\ncolumns:\n  distance: {name: gap, unit: um}\n"
 
 @pytest.mark.parametrize(
     ("version", "place", "value"),
-    # The class of an array (sparse, but its content is not), the tag of its name, and VAX numbers.
+    # A sparse class without sparse content, a wrong tag of the name, and VAX numbers.
     [("5", 144, 5), ("5", 176, 0x10000), ("4", 0, 2000)],
 )
 def test_a_matlab_file_that_ends_or_misleads_its_reader_is_refused(

@@ -1,4 +1,4 @@
-"""Channels of TDMS files, written here byte by byte after the description of the format."""
+"""Channels of TDMS files, written byte by byte as the format is specified."""
 
 import struct
 
@@ -99,7 +99,7 @@ def test_channels_that_were_not_sampled_together_are_refused(importer, tdms_file
     tdms_file.write_bytes(tdms(channels, reported))
     with pytest.raises(FileError, match=f"{key} 0.001 of 'log/gap' and 0.002 of 'log/n'"):
         importer(TDMS_MAP + "  trigger: {name: log/n}\n", "a.tdms")
-    importer(TDMS_MAP, "a.tdms")  # what is not read may be as it is
+    importer(TDMS_MAP, "a.tdms")  # channels that are not read may be damaged
 
 
 SLOPE = {"NI_Number_Of_Scales": 1.0, "NI_Scale[0]_Linear_Slope": 2.0}

@@ -1,4 +1,4 @@
-"""From a cloud on disk to what ``form.json`` says."""
+"""From a cloud on disk to ``form.json``."""
 
 import json
 import shutil
@@ -31,7 +31,7 @@ class Mirror:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A cloud with tip, tilt and piston of the part, noise of 10 nm, and dust."""
+    """Write a cloud with tip, tilt and piston of the part, noise of 10 nm, and dust."""
     folder = tmp_path_factory.mktemp("form")
     rng = np.random.default_rng(3)
     r, angle = np.linspace(RADIUS, 0, POINTS), np.linspace(0, 160 * np.pi, POINTS)
@@ -91,7 +91,7 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
 
 
 def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(folder, tmp_path):
-    """The part was not moved: its terms are those of the truth, and how sure that is, is said."""
+    """For an unmoved part the terms are the true ones within their stated uncertainty."""
     _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
     found = json.loads(path.read_text())
     assert found["removed"]["fitted"] == ["piston", "tip", "tilt"]
@@ -111,7 +111,7 @@ def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(fold
 
 
 def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp_path):
-    """Against least squares of the truth by differences of the twin's own part in six poses."""
+    """Compare with least squares by finite differences of the twin's part in six poses."""
     _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
     figures = json.loads(path.read_text())["deviation"]
     r, angle = RADIUS * np.sqrt(np.linspace(0, 1, 5000)), np.arange(5000) * 2.4
@@ -187,7 +187,7 @@ def test_a_folder_without_a_cloud_is_named(tmp_path, folder, capsys):
 
 
 def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
-    """20 nm of astigmatism that the instrument may have, in the fields beside the cloud."""
+    """Write 20 nm of possible astigmatism of the instrument into the systematic fields."""
     known = tmp_path / "known"
     shutil.copytree(folder, known)
     cloud = CloudFile(known / CLOUD).read()
@@ -207,7 +207,7 @@ def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
     )
     assert after[2, 2] == pytest.approx(20e-9, rel=0.02)
     assert after[3, 3] == pytest.approx(before[3, 3], rel=0.5)
-    # A tilt of the instrument goes into the pose, and leaves the form.
+    # A tilt of the instrument affects the pose, not the form.
     spindle = reported["removed"]["pose_uncertainty"]["spindle"]
     assert spindle["tilt"] == pytest.approx(3e-9 / RADIUS, rel=0.02)
     for name in ("peak_to_valley", "robust_peak_to_valley", "rms"):
@@ -215,7 +215,7 @@ def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
 
 
 def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path):
-    """It may be there or not: the figures say what was seen, and are that much less certain."""
+    """A possible error does not change the figures, but increases their uncertainty."""
     cloud = CloudFile(folder / CLOUD).read()
     u, v = (np.float64(cloud[name][::10]) / RADIUS for name in ("x", "y"))
     fields = 80e-9 * (u**2 - v**2)[np.newaxis]
@@ -237,7 +237,7 @@ def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path
 
 
 def test_the_deviations_are_left_for_other_programs(folder, tmp_path):
-    """As a map over the part, which our own reader takes like any other."""
+    """The deviation is written as a map over the part that the map reader accepts."""
     _, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)
     left = read_points(tmp_path / "deviation.ply")
     assert len(left.x) == json.loads(path.read_text())["points"]["used"]
@@ -246,7 +246,7 @@ def test_the_deviations_are_left_for_other_programs(folder, tmp_path):
 
 
 def test_a_map_of_another_program_goes_the_same_way(folder, tmp_path):
-    """Text in millimetres and nanometres; what it cannot tell is not evaluated."""
+    """Text in millimetres and nanometres; unknown systematic errors are not evaluated."""
     cloud = CloudFile(folder / CLOUD).read()[::4]
     text = np.stack([cloud["x"] * 1e3, cloud["y"] * 1e3, cloud["height"] * 1e9], axis=1)
     np.savetxt(tmp_path / "map.xyz", text, fmt="%.9g")
@@ -267,7 +267,7 @@ def test_a_scan_without_its_calibration_is_distinguished_from_a_map(folder, tmp_
 
 
 def test_a_fitted_move_that_masks_form_gives_a_warning(folder, tmp_path):
-    """Over a small disc a shift and astigmatism are one; held, the same points say much more."""
+    """On a small disc a shift cannot be separated from astigmatism; held, the form is certain."""
     words = ("--aperture", RADIUS / 6)
     notes = {}
     for fit in ("auto", "piston,tip,tilt"):

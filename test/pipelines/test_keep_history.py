@@ -1,4 +1,4 @@
-"""The catalogue: rows once, several writers, databases that fail, drift over months."""
+"""The catalogue: unique rows, several writers, failing databases, drift over months."""
 
 import dataclasses
 import json
@@ -24,7 +24,7 @@ FIRST_NS = 1_767_225_600 * 10**9  # 2026-01-01
 
 @pytest.fixture
 def address(tmp_path):
-    """Of an SQLite file, or of a server that the environment names, emptied."""
+    """Return the address of an empty catalogue: SQLite, or the server of the environment."""
     return str(tmp_path / "catalogue.sqlite")
 
 
@@ -44,7 +44,7 @@ def result(folder, bag="scan.mcap", rms=17e-9):
 
 
 def aged(calibration, delay):
-    """The same machine with another lag, as identified on another day."""
+    """Return a calibration of the same machine with another lag."""
     dynamics = dataclasses.replace(calibration.dynamics, delay=delay)
     return dataclasses.replace(calibration, dynamics=dynamics, settings={"machine": "lathe 1"})
 
@@ -102,7 +102,7 @@ def test_drift_of_a_machine_is_found_over_days(
 
 
 def test_a_clock_that_was_never_set_tells_no_time(tmp_path, small_scan_blocks):
-    """As of the twin, whose stamps count from zero: 1970 is when nothing was recorded."""
+    """Stamps of the twin count from zero, which is no date."""
     block = next(iter(small_scan_blocks))
     for day, known in ((-FIRST_NS // DAY_NS, None), (0, FIRST_NS)):
         with bags.BagReader(_bag(tmp_path / f"{day}.mcap", day, block)) as bag:

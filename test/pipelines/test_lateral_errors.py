@@ -1,4 +1,4 @@
-"""Points shifted sideways cost height by the slope of the surface, whether it was given or not."""
+"""Lateral errors change heights by the slope of the surface, with and without a nominal one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A measurement opened again: every point once, in its order, with the fields beside it."""
+"""Reading a measurement again: every point once, in order, with its systematic fields."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_all_points_come_in_their_order_whatever_the_portions(result, monkeypatc
     monkeypatch.setattr(form, "_PORTION", size)
     measured = open_measurement(result if whole else result / "cloud.ply")
     cloud = CloudFile(result / "cloud.ply").read()
-    for again in range(2):  # they can be read as often as one likes
+    for again in range(2):  # they can be read repeatedly
         columns, effects = joined(measured)
         for name, values in zip(("x", "y", "height"), columns, strict=True):
             assert values.dtype == np.float64
@@ -52,7 +52,7 @@ def test_all_points_come_in_their_order_whatever_the_portions(result, monkeypatc
 
 @pytest.mark.parametrize("size", [1, 64, 300, 5000])
 def test_fields_are_lines_between_their_points_across_portions(result, monkeypatch, size):
-    """Of every 37th point one is stored: each field linear between them, as numpy has it."""
+    """Fields are stored for every 37th point and interpolated linearly, as by numpy."""
     monkeypatch.setattr(form, "_PORTION", size)
     every, rng = 37, np.random.default_rng(1)
     kept = rng.normal(size=(2, -(-COUNT // every) + 1)).astype(np.float32)
@@ -104,7 +104,7 @@ def test_missing_input_is_reported_with_the_option_to_give(tmp_path):
 
 
 def test_fields_of_others_are_not_taken_for_those_of_a_map(result):
-    """Beside a map of another name they are of the cloud, not of it."""
+    """Fields next to a map of another name belong to the cloud."""
     save_fields(result / "systematic.npz", ScanFields(("tilt",), np.ones((1, 3)), 500))
     (result / "map.xyz").write_text("x_m y_m z_m\n0 0 1\n1 0 2\n0 1 3\n")
     measured = open_measurement(result / "map.xyz")

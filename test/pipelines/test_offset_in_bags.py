@@ -1,4 +1,4 @@
-"""Two counters that were not started together, in a bag: the motion tells by how much."""
+"""The offset of two counters that were not started together, determined from the motion."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ PROMPT = Calibration(
 
 
 def motion(time):
-    """Of no period within this record: steps of a walk, smooth at a sample."""
+    """Return a motion without a period in this record."""
     rng = np.random.default_rng(4)
     return sum(1e-6 * rng.normal() * np.sin(2 * np.pi * f * time + rng.uniform(0, 6))
                for f in rng.uniform(0.3, 30, 40))  # fmt: skip
 
 
 def write(path, ahead=0, *, late=0.0, stamp_off=0.0, lost=(), start=0, size=100, count=COUNT):
-    """Axes from ``start``; the probe counts ``ahead`` more for the same instant, and lags.
+    """Write axes from ``start``; the probe counts ``ahead`` more for the same instant, and lags.
 
     stamp_off: by which the probe's stamps are late [s];  lost: blocks of the probe that are missing
     """
@@ -59,7 +59,7 @@ def write(path, ahead=0, *, late=0.0, stamp_off=0.0, lost=(), start=0, size=100,
      (10**6, 0, 0.05), (-90_000, 10**5, 0.2)],
 )  # fmt: skip
 def test_the_offset_is_found_to_the_sample(tmp_path, ahead, start, stamp_off):
-    """However far the counters are apart, where stamps are off by less than a quarter second."""
+    """Any offset is found if stamps are off by less than a quarter second."""
     found = established_offset(
         write(tmp_path / "a.mcap", ahead, start=start, stamp_off=stamp_off), PROMPT
     )
@@ -80,7 +80,7 @@ def test_gaps_and_a_probe_that_begins_later_are_no_hindrance(tmp_path):
 
 
 def test_what_the_calibration_knows_of_the_lag_is_no_offset(tmp_path):
-    """A lag of 0.4 samples that is known leaves no fraction; unknown, it is told as one."""
+    """A known lag of 0.4 samples leaves no fraction; an unknown one is reported as a fraction."""
     path = write(tmp_path / "a.mcap", 5, late=0.4 * PERIOD)
     known = replace(PROMPT, dynamics=TransferFunction([1.0], [1.0], 0.4 * PERIOD))
     found = established_offset(path, known)

@@ -1,4 +1,4 @@
-"""The paper's experiments: what Eq. 12 and Table 1 say comes out, and the page sets it beside."""
+"""The paper's experiments reproduce Eq. 12 and Table 1, and the page compares them."""
 
 import json
 from dataclasses import replace
@@ -17,7 +17,7 @@ from omsm_ros.twin.scenario import Scenario
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch, true_calibration):
-    """Identification has tests of its own, and takes its time."""
+    """Replace the identification, which is slow and has its own tests."""
     monkeypatch.setattr(paper_experiments, "_calibrated", lambda seed: true_calibration)
 
 
@@ -56,14 +56,14 @@ def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
     assert raw > after
     page = (tmp_path / "m/report.html").read_text()
     assert "290 011 in 6 minutes" in page.replace("\u202f", " ")
-    # Beside the page it is a measurement like any other, which can be judged again.
+    # The folder is a complete measurement that can be evaluated again.
     assert json.loads((tmp_path / "m/summary.json").read_text())["samples"]
-    # Fig. 8 is maps before and after, and sections.
+    # Fig. 8 shows maps before and after, and sections.
     assert page.count("data:image/png") == 5
 
 
 def test_an_experiment_leaves_what_is_measured_alone(tmp_path, monkeypatch):
-    """Neither somebody's recording nor a measurement is replaced by the twin's; a second run is."""
+    """A recording or measurement is not overwritten; an earlier experiment is."""
 
     def quick(out, seed):
         (out / "chirp.mcap").write_text(f"of seed {seed}")

@@ -1,4 +1,4 @@
-"""The page of a finished correction is the one that the correction itself would have written."""
+"""The report written later equals the one that the correction writes itself."""
 
 import json
 import re

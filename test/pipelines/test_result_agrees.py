@@ -1,4 +1,4 @@
-"""The files of one measurement say one and the same: cloud, summary, form, page and map.
+"""The files of one measurement agree: cloud, summary, form, page and map.
 
 Read by Python's own library; the figures made again from the points by closed form and loops.
 """
@@ -48,7 +48,7 @@ def result(tmp_path_factory, small_scan_blocks, true_calibration):
 
 
 def strict(path):
-    """JSON by the letter of RFC 8259: no NaN, no name twice."""
+    """Parse JSON strictly by RFC 8259: no NaN, no repeated name."""
 
     def once(pairs):
         assert len(dict(pairs)) == len(pairs)
@@ -111,12 +111,12 @@ def test_the_deviation_is_that_of_the_points_from_the_mirror(cloud, summary):
     for name, values in (("corrected", away), ("raw", away + cloud["dynamic_error"])):
         reported = summary["deviation"][name]
         assert reported["peak_to_valley"] == pytest.approx(np.ptp(values), abs=1e-9)
-        # About some mean: piston is no form.
+        # About a mean value, as piston is not form.
         assert reported["rms"] == pytest.approx(np.std(values), rel=0.02)
 
 
 def test_the_budget_adds_up_to_the_uncertainty_of_the_points(cloud, summary):
-    """Root of the sum of squares: the mean square over the scan of what each source adds."""
+    """The budget is the root of the sum of squares of the sources."""
     parts = [size for name, size in summary["uncertainty_budget"].items()]
     reported = math.sqrt(sum(part**2 for part in parts))
     found = math.sqrt(float(np.mean(cloud["uncertainty"] ** 2)))
@@ -186,7 +186,7 @@ def test_the_map_of_the_page_is_that_of_the_deviation(result):
 
 
 def test_the_same_bag_gives_the_same_bytes(result, summary, true_calibration, tmp_path):
-    """But for the page, which has the hour at which it was made."""
+    """Except for the page, which states the time of its creation."""
     measure(
         result.parent / "scan.mcap", true_calibration, tmp_path, nominal=PAPER_MIRROR,
         accuracy=1e-6, report=False,

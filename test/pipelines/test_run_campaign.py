@@ -1,4 +1,4 @@
-"""A campaign corrects every bag, survives what happens to one, and goes on where it was."""
+"""A campaign corrects every bag, survives a crash of one, and continues where it was."""
 
 import json
 import os
@@ -94,7 +94,7 @@ def test_a_killed_process_costs_its_bag_and_no_other(shop, tmp_path, monkeypatch
 
 
 def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monkeypatch):
-    """Dask gives up a task that took four workers along, and raises what it calls it."""
+    """Dask gives up a task that killed four workers, and raises its own error."""
 
     class KilledWorker(Exception):
         pass

@@ -1,4 +1,4 @@
-"""What a surface asks of probe and axes, against closed forms."""
+"""Slopes and limits of a nominal surface, against closed forms."""
 
 import json
 

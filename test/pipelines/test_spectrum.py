@@ -1,4 +1,4 @@
-"""``omsm spectrum`` on bags of the twin: the paper's four scans, its page and its numbers."""
+"""``omsm spectrum`` on bags of the paper's four scans on the twin."""
 
 import json
 
@@ -25,7 +25,7 @@ SPEEDS = {"F1": 0.14, "F2": 1.875, "F3": 15.0}
 
 
 def scan(name, rpm):
-    """Flat marks of 15 µm; from F3 on the machine shakes at 680 Hz."""
+    """Write scans of marks of 15 µm; in F3 and F4 the machine vibrates at 680 Hz."""
     shaking = (VibrationLine(amplitude_m=5e-9, frequency_hz=680.0),) if rpm > 10 else ()
     errors = Disturbances(
         vibration=shaking,

@@ -1,4 +1,4 @@
-"""The folder of a spectrum holds what its last run made, and nothing of a run before it."""
+"""The folder of a spectrum holds only files of the last run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def scan(name, count, removed=0.25):
 
 @pytest.fixture
 def publish(monkeypatch, tmp_path):
-    """What is studied of each scan is not asked here: only what comes of it."""
+    """Replace the analysis; these tests are about files only."""
     monkeypatch.setattr(publish_spectrum, "summary_of", lambda scans, _: {"scans": len(scans)})
 
     def made(counts, stop=((1.0, 2.0),)):
@@ -81,7 +81,7 @@ def test_a_run_that_fails_leaves_the_earlier_one(publish, tmp_path, monkeypatch)
 
 
 def test_a_cloud_of_that_name_that_is_no_result_stays(publish, tmp_path):
-    """Without a spectrum.json beside it, nobody knows whose it is."""
+    """Without a spectrum.json, files of that name are not removed."""
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "band_stopped_9.ply").write_text("mine")
     publish([5])

@@ -1,4 +1,4 @@
-"""A scan that two drivers recorded side by side: the same points, however each cut its stream."""
+"""A scan recorded by two drivers gives the same points for any block lengths."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LOST = {"axes": [(12_000, 12_100), (30_000, 30_700)], "distance": [(20_032, 20_0
 
 
 def pieces(block, length, gaps):
-    """``block`` in blocks of ``length`` samples, without those of the gaps."""
+    """Yield ``block`` in blocks of ``length`` samples, without those of the gaps."""
     edges = [0, *(edge for gap in gaps for edge in gap), len(block)]
     names = "xyzbc" if isinstance(block, AxisBlock) else ("distance", "intensity", "status")
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
@@ -38,7 +38,7 @@ def pieces(block, length, gaps):
 
 
 def record(path, blocks, lengths, seed, lost):
-    """Write what two drivers send: counters apart, stamps and delivery uneven each by itself."""
+    """Write the streams of two drivers with different counters and uneven stamps and delivery."""
     random, messages = np.random.default_rng(seed), message_mapping.bag_messages()
     sent = []
     for (topic, gaps), stream, length in zip(

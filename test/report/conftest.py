@@ -24,7 +24,7 @@ def mirror():
 
 @pytest.fixture(scope="session")
 def cloud(mirror):
-    """A spiral over a mirror with a figure error; the dynamic error is 0.6 µm of ρ² sin 2θ."""
+    """Return a spiral over a mirror with a form error; the dynamic error is 0.6 µm of ρ² sin 2θ."""
     share = np.arange(POINTS) / POINTS
     radius, angle = PAPER_MIRROR_RADIUS_M * (1 - share), 2 * np.pi * TURNS * share
     x, y = radius * np.cos(angle), radius * np.sin(angle)
@@ -43,7 +43,7 @@ def cloud(mirror):
 
 @pytest.fixture(scope="session")
 def certified(true_calibration):
-    """Accepted, with a covariance that makes the band visible."""
+    """Return an accepted calibration with a covariance that makes the band visible."""
     variance = (0.01 * np.r_[true_calibration.dynamics.numerator[1:], 0.0]) ** 2
     size = len(true_calibration.covariance)
     covariance = np.zeros((size, size))
@@ -61,7 +61,7 @@ def certified(true_calibration):
 
 @pytest.fixture
 def summary():
-    """All that ``summary.json`` may say."""
+    """Return a complete content of ``summary.json``."""
     stream = {"received": 40_040, "corrected": 40_000, "pending": 0, "counted": {"settling": 40}}
     form = {
         "peak_to_valley": 179e-9,

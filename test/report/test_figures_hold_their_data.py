@@ -1,4 +1,4 @@
-"""What figures draw are the arrays that they are given, in the unit that their axes name."""
+"""Figures draw the given arrays in the units of their axes."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_the_difference_below_is_a_less_b_above(found, name):
 
 
 def test_a_profile_is_the_mean_of_the_points_along_its_line(found):
-    """By a loop over all places: each value lies among those near its place on the line."""
+    """Compare with a loop: each value is within the range of its neighbours on the line."""
     lower = difference_figures.profiles(found)["profile_x"].axes[1]
     (line,) = points_of(lower, "A − B")
     matched = found.matched
@@ -218,7 +218,7 @@ def test_errors_and_lags_of_a_free_path_are_those_of_their_bands():
 
 
 def studied(name="scan", count=4096, speed=0.01, seed=0, tone=None):
-    """White noise of 2 nm on a scan that runs evenly along its path."""
+    """Return white noise of 2 nm on a scan with constant speed along its path."""
     sample = np.arange(count)
     path = sample * 1e-3 * speed
     values = np.random.default_rng(seed).normal(0, 2e-9, count)

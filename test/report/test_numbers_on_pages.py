@@ -1,4 +1,4 @@
-"""Every number on a page is the number of the file beside it, to the digits that it shows."""
+"""Every number on a page equals that of the file, to the digits shown."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.spectrum import SpectrumPage
 from omsm_ros.report.spectrum import render as render_spectrum
 
-# Whatever a machine may give: from picometres to metres, and what nobody knows.
+# Any value from picometres to metres, and unknown ones.
 LENGTH = st.floats(1e-12, 1.0)
 KNOWN = st.one_of(st.none(), LENGTH)
 COUNT = st.integers(0, 10**9)

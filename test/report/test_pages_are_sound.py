@@ -153,14 +153,14 @@ PAGES = (report, spectrum, study, experiment, campaign, certificate, model, live
 
 @pytest.fixture(scope="module")
 def clean(true_calibration):
-    """Each page with harmless words everywhere, as long as the attack: long cells are wider."""
+    """Return each page with harmless words as long as the attack, as long cells are wider."""
     words = ("word " * 99)[: len(ATTACK) - 1] + "s"
     return {kind: kind(words, true_calibration) for kind in PAGES}
 
 
 @pytest.mark.parametrize("kind", PAGES)
 def test_text_from_outside_changes_no_tag_and_no_attribute(kind, clean, true_calibration):
-    """The page of an attack has the very tags of the page of a word, and its text says the rest."""
+    """The page of an attack has the same tags as the harmless page, and the attack as text."""
     hostile = Page(kind(ATTACK, true_calibration))
     harmless = Page(clean[kind])
     assert hostile.tags == harmless.tags
@@ -171,7 +171,7 @@ def test_text_from_outside_changes_no_tag_and_no_attribute(kind, clean, true_cal
 
 @pytest.mark.parametrize("kind", PAGES)
 def test_a_page_is_one_file(kind, clean):
-    """Nothing is fetched, no element has an action, and its policy forbids all but its own."""
+    """Nothing is fetched, no element has an action, and the policy allows only its own script."""
     page = Page(clean[kind])
     for key, value in page.attributes:
         assert not key.startswith("on"), key
@@ -190,7 +190,7 @@ def test_a_page_is_one_file(kind, clean):
 
 @pytest.mark.parametrize("kind", PAGES)
 def test_every_script_is_one_that_the_policy_names(kind, clean):
-    """By its hash, as a browser computes it; data are no script."""
+    """The script is allowed by its hash; data are no script."""
     html = clean[kind]
     (policy,) = re.findall(r'content="(default-src[^"]*)"', html)
     allowed = set(re.findall(r"'sha256-([^']+)'", policy.replace("&#39;", "'")))
@@ -221,7 +221,7 @@ def test_a_map_in_a_page_is_json_whatever_its_layer_is_called(true_calibration):
 
 
 def test_a_link_of_a_campaign_leads_where_the_page_lies(true_calibration):
-    """A name that begins with a minus, as of an angle, must not be typeset in its address."""
+    """A name that begins with a minus must not be typeset in its link."""
     names = ["-5", "a/-12.5", "-30%20mm", "b 7 mm", 'q"uote']
     rows = [CampaignEntry(n, "done", "", None, f"{n}/report.html", {}) for n in names]
     page = Page(render_campaign("Campaign", rows, true_calibration))

@@ -104,7 +104,7 @@ class TestStepResponse:
     TIME = 1e-3 * np.arange(3000)
 
     def recorded(self):
-        """Two edges, the second the steeper one; the probe is late by 5 ms and stands 7 µm off."""
+        """Return two edges, the second steeper; the probe lags by 5 ms with an offset of 7 µm."""
         encoder = 5e-6 * np.clip((self.TIME - 0.5) / 0.1, 0, 1)
         encoder = encoder + 10e-6 * np.clip((self.TIME - 2.0) / 0.02, 0, 1)
         late = np.r_[np.full(5, encoder[0]), encoder[:-5]]

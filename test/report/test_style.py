@@ -96,7 +96,7 @@ def test_drawing_leaves_the_settings_of_matplotlib_alone():
 @pytest.mark.parametrize("rows", [1, 2, 3])
 @pytest.mark.parametrize("columns", [1, 2])
 def test_no_axes_write_over_others_or_beyond_the_figure(rows, columns):
-    """Each with a title, and numbers and names along both of its sides."""
+    """Every figure has a title, and numbers and labels on both axes."""
     made, axes = style.figure(4.6 * columns, 2.6 * rows, rows, columns)
     for one in axes.flat:
         one.plot([0, 100], [0, 100])
@@ -112,7 +112,7 @@ def test_no_axes_write_over_others_or_beyond_the_figure(rows, columns):
 
 
 def test_axes_are_as_far_apart_as_their_texts_need_however_many_there_are():
-    """Measured on the paper: a taller figure has taller axes, and no wider gaps."""
+    """A taller figure has taller axes, and no wider gaps."""
     gaps = []
     for rows, height in ((2, 4.0), (2, 9.0), (4, 9.0)):
         axes = style.figure(5.0, height, rows)[1]
@@ -125,7 +125,7 @@ def test_axes_are_as_far_apart_as_their_texts_need_however_many_there_are():
     "around", [{"HOME": "/nonexistent"}, {"MPLBACKEND": "of_another_program"}], ids=str
 )
 def test_what_surrounds_a_command_costs_no_figure_and_no_line_on_stderr(around):
-    """A service has no home, and a notebook's backend stays set in shells that it opens."""
+    """A service has no home, and a notebook sets a backend in the shells that it opens."""
     kept = {k: v for k, v in os.environ.items() if k not in ("MPLCONFIGDIR", "XDG_CONFIG_HOME")}
     drawn = "from omsm_ros.report import style; style.png(style.figure(4, 3)[0])"
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""The map that a reader can enlarge: its data are the heights, its script fetches nothing."""
+"""The zoomable map: its data are the heights, and its script fetches nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def layer(count=20_000, unit="nm", symmetric=True, seed=0):
 
 
 def decoded(entry):
-    """Heights as the script reads them: two bytes a place, least y first."""
+    """Decode heights as the script does: two bytes per pixel, least y first."""
     pixels = np.round(255 * imread(io.BytesIO(b64decode(entry["png"])))).astype(int)
     codes = 256 * pixels[..., 0] + pixels[..., 1]
     return np.where(codes, entry["least"] + (codes - 1) * entry["step"], np.nan)
@@ -110,7 +110,7 @@ def test_a_browser_draws_it_from_a_file(tmp_path):
         capture_output=True, timeout=50, check=False,
     )  # fmt: skip
     picture = imread(tmp_path / "page.png")[..., :3]
-    # The ends of the palette are seen, on the map and on its bar.
+    # The ends of the palette are on the map and on its bar.
     for colour in ((68, 1, 84), (253, 231, 37)):
         near = np.all(np.abs(255 * picture - colour) < 12, axis=2)
         assert near.sum() > 300, found.stderr[-500:]

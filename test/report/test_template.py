@@ -1,4 +1,4 @@
-"""What a page does to a text: numbers set as in print, everything else as it is."""
+"""Typesetting of a page changes numbers only."""
 
 from __future__ import annotations
 

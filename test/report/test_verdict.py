@@ -1,4 +1,4 @@
-"""The verdict names every reason and is never better than its worst one."""
+"""The verdict states every reason and is never better than the worst one."""
 
 from __future__ import annotations
 

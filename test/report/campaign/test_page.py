@@ -23,7 +23,7 @@ def measurement(i, rms, state="done", name=None):
 
 @pytest.fixture
 def drifting():
-    """Twenty days at 0.5 nm a day, and one bad part."""
+    """Return twenty days of 0.5 nm drift per day, and one bad part."""
     random = np.random.default_rng(1)
     rms = 20e-9 + 0.5e-9 * np.arange(20) + random.normal(0, 0.3e-9, 20)
     rms[11] = 200e-9
@@ -39,7 +39,7 @@ def test_outliers_and_drift_are_named_with_their_size(drifting):
 
 
 def test_correlation_with_temperature_is_reported_with_its_size():
-    """2 nm a kelvin, over a fortnight that gets neither warmer nor older; all at one age."""
+    """Return 2 nm per kelvin over two weeks without a trend of temperature or age."""
     random = np.random.default_rng(2)
     warm = 20.0 + random.normal(0, 0.5, 14)
     reported = [measurement(i, 20e-9 + 2e-9 * (t - 20)) for i, t in enumerate(warm)]

@@ -1,4 +1,4 @@
-"""The certificate in Markdown says what the page says."""
+"""The certificate in Markdown has the contents of the page."""
 
 from __future__ import annotations
 

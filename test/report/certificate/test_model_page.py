@@ -1,4 +1,4 @@
-"""The page of a model says what the model is, and how it runs over this record."""
+"""The page of a model states the model and its simulation of the record."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Heights of any size are drawn in a unit that people read."""
+"""Heights of any size are drawn in a readable unit."""
 
 import numpy as np
 import pytest

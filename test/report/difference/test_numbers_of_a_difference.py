@@ -1,4 +1,4 @@
-"""Page, JSON and CSV of a comparison say one and the same, and what the arrays say."""
+"""Page, JSON and CSV of a comparison agree with its arrays."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def page(written):
 
 
 def test_the_table_of_places_is_the_difference(written):
-    """CSV by its own reader: places, difference, uncertainty, to the last bit."""
+    """The CSV file holds points, difference and uncertainty to the last bit."""
     out, found, facts = written
     with open(out / "difference.csv", newline="") as stream:
         rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(stream)]
@@ -137,7 +137,7 @@ def test_the_matching_is_reported_in_units(written, page):
 
 
 def test_thirty_nanometres_of_astigmatism_are_thirty_nanometres(written):
-    """Known by how the two were made; the aperture is a little smaller than the part."""
+    """The true difference is known; the aperture is a little smaller than the part."""
     terms = {(t["n"], t["m"]): t for t in written[2]["zernike"]["terms"]}
     edge = (RADIUS / written[2]["zernike"]["aperture"]["radius"]) ** 2
     assert terms[2, 2]["difference"] * edge == pytest.approx(-30e-9, abs=1e-9)

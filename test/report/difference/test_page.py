@@ -1,4 +1,4 @@
-"""The page of a comparison answers first, and shows what it is given."""
+"""The page of a comparison states the verdict first, and shows the given data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in the figures: values, units, limits, labels."""
+"""Values, units, limits and labels of the figures."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def deviations(cloud):
 
 
 def texts(figure):
-    """All that is written on the axes."""
+    """Return all texts on the axes."""
     found = []
     for axes in figure.get_axes():
         found += [axes.get_xlabel(), axes.get_ylabel(), axes.get_title(loc="left")]

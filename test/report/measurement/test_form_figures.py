@@ -1,4 +1,4 @@
-"""Figures of a registered part: what they show, in which units, with which uncertainty."""
+"""Figures of a registered part: values, units and uncertainties."""
 
 import numpy as np
 import pytest

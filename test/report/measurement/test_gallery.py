@@ -1,4 +1,4 @@
-"""One call makes all figures of a scan, by the names the page knows."""
+"""All figures of a scan by the names of the page."""
 
 from __future__ import annotations
 

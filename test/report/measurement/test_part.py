@@ -1,4 +1,4 @@
-"""Is the part good? What the page says of it first, and of what it rests on."""
+"""The verdict on the part, at the top of the page."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_what_was_taken_out_has_units_and_reasons():
     assert rows[1][:3] == ("tip", "50.0 µrad", "2.00 µrad")
     assert rows[2][1] == "0.250 1/m"
     assert rows[3][0] == "not clocking"
-    # What it would drag along is told here, and is not in the rows above.
+    # The correlated moves are stated here, not in the rows above.
     assert table.columns[-1] == table.prose
     assert rows[3][3].startswith("a sphere looks alike from all sides; clocking ± 17 mrad would")
     assert "tip ± 17 mrad" in rows[3][3]

@@ -1,4 +1,4 @@
-"""A cloud becomes an image that is true where there are points and empty where there are none."""
+"""The image of a cloud is correct at points and empty without points."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from omsm_ros.report.spectrum import motion
 
 
 def test_an_axis_that_stands_still_is_drawn_without_a_word():
-    """Z of a scan of a flat: no density, so no logarithm and no warning on the terminal."""
+    """Z of a scan of a flat has zero density, and no warning is printed."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         still = density(np.zeros(1000), 1e-3)
