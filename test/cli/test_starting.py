@@ -22,7 +22,7 @@ def test_omsm_alone_tells_what_to_do_next(capsys):
 def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monkeypatch, tmp_path):
     checks = [
         HostCheck("disk", "fine", "room"),
-        HostCheck("ROS 2", "faulty", "no omsm_msgs", "build it"),
+        HostCheck("ROS 2", "faulty", "rclpy without omsm_msgs", "build it"),
     ]
     monkeypatch.setattr(start, "examine_host", lambda folder, port: checks)
     assert cli.main(["doctor", "--folder", str(tmp_path)]) == 2

@@ -169,9 +169,9 @@ def test_a_campaign_that_was_altered_is_reported_by_its_part(tmp_path, change, r
 @pytest.mark.parametrize(
     ("scheduler", "reported"),
     [
-        ("tcp://10.0.0.7:8786", "beyond this host it must be tls://host:port"),
-        ("inproc://x", "beyond this host it must be"),
-        ("localhost:8786", "beyond this host it must be"),
+        ("tcp://10.0.0.7:8786", "on another host it must be tls://host:port"),
+        ("inproc://x", "on another host it must be"),
+        ("localhost:8786", "on another host it must be"),
         ("tcp://[::1", "is no address"),
     ],
 )
@@ -190,5 +190,5 @@ def test_a_scheduler_that_runs_whatever_it_is_sent_is_on_this_host(
 def test_what_a_campaign_decides_is_no_option_of_its_bags(shop, corrected, tmp_path, capsys, words):
     given = ["batch", str(shop("a.mcap")), "--calibration", str(tmp_path / "cal.json")]
     assert main([*given, "--out", str(tmp_path / "out"), "--", *words]) == 2
-    assert "stands after '--' as" in capsys.readouterr().err
+    assert "is given after '--' as" in capsys.readouterr().err
     assert not corrected

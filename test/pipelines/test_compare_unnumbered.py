@@ -33,7 +33,7 @@ def test_the_drift_that_is_stated_counts_in_the_order_of_the_file(tmp_path, asti
     stated = ComparisonOptions(drift=DRIFT, **known)
     _, facts = compare_measurements(a, b, stated, Asphere(0.1, -1.0))
     assert facts["verdict"] == verdict
-    assert "order in the file is taken for that of the scan" in facts["a"]["notes"][-1]
+    assert "order in the file is assumed to be the scan's" in facts["a"]["notes"][-1]
     assert facts["b"]["drift_from"] == "stated"
 
 

@@ -65,7 +65,7 @@ def test_a_folder_with_files_of_a_machine_is_refused_and_stays(tmp_path, name):
     kept = tmp_path / "cell" / name
     kept.parent.mkdir(parents=True)
     kept.write_text("precious")
-    with pytest.raises(OmsmError, match="holds files that no demonstration made"):
+    with pytest.raises(OmsmError, match="holds files that are not from a demonstration"):
         Demonstration(tmp_path / "cell").prepare()
     assert kept.read_text() == "precious"
     assert [p for p in (tmp_path / "cell").rglob("*") if p.is_file()] == [kept]
@@ -95,5 +95,5 @@ def test_a_recording_without_truth_has_no_true_response(step_test):
         probe_motion=np.zeros(1),
         surface_height=np.zeros(1),
     )
-    with pytest.raises(OmsmError, match="without the truth"):
+    with pytest.raises(OmsmError, match="holds no true values"):
         true_response(foreign)

@@ -215,12 +215,12 @@ def test_a_question_begins_no_catalogue(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("OMSM_CATALOGUE", raising=False)
     assert cli.main(["history"]) == 2
-    assert "set OMSM_CATALOGUE, or begin one with --add" in capsys.readouterr().err
+    assert "set OMSM_CATALOGUE, or create one with --add" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
 def test_a_catalogue_that_is_not_there_is_named_and_not_begun(capsys, tmp_path):
     path = tmp_path / "catalgoue.sqlite"
     assert cli.main(["history", "--catalogue", str(path)]) == 2
-    assert "begin one with --add" in capsys.readouterr().err
+    assert "create one with --add" in capsys.readouterr().err
     assert not path.exists()

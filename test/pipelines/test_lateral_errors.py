@@ -88,6 +88,6 @@ def test_live_without_a_surface_the_light_says_what_is_not_in_the_points(
         corrector.push_axes(small_scan.axes)
         corrector.push_distance(small_scan.distance)
         reasons = live_traffic_light(corrector, true_calibration, SAID, None).reasons
-        found = [r for r in reasons if "parameter nominal" in str(r.remedy)]
+        found = [r for r in reasons if "parameter 'nominal'" in str(r.remedy)]
         assert bool(found) == reported
         assert all("centre_x, decentre" in str(reason.what) for reason in found)

@@ -53,7 +53,7 @@ def test_another_nominal_surface_is_refused(shop, tmp_path, capsys):
     given = ["--calibration", str(shop / "cal.json"), "--nominal", str(tmp_path / "other.yaml")]
     before = (folder / "report.html").read_bytes()
     assert cli.main(["report", str(folder), *given]) == 2
-    assert "from the one that it was corrected with" in capsys.readouterr().err
+    assert "from that of the correction" in capsys.readouterr().err
     assert (folder / "report.html").read_bytes() == before
 
 
@@ -79,7 +79,7 @@ def test_a_rate_that_was_overridden_is_drawn_over_its_own_time(
 
 def test_another_calibration_is_refused(shop, true_calibration):
     other = replace(true_calibration, settings={"machine": "another"})
-    with pytest.raises(CalibrationError, match="give the one that it was corrected with"):
+    with pytest.raises(CalibrationError, match="give the calibration of the correction"):
         report_again(shop / "result", other)
 
 

@@ -127,8 +127,8 @@ def test_the_page_says_what_the_summary_says(page, summary):
     rows = page.table("Errors")
     for key, name in (
         ("peak_to_valley", "peak to valley"),
-        ("rms", "rms, every point alike"),
-        ("rms_area_weighted", "rms, every area alike"),
+        ("rms", "rms over the points"),
+        ("rms_area_weighted", "rms over the area"),
     ):
         for cell, side in zip(rows[f"deviation from nominal, {name}"], ("raw", "corrected"),
                               strict=True):  # fmt: skip
@@ -161,7 +161,7 @@ def test_the_form_is_one_in_its_file_in_the_summary_and_on_the_page(result, summ
         unit = {"nm": 1e-9, "µm": 1e-6}[found[2]]
         assert float(found[1]) * unit == pytest.approx(rms["value"], rel=0.05)
         assert float(found[3]) * unit == pytest.approx(2 * rms["uncertainty"], rel=0.06)
-    shown = {name.removeprefix("not ") for name in page.table("What was taken out")}
+    shown = {name.removeprefix("not ") for name in page.table("Removed pose")}
     assert set(form["removed"]["fitted"]) <= shown
     left = plain_readers.ply(result / "deviation.ply")
     assert len(left["z"]) == form["points"]["used"]

@@ -85,7 +85,7 @@ def test_the_budget_has_every_source_once_the_largest_first(sources):
         size, height, acts, known = shown[f"{row['source'].replace('_', ' ')} (x)"]
         assert says(size, row["standard_uncertainty"])
         assert says(height, row["height"])
-        assert acts == ("on each point" if row["kind"] == "random" else "on all together")
+        assert acts == ("on each point" if row["kind"] == "random" else "all points")
         assert known == ("not evaluated: why" if row["reason"] else "stated")
     order = [(row[4].startswith("not"), -(value_of(row[2]) or 0.0)) for row in found["rows"]]
     assert order == sorted(order)
@@ -227,15 +227,15 @@ def test_scans_sampling_and_band_stop_are_reported_in_their_units():
     assert stopped[1] == "310 to 330 Hz, 40.0 to 50.0 Hz"
     assert [value_of(stopped[k]) for k in (2, 3, 4)] == pytest.approx([5e-9, 3e-9, 4e-9])
     assert says(stopped[6], 0.25)
-    cells = page.table("Felt by the accelerometer")["scan, z"]
+    cells = page.table("Accelerometer lines")["scan, z"]
     assert cells[1] == "0.0912 m/s²"
     assert says(cells[2], 5e-9)
 
 
 @pytest.mark.parametrize(
     ("peaks", "level", "word"),
-    [([], "good", "No line beyond 3 σ"), (["PART"], "good", "All lines named"),
-     (["PART", "UNDECIDED"], "unknown", "Not all decided")],
+    [([], "good", "No line above 3 σ"), (["PART"], "good", "Source of every line identified"),
+     (["PART", "UNDECIDED"], "unknown", "Some lines of unknown source")],
 )  # fmt: skip
 def test_the_verdict_counts_the_lines(peaks, level, word):
     kinds = [getattr(source_hypotheses, name) for name in peaks]

@@ -68,7 +68,7 @@ class TestCalibrationTable:
         rows = dict(tables.calibration_table(given_calibration).rows)
         assert rows["static gain, probe per encoder"] == "0.9921260 ± 0.0000034"
         assert rows["delay of slow motion"] == "339.7 µs ± 1.1 µs"
-        assert rows["trusted up to"] == "100 Hz"
+        assert rows["valid up to"] == "100 Hz"
         assert rows["chi-square per degree of freedom"] == "1.01"
         assert rows["verdict"] == "accepted"
         # Eq. 12: 804 Hz of damping 0.19, and a real pole at 49 761 rad/s.
@@ -122,7 +122,7 @@ class TestBudgetAndMotion:
             "discretisation": {"peak_to_valley": 5e-14},
         }
         rows = dict(tables.motion_table(summary).rows)
-        assert rows["left by the uncertain dynamics, k = 1"] == "2.00 nm"
-        assert rows["motion beyond the trusted band"] == "0.12 %"
-        assert rows["could have run faster by"] == "3.25 ×"
+        assert rows["residual of the uncertain dynamics, k = 1"] == "2.00 nm"
+        assert rows["motion outside the valid band"] == "0.12 %"
+        assert rows["maximum speed"] == "3.25 × this scan"
         assert tables.motion_table({}).rows == []

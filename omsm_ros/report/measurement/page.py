@@ -81,7 +81,7 @@ def _expanded(figure: Mapping[str, Any]) -> str:
     """Return a figure with its expanded uncertainty, k = 2."""
     text = expanded(figure["value"], figure.get("uncertainty"), "m")
     bound = text.removeprefix("at most ")
-    return text if bound == text else f"< {bound} (k = 2), not resolved"
+    return text if bound == text else f"< {bound}, not resolved"
 
 
 def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:

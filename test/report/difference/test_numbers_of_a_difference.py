@@ -90,16 +90,16 @@ def test_the_headlines_are_the_numbers_of_the_file(written, page):
     value, detail = page.headlines["Difference, rms"]
     assert says(value, difference["rms"])
     assert says(detail.removeprefix("peak to valley "), difference["peak_to_valley"])
-    spread = page.headlines["Expanded uncertainty of a place"][0]
+    spread = page.headlines["Expanded uncertainty of a point"][0]
     assert says(spread, 2 * difference["uncertainty"])
-    assert int(page.headlines["Places compared"][0].replace(" ", "")) == difference["places"]
+    assert int(page.headlines["Points compared"][0].replace(" ", "")) == difference["places"]
     share = page.headlines["|E_n| < 1"][0].removesuffix(" of the area")
     assert says(share, facts["within"], 2)
 
 
 def test_the_tables_are_the_numbers_of_the_file(written, page):
     facts = written[2]
-    rows = page.table("Figures of both; U: 95 % for all together")
+    rows = page.table("Figures of both measurements; U: 95 % for all figures together")
     assert set(rows) == {figure(name) for name in facts["e_n"]}
     for name, number in facts["e_n"].items():
         a, b, expanded, e_n = rows[figure(name)]
@@ -107,7 +107,7 @@ def test_the_tables_are_the_numbers_of_the_file(written, page):
         assert says(b, number["b"], 5), name
         assert says(expanded, number["expanded"]), name
         assert says(e_n, number["e_n"]), name
-    rows = page.table("Zernike terms of A − B, one at the rim")
+    rows = page.table("Zernike terms of A − B, 1 at the rim")
     assert len(rows) == len(facts["zernike"]["terms"])
     for term in facts["zernike"]["terms"]:
         left, expanded, e_n = rows[f"Z({term['n']}, {term['m']})".replace("-", "−")]
@@ -117,13 +117,13 @@ def test_the_tables_are_the_numbers_of_the_file(written, page):
 
 
 def test_each_measurement_is_reported_with_file_points_and_notes(written, page):
-    rows = page.table("What each brought, k = 1")
+    rows = page.table("Both measurements, uncertainties k = 1")
     assert rows["file"] == ["/a/one.xyz", "/b/two.xyz"]
     facts = written[2]
     for k, side in enumerate("ab"):
         assert int(rows["points"][k].replace(" ", "")) == facts[side]["points"]
         assert says(rows["scatter of a point about its neighbours"][k], facts[side]["scatter"])
-        assert says(rows["cell of the local fits"][k], facts[side]["cell"])
+        assert says(rows["cell size of the local fits"][k], facts[side]["cell"])
         assert rows["notes"][k] == "as <it> is"
 
 

@@ -49,7 +49,7 @@ def _letters(text):
     [
         (0.0, 2e-9, "good", "The two measurements agree"),
         (40e-9, 2e-9, "bad", "The two measurements differ"),
-        (0.0, None, "unknown", "Nobody can tell whether they agree"),
+        (0.0, None, "unknown", "Agreement not decided"),
     ],
 )
 def test_the_verdict_comes_first(added, common, level, word):
@@ -94,9 +94,9 @@ def test_what_is_not_evaluated_is_not_a_number():
     assert [h.value for h in headlines(facts)][1] == "not evaluated"
     tables = {table.title: table.rows for table in records(facts)}
     assert all(
-        row[-1] == "not evaluated" for row in tables["Figures of both; U: 95 % for all together"]
+        row[-1] == "not evaluated" for row in tables["Figures of both measurements; U: 95 % for all figures together"]
     )
-    assert not tables["Zernike terms of A − B, one at the rim"]
+    assert not tables["Zernike terms of A − B, 1 at the rim"]
 
 
 def test_the_page_is_small():

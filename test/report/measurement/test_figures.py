@@ -139,7 +139,7 @@ class TestDynamicError:
         )
         assert figure.get_axes()[1].dataLim.ymax == pytest.approx(22.0)
         assert "±2u of a height" in texts(figure)
-        assert "true error left" not in texts(figure)
+        assert "true error after" not in texts(figure)
 
     def test_alone_it_is_one_panel(self, cloud):
         figure = figures.dynamic_error(cloud.time, cloud.dynamic_error)

@@ -43,7 +43,7 @@ def test_every_figure_has_a_place_on_the_page():
         "zernike_terms", "form_lines", "form_rings", "psd_radial", "psd_direction", "psd_areal",
     }  # fmt: skip
     page = render(Report("Form of a", "today", {}, None, made, {"zernike": ZERNIKE}, CURVES))
-    order = ["Is the part good?", "Can I trust that?", *(f'alt="{CAPTIONS[n].text}"'[:30] for n in (
+    order = ["Form of the part", "Validity of the measurement", *(f'alt="{CAPTIONS[n].text}"'[:30] for n in (
         "form_lines", "zernike_terms", "psd_radial"))]  # fmt: skip
     places = [page.index(text) for text in order if text in page]
     assert places == sorted(places)

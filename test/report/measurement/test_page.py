@@ -30,7 +30,7 @@ def report(summary, certified, figures):
 def test_is_well_formed_and_has_all_parts(report):
     page = Page(render(report))
     for text in (
-        "Mirror 7", "2025-01-31", "Trusted", "Surface", "Profiles", "Dynamic error",
+        "Mirror 7", "2025-01-31", "Valid", "Surface", "Profiles", "Dynamic error",
         "Dynamics of the probe", "Errors", "Samples", "Calibration", "Settings", "Versions",
         "exposure 1 ms", "0.1.0", "settling", report.calibration.id,
     ):  # fmt: skip
@@ -82,7 +82,7 @@ def test_everything_from_outside_is_escaped(summary, certified):
 
 def test_a_measurement_of_which_nothing_is_known_still_gives_a_page():
     page = Page(render(Report("Bag", "today", {})))
-    assert page.says("Not judged")
+    assert page.says("Validity not assessed")
     assert "img" not in page.tags
     assert "dl" not in page.tags
 
@@ -103,7 +103,7 @@ def test_settings_that_are_those_of_the_calibration_are_said_once(summary, certi
 
 @pytest.mark.parametrize(
     ("certificate", "word"),
-    [({"verdict": "accepted"}, "✓ Trusted"), ({"verdict": "rejected"}, "✕ Not to be trusted")],
+    [({"verdict": "accepted"}, "✓ Valid"), ({"verdict": "rejected"}, "✕ Measurement not valid")],
 )
 def test_the_verdict_is_a_sign_and_a_word_before_all_else(summary, certified, certificate, word):
     stated = certified_by({**certificate}, certified.certificate)
