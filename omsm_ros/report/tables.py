@@ -47,7 +47,7 @@ def error_table(summary: Mapping[str, object]) -> Table:
         rows.append((f"deviation from nominal, {name}", *(quantity(v, "m") for v in both)))
     for key in ("peak_to_valley", "rms"):
         both = [part(summary, f"dynamic_error_{side}", key) for side in ("before", "after")]
-        label = f"dynamic error, {_FIGURE_NAMES[key].split(',')[0]}"
+        label = f"dynamic error, {key.replace('_', ' ')}"
         rows.append((label, *(quantity(v, "m") for v in both)))
     for key in ("rms_before_fit", "rms"):
         value = part(summary, "form", "deviation", key)

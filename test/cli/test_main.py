@@ -104,7 +104,7 @@ def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
     assert ["decentre, clocking" in reason["what"] for reason in pose] == [True]
     assert not any("register the part" in reason["remedy"] for reason in pose)
     page = (tmp_path / "report.html").read_text()
-    assert "as it sits" in page
+    assert "before the fit" in page
     assert "registered" in page
 
 

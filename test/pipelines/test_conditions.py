@@ -50,7 +50,7 @@ def test_summary_and_page_tell_age_and_temperature(tmp_path, small_scan_blocks, 
     }  # fmt: skip
     page = (tmp_path / "out/report.html").read_text()
     assert "3.0 d" in page
-    assert "20.13 °C, +0.10 K from the beginning to the end" in page
+    assert "20.13 °C, +0.10 K from start to end" in page
     assert "2026-09-21" in page
 
 
@@ -78,4 +78,4 @@ def test_an_implausible_temperature_is_reported(tmp_path, small_scan_blocks, tru
     summary = measure(bag, true_calibration, tmp_path / "out", report=False)
     assert summary["conditions"]["temperature"]["mean"] == 20.0
     (said,) = [w for w in summary["warnings"] if "temperatures" in w]
-    assert said.startswith("1 of 2 temperatures cannot be, expected from -100 to 200 °C")
+    assert said.startswith("1 of 2 temperatures are implausible, expected from -100 to 200 °C")

@@ -40,7 +40,7 @@ def test_the_emulator_is_given_the_file_by_its_whole_path(tmp_path, monkeypatch)
     ("live", "equal", "said"),
     [
         (1000, True, "to the last bit"),
-        (900, False, "NO: 100 points were not made live"),
+        (900, False, "NO: 100 points are missing live"),
         (1000, False, "NO"),
     ],
 )

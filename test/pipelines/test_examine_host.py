@@ -75,7 +75,7 @@ def test_a_serial_port_that_is_absent_is_named_with_those_that_are_there(monkeyp
     monkeypatch.setattr(host, "serial_ports", lambda: ["/dev/ttyUSB0"])
     check = host._serial("/dev/ttyUSB7")
     assert check.state == FAULTY
-    assert check.found == "no /dev/ttyUSB7; there are: /dev/ttyUSB0"
+    assert check.found == "no /dev/ttyUSB7; available: /dev/ttyUSB0"
 
 
 def test_a_serial_port_without_permission_has_its_remedy(monkeypatch, tmp_path):

@@ -143,10 +143,10 @@ def test_the_command_tells_what_it_did(result, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "reported"),
     [
-        (["--out", "a.stl"], "'.stl' of 'a.stl' is not known; end it in one of .csv"),
+        (["--out", "a.stl"], "'.stl' of 'a.stl' is unknown, expected one of .csv"),
         (["--out", "a.x3p", "--spacing", "1e-12"], "spacing"),
         (["--out", "a.csv", "--unit", "ell"], "unit 'ell' is not known"),
-        (["--out", "a.dat", "--spacing", "1e-8"], "widen it"),
+        (["--out", "a.dat", "--spacing", "1e-8"], "widen --spacing"),
     ],
 )
 def test_a_wrong_wish_is_one_line(result, tmp_path, monkeypatch, capsys, arguments, reported):

@@ -286,7 +286,7 @@ def test_a_spindle_that_falls_back_by_a_turn_shows_its_unit(importer, counted, l
             assert turning(importer, share * turn[counted], stated)[0].rows == 900
             importer.out.unlink()
         else:
-            with pytest.raises(OmsmError, match=f"counted in {counted} does, the map says"):
+            with pytest.raises(OmsmError, match=f"an angle in {counted} does, the map says"):
                 turning(importer, share * turn[counted], stated)
 
 
@@ -301,7 +301,9 @@ def test_trigger_gaps_with_a_file_that_cannot_contain_them_are_refused(importer)
     (importer.folder / "d.csv").write_text("d\n1\n2\n3\n4\n")
     mapping = PROBE + "  trigger: {name: n}\n  z: {name: Z, unit: mm}\n"
     mapping += "".join(f"  {a}: {{constant: 0}}\n" for a in "xybc")
-    with pytest.raises(OmsmError, match=r"z\.csv lacks triggers, and .*d\.csv has no column"):
+    with pytest.raises(
+        OmsmError, match=r"missing in .*z\.csv, and .*d\.csv has neither trigger nor time"
+    ):
         importer(mapping, "z.csv", "d.csv")
     assert not importer.out.exists()
     (importer.folder / "z.csv").write_text("n,Z\n" + "".join(f"{n},0\n" for n in range(4)))
@@ -313,7 +315,7 @@ def test_a_column_that_is_not_there_or_stands_twice_is_reported_by_the_names_of_
     missing = refusal(read, "p,D\n0,1\n1,2\n", mapping)
     assert "no column 'd' of distance, but ['p', 'D']" in missing
     twice = refusal(read, "d,p,d\n1,0,1\n2,1,2\n", mapping)
-    assert "2 columns 'd', one of which is distance; rename the others" in twice
+    assert "2 columns 'd', of which distance is one; rename the others" in twice
 
 
 def test_a_name_that_yaml_reads_otherwise_wants_quotes(read):

@@ -107,7 +107,7 @@ def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monke
     monkeypatch.setattr(campaign, "correct_one", corrected)
     entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=1)
     assert [(e.bag, e.said) for e in entries if e.state == CRASHED] == [
-        ("b.mcap", "no worker came to an end with it (KilledWorker)")
+        ("b.mcap", "no worker finished it (KilledWorker)")
     ]
     assert len(entries) == 4
     assert load_campaign(tmp_path) == entries
@@ -138,7 +138,7 @@ def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
 
 def test_two_campaigns_do_not_share_a_folder(shop, tmp_path):
     with (
-        campaign._run_alone(tmp_path),
+        campaign._locked(tmp_path),
         pytest.raises(FileError, match="another campaign writes"),
     ):
         run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)

@@ -49,7 +49,7 @@ def test_an_axis_follows_a_cylinder_only_as_fast_as_it_can():
 
 
 def test_beyond_its_end_there_is_nothing_to_show():
-    with pytest.raises(DataError, match=r"no height on .* radius 0.01 m"):
+    with pytest.raises(DataError, match=r"no height at .* radius 0.01 m"):
         show_surface(Asphere(0.009), SCAN, MachineLimits())
 
 

@@ -92,7 +92,9 @@ def test_a_cloud_of_that_name_that_is_no_result_stays(publish, tmp_path):
 def test_a_band_that_is_not_of_these_points_is_refused(stopped):
     one = scan("s", 5)
     one.stopped = stopped
-    with pytest.raises(ConfigurationError, match="'s': no band was stopped, or its trigger start"):
+    with pytest.raises(
+        ConfigurationError, match="'s': no band was stopped, or its trigger counter restart"
+    ):
         without_bands(one)
 
 

@@ -44,8 +44,8 @@ def test_errors_and_headlines_are_those_of_the_summary(pv, rms, area, before, le
     rows = page.table("Errors")
     for name, (first, second) in {
         "deviation from nominal, peak to valley": (raw, pv),
-        "deviation from nominal, rms, every point alike": (raw, rms),
-        "deviation from nominal, rms, every area alike": (raw, area),
+        "deviation from nominal, rms over the points": (raw, rms),
+        "deviation from nominal, rms over the area": (raw, area),
         "dynamic error, peak to valley": (before, left),
         "dynamic error, rms": (before / 3, left / 3),
     }.items():
@@ -85,7 +85,7 @@ def test_the_budget_has_every_source_once_the_largest_first(sources):
         size, height, acts, known = shown[f"{row['source'].replace('_', ' ')} (x)"]
         assert says(size, row["standard_uncertainty"])
         assert says(height, row["height"])
-        assert acts == ("on each point" if row["kind"] == "random" else "all points")
+        assert acts == ("none" if row["kind"] == "random" else "all points")
         assert known == ("not evaluated: why" if row["reason"] else "stated")
     order = [(row[4].startswith("not"), -(value_of(row[2]) or 0.0)) for row in found["rows"]]
     assert order == sorted(order)
@@ -188,7 +188,7 @@ def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, signifi
     [
         ({"true_frequency": 680.0, "true_wavelength": 1e-3, "order": 3}, "680.00 Hz"),
         ({"true_wavelength": 1.5e-5, "order": 3}, "15.00 µm"),
-        ({"order": 3}, "3 a turn"),
+        ({"order": 3}, "3 per turn"),
         ({}, ""),
     ],
 )

@@ -85,7 +85,7 @@ class TestBode:
         def notes(calibration):
             return [t.get_text() for t in bode(calibration, None, 1e-3).get_axes()[0].texts]
 
-        assert notes(certified) == ["not trusted"]
+        assert notes(certified) == ["not valid"]
         assert notes(replace(certified, valid_up_to=500.0)) == []
 
     def test_a_calibration_without_dynamics_is_drawn(self, certified):

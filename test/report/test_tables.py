@@ -21,7 +21,7 @@ def test_part_finds_what_is_there_and_nothing_else():
 class TestErrorTable:
     def test_names_before_and_after(self, summary):
         rows = {row[0]: list(row[1:]) for row in tables.error_table(summary).rows}
-        assert rows["deviation from nominal, rms, every point alike"] == ["184 nm", "17.5 nm"]
+        assert rows["deviation from nominal, rms over the points"] == ["184 nm", "17.5 nm"]
         assert rows["dynamic error, peak to valley"] == ["1.23 µm", "8.70 nm"]
         assert rows["standard uncertainty of a height, largest"] == ["", "12.5 nm"]
 
@@ -67,7 +67,7 @@ class TestCalibrationTable:
         given_calibration = replace(certified, certificate=certificate)
         rows = dict(tables.calibration_table(given_calibration).rows)
         assert rows["static gain, probe per encoder"] == "0.9921260 ± 0.0000034"
-        assert rows["delay of slow motion"] == "339.7 µs ± 1.1 µs"
+        assert rows["low-frequency delay"] == "339.7 µs ± 1.1 µs"
         assert rows["valid up to"] == "100 Hz"
         assert rows["chi-square per degree of freedom"] == "1.01"
         assert rows["verdict"] == "accepted"
@@ -79,7 +79,7 @@ class TestCalibrationTable:
         rows = dict(tables.calibration_table(replace(certified, certificate=Certificate())).rows)
         assert "verdict" not in rows
         assert "edges used" not in rows
-        assert rows["delay of slow motion"] == "339.7 µs"
+        assert rows["low-frequency delay"] == "339.7 µs"
 
     def test_remarks_are_reasons_and_warnings(self, certified):
         certificate = {"reasons": ["one"], "warnings": ["two", "three"]}

@@ -32,9 +32,9 @@ def drifting():
 
 def test_outliers_and_drift_are_named_with_their_size(drifting):
     reported = remarks(drifting, judge(drifting))
-    assert any(t.startswith("11.mcap stands out: deviation from nominal") for t in reported)
+    assert any(t.startswith("11.mcap is an outlier: deviation from nominal") for t in reported)
     (drift,) = [t for t in reported if "rms by area drifts" in t]
-    assert "pm a day" in drift or "nm a day" in drift
+    assert "pm per day" in drift or "nm per day" in drift
     assert not any("ncertainty" in t for t in reported)
 
 
@@ -45,8 +45,8 @@ def test_correlation_with_temperature_is_reported_with_its_size():
     reported = [measurement(i, 20e-9 + 2e-9 * (t - 20)) for i, t in enumerate(warm)]
     for one, t in zip(reported, warm, strict=True):
         one.summary["conditions"] = {"temperature": {"mean": t}, "calibration_age": 86400.0}
-    (said,) = [t for t in remarks(reported, judge(reported)) if "rms by area goes" in t]
-    assert "temperature, 2.00 nm to 2.00 nm a kelvin" in said
+    (said,) = [t for t in remarks(reported, judge(reported)) if "rms by area depends" in t]
+    assert "temperature, 2.00 nm to 2.00 nm per kelvin" in said
     assert not any("Age" in t for t in remarks(reported, judge(reported)))
 
 
@@ -62,7 +62,7 @@ def test_few_measurements_are_said_to_be_too_few():
     few = [measurement(0, 20e-9), measurement(1, 20e-9, "crashed")]
     assert remarks(few, judge(few)) == [
         "1.mcap: crashed, no axes",
-        "outliers and drift: not evaluated, of fewer than 5 measurements",
+        "outliers and drift: not evaluated, fewer than 5 measurements",
     ]
 
 

@@ -133,7 +133,7 @@ def test_the_matching_is_reported_in_units(written, page):
     for name, value in facts["registration"]["moved"].items():
         (cell,) = rows[f"B moved in {name}"]
         assert says(cell, value), name
-    assert says(rows["places"][0], facts["resampling"]["spacing"])
+    assert says(rows["grid spacing"][0], facts["resampling"]["spacing"])
 
 
 def test_thirty_nanometres_of_astigmatism_are_thirty_nanometres(written):

@@ -94,7 +94,8 @@ def test_what_is_not_evaluated_is_not_a_number():
     assert [h.value for h in headlines(facts)][1] == "not evaluated"
     tables = {table.title: table.rows for table in records(facts)}
     assert all(
-        row[-1] == "not evaluated" for row in tables["Figures of both measurements; U: 95 % for all figures together"]
+        row[-1] == "not evaluated"
+        for row in tables["Figures of both measurements; U: 95 % for all figures together"]
     )
     assert not tables["Zernike terms of A − B, 1 at the rim"]
 

@@ -43,8 +43,11 @@ def test_every_figure_has_a_place_on_the_page():
         "zernike_terms", "form_lines", "form_rings", "psd_radial", "psd_direction", "psd_areal",
     }  # fmt: skip
     page = render(Report("Form of a", "today", {}, None, made, {"zernike": ZERNIKE}, CURVES))
-    order = ["Form of the part", "Validity of the measurement", *(f'alt="{CAPTIONS[n].text}"'[:30] for n in (
-        "form_lines", "zernike_terms", "psd_radial"))]  # fmt: skip
+    alternatives = (
+        f'alt="{CAPTIONS[name].text}"'[:30]
+        for name in ("form_lines", "zernike_terms", "psd_radial")
+    )
+    order = ["Form of the part", "Validity of the measurement", *alternatives]
     places = [page.index(text) for text in order if text in page]
     assert places == sorted(places)
     assert set(form_figures.form_figures({"zernike": ZERNIKE}, {})) == {"zernike_terms"}
