@@ -117,7 +117,7 @@ def _declare_use(sub: argparse.ArgumentParser) -> None:
         dest="scan",
         type=Path,
         metavar="SCAN",
-        help="intended scan, a bag or a plan as CSV time_s,z_m, which sets the limits of the verdict; "
+        help="intended scan, a bag or a plan as CSV time_s,z_m, for the limits of the verdict; "
         "default: the paper's, 30 rpm over its mirror",
     )
     sub.add_argument(
@@ -130,8 +130,8 @@ def _declare_use(sub: argparse.ArgumentParser) -> None:
         type=json_object,
         default={},
         metavar="JSON",
-        help="entries of the certificate: machine, probe, probe_serial_number, target, temperature_c, "
-        "operator, laboratory, method",
+        help="entries of the certificate: machine, probe, probe_serial_number, target, "
+        "temperature_c, operator, laboratory, method",
     )
 
 
