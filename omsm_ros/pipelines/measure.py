@@ -217,8 +217,7 @@ def measure(
 
     lateral: standard uncertainty of x and y [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.pipelines.correct.correct_bag`
-    stated: uncertainty sources of the machine
-    accuracy: required expanded uncertainty, k = 2 [m]
+    stated: uncertainty sources;  accuracy: required expanded uncertainty, k = 2 [m]
     register: options of a registration to ``nominal``; None: no registration
     report: False writes no report, which takes longer than everything else
 

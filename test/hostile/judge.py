@@ -27,7 +27,8 @@ RESULT = "out"
 REMEDIES = (
     "check", "delete", "expected", "give", "install", "use", "record", "identify", "write", "see",
     "call", "make", "move", "remove", "sample", "look", "plan", "choose", "leave", "convert",
-    "start", "both are", "are needed", "reverse", "invert", "add ", "process less", "wait until", "scan the", "scan at",
+    "start", "both are", "are needed", "reverse", "scan the", "scan at",
+    "invert", "add ", "process less", "wait until",
     "scan one", "name columns", "at least", "more than",
     "set the", "needs", "must", "state ", "thin it", "save it", "name the", "name it", "name each",
     "measure", "hold what",
