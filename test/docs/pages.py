@@ -107,7 +107,7 @@ def filled_in(command):
             words.append(_ENDINGS[token])
         elif words and words[-1] == "--out" and token[0].isupper():
             words.append("made" + Path(token).suffix)
-        elif token == "SCAN" and word in ("selfcal", "spectrum"):
+        elif token == "SCAN" and word in ("selfcal", "spectrum", "adjust"):
             words.append(next(scans))
         else:
             head, at, place = token.partition("@")
