@@ -78,7 +78,7 @@ def _adjust(args: argparse.Namespace) -> Facts:
         )
     facts = adjustment_facts(found, scans, calibration, args.tolerance)
     write_adjustment(args.out, facts, found, scans, report=not args.no_report)
-    return facts
+    return {**facts, "out": str(args.out)}
 
 
 def _show(facts: Facts) -> None:
@@ -94,7 +94,7 @@ def _show(facts: Facts) -> None:
                + (f": {status}" if status else ""))
               for name, declared, found, _, status in source_table(facts).rows),
             ("", tested_text(facts)),
-            written(facts["files"].values()),
+            written(facts["files"].values(), facts["out"]),
         ]
     )  # fmt: skip
 
