@@ -1,10 +1,9 @@
-"""Commands for calibrations: plan, verify, compare, calset."""
+"""Commands for calibrations: verify, compare, calset."""
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -29,17 +28,8 @@ from omsm_ros.core.calibration.repeatability import (
     compare_calibrations,
     repeatability,
 )
-from omsm_ros.core.kinematics.trajectories import (
-    PLANNED_COUNT,
-    PLANNED_DWELL_S,
-    SECOND_SHARE,
-    plan_csv,
-    plan_gcode,
-    plan_steps,
-)
 from omsm_ros.errors import CalibrationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
-from omsm_ros.io.files import save_text
 from omsm_ros.pipelines.verify_calibration import established_offset, path_check_of
 from omsm_ros.readable import quantity
 from omsm_ros.report.verdict import verdict_text
@@ -128,75 +118,6 @@ def _repeatability_facts(found: Repeatability) -> Facts:
     return arrays | {"text": found.text()}
 
 
-def _declare_plan(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("what", choices=("steps",))
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    for name, kind, default, meaning in (
-        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
-        ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
-        (
-            "--second-step",
-            quantities.STEP,
-            None,
-            "height of every other step [m]; 3/9.8 of --step by default",
-        ),
-        (
-            "--count",
-            quantities.COUNT,
-            PLANNED_COUNT,
-            "number of steps up, and of steps down, from the middle",
-        ),
-        (
-            "--dwell",
-            quantities.DWELL,
-            PLANNED_DWELL_S,
-            "time from edge to edge [s]; four times the dwell halves the undetected creep",
-        ),
-        ("--rise", quantities.RISE, 20e-3, "rise time of an edge [s]"),
-        ("--half-range", quantities.STEP, 50e-6, "half the measuring range of the probe [m]"),
-    ):
-        sub.add_argument(name, type=number(kind), default=default, help=meaning)
-
-
-def _plan(args: argparse.Namespace) -> Facts:
-    plan = plan_steps(
-        sample_period=args.sample_period,
-        step=args.step,
-        second_step=args.second_step or SECOND_SHARE * args.step,
-        count=args.count,
-        dwell=args.dwell,
-        rise=args.rise,
-        half_range=args.half_range,
-    )
-    csv, gcode = args.out / "steps.csv", args.out / "steps.nc"
-    save_text(csv, plan_csv(plan, args.sample_period))
-    save_text(gcode, plan_gcode(plan))
-    return {
-        "edges": len(plan.starts),
-        "heights": sorted(set(map(abs, plan.heights)), reverse=True),
-        "travel": plan.travel,
-        "duration": plan.duration,
-        "rise": plan.rise,
-        "files": {"csv": str(csv), "gcode": str(gcode)},
-    }
-
-
-def _lengths(lengths: Sequence[float]) -> str:
-    return " and ".join(quantity(length, "m") for length in lengths)
-
-
-def _show_plan(facts: Facts) -> None:
-    table(
-        [
-            ("edges", f"{facts['edges']} of {_lengths(facts['heights'])}"),
-            ("travel", _lengths([facts["travel"]])),
-            ("duration", quantity(facts["duration"], "s")),
-            ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
-            written(facts["files"].values()),
-        ]
-    )
-
-
 _PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
 
 
@@ -255,7 +176,6 @@ def _show_calset(facts: Facts) -> None:
 
 
 COMMANDS = (
-    CliCommand("plan", _declare_plan, _plan, _show_plan),
     CliCommand("verify", _declare_verify, _verify, _show_verify),
     CliCommand("compare", _declare_compare, _compare, lambda facts: say_lines(facts["text"])),
     CliCommand("calset", _declare_calset, _calset, _show_calset, rejected),

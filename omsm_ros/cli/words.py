@@ -33,7 +33,7 @@ TASKS: dict[str, dict[str, Word]] = {
         ),
     },
     "dynamics of probe and machine": {
-        "plan": Word("calibration", "write a step test for the machine"),
+        "plan": Word("plan", "write a step test for the machine, or scans of a part"),
         "identify": Word(
             "identify", "identify the transfer function from encoder to probe from a step test"
         ),

@@ -1,0 +1,172 @@
+"""The command that plans a step test, or scans of a part: plan."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from omsm_ros import quantities
+from omsm_ros.cli.arguments import number
+from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.core.correction.machine_sources import NOTHING_STATED
+from omsm_ros.core.kinematics.limits import MachineLimits
+from omsm_ros.core.kinematics.trajectories import (
+    PLANNED_COUNT,
+    PLANNED_DWELL_S,
+    SECOND_SHARE,
+    plan_csv,
+    plan_gcode,
+    plan_steps,
+)
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.descriptions import load_limits, load_sources, load_surface
+from omsm_ros.io.files import save_text
+from omsm_ros.readable import quantity
+
+
+def _declare_plan(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("what", choices=("steps", "scans"), help="a step test, or scans of a part")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    steps = sub.add_argument_group("steps")
+    for name, kind, default, meaning in (
+        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
+        ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
+        (
+            "--second-step",
+            quantities.STEP,
+            None,
+            "height of every other step [m]; 3/9.8 of --step by default",
+        ),
+        (
+            "--count",
+            quantities.COUNT,
+            PLANNED_COUNT,
+            "number of steps up, and of steps down, from the middle",
+        ),
+        (
+            "--dwell",
+            quantities.DWELL,
+            PLANNED_DWELL_S,
+            "time from edge to edge [s]; four times the dwell halves the undetected creep",
+        ),
+        ("--rise", quantities.RISE, 20e-3, "rise time of an edge [s]"),
+        ("--half-range", quantities.STEP, 50e-6, "half the measuring range of the probe [m]"),
+    ):
+        steps.add_argument(name, type=number(kind), default=default, help=meaning)
+    _declare_scans(sub.add_argument_group("scans"))
+
+
+def _plan(args: argparse.Namespace) -> Facts:
+    return _plan_scans(args) if args.what == "scans" else _plan_steps(args)
+
+
+def _plan_steps(args: argparse.Namespace) -> Facts:
+    plan = plan_steps(
+        sample_period=args.sample_period,
+        step=args.step,
+        second_step=args.second_step or SECOND_SHARE * args.step,
+        count=args.count,
+        dwell=args.dwell,
+        rise=args.rise,
+        half_range=args.half_range,
+    )
+    csv, gcode = args.out / "steps.csv", args.out / "steps.nc"
+    save_text(csv, plan_csv(plan, args.sample_period))
+    save_text(gcode, plan_gcode(plan))
+    return {
+        "edges": len(plan.starts),
+        "heights": sorted(set(map(abs, plan.heights)), reverse=True),
+        "travel": plan.travel,
+        "duration": plan.duration,
+        "rise": plan.rise,
+        "files": {"csv": str(csv), "gcode": str(gcode)},
+    }
+
+
+def _lengths(lengths: Sequence[float]) -> str:
+    return " and ".join(quantity(length, "m") for length in lengths)
+
+
+def _show_plan(facts: Facts) -> None:
+    if "sets" in facts:
+        _show_scans(facts)
+        return
+    table(
+        [
+            ("edges", f"{facts['edges']} of {_lengths(facts['heights'])}"),
+            ("travel", _lengths([facts["travel"]])),
+            ("duration", quantity(facts["duration"], "s")),
+            ("rise", f"{quantity(facts['rise'], 's')}, dithered within the sample period"),
+            written(facts["files"].values()),
+        ]
+    )
+
+
+def _declare_scans(group: argparse._ArgumentGroup) -> None:
+    group.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="surface of the part")
+    group.add_argument(
+        "--sources", type=Path, metavar="SOURCES.yaml", help="declared sources of the machine"
+    )
+    group.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="of machine and probe")
+    for name, kind, default, meaning in (
+        ("--accuracy", quantities.UNCERTAINTY, 20e-9, "expanded uncertainty asked for, k = 2 [m]"),
+        ("--radius", quantities.LENGTH, 12.7e-3, "radius of the part [m]"),
+        ("--feed", quantities.LENGTH, 1e-4, "radial feed of a turn [m]"),
+        ("--rpm", quantities.SPEED, 30.0, "spindle speed of the first scan [1/min]"),
+    ):
+        group.add_argument(name, type=number(kind), default=default, help=meaning)
+
+
+def _plan_scans(args: argparse.Namespace) -> Facts:
+    # Here, because a step test needs nothing of what adjusts scans.
+    from omsm_ros.core.adjustment import ScanDesign
+    from omsm_ros.pipelines.plan_scans import plan_facts, planned_sets
+
+    if args.nominal is None:
+        raise ConfigurationError("the surface of the part is missing; give --nominal SURFACE.yaml")
+    nominal = load_surface(args.nominal)
+    first = ScanDesign(rpm=args.rpm, start=args.radius, end=0.0, pitch=args.feed)
+    sets = planned_sets(
+        first,
+        nominal,
+        load_sources(args.sources) if args.sources else NOTHING_STATED,
+        args.accuracy,
+        load_limits(args.limits) if args.limits else MachineLimits(),
+    )
+    return plan_facts(sets, args.accuracy, args.out, nominal)
+
+
+def _scan_text(scan: Mapping[str, Any]) -> str:
+    outward = abs(scan["end"]) > abs(scan["start"])
+    turned = f" turned by {np.degrees(scan['clocking']):.0f}°" if scan["clocking"] else ""
+    beyond = " from beyond the centre" if scan["start"] * scan["end"] < 0 else ""
+    return f"{abs(scan['rpm']):g} rpm {'outward' if outward else 'inward'}{beyond}{turned}"
+
+
+def _show_scans(facts: Facts) -> None:
+    rows = []
+    for one in facts["sets"]:
+        scans = ", ".join(map(_scan_text, one["scans"]))
+        verified = "" if len(one["scans"]) > 1 else "; nothing verifies it"
+        rows.append(
+            (
+                one["name"],
+                f"U = {quantity(one['expanded_uncertainty'], 'm', 2)} (rms, k = 2) in "
+                f"{one['duration'] / 60:.1f} min: {scans}{verified}",
+            )
+        )
+    reached = "reaches" if facts["reaches"] else "does not reach"
+    table(
+        [
+            *rows,
+            ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
+            written(facts["files"]),
+        ]
+    )
+
+
+COMMANDS = (CliCommand("plan", _declare_plan, _plan, _show_plan),)

@@ -1,0 +1,68 @@
+"""``omsm plan scans``: sets of scans with what they reach, and programs that follow the part."""
+
+import json
+
+import numpy as np
+import pytest
+
+from omsm_ros import cli
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.pipelines.record_twin import write_nominal
+
+
+@pytest.fixture
+def nominal(tmp_path):
+    write_nominal(tmp_path / "mirror.yaml")
+    return tmp_path / "mirror.yaml"
+
+
+def planned(capsys, *words):
+    assert cli.main(["plan", "scans", "--json", *map(str, words)]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_the_shortest_verifiable_set_that_reaches_is_chosen(capsys, nominal, tmp_path):
+    found = planned(capsys, "--nominal", nominal, "--out", tmp_path, "--accuracy", 100e-9)
+    assert found["reaches"]
+    chosen, *others = found["sets"]
+    assert found["set"] == chosen["name"]
+    assert len(chosen["scans"]) > 1
+    reaching = [s for s in others if s["reaches"] and len(s["scans"]) > 1]
+    assert reaching
+    assert all(chosen["duration"] <= s["duration"] for s in reaching)
+    assert len(found["sets"][-1]["scans"]) == 1
+
+
+def test_more_scans_leave_less_uncertain(capsys, nominal, tmp_path):
+    found = planned(capsys, "--nominal", nominal, "--out", tmp_path)
+    reached = {s["name"]: s["expanded_uncertainty"] for s in found["sets"]}
+    assert reached["full"] < reached["quick"] < reached["single"]
+
+
+def test_the_programs_follow_the_nominal_surface(capsys, nominal, tmp_path):
+    found = planned(capsys, "--nominal", nominal, "--out", tmp_path, "--radius", 3e-3)
+    table = np.genfromtxt(tmp_path / "scan_2.csv", delimiter=",", names=True)
+    x, z, c = (table[name] for name in ("x_m", "z_m", "c_rad"))
+    height = PAPER_MIRROR.height(x * np.cos(c), -x * np.sin(c))
+    np.testing.assert_allclose(z, height, atol=1e-10)
+    speed = np.diff(c) / np.diff(table["t_s"]) * 30 / np.pi
+    scan = found["sets"][0]["scans"][1]
+    np.testing.assert_allclose(speed, scan["rpm"], rtol=1e-3)
+    lines = (tmp_path / "scan_2.nc").read_text().splitlines()
+    moves = [line for line in lines if line.startswith("G1")]
+    assert len(moves) == len(x) - 1
+    last = {word[0]: float(word[1:]) for word in moves[-1].split()}
+    assert last["Z"] == pytest.approx(z[-1] * 1e3, abs=1e-6)
+
+
+def test_a_scan_beyond_the_limits_is_refused_with_the_limit(capsys, nominal, tmp_path):
+    limits = tmp_path / "limits.yaml"
+    limits.write_text("spindle_speed_rpm: 20.0\n")
+    words = ["plan", "scans", "--nominal", nominal, "--out", tmp_path, "--limits", limits]
+    assert cli.main([str(w) for w in words]) == 2
+    assert "--rpm" in capsys.readouterr().err
+
+
+def test_a_missing_surface_is_named(capsys, tmp_path):
+    assert cli.main(["plan", "scans", "--out", str(tmp_path)]) == 2
+    assert "--nominal" in capsys.readouterr().err
