@@ -35,7 +35,7 @@ _WRONG_SIGMAS, _WRONG_M = 3.0, 5e-9
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was said of one machine, and whether it is true.
+    """Verdict on one machine, compared with the truth.
 
     verdict: code;  refused: True if step test or scans were refused
     deviates: of PV, rms and terms from the truth over their standard uncertainty
@@ -64,12 +64,11 @@ def blocks_of(made: Recording) -> Iterator[tuple[AxisBlock, DistanceBlock]]:
                 "sample_period": _PERIOD_S,
             }
             zero = np.zeros(part.stop - part.start)
-            axes = AxisBlock(
-                **head, x=made.x[part], y=zero, z=made.z[part], b=zero, c=made.c[part]
-            )
+            axes = AxisBlock(**head, x=made.x[part], y=zero, z=made.z[part], b=zero, c=made.c[part])
             status = np.where(np.isfinite(made.distance[part]), Status.OK, Status.NO_TARGET)
-            yield axes, DistanceBlock(
-                **head, distance=made.distance[part], status=status.astype(np.uint8)
+            yield (
+                axes,
+                DistanceBlock(**head, distance=made.distance[part], status=status.astype(np.uint8)),
             )
 
 

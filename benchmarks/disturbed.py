@@ -118,7 +118,7 @@ def _lies(what: str, found: Sequence[Outcome]) -> Row:
 
 
 def _wrong_causes(what: str, found: Sequence[Outcome]) -> Row:
-    """Of those with a reservation or rejected, the share that names a wrong cause."""
+    """Return the share of reserved or rejected results that name a wrong cause."""
     stated = [o for o in found if o.named]
     wrong = [o for o in stated if o.named == named_causes.WRONG]
     share = _percent(wrong, stated) if stated else 0.0

@@ -63,9 +63,10 @@ _MADE = {
 def judged(name: str, findings: Iterable[Finding]) -> str:
     """Return whether the causes that ``findings`` name are those of the disturbance ``name``.
 
-    name: of the catalogue; of a pair, both with " + " between them
-    RIGHT if every finding names a cause that was made, WRONG if one does not, and UNKNOWN if no
-    finding names a cause.
+    name: of the catalogue; a pair has " + " between its two names
+
+    RIGHT if every finding names a cause that was made, WRONG if one does not. UNKNOWN if no finding
+    names a cause.
     """
     made = {
         cause

@@ -48,8 +48,8 @@ def write_spiral(path: Path, samples: int, block: int = _BLOCK, seed: int = 0) -
 def write_two_drivers(path: Path, samples: int, seed: int = 0) -> None:
     """Write the same motion as sent by separate drivers of axes and probe.
 
-    Each cuts its own blocks, counts from its own start (the probe's count and TWO_DRIVERS_OFFSET
-    are the axes'), stamps with a clock that scatters by 20 µs, and delivers up to 20 ms late.
+    Each cuts its own blocks and counts from its own start: the count of the axes is that of the
+    probe plus TWO_DRIVERS_OFFSET. Its clock scatters by 20 µs, and it delivers up to 20 ms late.
     """
     random = np.random.default_rng(seed)
     noise = random.normal(0.0, 1e-8, _BLOCK)

@@ -1,8 +1,8 @@
 """Identification of measured data against the peers: ``python -m benchmarks.real_data``.
 
-Each method identifies the first half of a DaISy record (De Moor et al., KU Leuven) and runs
-freely over the second, from a state it could know at the end of the first. The score is the
-variance accounted for there.
+Each method identifies the first half of a DaISy record (De Moor et al., KU Leuven). It then
+simulates the second half from its state at the end of the first. The score is the variance
+accounted for in the second half.
 Peers are optional: ``pip install nfoursid sippy_unipi ctrlsys pandas``; Octave with its control
 package (``apt install octave octave-control``), whose seconds include those it takes to start.
 """

@@ -1,6 +1,6 @@
-"""Recordings of the twin that several tests look at; made once, never changed.
+"""Fixtures: recordings of the twin that several tests share, made once and never changed.
 
-And their order: several processes share the tests, a file each, and files with nodes mostly wait.
+The order of tests: several processes share the test files, and files with nodes mostly wait.
 """
 
 import signal
@@ -17,10 +17,10 @@ from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
 
 
 def pytest_configure():
-    """What a busy computer and a shell in the background would make of the tests.
+    """Make the tests independent of a busy computer and of a shell in the background.
 
-    An example of hypothesis would have 200 ms; each test has its time-out. Such a shell ignores
-    SIGINT, and so would every node that a test starts.
+    Hypothesis limits an example to 200 ms, but each test has its own time-out. A background shell
+    ignores SIGINT, and so would every node that a test starts.
     """
     hypothesis.settings.register_profile("whole tests are timed", deadline=None)
     hypothesis.settings.load_profile("whole tests are timed")

@@ -1,7 +1,7 @@
-"""Studied scans at an even pace and the lines in them, as numbers: no heights, so in no time.
+"""Scans at a constant pace and their spectral lines, as numbers without heights, to save time.
 
-What is on the part, shakes or turns with the spindle is seen where folding puts it, by looking at
-all images.
+Lines of the part, of vibration and of the spindle appear at their alias frequencies; all images are
+searched.
 """
 
 from types import SimpleNamespace
@@ -20,7 +20,7 @@ def scan(
     feed=1e-4, name="A", acceleration_lines=None, on_circle=False,
     rings=(0.0, 0.0),
 ):  # fmt: skip
-    """``pace`` [m/s] along the path, ``turning`` [turns/s], ``feed`` [m/turn], so many ``seconds``.
+    """Return a scan of ``seconds`` at ``pace`` [m/s], ``turning`` [turns/s] and ``feed`` [m/turn].
 
     sigma: of the amplitude of a line [m];  rings: the radii at which it begins and ends [m]
     """
@@ -61,7 +61,7 @@ def scan(
 
 
 def line(frequency, amplitude=5 * NM, uncertainty=1e-4, coordinate=TIME, **possible):
-    """Of so many waves a unit of ``coordinate``, and of others in which it may be one."""
+    """Return a line of ``frequency`` in waves per unit of ``coordinate``, and its alternatives."""
     return SpectralLine(
         coordinate=coordinate, frequency=frequency, cosine=amplitude, sine=0.0,
         frequency_uncertainty=uncertainty, possible={coordinate: frequency, **possible},

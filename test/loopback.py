@@ -1,7 +1,7 @@
 """A driver and its instrument on one thread and one simulated clock.
 
-Nothing waits: reading moves the clock on until there is something to read. What took minutes
-takes milliseconds, and happens the same way every time.
+Nothing waits: reading moves the clock on until there is something to read. Minutes of
+simulated time take milliseconds, and every run is the same.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class Loopback:
 
     @property
     def line(self) -> _DeviceEnd:
-        """What the instrument is given."""
+        """The end of the line that the instrument holds."""
         return _DeviceEnd(self)
 
     # The driver's side.

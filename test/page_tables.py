@@ -84,9 +84,9 @@ def value_of(text):
 
 
 def says(text, value, digits=3):
-    """Whether a cell says ``value``, rounded to so many digits."""
+    """Return whether a cell contains ``value``, rounded to ``digits``."""
     reported = value_of(text)
     if reported is None or value is None:
         return reported is value
-    # A digit more is no lie: a probe of half a unit in the last place, and of binary fractions.
+    # Allow half a unit in the last place, and rounding of binary fractions.
     return abs(reported - value) <= 0.5001 * 10.0 ** (1 - digits) * abs(value) + 1e-300

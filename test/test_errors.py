@@ -1,4 +1,4 @@
-"""What an error says in one line: how long, with which ends; and the limit of open files."""
+"""Text of an error on one line: its length and its ends; and the limit of open files."""
 
 import errno
 import math

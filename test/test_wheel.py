@@ -95,7 +95,7 @@ def test_it_installs_every_command(wheel):
 
 @pytest.mark.parametrize("absent", ["rclpy", "omsm_msgs"])
 def test_a_node_that_finds_no_ros_ends_in_one_line(installed, absent):
-    """Of ``pip install`` without ROS, and of ``ros2 run`` without the messages."""
+    """Covers ``pip install`` without ROS, and ``ros2 run`` without the messages."""
     program = (
         f"import sys, types; sys.path.insert(0, {str(installed)!r})\n"
         "sys.modules['rclpy'] = sys.modules['omsm_msgs'] = types.ModuleType('stand_in')\n"
@@ -114,7 +114,7 @@ def test_a_node_that_finds_no_ros_ends_in_one_line(installed, absent):
 
 
 def licence(package):
-    """What a package says of its licence: expression, classifiers, or its first lines."""
+    """Return the licence that a package states: expression, classifiers, or its first lines."""
     about = importlib.metadata.metadata(package)
     classifiers = [c for c in about.get_all("Classifier", []) if c.startswith("License")]
     return " ".join([about.get("License-Expression", ""), *classifiers, about.get("License", "")])

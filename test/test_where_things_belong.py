@@ -1,4 +1,4 @@
-"""What a newcomer adds goes into one room, and is then everywhere: each is added here, and seen.
+"""Each kind of extension needs one change in one folder, and then appears everywhere.
 
 The answers in words stand in docs/design/where-things-belong.md.
 """
@@ -135,7 +135,7 @@ def test_an_uncertainty_source_is_added_in_core_correction(source, true_calibrat
     assert budget[source] == pytest.approx(np.sqrt(mean_square), rel=1e-6, abs=0)
 
 
-# What needs another source: tried on a copy of it.
+# Additions that change the source are tested on a copy of it.
 
 
 def changed_copy(folder, path, *changes):

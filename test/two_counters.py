@@ -23,7 +23,7 @@ Blocks = list[tuple[AxisBlock, DistanceBlock]]
 
 
 def motion(kind: str) -> FloatArray:
-    """Z of a chirp, of uneven steps, of a sine, or at rest [m], (n,)."""
+    """Return Z of a chirp, of uneven steps, of a sine, or of a stationary axis [m], (n,)."""
     t = np.arange(N + 2000) * PERIOD
     if kind == "chirp":
         return np.asarray(20e-6 * np.sin(2 * np.pi * (0.5 * t + 0.35 * t**2)))

@@ -142,7 +142,7 @@ def air(rms: float, corner: float = 0.05) -> Effect:
     return effect
 
 
-def knock(amplitude: float, at: float, tilt: float = 0.0) -> Effect:
+def height_step(amplitude: float, at: float, tilt: float = 0.0) -> Effect:
     """Step by ``amplitude`` and ``tilt`` × part's x when the share ``at`` of a scan is done."""
 
     def effect(now: Moment) -> Array:

@@ -80,7 +80,7 @@ def _harmonic(kind: Callable, per_turn: float) -> Build:
 
 
 def _radial(m: Machine, value: float, site: Site) -> Machine:
-    """Move the spindle sideways twice a turn."""
+    """Move the spindle laterally twice a turn."""
     phase = site.phase()
     wave = effects.offset_beam_by(lambda now: np.cos(2 * now.c + phase), abs(value) * 2**0.5)
     return m.plus("place", wave)

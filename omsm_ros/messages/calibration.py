@@ -4,7 +4,7 @@ from __future__ import annotations
 
 TEMPLATES: dict[str, str] = {
     "calibration.text": "{text}",
-    # What a calibration file or message contains.
+    # Content of a calibration file or message.
     "calibration.severity": "finding of severity {severity!r}, expected one of {known}",
     "calibration.verdict": (
         "certificate: verdict is {verdict}, expected one of {known}; identify again"
@@ -74,7 +74,7 @@ TEMPLATES: dict[str, str] = {
     ),
     # Use with other data.
     "calibration.not_applicable": (
-        "calibration {id} does not belong to these data: {reasons}. Set the cell as it was, "
+        "calibration {id} does not match these data: {reasons}. Set the cell as it was, "
         "identify again, or ignore the difference ({opt.override})"
     ),
     "calibration.not_judged": "its certificate states no verdict",
@@ -94,7 +94,7 @@ TEMPLATES: dict[str, str] = {
     ),
     # Model errors that a test could not detect.
     "calibration.undetected_creep": "slow relaxation (creep) of {parameter:s}",
-    "calibration.undetected_mode": "a light mode at {parameter:Hz}",
+    "calibration.undetected_mode": "a lightly damped mode at {parameter:Hz}",
     "calibration.undetected_stiffening": "a stiffness that grows with the deflection",
     "calibration.undetected_other": "an undetected model error",
     # Comparison and repeatability.

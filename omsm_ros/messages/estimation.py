@@ -52,7 +52,7 @@ TEMPLATES: dict[str, str] = {
     # Orders and excitation.
     "estimation.order": "order {order!r}, expected 0 (choose) to {most}",
     "estimation.too_many_samples": (
-        "{samples} samples are used, at most {most} fit into memory beside their derivatives; give "
+        "{samples} samples are used, at most {most} fit into memory with their derivatives; give "
         "a shorter {opt.duration}"
     ),
     "estimation.too_few_samples": (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# What to do at the machine against each model error.
+# Remedies at the machine for each model error.
 _CREEP = "let the joints of probe and target settle, and rest longer on each plateau"
 _MODE = "look for a loose part, and for what the machine stands on"
 _BACKLASH = "tighten the mount of the probe, or preload it"
@@ -14,7 +14,7 @@ _DRIFT = "let the machine warm up and its joints settle, and shield it"
 
 _NAMES = {
     "creep": ("slow relaxation (creep) with a time constant of {time_constant_s:s/2}", _CREEP),
-    "mode": ("a light mode at {frequency_hz:Hz/4}", _MODE),
+    "mode": ("a lightly damped mode at {frequency_hz:Hz/4}", _MODE),
     "backlash": ("backlash of ±{size_m:m}", _BACKLASH),
     "friction": (
         "friction of ±{size_m:m} that slides after {travel_m:m} of travel",
@@ -120,14 +120,14 @@ TEMPLATES: dict[str, str] = {
         "sampling; use jerk-limited or dithered edges, or sample faster"
     ),
     "identification.creep_within_plateau": (
-        "drift or creep leaves the gain of a motion uncertain by {half_width:%} against that at "
-        "rest, at most {gain:%} are allowed: in this motion a relaxation of {time_constant_s:s/2} "
+        "drift or creep leaves the dynamic gain uncertain by {half_width:%} relative to the static "
+        "gain, {gain:%} is allowed: in this motion a relaxation of {time_constant_s:s/2} "
         "looks like static gain; move in steps that rest {time_constant_s:s/2} or longer "
         "({opt.dwell} of the step plan)"
     ),
     "identification.creep_beyond_plateau": (
-        "drift or creep leaves the gain of a motion uncertain by {half_width:%} against that at "
-        "rest, at most {gain:%} are allowed: a relaxation of {time_constant_s:s/2} does not show "
+        "drift or creep leaves the dynamic gain uncertain by {half_width:%} relative to the static "
+        "gain, {gain:%} is allowed: a relaxation of {time_constant_s:s/2} does not show "
         "on plateaus of {plateau_s:s/2}; let the machine settle and rest {time_constant_s:s/2} on "
         "each plateau ({opt.dwell} of the step plan)"
     ),

@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 PARAMETERS = (
     Parameter("buffer_samples", 3_600_000, "samples kept per topic", quantities.BUFFER_SAMPLES),
     Parameter(
-        "output", "calibration.json", "link to the calibration in force; each has a file beside it"
+        "output",
+        "calibration.json",
+        "link to the calibration in force; each has a file in the same folder",
     ),
     Parameter("report", "", "folder for the certificate of each identification; empty = none"),
     Parameter("settings", "", "JSON object of the cell's settings, stored in the calibration"),
@@ -75,8 +77,8 @@ class CalibratorNode(ManagedNode):
         self._last, self._trouble = "nothing identified yet", ""
         self._claim(undo)
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
-        self._aside = BackgroundWorker(self, undo)
-        self._aside.serve(undo, Identify, "~/identify", self._on_identify)
+        self._worker = BackgroundWorker(self, undo)
+        self._worker.serve(undo, Identify, "~/identify", self._on_identify)
         self._probe: dict[str, object] = {}
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
         self._publish_stored()
@@ -148,7 +150,7 @@ class CalibratorNode(ManagedNode):
     async def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
         try:
             bag = self._bag(request.bag)
-            identified = await self._aside.do(self._work(request, bag))
+            identified = await self._worker.do(self._work(request, bag))
             calibration = identified.calibration
             since_ns = self._topic.decided()
             response.calibration = message_mapping.calibration_message(
@@ -156,9 +158,9 @@ class CalibratorNode(ManagedNode):
             )
             response.success, self._last = self._judge(calibration, since_ns)
             if response.success and self.values["catalogue"]:
-                self._last += await self._aside.do(partial(self._noted, bag, calibration))
+                self._last += await self._worker.do(partial(self._noted, bag, calibration))
             if self.values["report"]:
-                said = await self._aside.do(partial(self._certified, bag, identified))
+                said = await self._worker.do(partial(self._certified, bag, identified))
                 self._last += said
         except OmsmError as err:
             response.success, self._last = False, f"identification failed: {one_line(err)}"
@@ -251,7 +253,7 @@ class CalibratorNode(ManagedNode):
         in_force = self._topic.calibration
         values: dict[str, object] = {
             "calibration": in_force.id if in_force else "",
-            "requests_waiting": self._aside.waiting,
+            "requests_waiting": self._worker.waiting,
             "blocks_refused": sum(self._refused.values()),
         }
         for topic, buffer in self._buffers.items():

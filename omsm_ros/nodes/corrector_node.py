@@ -284,9 +284,9 @@ class CorrectorNode(ManagedNode):
         )
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
         publish_frames(self, undo, self._options.geometry, self.values)
-        self._aside = BackgroundWorker(self, undo)
-        self._aside.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
-        self._aside.serve(undo, PredictError, "~/predict_error", self._on_predict)
+        self._worker = BackgroundWorker(self, undo)
+        self._worker.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
+        self._worker.serve(undo, PredictError, "~/predict_error", self._on_predict)
         if path := self.values["calibration"]:
             self._put_in_force(load_calibration(path), since(Path(path)))
         else:
@@ -371,7 +371,7 @@ class CorrectorNode(ManagedNode):
         response.id = self._in_force_id()
         folders = self.values["calibration_folders"]
         path = resolved_within(Path(request.path), folders, CalibrationError, "calibration")
-        calibration = await self._aside.do(partial(load_for_others, path))
+        calibration = await self._worker.do(partial(load_for_others, path))
         self._put_in_force(calibration, self._topic.decided())
         response.success, response.message = True, "in use"
         response.id = self._in_force_id()
@@ -389,7 +389,7 @@ class CorrectorNode(ManagedNode):
         if bag:
             bag = str(resolved_within(Path(bag), self.values["bag_folders"], BagError, "bag"))
         known, period = self._topic.calibration, request.sample_period
-        prediction = await self._aside.do(partial(_prediction, known, bag, request.z, period))
+        prediction = await self._worker.do(partial(_prediction, known, bag, request.z, period))
         response.peak_to_valley = prediction.peak_to_valley
         response.rms = prediction.rms
         response.outside_band_fraction = prediction.outside_band_fraction
@@ -470,7 +470,7 @@ class CorrectorNode(ManagedNode):
             )
             report.values |= light_values(light)
         report.values["points_subscribers"] = self._points.get_subscription_count()
-        report.values["requests_waiting"] = self._aside.waiting
+        report.values["requests_waiting"] = self._worker.waiting
         if self._frame != self.values["workpiece_frame"]:
             report.add(
                 WARN, "correcting although the settings do not match the calibration (overridden)"

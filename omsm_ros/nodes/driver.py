@@ -187,8 +187,8 @@ class ConfocalDriverNode(DriverNode):
     def configure(self, undo: ExitStack) -> None:
         """Make the device, not yet connected, and answer requests."""
         super().configure(undo)
-        self._aside = BackgroundWorker(self, undo)
-        self._aside.serve(undo, Trigger, "~/dark_reference", self._on_dark_reference)
+        self._worker = BackgroundWorker(self, undo)
+        self._worker.serve(undo, Trigger, "~/dark_reference", self._on_dark_reference)
 
     async def _on_dark_reference(
         self, request: Trigger.Request, response: Trigger.Response
@@ -199,7 +199,7 @@ class ConfocalDriverNode(DriverNode):
                 f"device {self.values['device']!r} takes no dark reference by command; take "
                 "it as the device's manual says"
             )
-        await self._aside.do(partial(self._reader.ask, take, _DARK_REFERENCE_S))
+        await self._worker.do(partial(self._reader.ask, take, _DARK_REFERENCE_S))
         response.success, response.message = True, "dark reference taken; identify again"
 
 

@@ -39,7 +39,7 @@ MAP = "difference.csv"
 
 _METHOD = (
     "local quadratic regression on means of square cells, tricube weights over "
-    f"{RADIUS_CELLS:g} cells, beside a polynomial of degree {TREND_DEGREE}"
+    f"{RADIUS_CELLS:g} cells, together with a polynomial of degree {TREND_DEGREE}"
 )
 
 

@@ -460,7 +460,7 @@ def _accuracy_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def adjustment_rows(adjusted: dict[str, Any]) -> Iterable[tuple[str, str]]:
-    """Yield names and texts of the verdict, beside the truth of the twin."""
+    """Yield names and texts of the verdict, and the truth of the twin."""
     yield "form of the part", headline(adjusted)
     yield "  verdict", adjusted["verdict"]["text"]
     for reason in adjusted["verdict"]["reasons"]:

@@ -153,10 +153,9 @@ def judge_form(
 
     asked: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
     filters: wavelengths of the S- and the L-filter [m], None for those that the points allow
-    tolerance: of the peak to valley of 99.5 % of the part [m], None without one
+    tolerance: of the peak to valley of 99.5 % of the part [m], None without one.
 
-    Raises DataError for points that do not fit the surface, or do not determine a degree of
-    freedom that was asked for.
+    Raises DataError for points that do not fit the surface or do not determine the pose asked for.
     """
     form = measured.form(surface, asked, aperture, filters)
     facts = form_facts(form, measured, surface)

@@ -117,7 +117,9 @@ def offset_in(
     z, d = z[:both], d[:both]
     known = np.flatnonzero(np.isfinite(z))
     if not len(known):
-        raise DataError(f"{str(path)!r} has no position of Z beside its distance; record a motion")
+        raise DataError(
+            f"{str(path)!r} has no position of Z at the times of its distance; record a motion"
+        )
     z = np.interp(np.arange(both), known, z[known])
     found = counter_offset(
         z,

@@ -1,4 +1,4 @@
-"""Whole turns of an encoder are added for any motion and blocks, also after spoilt counts."""
+"""Full turns of an encoder are added for any motion and blocks, also after invalid counts."""
 
 import numpy as np
 import pytest

@@ -139,7 +139,7 @@ def test_who_is_faster_into_a_folder_keeps_it(tmp_path):
 
 @pytest.mark.parametrize("mine", [MEASUREMENT_FILES, FORM_FILES])
 def test_a_measurement_may_have_a_form_and_a_form_has_no_measurement(tmp_path, mine):
-    """Else a form written into the folder of a result would invalidate the result."""
+    """A form written into the folder of a result must not invalidate the result."""
     out = tmp_path / "out"
     with result_folder(out, MEASUREMENT_FILES) as folder:
         for name in ("cloud.ply", "form.json", "summary.json"):

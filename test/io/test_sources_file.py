@@ -15,7 +15,7 @@ WAVE = (
     "{source: spindle_axial, per_turn: 2, value: 8.0e-9, unit: m, distribution: arcsine, "
     "how: evaluated, reason: ball}"
 )
-NOISE = "{source: probe_noise, value: 1.0e-8, unit: m, how: evaluated, reason: at rest}"
+NOISE = "{source: probe_noise, value: 1.0e-8, unit: m, how: evaluated, reason: fixed target}"
 
 
 def load(folder: Path, *items: str, head: str = HEAD):

@@ -202,7 +202,7 @@ def test_a_stated_period_that_time_contradicts_is_refused(tmp_path):
         imported(tmp_path, TIMED + 'delimiter: ";"\nsample_period: 0.002\n', "a.csv")
 
 
-# What logs hold.
+# Content of logs.
 
 PROBE = "sample_period: 0.001\ncolumns:\n  distance: {name: d, unit: um}\n"
 

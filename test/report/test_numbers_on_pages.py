@@ -171,8 +171,10 @@ def peak(kind="part", **changes):
 @FEW
 @given(st.floats(1e-3, 1e5), st.floats(1e-7, 1e-1), LENGTH, st.floats(3, 900))
 def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, significance):
-    reported = peak(PART, frequency=frequency, wavelength_along_path=wavelength, amplitude=amplitude,
-                significance=significance)  # fmt: skip
+    reported = peak(
+        PART, frequency=frequency, wavelength_along_path=wavelength, amplitude=amplitude,
+        significance=significance,
+    )  # fmt: skip
     page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([reported]), {})))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[0] == PART
@@ -210,8 +212,10 @@ def test_scans_sampling_and_band_stop_are_reported_in_their_units():
     stop = {"bands": [[310.0, 330.0], [40.0, 50.0]], "rms_before": 5e-9, "rms_after": 3e-9,
             "rms_removed": 4e-9, "settling_at_the_ends": 0.25}  # fmt: skip
     summary = spectrum_summary([peak()], stop=stop)
-    acceleration_lines = {"axis": "z", "frequency": 680.0, "acceleration": 0.0912, "displacement": 5e-9,
-            "significance": 44.0}  # fmt: skip
+    acceleration_lines = {
+        "axis": "z", "frequency": 680.0, "acceleration": 0.0912, "displacement": 5e-9,
+        "significance": 44.0,
+    }  # fmt: skip
     summary["scans"][0]["accelerometer"] = {"lines": [acceleration_lines]}
     page = PageTables(render_spectrum(SpectrumPage(summary, {})))
     (scans,) = (t for t in page.tables if "duration" in t["columns"])

@@ -39,7 +39,7 @@ class Calibration:
     """G_m with its covariance and the settings it was measured under.
 
     dynamics: G_m(s), fitted with G_m(0) = 1
-    static_gain: probe travel per encoder travel at rest [1]; the corrector divides the
+    static_gain: static probe travel per encoder travel [1]; the corrector divides the
         probe's distance by it, for the encoder is the length standard
     sample_period: of the data it was identified from [s]
     valid_up_to: highest frequency at which the response is trusted [Hz]
@@ -111,7 +111,7 @@ class Calibration:
 
     @property
     def latency(self) -> Latency:
-        """What is known of the latency of the probe; unresolved where nothing is stated."""
+        """Stated latency of the probe; an unresolved one where nothing is stated."""
         stated = self.certificate.latency
         return unresolved_latency(self.dynamics.low_frequency_delay) if stated is None else stated
 
@@ -191,7 +191,7 @@ def excess_latency_text(
 ) -> Notice | None:
     """Return a notice on a ``delay`` ± ``uncertainty`` [s] beyond the whole lag of Z, else None.
 
-    What is left of the lag would be a structure that moves before its slide.
+    A longer latency is not plausible: the structure would have to move before its slide.
     """
     lag = calibration.dynamics.low_frequency_delay
     spread = calibration.low_frequency_delay_uncertainty

@@ -41,7 +41,7 @@ def _check_uncertainty(value: float | None, name: str) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """What was calibrated, by whom, with what and when.
+    """Origin of a calibration: machine, probe, operator, method and time.
 
     recorded_ns: when the recording began [ns, ROS time]
     input: of the identification, "encoder" or "reference"
@@ -108,7 +108,7 @@ class CandidateFit:
 
 @dataclass(frozen=True, kw_only=True)
 class Residual:
-    """What the fitted model leaves of the readings.
+    """Statistics of the residual of the fitted model.
 
     rms_m: of the residual;  noise_m: standard deviation of a reading where the axis rests
     chi_square: mean square residual where the axis moves over that of the noise
@@ -154,7 +154,7 @@ class TwoMassModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Response:
-    """What the identified response looks like.
+    """Properties of the identified response.
 
     low_frequency_delay_s: of slow motion, with its standard uncertainty
     inter_sample_delay_bound_s: bound on its bias from motion between the samples
@@ -265,7 +265,7 @@ class UndetectedEntry:
 class Undetected:
     """Model errors that the test could not detect.
 
-    gain_u: standard uncertainty that they leave in the gain of what moves against that at rest
+    gain_u: standard uncertainty that they leave in the dynamic gain relative to the static gain
     plateau_s: time from edge to edge of the test;  plateau_needed_s: one that would show them
     slowest_creep_s, lowest_mode_hz: beyond which none is assumed to exist
     """

@@ -1,4 +1,4 @@
-"""What a calibration is for: the Z motion of the scans to be corrected, and the accuracy asked."""
+"""Intended use of a calibration: Z motion of the scans to be corrected, and their accuracy."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Has the machine changed since it was calibrated? Compare two identified responses.
+"""Repeatability of calibrations, and change of a machine between two of them.
 
-The comparison is of the responses over the band both know, through both covariances: the
-same, or changed by so much at so many sigma.
+Two identified responses are compared over their common valid band with both covariances. The
+result is the change and its significance in standard deviations.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class Repeatability:
-    """Of ``count`` calibrations of one machine.
+    """Scatter of ``count`` calibrations of one machine.
 
     delay: low-frequency [s];  static_gain: [1]
     frequency: (k,) [Hz], at which gain [1, relative] and phase [rad] have a standard deviation

@@ -1,4 +1,4 @@
-"""Of many measurements: which stands out, and do they drift?"""
+"""Outliers and linear trend of many measurements."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 _LIMIT = 3.5
 # The median absolute deviation of a normal distribution is 0.6745 of its standard deviation.
 _NORMAL = 0.6745
-# Of fewer, a median and its spread say nothing.
+# A median and its spread are not reliable for fewer values.
 FEWEST = 5
-# All slopes between so many points are half a million: milliseconds, and a few megabytes.
+# Limits the number of slopes between two points to half a million, a few megabytes.
 _MOST = 1000
 
 
 def outliers(values: FloatArray) -> BoolArray:
     """Return True for each of ``values`` (n,) that lies far from the others; NaN never does.
 
-    By the modified z-score ``0.6745 |v − median| / MAD`` > 3.5. Of fewer than five nothing is
-    said; where half the values are equal, every other one stands out by its mean deviation.
+    The criterion is the modified z-score ``0.6745 |v − median| / MAD`` > 3.5. Fewer than five
+    values have no outliers. Where half the values are equal, the mean deviation replaces the MAD.
     """
     found = np.zeros(len(values), np.bool_)
     known = np.isfinite(values)
@@ -52,9 +52,9 @@ class LinearTrend:
 def trend(times: FloatArray, values: FloatArray) -> LinearTrend | None:
     """Return the slope of ``values`` (n,) over ``times`` [s] (n,) after Theil and Sen.
 
-    The median of all slopes between two points: a third of the points may be wrong. Of more than
-    1000 points, 1000 are taken evenly from the first to the last. None for fewer than five known
-    values, or where all were taken at one time.
+    It is the median of all slopes between two points: a third of the points may be wrong. More
+    than 1000 points are thinned evenly to 1000. None for fewer than five known values, or where
+    all were taken at one time.
     """
     known = np.flatnonzero(np.isfinite(values) & np.isfinite(times))
     if len(known) < FEWEST or np.ptp(times[known]) <= 0:

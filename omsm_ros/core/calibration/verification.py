@@ -1,4 +1,4 @@
-"""How far is the probe from the model on a free path? The paper's Fig. 9."""
+"""Difference between probe and model on a free path, as in the paper's Fig. 9."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy import signal
 
 from omsm_ros.core.streams.blocks import FloatArray
 
-# Of the motion; a longer taper would hide where a sweep begins and ends.
+# Tapered share of the motion; a longer taper would remove the ends of a sweep.
 _TAPERED = 0.02
 # Share of the strongest band's power.
 _EXCITED = 0.1

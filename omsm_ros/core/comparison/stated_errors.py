@@ -97,9 +97,9 @@ def likely_drift(
     noise: independent standard deviation of each place (m,) [m]
     drifts: shapes for a size of one metre (l, m)
 
-    The posterior of the size s follows from ``difference ~ N(0, noise² + knownᵀ known + s² driftsᵀ
-    drifts)`` with a prior uniform in log s. Twice the result covers 95.45 % of the drift averaged
-    over that posterior, as a Student factor does for one observation.
+    The difference has the distribution ``N(0, noise² + knownᵀ known + s² driftsᵀ drifts)``.
+    The prior of the size s is uniform in log s. Twice the result covers 95.45 % of the drift
+    averaged over the posterior of s, as a Student factor does for one observation.
     """
     some = np.linspace(0, len(difference) - 1, min(_NODES, len(difference))).astype(np.int64)
     shapes = known[:, some]

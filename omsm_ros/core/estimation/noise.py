@@ -223,7 +223,7 @@ def correct_errors_in_variables(
     made = np.where(problem.used, problem.modelled(fitted) - quiet.modelled(fitted), 0.0)
     if not np.any(made):
         return None
-    share, band = _unfollowed_share(problem.on_grid(fitted.residual, 0.0), made)
+    share, band = _errors_in_variables_share(problem.on_grid(fitted.residual, 0.0), made)
     if share is None:
         return None
     errors_in_variables = fft.irfft(share[band] * fft.rfft(noise), len(noise))
@@ -235,7 +235,9 @@ def correct_errors_in_variables(
     )
 
 
-def _unfollowed_share(residual: FloatArray, made: FloatArray) -> tuple[FloatArray | None, IntArray]:
+def _errors_in_variables_share(
+    residual: FloatArray, made: FloatArray
+) -> tuple[FloatArray | None, IntArray]:
     """Return the share of ``made`` (n,) that ``residual`` (n,) lacks in each band, and the bands.
 
     Bands that do not differ have one share. Others have their own: vibration of the servo is

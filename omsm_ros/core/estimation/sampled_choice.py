@@ -107,8 +107,8 @@ def choose_sampled(
 
     order: number of poles, 0 to choose;  max_delay: whole samples to try
 
-    Raises IdentificationError when too few samples are used for the order asked for, or the input
-    has too few frequencies, for an order beyond MAX_POLES, or where a value is not finite.
+    Raises IdentificationError for too few samples or frequencies of the input, for an order beyond
+    MAX_POLES, or where a value is not finite.
     """
     most = check_record(input, output, used, order)
     centred = np.where(used, output - np.mean(output[used]), 0.0)

@@ -45,8 +45,8 @@ from omsm_ros.errors import StepTestError
 
 # Evenly over the band; a covariance of seven coefficients has no more directions than that.
 _LINES = 40
-# Root of the reduced χ², which has one or two degrees of freedom: chance exceeds it three times in
-# a thousand at most.
+# Root of the reduced χ², with one or two degrees of freedom: chance exceeds it three times in a
+# thousand at most.
 _GREATEST_MISFIT = 3.0
 # Beyond this relative uncertainty of a mass its linear propagation does not hold.
 _GREATEST_UNCERTAINTY = 0.5

@@ -38,7 +38,7 @@ Findings = Iterator[Finding]
 WORST_AGREEMENT = 2.5
 # The square of a residual over that of the noise, above which the residual is not noise.
 WORST_CHI_SQUARE = 1.3
-# Below it the readings at rest are noisier than in motion: something still rings.
+# Below it the readings of a stationary axis are noisier than in motion: a mode still rings.
 LEAST_CHI_SQUARE = 0.3
 # Standard uncertainties beyond which a lag is not due to chance.
 _SIGNIFICANT = 5.0
@@ -206,7 +206,7 @@ def late_reference(lag: ReferenceLag | None, harmless: float) -> Findings:
 def dynamic_gain_finding(
     uncertainty: float, time_constant: float, plateau: float, limit: float
 ) -> Findings:
-    """Reject a test that leaves the gain of what moves too uncertain against that at rest.
+    """Reject a test whose dynamic gain is too uncertain relative to the static gain.
 
     uncertainty: standard, of that gain, relative, from a relaxation of ``time_constant`` [s]
     plateau: time from edge to edge [s];  limit: of the 95 % band, relative
@@ -263,7 +263,7 @@ def accuracy(use: IntendedUse, reached: float) -> Findings:
 
 
 def requested_order(order: int, factor: float) -> Findings:
-    """Warn of uncertainties that were taken ``factor`` times as large, see ``inflate_to_free_choice``."""
+    """Warn of uncertainties enlarged by ``factor``, see ``inflate_to_free_choice``."""
     if factor > 1:
         yield Finding("identification.requested_order", WARNING, {"order": order, "factor": factor})
 

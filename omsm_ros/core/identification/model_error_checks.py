@@ -59,7 +59,7 @@ _UNMODELLED_CODES = {
     MODE: "identification.unmodelled_mode",
     STIFFENING: "identification.unmodelled_stiffening",
 }
-# What the parameter of a family is, for its sentence.
+# Name of the parameter of a family in the values of a finding.
 _PARAMETERS = {
     CREEP: "time_constant_s",
     MODE: "frequency_hz",

@@ -1,4 +1,4 @@
-"""Is the residual of a fit only noise? Tests of it, and a second method.
+"""Tests whether the residual of a fit is only noise, and a second method.
 
 The tests of Ljung (1999, ch. 16). A white residual says that the model of the noise is right, one
 that is independent of the motion says that the dynamics are. The second matters more: the
@@ -22,7 +22,7 @@ from omsm_ros.linear_algebra import orthonormal
 
 # As resid of the System Identification Toolbox takes.
 _LAGS = 25
-# After an edge the response is looked at for this long.
+# The response after an edge is tested for this long.
 _AFTER_EDGE_S = 50e-3
 # Then a standard deviation is known to a twentieth.
 _LEAST_STATIONARY_SAMPLES = 200
@@ -58,7 +58,7 @@ class ResidualTests:
 
 
 def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests:
-    """Compare the residual of ``fitted`` with the noise at rest, with itself, with the motion."""
+    """Test the residual of ``fitted`` against stationary noise, whiteness and the motion."""
     on_grid = np.zeros(len(problem.used))
     on_grid[problem.used] = fitted.residual
     active = problem.used & _active(steps, problem.period)
@@ -66,8 +66,8 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
     step = reading_step(problem.output[problem.used]) if problem.shared > 0 else 0.0
     crossing = problem.used & (np.abs(np.gradient(problem.input)) > step)
     if step > 0 and np.sum(crossing) >= _LEAST_CROSSINGS:
-        # Readings that hardly change at rest do not tell the noise: rounding holds it. Where the
-        # axis crosses a step from sample to sample, it scatters over the whole step.
+        # Rounded readings of a stationary axis hardly change and do not show the noise. Where the
+        # axis crosses a step from sample to sample, the rounding error covers the whole step.
         active = crossing
         noise = max(noise, step / np.sqrt(12.0), _white_noise_deviation(on_grid[crossing]))
     seen_moving = on_grid[active] if np.any(active) else fitted.residual
@@ -93,7 +93,7 @@ def _axis_timing(
     excess: of the mean square of the residual where ``moves`` (n,), over ``noise``² [m²]
     """
     rate = rate_of(problem)
-    # Noise that was taken out at rest only would look like scatter where the axis moves.
+    # Noise removed only where the axis is stationary would look like scatter in motion.
     recorded = (
         problem.input
         if problem.errors_in_variables is None
@@ -107,10 +107,10 @@ def _axis_timing(
 
 
 def noise_colour(problem: Problem, fitted: Fit, steps: Steps) -> float:
-    """Return the power of the noise at rest at low frequency, over its mean; 1 for white noise."""
+    """Return the stationary noise density at low frequency over its mean; 1 for white noise."""
     on_grid = problem.output - problem.modelled(fitted)
     rest = on_grid[problem.used & ~_active(steps, problem.period)]
-    # Readings that hardly change at rest do not tell it either.
+    # Rounded readings of a stationary axis hardly change and have no spectrum of noise.
     if len(rest) < _LEAST_STATIONARY_SAMPLES or problem.shared > 0:
         return 1.0
     rest = rest - np.mean(rest)
@@ -158,7 +158,8 @@ def independence(residual: FloatArray, drive: FloatArray, lags: int = _LAGS) -> 
 def follows_beyond(problem: Problem, fitted: Fit, coarse: Problem) -> float:
     """Return the p-value that the residual does not follow motion too fast for ``coarse``.
 
-    In bands as narrow as a light mode is wide: what a model misses turns in phase across more.
+    The bands are as narrow as a lightly damped mode: unmodelled dynamics change phase within one
+    octave.
     """
     spectrum = problem.padded_spectrum(problem.on_grid(fitted.residual, 0.0))
     drive = problem.s * problem.output_spectrum(fitted)
@@ -187,9 +188,9 @@ def _correlation(a: FloatArray, b: FloatArray, lags: int) -> FloatArray:
 def response_agreement(residual: FrequencyResponse, up_to: float) -> float:
     """Return the mean square difference of two responses over its variance, 0 to ``up_to`` [Hz].
 
-    residual: response, without a model, of what a model leaves of the output. That is the
-        response of what was seen less that of what was modelled, both through the same
-        windows: what these leak of a light mode is in both, and cancels.
+    residual: response of the residual, estimated without a model: that of the measured output
+        less that of the modelled output, both through the same windows. The leakage of a
+        lightly damped mode is in both, and cancels.
     NaN where there is no line.
     """
     lines = (residual.frequency > 0) & (residual.frequency <= up_to)

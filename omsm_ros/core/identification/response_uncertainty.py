@@ -34,10 +34,11 @@ class ResponseUncertainty:
     """How well the chosen model is known.
 
     covariance: (p, p) of the coefficients, all terms included;  from_noise: (p, p) without them
-    gain_variance: of the gain of the probe per travel at rest [1]
+    gain_variance: of the static gain [1]
     excited_up_to: [Hz] beyond which the motion would show no error of the response
     valid_up_to: [Hz] up to which the response is trusted; 0 if nowhere
-    widened: factor on the uncertainties, and clearly_better: number of poles, see inflate_to_free_choice
+    widened: factor on the uncertainties;  clearly_better: number of poles, see
+        inflate_to_free_choice
     """
 
     covariance: FloatArray

@@ -38,8 +38,8 @@ def undetected_covariance(
     """Return covariances (p, p) of undetected terms, and the terms for the certificate.
 
     drift: columns of the background that model a drift
-    settings: with "priors", an object of standard uncertainties by the name of a family, a
-        term is taken no larger than its prior
+    settings: may hold "priors", standard uncertainties by the name of a family; a term is taken
+        no larger than its prior
 
     Raises ConfigurationError for a prior of another family, or that is no positive number.
     """
@@ -63,7 +63,7 @@ def undetected_covariance(
 def alternative_modes(
     without: Sequence[ResidualDiagnostics], terms: Sequence[ModelErrorTerm], fitted: Fit
 ) -> list[FloatArray]:
-    """Return covariances (p, p) of what each light mode among ``terms`` may be instead.
+    """Return covariances (p, p) of the alternatives of each lightly damped mode in ``terms``.
 
     without: survey of the fit before each of ``terms`` became a part of ``fitted``
     """

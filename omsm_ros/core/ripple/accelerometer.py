@@ -18,7 +18,7 @@ from omsm_ros.errors import ConfigurationError, DataError
 
 AXES = ("x", "y", "z")
 PROBE, SLIDE = "probe", "carriage"
-"""Where the accelerometer is mounted: on the probe, unseen by the encoder, or on its slide."""
+"""Mount of the accelerometer: on the probe, not measured by the encoder, or on the slide."""
 
 # Fewest samples for an estimate of the noise floor.
 _LEAST_SAMPLES = 256

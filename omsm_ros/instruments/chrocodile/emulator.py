@@ -1,9 +1,9 @@
 """Emulated CHRocodiles, in the dollar protocol and in the packet protocol.
 
-Imitated in the dollar protocol: commands with echo, answer and ``ready``, telegrams in both
-formats, the selection of signals and its description, rounding of rates, counters that wrap,
-invalid samples as distance and intensity zero, encoders of 32 bits, settings that a power cycle
-sets back, and the faults of ``Instrument``. In the packet protocol also: updates and ``CONF`` to
+In the dollar protocol it answers commands with echo, answer and ``ready``. It sends telegrams in
+both formats, describes the selected signals, rounds rates, wraps its counters, and sends invalid
+samples as distance and intensity zero. Encoders have 32 bits; a power cycle resets the settings.
+It has the faults of ``Instrument``. In the packet protocol also: updates and ``CONF`` to
 a new client, tickets, refusals, data formats with their counter, another order of signals than
 selected, packets of many samples, and the time offset of triggered samples.
 

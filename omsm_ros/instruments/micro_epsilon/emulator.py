@@ -1,8 +1,8 @@
 """Emulated Micro-Epsilon controllers: confocalDT over RS-422 and Ethernet, capaNCDT.
 
-Imitated: values and error values, blocks of several frames, counters of 32 bits (18 over RS-422),
-three encoders, rates that are rounded or refused, echo and prompt of the command port, and the
-faults of ``Instrument``.
+It sends values and error values, blocks of several frames, counters of 32 bits (18 over RS-422)
+and three encoders. It rounds or refuses rates, has the echo and prompt of the command port, and
+the faults of ``Instrument``.
 
 Not imitated: exposure control, several peaks, video signals, statistics, mathematics between
 channels, linearisation, most commands (they are answered as unknown).

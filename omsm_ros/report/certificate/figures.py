@@ -119,7 +119,7 @@ def _draw_over_time(axes: Axes, fitted: FittedRecord, noise: float | None) -> No
     axes.fill_between(at, low, high, color=style.AFTER, linewidth=0.5)
     if noise is not None:
         for sign in (-1, 1):
-            label = "±2 × noise at rest" if sign > 0 else None
+            label = "±2 × stationary noise" if sign > 0 else None
             axes.axhline(2 * sign * noise / NANOMETRE_M, label=label, **_LIMIT)
         style.legend_above(axes)
     axes.margins(x=0.01)

@@ -17,7 +17,7 @@ from omsm_ros.report.certificate.page import (
 )
 from omsm_ros.report.tables import Table
 
-# What could make text from outside into anything but text.
+# Characters that Markdown would interpret in a text from a file.
 _SPECIAL = re.compile(r"([\\`*_{}\[\]#|~!$])")
 
 

@@ -153,9 +153,9 @@ CAPTIONS = {
     "order": ("Each candidate is a structure that was fitted to the same samples."),
 }
 _CLOSING = (
-    "On a fixed target the probe reads offset + drift ∓ static gain · G_m z (− where the distance "
-    "falls when Z rises, + where it rises), with G_m(0) = 1 and z "
-    "from the encoder. After ± stands the standard uncertainty, k = 1; bands are 95 %."
+    "On a fixed target the probe reads offset + drift ∓ static gain · G_m z, with G_m(0) = 1 and z "
+    "from the encoder. The sign is − where the distance falls when Z rises, else +. "
+    "After ± stands the standard uncertainty, k = 1; bands are 95 %."
 )
 
 

@@ -116,7 +116,7 @@ def _remarks(candidate: CandidateFit, least: float, certificate: Certificate) ->
 
 
 def gain_table(calibration: Calibration) -> Table:
-    """Return the static gains: the probe's scale, or the encoder's? And how far each is from 1."""
+    """Return the static gains of probe, encoder and reference, and their deviation from 1."""
     found = calibration.certificate.static_gain
     rows = [_gain_row("probe per encoder, fitted", calibration.static_gain, found.uncertainty)]
     for name, gain in (

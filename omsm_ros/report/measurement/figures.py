@@ -340,7 +340,7 @@ def _profiles(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, 
     x, y = cloud.x, cloud.y
     size = 2 * float(np.hypot(x, y).max())
     feed = _feed(cloud)
-    # Whole turns, so that errors of other orders average out.
+    # Segments of full turns average out the errors of other orders.
     spacing = feed * np.ceil(size / _SEGMENTS / feed) if feed else size / _SEGMENTS
     made = {}
     for name, (angle, title, position) in _LINES.items():

@@ -235,10 +235,10 @@ def provenance_table(summary: Mapping[str, Any]) -> Table:
 
 @dataclass(frozen=True, slots=True)
 class Caption:
-    """Caption of a figure; ``wide`` figures fill half a row, others a third."""
+    """Caption of a figure; ``half_row`` figures fill half a row, others a third."""
 
     text: str
-    wide: bool = True
+    half_row: bool = True
 
 
 MAPS = {

@@ -164,7 +164,7 @@ def test_the_order_of_a_scan_is_that_of_the_points_around():
 
 
 def test_a_dense_patch_counts_by_its_area():
-    """A thousand points told at each of four places do not drag the fit to their error."""
+    """A thousand points given at each of four places do not drag the fit to their error."""
     x, y = (np.concatenate([v, np.repeat(v[:4], 500)]) for v in (X, Y))
     height = polynomial(x, y)
     found = LocalQuadratic(points(height, x, y), SIDE).at(AT_X, AT_Y)

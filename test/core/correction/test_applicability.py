@@ -18,7 +18,7 @@ from omsm_ros.errors import CalibrationError
 SETTINGS = {"exposure_s": 0.5e-3, "averaging": 1, "machine": "Nanoform 250", "triggered": True}
 
 
-def told_of(known: Calibration, **options: object) -> tuple[str, ...]:
+def objection_texts(known: Calibration, **options: object) -> tuple[str, ...]:
     return tuple(map(str, objections(known, **options)))  # type: ignore[arg-type]
 
 
@@ -53,8 +53,8 @@ PROBE = {"probe.averaging": 4.0, "probe.model": "A"}
 )
 def test_what_the_probe_tells_is_compared_where_both_know(reported, reasons):
     known = replace(calibration(), settings=SETTINGS | PROBE)
-    assert told_of(known, probe=reported) == reasons
-    assert told_of(known, settings=SETTINGS, probe=reported) == reasons
+    assert objection_texts(known, probe=reported) == reasons
+    assert objection_texts(known, settings=SETTINGS, probe=reported) == reasons
 
 
 def test_a_calibration_belongs_to_one_setting_of_the_probe():
@@ -75,7 +75,7 @@ def test_what_is_not_asked_is_not_objected_to() -> None:
 
 def test_a_calibration_that_nobody_judged_is_objected_to() -> None:
     unjudged = replace(calibration(), certificate=Certificate())
-    assert told_of(unjudged) == ("its certificate states no verdict",)
+    assert objection_texts(unjudged) == ("its certificate states no verdict",)
 
 
 @pytest.mark.parametrize(
@@ -91,12 +91,14 @@ def test_a_calibration_that_nobody_judged_is_objected_to() -> None:
 def test_a_setting_that_differs_is_reported_with_both_values(
     name: str, value: object, text: str
 ) -> None:
-    assert told_of(calibration(), settings=SETTINGS | {name: value}) == (text,)
+    assert objection_texts(calibration(), settings=SETTINGS | {name: value}) == (text,)
 
 
 def test_a_setting_that_is_no_longer_known_is_reported() -> None:
     now = {k: v for k, v in SETTINGS.items() if k != "averaging"}
-    assert told_of(calibration(), settings=now) == ("averaging is not known, calibrated with 1",)
+    assert objection_texts(calibration(), settings=now) == (
+        "averaging is not known, calibrated with 1",
+    )
 
 
 def test_numbers_are_compared_as_numbers() -> None:
@@ -105,21 +107,21 @@ def test_numbers_are_compared_as_numbers() -> None:
 
 
 def test_another_rate_is_reported() -> None:
-    found = told_of(calibration(), sample_period=0.5e-3)
+    found = objection_texts(calibration(), sample_period=0.5e-3)
     assert found == ("sample period is 0.0005 s, calibrated at 0.001 s",)
 
 
 def test_a_failed_certificate_tells_its_reasons() -> None:
     failed = calibration(verdict="rejected", reasons=["too noisy", "too few edges"])
-    (text,) = told_of(failed)
+    (text,) = objection_texts(failed)
     assert text == "its certificate says 'rejected' (too noisy; too few edges)"
 
 
 def test_a_probe_turned_round_since_is_reported() -> None:
-    (text,) = told_of(calibration(polarity=1), polarity=-1)
+    (text,) = objection_texts(calibration(polarity=1), polarity=-1)
     assert text.startswith("polarity is -1, calibrated with 1 (the distance falls as z rises)")
     assert text.endswith("state polarity 1 ('polarity')")
-    assert "rises as z rises" in told_of(calibration(polarity=-1), polarity=1)[0]
+    assert "rises as z rises" in objection_texts(calibration(polarity=-1), polarity=1)[0]
 
 
 def test_objections_refuse_unless_overridden_and_are_recorded() -> None:

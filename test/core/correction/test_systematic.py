@@ -76,7 +76,7 @@ POSES = {
 def test_pose_is_what_the_posed_surface_says(name: str, points: ScanPoints) -> None:
     for field, pose in zip(fields(name, points), POSES[name], strict=True):
         moved = MountedSurface(PAPER_MIRROR, pose).height(points.x, points.y)
-        # A tilted point goes sideways by its height, which is left out: a hundredth here.
+        # A tilt moves a point laterally by its height, which is left out: a hundredth here.
         limit = 2e-2 if name == "tilt" else 2e-3
         difference(name, field, (moved - points.height) / SMALL, limit)
 

@@ -178,7 +178,7 @@ def test_what_a_plateau_shares_goes_from_all_to_nothing_with_the_noise() -> None
         mean = np.bincount(number, rounded - place[number]) / 50
         if noise in (0.15 * STEP, 0.3 * STEP):
             left = np.var(mean) - (noise**2 + STEP**2 / 12) / 50
-            # Little noise is not told from rounding: then all may be shared.
+            # Little noise cannot be distinguished from rounding: then all may be shared.
             most = STEP**2 / 12 if noise < 0.2 * STEP else 2 * left
             assert 0.9 * left < shared[-1] < 1.001 * most
     assert shared[0] == pytest.approx(STEP**2 / 12, rel=0.01, abs=0)

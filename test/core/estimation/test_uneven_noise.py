@@ -40,7 +40,7 @@ def test_a_motion_that_hardly_ever_rests_shows_none(seed):
 def test_a_lag_that_the_model_misses_is_no_scatter():
     noise = np.random.default_rng(2).normal(0, 10e-9, len(TIME))
     assert timing_variance(noise + 50e-6 * RATE, RATE) == 0.0
-    # Nor can it be told where nothing rests.
+    # It is not identifiable either without a stationary segment.
     assert timing_variance(noise, np.ones(len(TIME))) == 0.0
 
 

@@ -27,7 +27,7 @@ def terms_of(shift, *asked):
 def test_terms_of_a_sphere_hold_what_a_shift_along_itself_makes_of_them():
     straight, shifted = terms_of(0.0, "auto"), terms_of(1e-3, "auto")
     named = terms_of(0.0, "piston", "tip", "tilt")
-    # Coma that is shifted sideways is astigmatism, by three times its share of the radius.
+    # A lateral shift of coma gives astigmatism, by three times its share of the radius.
     change = abs(shifted[2, -2][0] - straight[2, -2][0])
     assert change > 10 * named[2, -2][1]
     assert 0.7 * change < straight[2, -2][1] < 2 * change

@@ -40,7 +40,7 @@ def identified(seed=1):
 
 
 def from_noise(calibration: Calibration):
-    """Covariance of the coefficients from noise alone, without what could hide."""
+    """Return the covariance of the coefficients from noise, without undetected model errors."""
     size = len(calibration.covariance)
     return np.reshape(calibration.certificate.noise_covariance, (size, size))
 

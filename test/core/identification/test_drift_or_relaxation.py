@@ -1,4 +1,4 @@
-"""What wanders during a test may be a drift, or the beginning of a relaxation."""
+"""Slow changes during a test may be a drift, or the beginning of a relaxation."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_drift_taken_for_noise_comes_back_into_the_residual():
     kept = diagnostics.problem.background.shape[1] - sum(part.stop - part.start for part in drift)
     assert bare.problem.background.shape[1] == len(bare.fitted.background) == kept
     assert isinstance(bare, ResidualDiagnostics)
-    # Of micrometres of relaxation a drift of nanometres hides a small part.
+    # A drift of nanometres can replace a small part of a relaxation of micrometres.
     free, as_noise = (max(map(open_to, one.creep)) for one in (diagnostics, bare))
     assert as_noise < 0.5 * free
     # The band takes no more than the least of what either says.
@@ -90,7 +90,7 @@ def test_the_band_holds_a_relaxation_that_only_begins_in_the_record(records):
 
 
 def sigmas(calibration, size):
-    """Of its error at 1 Hz, where the whole relaxation is missing."""
+    """Return the error at 1 Hz over its uncertainty, where the whole relaxation is missing."""
     at = np.array([1.0])
     truth = (1 - size) * np.exp(-2j * np.pi * at * LAG)
     off = abs(calibration.dynamics.response(at) / truth - 1)[0]

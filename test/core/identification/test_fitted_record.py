@@ -1,4 +1,4 @@
-"""What is drawn of a recording is what was certified, and shows what a model misses."""
+"""The drawn record is the one that was certified, and it shows unmodelled dynamics."""
 
 from __future__ import annotations
 

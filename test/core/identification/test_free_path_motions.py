@@ -53,7 +53,7 @@ def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, par
     frequency = np.geomspace(0.5, reaches, 20)
     found, truth = (g.response(frequency) for g in (calibration.dynamics, plant.dynamics))
     error = np.log(found / truth)
-    # What repeated tests scatter by, without what could hide in each: the narrower band.
+    # The narrower band is the scatter of repeated tests, without undetected model errors.
     band = response_band(calibration.dynamics, calibration.noise_covariance, frequency)
     assert np.max(np.abs(error.real) / band.gain) < 3.5
     assert np.max(np.abs(error.imag) / band.phase) < 3.5
@@ -74,7 +74,7 @@ def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
 def test_a_second_frequency_tells_them_apart():
     sines = Multisine(frequencies=(2.0, 9.0), amplitude=15e-6)
     calibration = identified(sines, LIGHT_MODE, WHOLE, 1)
-    # Of 20 s without a rest, drift and creep may still be part of the gain.
+    # In 20 s without a stationary segment, drift and creep may still be part of the gain.
     assert all("drift or creep" in reason for reason in first_reasons(calibration))
     assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
 
@@ -121,7 +121,7 @@ def refusal(record):
 
 
 def test_what_the_motion_cannot_show_at_all_is_unknown_and_the_calibration_can_be_written():
-    """Of a half sweep, in which a relaxation of a minute is wholly taken for drift."""
+    """A relaxation of a minute is taken for drift in half a sweep."""
     made = identified(Chirp(), Plant(), slice(12_500, None), 3)
     assert made.certificate.verdict == "rejected"
     assert made.certificate.undetected.terms[0].missed is None

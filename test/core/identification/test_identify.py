@@ -95,7 +95,7 @@ class TestStepTest:
         sigma = identified().low_frequency_delay_noise
         assert 0.2e-6 < sigma < 3e-6
         assert abs(certificate.response.low_frequency_delay_s - 339.7e-6) < 4 * sigma
-        # What could hide comes on top.
+        # The uncertainty of undetected model errors is added.
         assert sigma < certificate.response.low_frequency_delay_uncertainty_s < 3 * sigma
 
     def test_a_candidate_names_its_scores(self):

@@ -1,4 +1,4 @@
-"""Records with dropouts, drift, backlash, sharp edges: identified, told, or refused by name."""
+"""Records with dropouts, drift, backlash, sharp edges: identified, reported, or refused by name."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ class TestImperfectData:
         "start", [505, *(pytest.param(k, marks=pytest.mark.soak) for k in (530, 560))]
     )
     def test_a_record_that_starts_while_a_light_mode_rings_identifies_as_well(self, start):
-        """The first edge is at 500: the axis is at rest or nearly so, the mode is not."""
+        """The first edge is at sample 500: the axis has nearly stopped, the mode still rings."""
         truth, frequency = resonance(60.0, 0.02), np.array([1.0, 15.0, 40.0])
         recording = recorded(plant=Plant(truth))
         seen = np.where(recording.distance.ok, recording.distance.distance, np.nan)
@@ -108,8 +108,8 @@ class TestImperfectData:
         gain, phase = errors(calibration, truth, frequency)
         assert np.all(np.abs(gain) < 3 * band.gain)
         assert np.all(np.abs(phase) < 3 * band.phase)
-        # To know no more than the whole record is fair, to know much less is not. What could hide
-        # in either depends on its first rest, which the whole record alone has.
+        # The uncertainty from noise may be larger than that of the whole record, but not much.
+        # Undetected model errors depend on the first stationary segment, which is missing here.
         whole = identify(record_of(recording)).calibration
         noise, whole_noise = (
             response_band(c.dynamics, c.noise_covariance, frequency) for c in (calibration, whole)

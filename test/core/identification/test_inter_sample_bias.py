@@ -55,7 +55,7 @@ def test_the_bound_is_never_below_the_bias(rise, servo, dynamics):
 
 @pytest.mark.parametrize(("rise", "servo"), EDGES)
 def test_of_a_response_that_rises_beyond_half_the_rate_the_bound_is_no_exaggeration(rise, servo):
-    """Eq. 12 is 5.4 times as strong at 850 Hz as at rest."""
+    """The gain of Eq. 12 at 850 Hz is 5.4 times the static gain."""
     assert bound_of(rise, servo) < 1.5 * abs(bias_of(rise, servo))
 
 

@@ -89,7 +89,7 @@ def driven(truth):
 
 
 def test_what_fewer_samples_cannot_show_is_seen_in_the_residual():
-    """A light mode at 260 Hz, where every third sample shows up to 167 Hz."""
+    """A weakly excited mode at 260 Hz, beyond the 167 Hz that every third sample resolves."""
     omega = 2 * np.pi * 260
     light = TransferFunction.from_ascending(
         [1.0, 0.04 / omega, 0.98 / omega**2], [1.0, 0.04 / omega, omega**-2]

@@ -1,4 +1,4 @@
-"""What is read off noisy recordings of known plants is as near the truth as it is said to be."""
+"""Physical parameters of known plants are within their stated uncertainty."""
 
 from functools import lru_cache
 
@@ -49,7 +49,7 @@ def test_a_lone_mode_is_where_it_is_said_to_be():
     assert np.all(np.abs(over) < 4)
 
 
-@pytest.mark.soak  # twelve identifications of a light mode
+@pytest.mark.soak  # twelve identifications of a lightly damped mode
 def test_noise_of_the_encoder_that_rings_at_the_mode_counts():
     """2 nm of it, 50 nm at the resonance, in a line too narrow for the residual to show."""
     over = [off(identified(LONE, seed, encoder_noise=2e-9), LONE, 0)[0] for seed in range(1, 13)]

@@ -128,7 +128,7 @@ def test_the_response_without_a_model_agrees_with_the_truth_and_not_with_another
 
 @pytest.mark.parametrize("memory", [0.0, 0.5])
 def test_the_colour_of_noise_at_rest_is_that_of_its_filter(memory):
-    """Of e(k) = a e(k-1) + w(k) the density at rest is (1 + a)/(1 - a) of its mean."""
+    """The density of e(k) = a e(k-1) + w(k) at 0 Hz is (1 + a)/(1 - a) times its mean."""
     problem, steps = stepped(0.0005, noise=0.0)
     white = np.random.default_rng(8).normal(0, 1e-8, len(problem.output))
     noise = signal.lfilter([1.0], [1.0, -memory], white)

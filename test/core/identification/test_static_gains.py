@@ -1,4 +1,4 @@
-"""Gains from plateaus, and who is wrong."""
+"""Static gains from plateaus show whether the probe or the encoder is wrong."""
 
 import numpy as np
 import pytest

@@ -33,7 +33,7 @@ def calibrated(collocated, mass):
 def test_an_identified_machine_is_known_within_its_uncertainty(collocated):
     entry = calibrated(collocated, 10.0).certificate.response.two_mass
     assert entry.collocated is collocated
-    # Of two degrees of freedom; a right model is worse once in a thousand.
+    # The correct model exceeds this χ² once in a thousand.
     assert stats.chi2.sf(2 * entry.misfit**2, 2) > 1e-3
     assert entry.model["m1"] == 10.0
     assert entry.table_mass_kg == 10.0

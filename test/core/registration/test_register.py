@@ -184,7 +184,7 @@ def test_the_stated_uncertainty_holds_what_the_form_of_the_part_does_to_the_pose
 
 
 def test_coma_of_an_asphere_is_a_shift_and_the_uncertainty_holds_it():
-    """Moved sideways an asphere shows coma alone; trefoil, which it has none of, does not tell."""
+    """A lateral shift of an asphere gives coma but no trefoil, so trefoil does not determine it."""
     nominal = Asphere(0.08, -1.2, (0.0, 20.0))
     pose = Pose(x=2e-4, y=-3e-4, tip=2e-3)
     error = ZernikeSurface(RADIUS, (0, 0, 0, 0, 30e-9, 40e-9, 10e-9, -11e-9))

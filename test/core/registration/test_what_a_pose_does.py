@@ -1,4 +1,4 @@
-"""A registration told as effects: rigid motions of scipy, portions, and the reader of a sphere."""
+"""Effects of a registration: rigid motions of scipy, portions, and the reader of a sphere."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class TestNumbers:
         lone = replace(
             calibration,
             dynamics=TransferFunction.from_ascending([1.0], [1.0, 0.04 / omega, omega**-2]),
-            # Of the stiffness alone, 0.2 %: half of it is the frequency's, all the residue's.
+            # The stiffness is uncertain by 0.2 %: half of it in the frequency, all in the residue.
             covariance=np.diag([0.0, 0.0, (2e-3 * omega**-2) ** 2, 0.0]),
         )
         (row,) = mode_table(lone).rows

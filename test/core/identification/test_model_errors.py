@@ -1,4 +1,4 @@
-"""What hides in a step test: columns against closed forms, and findings against the truth."""
+"""Model errors of a step test: columns against closed forms, and findings against the truth."""
 
 from dataclasses import replace
 

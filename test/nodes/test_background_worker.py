@@ -1,4 +1,4 @@
-"""Work beside the samples leaves nothing behind."""
+"""The background worker frees its resources."""
 
 import os
 import platform
