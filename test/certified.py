@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
+from omsm_ros.core.calibration.calibration import certificate_of_version_1
 from omsm_ros.core.calibration.certificate import Certificate
-from omsm_ros.core.calibration.version_1 import certificate_of_version_1
 
 
 def certified_by(

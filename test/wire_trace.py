@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.trace import CLOSED, OPENED, READ, WRITTEN
+from omsm_ros.instruments.factory import CLOSED, OPENED, READ, WRITTEN
 from omsm_ros.units import NANOSECONDS_PER_S
 
 

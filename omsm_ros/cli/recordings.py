@@ -8,7 +8,7 @@ from pathlib import Path
 
 from omsm_ros.cli.arguments import add_bags, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
-from omsm_ros.pipelines.inspect_bag import Inspection, inspect_bag
+from omsm_ros.pipelines.recording import Inspection, inspect_bag
 from omsm_ros.readable import quantity
 
 

@@ -143,8 +143,13 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     source: name of the recording, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.markdown import picture_name, render_markdown
-    from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
+    from omsm_ros.report.certificate.page import (
+        CertificatePage,
+        certificate_figures_of,
+        picture_name,
+        render,
+        render_markdown,
+    )
 
     calibration = identified.calibration
     certificate = CertificatePage(

@@ -16,7 +16,7 @@ from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
 from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
 from omsm_ros.instruments.emulator import AXIS_SCALING
-from omsm_ros.instruments.trace import TracedTransport
+from omsm_ros.instruments.factory import TracedTransport
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 

@@ -14,7 +14,7 @@ from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.message_mapping import typestore, vibration_levels
 from omsm_ros.io.topics import VIBRATION_TOPIC
-from omsm_ros.pipelines.inspect_bag import inspect_bag
+from omsm_ros.pipelines.recording import inspect_bag
 
 SIZE, FREQUENCY = 50e-9, 680.0
 

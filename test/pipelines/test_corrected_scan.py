@@ -16,9 +16,8 @@ from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines import correct
 from omsm_ros.pipelines.correct import Admission, CorrectedScan, correct_bag
-from omsm_ros.pipelines.inspect_bag import inspect_bag
 from omsm_ros.pipelines.measure import measure
-from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.recording import Recording, inspect_bag
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from omsm_ros.core.calibration.certificate import Undetected
@@ -42,7 +42,7 @@ class IdentificationEvidence:
     known: ResponseUncertainty
     limits: ResponseLimits
     searched: SearchResult
-    undetected: Undetected = Undetected()
+    undetected: Undetected = field(default_factory=Undetected)
     contrasts: Sequence[Contrast] = ()
     reference: ReferenceLag | None = None
     use: IntendedUse = PAPER_USE

@@ -8,7 +8,7 @@ On a fixed target ``distance = offset + drift · t - static_gain · (G_m u)(t)``
 | choose and fit a model | :mod:`model_choice` |
 | model what the residual shows besides | :mod:`model_error_search` |
 | covariance from noise | :mod:`response_uncertainty` |
-| further terms of the covariance | :mod:`covariance_terms`, :mod:`undetected_covariance` |
+| further terms of the covariance | :mod:`covariance_terms` |
 | checks | :mod:`checks`, :mod:`model_error_checks` |
 | certificate and verdict | :mod:`certify` |
 """
@@ -31,9 +31,11 @@ from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, che
 from omsm_ros.core.identification.certify import certificate_of
 from omsm_ros.core.identification.checks import CHECKS
 from omsm_ros.core.identification.covariance_terms import (
+    alternative_modes,
     contrast_covariance,
     delay_covariance,
     reference_lag,
+    undetected_covariance,
 )
 from omsm_ros.core.identification.evidence import IdentificationEvidence
 from omsm_ros.core.identification.model_choice import ChosenModel, model_from_start
@@ -41,10 +43,6 @@ from omsm_ros.core.identification.model_error_search import SearchResult, search
 from omsm_ros.core.identification.response_uncertainty import (
     inflate_to_free_choice,
     response_uncertainty,
-)
-from omsm_ros.core.identification.undetected_covariance import (
-    alternative_modes,
-    undetected_covariance,
 )
 from omsm_ros.core.lti.frequency_response import ResponseLimits
 from omsm_ros.core.model_errors.families import DRIFT

@@ -40,7 +40,7 @@ def with_noise(scale: float = 1.0) -> Calibration:
                 "carried": 0.0,
                 "effect_on_scan_m": 1e-9,
             }
-        ],  # fmt: skip
+        ],
         "plateau_s": 0.5,
     }
     return replace(

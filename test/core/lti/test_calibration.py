@@ -215,7 +215,7 @@ USES: dict[str, Callable[[Calibration], object]] = {
 def test_an_uncertainty_that_is_none_is_named_by_all(
     use: Callable[[Calibration], object], stated: object
 ) -> None:
-    with pytest.raises(CalibrationError, match="static_gain.uncertainty is"):
+    with pytest.raises(CalibrationError, match=r"static_gain\.uncertainty is"):
         use(certified(static_gain_uncertainty=stated))
 
 
@@ -269,7 +269,7 @@ ENTRY = to_json(declared_latency(3e-4, 1e-4, 1e-6, "data sheet"))
 )
 def test_an_entry_that_is_no_latency_is_named(entry: object, said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
-        certified(latency=entry).latency
+        _ = certified(latency=entry).latency
 
 
 def test_a_latency_that_is_typed_is_the_callers_to_correct() -> None:

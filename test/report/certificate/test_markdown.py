@@ -8,10 +8,11 @@ from html import unescape
 
 from certified import certified_by
 
-from omsm_ros.report.certificate.markdown import picture_name, render_markdown
 from omsm_ros.report.certificate.page import (
     CAPTIONS,
     CertificatePage,
+    picture_name,
+    render_markdown,
     sections,
 )
 

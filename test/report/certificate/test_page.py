@@ -16,11 +16,11 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
-from omsm_ros.report.certificate.markdown import render_markdown
 from omsm_ros.report.certificate.page import (
     CAPTIONS,
     CertificatePage,
     render,
+    render_markdown,
     sections,
     verdict_on_calibration,
 )
