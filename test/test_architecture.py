@@ -186,7 +186,7 @@ def loaded_by_name():
 
 
 def test_few_files_are_imported_by_one_other_only():
-    """A module of fewer lines belongs into the one that imports it; one loaded by name does not."""
+    """A small module belongs in its only importer; modules loaded by name are not counted."""
     names = {_name(p) for p in MODULES}
     by_name = loaded_by_name()
     assert by_name <= names

@@ -1,4 +1,4 @@
-"""Makes the devices that parameters describe, not yet connected; traces their traffic on request."""
+"""Makes the devices that parameters describe, not yet connected, and traces their traffic."""
 
 from __future__ import annotations
 

@@ -98,16 +98,15 @@ class Machine:
             z = (r + dx + 1j * dy) * np.exp(-1j * (c + clocking))
             return z.real, z.imag
 
-        lift = MIRROR.height(*place(c, r)) / 0.6e-3
-        bow = wrong.get("bow_of_z", 0.0) * (np.cos(np.pi * lift) - 1)
+        there = place(c, r)
+        z = MIRROR.height(*there)
+        bow = wrong.get("bow_of_z", 0.0) * (np.cos(np.pi * (z / 0.6e-3)) - 1)
         seen = place(
             c - self.latency * omega + wrong.get("c_lost", 0.0) * (t > 0.5 * duration),
             r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow, wrong.get("centre_y", 0.0),
         )  # fmt: skip
         at = (seen[0] + 1j * seen[1]) * np.exp(-1j * turned) - complex(*moved)
         seen = (at.real, at.imag)
-        there = place(c, r)
-        z = MIRROR.height(*there)
         step = 1e-4
         z_rate = (
             MIRROR.height(*place(c + omega * step, r + r_rate * step))
