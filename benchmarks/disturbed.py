@@ -5,11 +5,12 @@ also small and large ones, ten tests each, and random pairs. A calibration may b
 with reservations (the disturbance is modelled, or covered by a wider band), or rejected with the
 cause. It must not be accepted if the response is off by more than three stated standard
 uncertainties and by more than five nanometres on the paper's scan. With ``--full`` the table goes
-to docs/disturbances.md.
+to docs/disturbances.md; ``python -m benchmarks.disturbed SEEDS PAIRS`` writes it from fewer tests.
 """
 
 from __future__ import annotations
 
+import sys
 import textwrap
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -81,28 +82,42 @@ def rows(full: bool) -> Iterator[Row]:
     clean = [outcome("clean", NOTHING, seed) for seed in range(100 if full else 10)]
     alarms = [o for o in clean if o.verdict != ACCEPTED]
     yield at_most("false alarms on clean tests", _percent(alarms, clean), "%", 2, runs=len(clean))
-    met = {k: v for k, v in CATALOGUE.items() if not k.startswith(_OF_THE_PART)}
-    found = [
-        outcome(f"{name}, {size}", disturbances, seed)
-        for name, sizes in met.items()
-        for size, disturbances in zip(SIZES, sizes, strict=True)
-        if full or size == SIZES[1]
-        for seed in range(_SEEDS if full else 1)
-    ]
+    found = _alone(SIZES, _SEEDS) if full else _alone(SIZES[1:2], 1)
     yield _lies("alone", found)
     yield shown("rejected, alone", _percent([o for o in found if not o.accepted], found), "%")
     yield _wrong_causes("alone", found)
     if full:
-        pairs = list(_pairs(met))
+        pairs = list(_pairs(_PAIRS))
         yield _lies("in pairs", pairs)
         yield _wrong_causes("in pairs", pairs)
         _TABLE.write_text(page([*clean[:1], *found], pairs))
 
 
-def _pairs(met: dict[str, tuple[Disturbances, Disturbances, Disturbances]]) -> Iterator[Outcome]:
+def write_table(seeds: int, pairs: int) -> None:
+    """Write docs/disturbances.md from ``seeds`` tests of each case, and ``pairs`` drawn pairs."""
+    alone = [outcome("clean", NOTHING, 0), *_alone(SIZES, seeds)]
+    _TABLE.write_text(page(alone, list(_pairs(pairs))))
+
+
+def _of_a_step_test() -> dict[str, tuple[Disturbances, Disturbances, Disturbances]]:
+    return {k: v for k, v in CATALOGUE.items() if not k.startswith(_OF_THE_PART)}
+
+
+def _alone(wanted: Sequence[str], seeds: int) -> list[Outcome]:
+    return [
+        outcome(f"{name}, {size}", disturbances, seed)
+        for name, sizes in _of_a_step_test().items()
+        for size, disturbances in zip(SIZES, sizes, strict=True)
+        if size in wanted
+        for seed in range(seeds)
+    ]
+
+
+def _pairs(count: int) -> Iterator[Outcome]:
     random = np.random.default_rng(_SEED)
+    met = _of_a_step_test()
     names = list(met)
-    for seed in range(_PAIRS):
+    for seed in range(count):
         one, other = random.choice(names, 2, replace=False)
         k = int(random.integers(len(SIZES)))
         try:
@@ -181,8 +196,8 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
             "# Disturbed step tests",
             "",
             "Verdict of `omsm identify` on step tests of disturbed machines, compared with the "
-            "truth of the twin. `python -m benchmarks disturbed --full` writes this page, from "
-            f"{_SEEDS} tests a case and {_PAIRS} pairs; the numbers actually tested are below. "
+            "truth of the twin. `python -m benchmarks disturbed --full` writes this page from "
+            f"{_SEEDS} tests a case and {_PAIRS} pairs.{_fewer(by_name, pairs)} "
             "Error and stated uncertainty are those of the linear response on the paper's scan, "
             "in the test with the largest error. σ is the largest error of the response over its "
             "stated uncertainty, from 0.1 Hz to the end of the valid range. Named: whether the "
@@ -199,6 +214,14 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
             "",
         ]
     )
+
+
+def _fewer(by_name: Mapping[str, Sequence[Outcome]], pairs: Sequence[Outcome]) -> str:
+    """Return a sentence that tells the numbers of a shorter run; empty for the full one."""
+    seeds = max(map(len, by_name.values()))
+    if seeds >= _SEEDS:
+        return ""
+    return f" The table below is of a shorter run: {seeds} a case and {len(pairs)} pairs."
 
 
 def _pairs_of(pairs: Sequence[Outcome]) -> list[str]:
@@ -260,3 +283,7 @@ def _named(found: Sequence[Outcome]) -> str:
     """Return how often the named cause was right, unknown or wrong."""
     kinds = Counter(o.named for o in found if o.named)
     return ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+
+
+if __name__ == "__main__":
+    write_table(*map(int, sys.argv[1:3]))

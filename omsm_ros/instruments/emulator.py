@@ -350,7 +350,8 @@ class Instrument:
             last = (self._taken + count) * true_period
         seconds = last - np.arange(count)[::-1] * true_period
         device = seconds * (1 + self.faults.drift * PPM) * NANOSECONDS_PER_S
-        return np.rint(device).astype(np.int64) + self._clock_offset
+        ticks: np.ndarray = np.rint(device).astype(np.int64)
+        return ticks + self._clock_offset
 
     def _disturb(self, measured: Measured) -> Measured:
         """Return the samples, the first of them saturated or without target."""
