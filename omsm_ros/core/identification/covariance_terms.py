@@ -192,7 +192,7 @@ def alternative_modes(
 ) -> list[FloatArray]:
     """Return covariances (p, p) of the alternatives of each lightly damped mode in ``terms``.
 
-    without: survey of the fit before each of ``terms`` became a part of ``fitted``
+    without: diagnostics of the fit before each of ``terms`` became a part of ``fitted``
     """
     return [
         alternative_mode_covariance(before, term, fitted)
