@@ -43,8 +43,8 @@ def test_effects_of_an_undetermined_degree_of_freedom_are_reported_separately(fa
     assert rows["tip"] == "1.0 µrad ± 5.0 µrad (k = 1)"
     assert rows["y"] == "22.0 µm ± 4.0 µm (k = 1)"
     reported = rows["clocking not fitted"]
-    assert reported.startswith("it does what tip and y do; clocking ± 17 mrad would go with")
-    assert reported.endswith("tip ± 17 mrad, y ± 900 µm, at the same form")
+    assert reported.startswith("it does what tip and y do; clocking ± 17 mrad correlates with")
+    assert reported.endswith("tip ± 17 mrad, y ± 900 µm, at equal form")
 
 
 def test_a_fixed_degree_of_freedom_is_reported_with_the_reason(facts):

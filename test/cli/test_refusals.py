@@ -112,7 +112,7 @@ def test_doctor_names_the_limit_of_open_files(capsys, monkeypatch, tmp_path):
         2,
         "omsm: not ready: open files; see the remedies above",
     )
-    assert f"NO  open files         a process may hold {most} open" in out
+    assert f"NO  open files         a process may open {most} files" in out
     assert "→ give it more with 'ulimit -n 1024'" in out
 
 

@@ -148,4 +148,4 @@ def test_correlated_moves_are_reported_only_where_both_are_known(own, share):
     reported = correlated_moves(form, "clocking")
     assert bool(reported) is bool(own and share)
     if reported:
-        assert reported.startswith("; clocking ± 2.0 µrad would go with tip ± 1.0 µrad")
+        assert reported.startswith("; clocking ± 2.0 µrad correlates with tip ± 1.0 µrad")

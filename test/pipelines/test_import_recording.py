@@ -323,7 +323,7 @@ def test_a_pickle_is_not_opened(tmp_path):
     [
         ("columns: {distance: {name: d}}\nsample_period: 0.001", "distance has no unit"),
         ("columns: {distance: {name: d, unit: furlong}}\nsample_period: 1", "'furlong'"),
-        ("columns: {distance: {name: d, unit: count}}\nsample_period: 1", "what is one count"),
+        ("columns: {distance: {name: d, unit: count}}\nsample_period: 1", "one count in SI"),
         ("columns: {distance: {name: d, unit: count, count: 5}}\nsample_period: 1", "one count is"),
         ("columns: {distance: {name: d, unit: um}}", "neither sample_period nor"),
         ("columns: {z: {name: d, unit: um}}\nsample_period: 1", "no column for x, y, b, c"),
@@ -332,7 +332,7 @@ def test_a_pickle_is_not_opened(tmp_path):
         ("columns: {x: {constant: 3}}\nsample_period: 1", "x has no unit"),
         ("columns: {}\nsample_period: 1", "write one of them into the map"),
         ("columns: {distance: {name: d, unit: um}}\nsample_period: 1e9", "sample_period"),
-        ('columns: {distance: {name: d, unit: um}}\nsample_period: 1\ndecimal: ","', "fraction"),
+        ('columns: {distance: {name: d, unit: um}}\nsample_period: 1\ndecimal: ","', "decimal sign"),
     ],
 )
 def test_what_a_map_leaves_unclear_is_asked_for(tmp_path, mapping, said):

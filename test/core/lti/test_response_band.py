@@ -304,6 +304,6 @@ def test_noise_through_rows_is_the_same_in_blocks_as_at_once(monkeypatch):
     for length in (90, 96, 101):
         noise = np.full(length // 2 + 1, 2.5)
         for values in (10_000, 2 * length):
-            monkeypatch.setattr("omsm_ros.core.estimation.covariance._VALUES", values)
+            monkeypatch.setattr("omsm_ros.core.estimation.covariance.BLOCK_VALUES", values)
             found = weighted_gram(rows, length, noise)
             np.testing.assert_allclose(found, 2.5 * rows @ rows.T, atol=1e-9)
