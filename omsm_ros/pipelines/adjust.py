@@ -146,7 +146,7 @@ def on_one_clock(scans: Sequence[AdjustedScan]) -> list[AdjustedScan]:
 _RENAMED = {"probe_noise": "noise"}
 # Declared sources that no scan adjusts: single readings, and periodic errors of unknown phase.
 NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "discretisation",
-                "vibration", "encoder_interpolation", "probe_periodic", "probe_slope")  # fmt: skip
+                "encoder_interpolation", "probe_periodic", "probe_slope")  # fmt: skip
 
 
 def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ...]:

@@ -183,7 +183,7 @@ def _adjusted(
     views = [view_of(s, k, begin, surface) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, priors)
     walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
-    solution, refutations = _fitted(network, views, sizes, walk)
+    solution, refutations = _fitted(network, views, sizes, priors)
     form = form_map(solution, surface, removed)
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
@@ -228,9 +228,11 @@ def _network(
 
 
 def _fitted(
-    network: Network, views: Sequence[ScanView], sizes: Mapping[str, float], walk: float | None
-) -> tuple[Solution, tuple[Refutation, ...]]:
+    network: Network, views: Sequence[ScanView], sizes: Mapping[str, float],
+    priors: Sequence[Source],
+) -> tuple[Solution, tuple[Refutation, ...]]:  # fmt: skip
     """Return the solution, lines and steps of the residuals among its families."""
+    walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
     y = network.blocks.deviation
     first = settled(solve(network, y, start_scales(network, walk), sizes), _FIRST_STEPS)
     extra: list[Family] = []
@@ -239,7 +241,7 @@ def _fitted(
         extra += map(step_family, steps_of(first, view.index))
     if extra:
         network = network_with(network, extra, block_columns(views, extra))
-    return fit_and_refute(network, y, first.scales, sizes)
+    return fit_and_refute(network, y, first.scales, {**sizes, **prior_sizes(extra, priors)})
 
 
 def _wrong_signs(views: Sequence[ScanView]) -> tuple[tuple[int, float], ...]:

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from omsm_ros.core.adjustment.families import REPEATED_TRACK, Family, only
+from omsm_ros.core.adjustment.families import REPEATED_TRACK, VIBRATION, Family, only
 from omsm_ros.core.adjustment.network import Network, Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
 from omsm_ros.core.streams.blocks import FloatArray
@@ -133,7 +133,7 @@ def line_family(line: Line) -> Family:
     def columns(v: ScanView) -> FloatArray:
         return np.stack([np.cos(turned * v.since), np.sin(turned * v.since)])
 
-    name = f"vibration/{line.frequency:.4g}@{line.scan}"
+    name = f"{VIBRATION}/{line.frequency:.4g}@{line.scan}"
     return Family(name, "m", 2, only(line.scan, 2, columns), 1e-7, REPEATED_TRACK)
 
 

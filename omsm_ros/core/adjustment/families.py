@@ -128,13 +128,20 @@ SUB_HARMONICS = (1 / 2, 3 / 2, 5 / 2, 1 / 3, 2 / 3, 4 / 3, 5 / 3)
 _TILT_HARMONICS, _RADIAL_HARMONICS, _C_HARMONICS = (2, 3, 4), (2, 3), (1, 2)
 
 
-# Declared sources without columns: scales of noise and drift, and what one scan alone cannot have.
-_ELSEWHERE = ("drift_walk", "noise", "tilt", "part_shift", "part_turn", "expansion")
+VIBRATION = "vibration"
+"""Declared source of all lines in time, ``vibration/frequency@scan``."""
+# Declared sources without columns of their own: scales of noise and drift, lines that are looked
+# for in the residuals, and what one scan alone cannot have.
+_ELSEWHERE = ("drift_walk", "noise", VIBRATION, "tilt", "part_shift", "part_turn", "expansion")
 
 
 def base_name(family: str) -> str:
-    """Return the name of the declared source of ``family``, without the scan's number."""
-    return family.split("@")[0]
+    """Return the name of the declared source of ``family``, without the scan's number.
+
+    Lines in time have one declared source, at whatever frequency they stand.
+    """
+    name = family.split("@")[0]
+    return VIBRATION if name.startswith(f"{VIBRATION}/") else name
 
 
 def prior_sizes(families: Sequence[Family], priors: Sequence[Source]) -> dict[str, float]:

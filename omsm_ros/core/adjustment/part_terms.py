@@ -1,9 +1,11 @@
 """The part: Zernike terms, rings about the spindle, and cells for what they do not resolve.
 
 Terms are regular at the axis, which errors of the machine need not be: one scan separates them by
-that. Rings are what turning leaves: hat functions of the radius of one variance, estimated from the
-scans; without them a ring would pass for a cone, a drift or a bend of a slide. Cells are random
-effects of one variance, common to all scans, eliminated cell by cell.
+that, except where they are rotationally symmetric. A turned part may have any profile over the
+radius, a cone at the centre too: the cone is free, and rings are hat functions of one variance,
+estimated from the scans. Without them a ring would pass for an error of the spindle centre, a
+drift or a bend of a slide. Cells are random effects of one variance, common to all scans,
+eliminated cell by cell.
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zerni
 FREE_DEGREE, HIGHEST_DEGREE = 10, 24
 # Stands for a degree among the variances that are estimated.
 RINGS = -1
+# A tool that misses the centre turns a cone: power of the radius, not a degree of a term.
+_CONE = 1
 # Knots over the radius, two turns apart at least.
 _MOST_KNOTS, _TURNS_A_KNOT = 64, 2
 # A form that large is no form error of a finished part: no prior at all.
@@ -51,13 +55,15 @@ class PartModel:
     ring_knots: int
 
     def values(self, x: FloatArray, y: FloatArray, span: FloatArray | None = None) -> FloatArray:
-        """Return terms and rings at x, y [m], (n, k), terms averaged over arcs ``span`` [rad]."""
+        """Return terms, cone and rings at x, y [m], (n, k), terms averaged over arcs ``span`` [rad]."""
         made = np.ascontiguousarray(zernike_values(*self.disc.scaled(x, y), self.terms).T)
         if span is not None:
             order = np.array([abs(t.m) for t in self.terms])
             for m in np.unique(order):
                 made[:, order == m] *= np.sinc(span * m / (2 * np.pi))[:, np.newaxis]
-        return np.concatenate([made, self._hats(np.hypot(x, y))], axis=1)
+        radius = np.hypot(x, y)
+        cone = (radius / self.outer)[:, np.newaxis]
+        return np.concatenate([made, cone, self._hats(radius)], axis=1)
 
     def _hats(self, radius: FloatArray) -> FloatArray:
         """Return hat functions of the radius about the spindle [m], (n, ring_knots)."""
@@ -76,12 +82,13 @@ class PartModel:
     def free(self) -> FloatArray:
         """Standard deviations where nothing is known [m]; 0 for those that are estimated."""
         terms = [_FREE_M if t.n <= FREE_DEGREE else 0.0 for t in self.terms]
-        return np.array([*terms, *np.zeros(self.ring_knots)])
+        return np.array([*terms, _FREE_M, *np.zeros(self.ring_knots)])
 
     @property
     def degrees(self) -> IntArray:
-        """Degree of each term, and ``RINGS`` for the rings, (k,)."""
-        return np.array([*(t.n for t in self.terms), *np.full(self.ring_knots, RINGS)])
+        """Degree of each term, of the cone, and ``RINGS`` for the rings, (k,)."""
+        rings = np.full(self.ring_knots, RINGS)
+        return np.array([*(t.n for t in self.terms), _CONE, *rings])
 
     def cell_of(self, x: FloatArray, y: FloatArray) -> IntArray:
         """Return the number of the cell at x, y [m] among all of the disc, (n,)."""
@@ -105,7 +112,8 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
         x, y = 0.0, 0.0
     radius = float(np.max(np.hypot(blocks.x - x, blocks.y - y)))
     rings = int(np.clip(turns // _TURNS_A_RING, _LEAST_RINGS, _MOST_RINGS))
-    terms = terms_up_to(highest)
+    # Rings stand for the rotationally symmetric terms of high degree.
+    terms = tuple(t for t in terms_up_to(highest) if t.m or t.n <= FREE_DEGREE)
     about = np.hypot(blocks.x, blocks.y)
     knots = int(np.clip(turns // _TURNS_A_KNOT, 4, _MOST_KNOTS))
     empty = PartModel(
