@@ -25,6 +25,7 @@ from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
 from omsm_ros.core.streams.blocks import Account, AxisBlock, FloatArray, IntArray
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io.files import REPORT, save_json, save_text
@@ -149,10 +150,17 @@ NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "disc
                 "encoder_interpolation", "probe_periodic", "probe_slope")  # fmt: skip
 
 
-def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ...]:
+# Where the gain's growth with the square of the frequency is read from its covariance [Hz].
+_CURVATURE_HZ = 10.0
+
+
+def priors_of(
+    stated: MachineSources, abbe_arm: float = 0.0, calibration: Calibration | None = None
+) -> tuple[Source, ...]:
     """Return the declared sources as priors of the adjustment, but those of ``NOT_ADJUSTED``.
 
     abbe_arm: over which pitch acts, unless it is stated with its own [m]
+    calibration: its uncertainty of the lag adds to the declared change; None: it is exact
     """
     found: dict[str, Source] = {}
     for source in stated.stated:
@@ -162,7 +170,21 @@ def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ..
         before = found.get(prior.name, replace(prior, uncertainty=0.0))
         size = float(np.hypot(before.uncertainty, prior.uncertainty))
         found[prior.name] = replace(prior, uncertainty=size)
+    if calibration is not None:
+        lag, curvature = _of_dynamics(calibration)
+        if change := found.get("lag_change"):
+            size = float(np.hypot(change.uncertainty, lag))
+            found["lag_change"] = replace(change, uncertainty=size)
+        found["lag_curvature"] = Source("lag_curvature", curvature, evaluated=True)
     return tuple(found.values())
+
+
+def _of_dynamics(calibration: Calibration) -> tuple[float, float]:
+    """Return the standard uncertainties of the lag [s] and of the gain over ω² [s²]."""
+    gain, _ = relative_response_jacobian(calibration.dynamics, np.array([_CURVATURE_HZ]))
+    spread = float(spread_along(gain[0], calibration.covariance))
+    curvature = spread / (2 * np.pi * _CURVATURE_HZ) ** 2
+    return calibration.low_frequency_delay_uncertainty, curvature
 
 
 def _prior(source: StatedSource, abbe_arm: float) -> Source:
@@ -218,7 +240,11 @@ def adjust_bags(
     )
     found = adjust(
         [scan.data for scan in scans],
-        priors_of(stated, options.geometry.abbe_arm if options else 0.0),
+        priors_of(
+            stated,
+            options.geometry.abbe_arm if options else 0.0,
+            calibration,
+        ),
         nominal=nominal,
         accuracy=accuracy,
         accepted=accepted,

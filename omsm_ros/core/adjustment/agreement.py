@@ -23,6 +23,8 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
 # Of adjustments whose scans agree, with any E_n beyond its limit.
 _BY_CHANCE = 0.005
+# What declared errors without columns add to a term of one scan, k = 1 [m].
+_UNMODELLED_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +82,7 @@ def _compared(
     name = f"{DIFFERS}@{scan}"
     family = next(f for f in solution.network.families if f.name == name)
     evidence = evidence_of(solution, family)
-    terms = np.abs(evidence.values) / (2 * np.maximum(evidence.uncertainty, 1e-15))
+    terms = np.abs(evidence.values) / (2 * np.hypot(evidence.uncertainty, _UNMODELLED_M))
     number = len(alone) * (len(terms) + 2)
     return ScanAgreement(
         scan=scan,
