@@ -26,7 +26,7 @@ from omsm_ros.core.adjustment.families import (
     prior_sizes,
     ranges_of,
 )
-from omsm_ros.core.adjustment.figures import POSE, FormMap, form_map
+from omsm_ros.core.adjustment.figures import POSE, FormMap, effects_on_form, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
@@ -67,7 +67,8 @@ class SourceFinding:
     name, unit: of the family;  declared: standard uncertainty [unit], None where nothing was
     found, uncertainty: by the adjustment, each component (size,) [unit]; of a family that takes
         no part, by its score test
-    effect: rms of what was found on the heights [m];  possible: of what is left open, k = 1 [m]
+    effect: rms of what was found on the heights [m];  possible: of what is left
+        open on the form, k = 1 [m]
     shown: True if the scans determine it, else ``shown_by`` would
     deviate: of found from declared, in standard deviations
     refuted: True if released;  alike: families that explain the same
@@ -193,11 +194,12 @@ def _adjusted(
         refutations, declared, agreement, wrong, (found_walk, walk), accepted
     )
     evidences = _evidences(solution, refutations)
+    effects = effects_on_form(solution, evidences, surface, removed)
     enough = redundant(scans)
     verdict = verdict_of(
         contradictions,
-        not_evaluated(evidences, priors, accuracy),
-        rests_on(evidences, declared),
+        not_evaluated(evidences, effects, priors, accuracy),
+        rests_on(evidences, effects, declared),
         enough,
         2 * form.pv.uncertainty,
         accuracy,
@@ -205,7 +207,7 @@ def _adjusted(
     )
     return Adjustment(
         form=form,
-        sources=_findings(solution, evidences, priors, refutations),
+        sources=_findings(solution, evidences, effects, priors, refutations),
         refutations=refutations,
         agreement=agreement,
         wrong_sign=wrong,
@@ -262,6 +264,7 @@ def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[E
 def _findings(
     solution: Solution,
     evidences: Sequence[Evidence],
+    effects: Mapping[str, float],
     priors: Sequence[Source],
     refutations: Sequence[Refutation],
 ) -> tuple[SourceFinding, ...]:
@@ -283,7 +286,7 @@ def _findings(
                     solution.uncertainty(family.name) if takes_part else evidence.uncertainty
                 ),
                 effect=evidence.effect,
-                possible=evidence.possible,
+                possible=effects[family.name],
                 shown=evidence.shown,
                 shown_by=family.shown_by,
                 deviate=evidence.deviate,

@@ -21,6 +21,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 _LEAST_SHOWN = 0.1
 # Of a column's information: what of it the other columns leave, rounding aside.
 _LEAST_LEFT = 1e-10
+# Effect of a column of zeros, over its noise: a speed that is the same in all scans.
+_NO_COLUMN = 1e-100
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,8 @@ class Evidence:
     effect: rms of the family's share of the heights [m], by ``values``
     gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``
         instead of the declared one; a family that could explain anything gains less (Occam)
-    possible: what it may do to the heights as far as the scans and its size leave it open,
-        standard uncertainty, rms without piston and tilts [m]
+    spread: root of the covariance of ``values``, (size, size); of a family that takes part, after
+        the adjustment
     open: True if a direction of it is not shown by the scans
     deviate: of a normal distribution, as rare as χ² is
     """
@@ -46,7 +48,7 @@ class Evidence:
     freedom: int
     effect: float
     gain: float
-    possible: float
+    spread: FloatArray
     open: bool
 
     @property
@@ -116,7 +118,7 @@ def _of_absent(solution: Solution, family: Family) -> Evidence:
     scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
     information, axes = np.linalg.eigh(left / scale / scale[:, np.newaxis])
     # What is wider than anything plausible is not determined.
-    plausible = 1 / np.min(family.wide * scale) ** 2
+    plausible = 1 / max(float(np.min(family.wide * scale)), _NO_COLUMN) ** 2
     shown = information > max(_LEAST_LEFT, plausible)
     moved = axes.T @ (score / scale)
     known = np.where(shown, information, 1.0)
@@ -148,17 +150,10 @@ def _evidence(
     tested: χ², its degrees of freedom, and the gain;  spread: root of the covariance (size, size)
     """
     net = solution.network
-    column = net.column(family.name)
-    weights = net.blocks.count / np.sum(net.blocks.count)
-    effect = float(np.sqrt(weights @ (column @ values) ** 2))
-    pose = np.stack([np.ones(len(net.blocks)), net.blocks.x, net.blocks.y], axis=1)
-    pose /= np.max(np.abs(pose), axis=0)
-    root = np.sqrt(weights)[:, np.newaxis]
-    fitted = np.linalg.solve((pose * root).T @ (pose * root), (pose * root).T @ (column * root))
-    free = (column - pose @ fitted) @ spread
-    possible = float(np.sqrt(np.sum(weights @ free**2)))
+    change = net.column(family.name) @ values
+    effect = float(np.sqrt(np.average(change**2, weights=net.blocks.count)))
     chi_square, freedom, gain = tested
     return Evidence(
-        family, values, uncertainty, chi_square, freedom, effect, gain, possible,
+        family, values, uncertainty, chi_square, freedom, effect, gain, spread,
         freedom < family.size,
     )  # fmt: skip

@@ -77,11 +77,13 @@ class Family:
 class Ranges:
     """What the columns are scaled by: the extent of all scans together.
 
-    speed: mean magnitude [rad/s];  duration: of all [s];  motion, distance, radius: half ranges [m]
+    speed: mean magnitude, speeds: of each, with sign [rad/s];  duration: of all [s]
+    motion, distance, radius: half ranges [m]
     slide, lift: least and greatest slide x and motion [m];  clampings: number of each scan's
     """
 
     speed: float
+    speeds: tuple[float, ...]
     duration: float
     motion: float
     distance: float
@@ -89,8 +91,11 @@ class Ranges:
     slide: tuple[float, float]
     lift: tuple[float, float]
     clampings: tuple[int, ...]
-    both_directions: bool
     lengths: Mapping[str, float] = field(default_factory=dict)
+
+
+# A probe that is driven through less of its range shows no error of it.
+_LEAST_DISTANCE_M = 1e-6
 
 
 def ranges_of(
@@ -107,15 +112,15 @@ def ranges_of(
 
     lift, distance = ends("motion"), ends("distance")
     return Ranges(
+        speeds=tuple(v.speed for v in views),
         speed=float(np.mean([abs(v.speed) for v in views])),
         duration=ends("time")[1] or 1.0,
         motion=(lift[1] - lift[0]) / 2 or 1.0,
-        distance=max(map(abs, distance)) or 1.0,
+        distance=max(*map(abs, distance), _LEAST_DISTANCE_M),
         radius=float(max(np.max(np.hypot(v.x, v.y)) for v in views)),
         slide=ends("slide_x"),
         lift=lift,
         clampings=tuple(clampings),
-        both_directions=len({float(np.sign(v.speed)) for v in views}) > 1,
         lengths={p.name: p.correlation_length for p in priors if p.correlation_length is not None},
     )
 
@@ -132,7 +137,8 @@ VIBRATION = "vibration"
 """Declared source of all lines in time, ``vibration/frequency@scan``."""
 # Declared sources without columns of their own: scales of noise and drift, lines that are looked
 # for in the residuals, and what one scan alone cannot have.
-_ELSEWHERE = ("drift_walk", "noise", VIBRATION, "tilt", "part_shift", "part_turn", "expansion")
+_ELSEWHERE = ("drift_walk", "noise", VIBRATION, "tilt", "part_shift", "part_turn", "expansion",
+              "lag_speed", "lag_direction")  # fmt: skip
 
 
 def base_name(family: str) -> str:
@@ -188,18 +194,20 @@ def _one(
     return Family(name, unit, 1, lambda v: column(v)[np.newaxis], wide, shown_by, default)
 
 
+# Of the mean speed: a spindle holds its speed better.
+_SAME_SPEED = 0.01
+
+
 def _dynamic(r: Ranges) -> list[Family]:
     """Lag since the step test and what may change it, latency, asymmetry and backlash."""
     far = max(abs(r.slide[0]), abs(r.slide[1]))
     middle = sum(r.lift) / 2
-    return [
+    found = [
         # A step test leaves less than 0.1 ms of lag unknown; the default covers its change.
         _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
         _one("lateral_lag", "s", lambda v: v.sideways(v.x_rate, v.y_rate), 3e-4, OTHER_STAND_OFF),
         _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, OTHER_SPEED),
         _one("motion_error", "m", lambda v: np.sign(v.motion_rate), 1e-7, OTHER_DIRECTION),
-        _one("lag_speed", "s", lambda v: v.motion_rate * (abs(v.speed) / r.speed - 1), 1e-4,
-             OTHER_SPEED),
         _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
              OTHER_SPEED),
         _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
@@ -208,10 +216,16 @@ def _dynamic(r: Ranges) -> list[Family]:
         _one("lag_curvature", "s2", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
         _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
         _one("removed", "1", lambda v: v.removed, 2.0, OTHER_SPEED),
-        # With one direction it is the change of the lag.
-        *([_one("lag_direction", "s", lambda v: v.motion_rate * np.sign(v.speed), 1e-4,
-                OTHER_SPEED)] if r.both_directions else []),
     ]  # fmt: skip
+    speeds = np.abs(r.speeds)
+    # With one speed, or one direction, the column is that of the lag itself.
+    if np.ptp(speeds) > _SAME_SPEED * r.speed:
+        found.append(_one("lag_speed", "s", lambda v: v.motion_rate * (abs(v.speed) / r.speed - 1),
+                          5e-5, OTHER_SPEED))  # fmt: skip
+    if min(r.speeds) < 0 < max(r.speeds):
+        found.append(_one("lag_direction", "s", lambda v: v.motion_rate * np.sign(v.speed), 5e-5,
+                          OTHER_SPEED))  # fmt: skip
+    return found
 
 
 def _geometric(r: Ranges) -> list[Family]:
@@ -304,7 +318,7 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         ("spindle_axial", "m", (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
         ("spindle_tilt", "rad", _TILT_HARMONICS, _tilting, 1e-5),
         ("spindle_radial", "m", _RADIAL_HARMONICS, _radial, 1e-6),
-        ("c_error", "rad", _C_HARMONICS, _angular, 3e-4),
+        ("c_error", "rad", _C_HARMONICS, _angular, 5e-5),
     )
     return [
         Family(order_name(name, n), unit, 2, columns(n), wide, RECLOCKED)

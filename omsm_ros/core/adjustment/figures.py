@@ -9,11 +9,12 @@ draws of the map.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import linalg, sparse
 
+from omsm_ros.core.adjustment.evidence import Evidence
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.registration.placement import Aperture
@@ -92,8 +93,9 @@ def form_map(
     nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
     seed: of the draws
     """
-    made = _Drawn.of(solution, nominal, removed, seed)
-    places, rows = made.places, made.rows
+    made = _Made.of(solution, nominal, removed)
+    places, rows = made.places, made.rows[:, solution.active]
+    pv, rms = made.pv_and_rms(solution, seed)
     spread = solution.factor.forward(rows.T)
     raw = spread.T @ spread
     of_cells = made.member @ sparse.diags_array(made.share) @ made.member.T
@@ -106,8 +108,8 @@ def form_map(
         height=made.height,
         area=places.area,
         covariance=covariance,
-        pv=made.pv,
-        rms=made.rms,
+        pv=pv,
+        rms=rms,
         disc=solution.network.part.disc,
         terms=terms,
         coefficients=by_heights @ made.height,
@@ -121,15 +123,41 @@ def pv_and_rms(
     solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE, seed: int = 0
 ) -> tuple[Figure, Figure]:
     """Return PV and rms of the form that ``solution`` found, as :func:`form_map` does."""
-    made = _Drawn.of(solution, nominal, removed, seed)
-    return made.pv, made.rms
+    return _Made.of(solution, nominal, removed).pv_and_rms(solution, seed)
+
+
+def effects_on_form(
+    solution: Solution,
+    evidences: Sequence[Evidence],
+    nominal: Surface | None,
+    removed: Sequence[str] = POSE,
+) -> dict[str, float]:
+    """Return by family what it may do to the form, rms over the part, k = 1 [m].
+
+    As far as the scans, and the size of the family, leave it open; all others are fitted beside it.
+    """
+    made = _Made.of(solution, nominal, removed)
+    # L P, with P the covariance of the parameters that take part.
+    through = made.rows[:, solution.active] @ solution.covariance
+    found = {}
+    for one in evidences:
+        here = solution.network.place[one.family.name]
+        if one.family.name in solution.sizes:
+            first = int(np.searchsorted(solution.active, here.start))
+            own = through[:, first : first + one.family.size]
+            change = own @ np.linalg.pinv(solution.covariance_of(here), rcond=1e-10)
+        else:
+            change = through @ solution.matrix[solution.active, here] - made.rows[:, here]
+        moved = made.free(change @ one.spread)
+        found[one.family.name] = float(np.sqrt(np.sum(made.places.area @ moved**2)))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
-class _Drawn:
-    """The map, what it depends on, and its PV and rms by draws.
+class _Made:
+    """The map, and what it depends on.
 
-    rows: change of the map by the parameters that take part (n, a);  share: variance of cells
+    rows: change of the map by all parameters (n, p);  share: variance of cells
     member: cell of each place (n, cells);  columns, fit: of the pose (n, k), (k, n)
     """
 
@@ -141,13 +169,9 @@ class _Drawn:
     member: sparse.csr_array
     columns: FloatArray
     fit: FloatArray
-    pv: Figure = field(init=False)
-    rms: Figure = field(init=False)
 
     @classmethod
-    def of(
-        cls, solution: Solution, nominal: Surface | None, removed: Sequence[str], seed: int
-    ) -> _Drawn:
+    def of(cls, solution: Solution, nominal: Surface | None, removed: Sequence[str]) -> _Made:
         """Return the map of ``solution``."""
         net, scales = solution.network, solution.scales
         places = _places(solution)
@@ -163,14 +187,16 @@ class _Drawn:
         member = sparse.csr_array(
             (np.ones(number), (np.arange(number), places.cell)), shape=(number, len(share))
         )
-        made = cls(
+        return cls(
             places, height - columns @ (fit @ height), fit @ height,
-            rows[:, solution.active], share, member, columns, fit,
+            rows, share, member, columns, fit,
         )  # fmt: skip
-        draws = made.free(made.errors(solution, seed))
-        object.__setattr__(made, "pv", _figure(made.height, draws, _pv))
-        object.__setattr__(made, "rms", _figure(made.height, draws, lambda h: _rms(places, h)))
-        return made
+
+    def pv_and_rms(self, solution: Solution, seed: int) -> tuple[Figure, Figure]:
+        """Return PV and rms with their uncertainty by draws."""
+        draws = self.free(self.errors(solution, seed))
+        rms = _figure(self.height, draws, lambda h: _rms(self.places, h))
+        return _figure(self.height, draws, _pv), rms
 
     def free(self, heights: FloatArray) -> FloatArray:
         """Return ``heights`` (n, …) without their pose."""
@@ -186,7 +212,7 @@ class _Drawn:
         of_cells = np.sqrt(self.share)[:, np.newaxis] * random.standard_normal(
             (len(self.share), _DRAWS)
         )
-        return np.asarray(self.rows @ moved + self.member @ of_cells)
+        return np.asarray(self.rows[:, solution.active] @ moved + self.member @ of_cells)
 
 
 def _pv(heights: FloatArray) -> FloatArray:

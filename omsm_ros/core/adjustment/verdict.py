@@ -5,7 +5,7 @@ Codes and values only; sentences are made elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,9 +115,14 @@ _OPEN_M = 20e-9
 
 
 def not_evaluated(
-    evidences: Sequence[Evidence], priors: Sequence[Source], accuracy: float | None
+    evidences: Sequence[Evidence],
+    effects: Mapping[str, float],
+    priors: Sequence[Source],
+    accuracy: float | None,
 ) -> tuple[Reason, ...]:
-    """Return families that nobody evaluated, that these scans do not show, and that may matter.
+    """Return families that nobody evaluated, that these scans leave open, and that may matter.
+
+    effects: of each family on the form, k = 1 [m]
 
     What is declared only is taken as large as it plausibly is (``Family.wide``); families with a
     default count with that or their declaration. The second name of a reason is the scan or
@@ -129,10 +134,12 @@ def not_evaluated(
     for one in evidences:
         family = one.family
         prior = stated.get(base_name(family.name))
-        if not (family.named and one.open) or family.default is not None:
+        if not family.named or family.default is not None:
             continue
-        possible, code = one.possible, NOT_EVALUATED
+        possible, code = effects[family.name], NOT_EVALUATED
         if prior is not None:
+            if not one.open:
+                continue
             possible *= 0.0 if prior.evaluated else family.wide / max(prior.uncertainty, 1e-15)
             code = DECLARED_ONLY
         if possible > limit:
@@ -141,11 +148,11 @@ def not_evaluated(
 
 
 def rests_on(
-    evidences: Sequence[Evidence], declared: Collection[str]
+    evidences: Sequence[Evidence], effects: Mapping[str, float], declared: Collection[str]
 ) -> tuple[tuple[str, float], ...]:
     """Return the declared sources that these scans leave as they were declared."""
     found = [
-        (e.family.name, e.possible)
+        (e.family.name, effects[e.family.name])
         for e in evidences
         if base_name(e.family.name) in declared and e.open
     ]

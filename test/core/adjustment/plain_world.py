@@ -113,12 +113,15 @@ class Machine:
             - MIRROR.height(*place(c - omega * step, r - r_rate * step))
         ) / (2 * step)
         true = MIRROR.height(*seen) + self.part(*seen)
+        stand_off = wrong.get("stand_off", 0.0)
+        z = z - stand_off * np.sin(2 * np.pi * t / 7.0)
+        z_rate = z_rate - stand_off * (2 * np.pi / 7.0) * np.cos(2 * np.pi * t / 7.0)
         height = true + lag * z_rate + self._of_machine(c, r, t, z, z_rate, duration, wrong)
         height = height + self.noise * self.random.standard_normal(len(t))
-        stand_off = wrong.get("stand_off", 10e-6) * np.sin(2 * np.pi * t / 7.0)
-        distance = stand_off + (true - z)
         removed = wrong.get("removed_lag", 340e-6) * z_rate
         height = height + wrong.get("wrong_sign", 0.0) * removed
+        # What makes the height together with H(z) = z − removed.
+        distance = height - (z - removed)
         # In the frame of the chuck the part's place is turned by the clocking.
         chuck = (there[0] + 1j * there[1]) * np.exp(1j * clocking)
         scan = ScanData(

@@ -22,7 +22,6 @@ ONE_SCAN = [
 ]
 TWO_SCANS = [
     *ONE_SCAN,
-    ("growth", "squareness", None),
     ("latency", "lag_change", None),
     ("lag_by_z", "lag_motion", None),
     ("lag_by_x", "lag_x", None),
