@@ -74,6 +74,7 @@ _MARK = "made_by_omsm_demo.txt"
 # Sizes of errors that two scans do not show; the twin has none of them.
 _EVALUATED = {
     "encoder_scale": 1e-6,
+    "squareness": 1e-8,
     "pitch": 1e-6,
     "straightness_x": 2e-9,
     "probe_slope_square": 1e-8,

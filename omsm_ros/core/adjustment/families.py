@@ -213,7 +213,7 @@ def _dynamic(r: Ranges) -> list[Family]:
         _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
         _one("lag_time", "s", lambda v: v.motion_rate * (v.time / r.duration - 0.5), 1e-4,
              OTHER_SPEED),
-        _one("lag_curvature", "s2", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
+        _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
         _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
         _one("removed", "1", lambda v: v.removed, 2.0, OTHER_SPEED),
     ]  # fmt: skip

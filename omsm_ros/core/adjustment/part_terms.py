@@ -55,7 +55,8 @@ class PartModel:
     ring_knots: int
 
     def values(self, x: FloatArray, y: FloatArray, span: FloatArray | None = None) -> FloatArray:
-        """Return terms, cone and rings at x, y [m], (n, k), terms averaged over arcs ``span`` [rad]."""
+        """Return terms, cone and rings at x, y [m], (n, k), terms averaged over arcs ``span``
+        [rad]."""
         made = np.ascontiguousarray(zernike_values(*self.disc.scaled(x, y), self.terms).T)
         if span is not None:
             order = np.array([abs(t.m) for t in self.terms])
