@@ -61,6 +61,7 @@ OF_A_BAG = {
     "align": ["--calibration", "CAL", "--radius", "0.1", "--out", "OUT"],
     "selfcal": ["BAG", "--calibration", "CAL", "--out", "OUT"],
     "reversal": ["BAG", "--calibration", "CAL"],
+    "adjust": ["--calibration", "CAL", "--out", "OUT"],
     "spectrum": ["--out", "OUT"],
     "form": ["--calibration", "CAL", "--nominal", "SURFACE", "--out", "OUT"],
 }

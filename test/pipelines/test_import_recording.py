@@ -332,7 +332,10 @@ def test_a_pickle_is_not_opened(tmp_path):
         ("columns: {x: {constant: 3}}\nsample_period: 1", "x has no unit"),
         ("columns: {}\nsample_period: 1", "write one of them into the map"),
         ("columns: {distance: {name: d, unit: um}}\nsample_period: 1e9", "sample_period"),
-        ('columns: {distance: {name: d, unit: um}}\nsample_period: 1\ndecimal: ","', "decimal sign"),
+        (
+            'columns: {distance: {name: d, unit: um}}\nsample_period: 1\ndecimal: ","',
+            "decimal sign",
+        ),
     ],
 )
 def test_what_a_map_leaves_unclear_is_asked_for(tmp_path, mapping, said):
