@@ -94,8 +94,8 @@ def test_the_prediction_states_the_undetected_error_and_the_dwell_that_would_rev
     )
     path = ScanPath(z=z, sample_period=PERIOD)
     found = predict_error(with_noise(), path, 50e-9, unlimited)
-    assert found.residual_undetected == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
-    assert found.residual == pytest.approx(found.residual_undetected, rel=0.01)
+    assert found.residual_hidden == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
+    assert found.residual == pytest.approx(found.residual_hidden, rel=0.01)
     assert "cannot detect, mostly slow relaxation (creep) of 10.5 s" in found.message
     # 100 nm against 50 nm: four times as long.
     assert "rests of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message
