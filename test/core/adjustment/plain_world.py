@@ -56,6 +56,11 @@ def _fading(z, samples):
     return signal.lfilter([step], [1, step - 1], z, zi=[z[0] * (1 - step)])[0] - z
 
 
+def _height_rate(place, step=1e-4):
+    """Return the rate of the mirror's height [m/s] at ``place``, a function of time [s]."""
+    return (MIRROR.height(*place(step)) - MIRROR.height(*place(-step))) / (2 * step)
+
+
 class Machine:
     """One part on one machine; ``scan`` may be called again for further scans.
 
@@ -107,11 +112,7 @@ class Machine:
         )  # fmt: skip
         at = (seen[0] + 1j * seen[1]) * np.exp(-1j * turned) - complex(*moved)
         seen = (at.real, at.imag)
-        step = 1e-4
-        z_rate = (
-            MIRROR.height(*place(c + omega * step, r + r_rate * step))
-            - MIRROR.height(*place(c - omega * step, r - r_rate * step))
-        ) / (2 * step)
+        z_rate = _height_rate(lambda dt: place(c + omega * dt, r + r_rate * dt))
         true = MIRROR.height(*seen) + self.part(*seen)
         stand_off = wrong.get("stand_off", 0.0)
         z = z - stand_off * np.sin(2 * np.pi * t / 7.0)
