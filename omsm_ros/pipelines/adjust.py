@@ -238,10 +238,9 @@ def adjust_bags(
             for k, bag in enumerate(bags)
         ]
     )
-    arm = options.geometry.abbe_arm if options else 0.0
     found = adjust(
         [scan.data for scan in scans],
-        priors_of(stated, arm, calibration),
+        priors_of(stated, options.geometry.abbe_arm if options else 0.0, calibration),
         nominal=nominal,
         accuracy=accuracy,
         accepted=accepted,
