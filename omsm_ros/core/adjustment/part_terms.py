@@ -24,10 +24,13 @@ from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zerni
 FREE_DEGREE, HIGHEST_DEGREE = 10, 24
 # Stands for a degree among the variances that are estimated.
 RINGS = -1
+# Stands for the degrees of rotationally symmetric terms above the free ones: turning leaves them,
+# and their variance says nothing of the others.
+SYMMETRIC = -2
 # A tool that misses the centre turns a cone: power of the radius, not a degree of a term.
 _CONE = 1
-# Knots over the radius, two turns apart at least.
-_MOST_KNOTS, _TURNS_A_KNOT = 64, 2
+# Knots over the radius, a turn apart at least.
+_MOST_KNOTS, _TURNS_A_KNOT = 64, 1
 # A form that large is no form error of a finished part: no prior at all.
 _FREE_M = 1e-5
 # Of the radius: a spiral about the axis begins and ends within a pitch of where it should.
@@ -87,9 +90,10 @@ class PartModel:
 
     @property
     def degrees(self) -> IntArray:
-        """Degree of each term, of the cone, and ``RINGS`` for the rings, (k,)."""
+        """Degree of each term and of the cone, ``SYMMETRIC`` or ``RINGS`` instead, (k,)."""
         rings = np.full(self.ring_knots, RINGS)
-        return np.array([*(t.n for t in self.terms), _CONE, *rings])
+        terms = [SYMMETRIC if t.m == 0 and t.n > FREE_DEGREE else t.n for t in self.terms]
+        return np.array([*terms, _CONE, *rings])
 
     def cell_of(self, x: FloatArray, y: FloatArray) -> IntArray:
         """Return the number of the cell at x, y [m] among all of the disc, (n,)."""
@@ -113,8 +117,7 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
         x, y = 0.0, 0.0
     radius = float(np.max(np.hypot(blocks.x - x, blocks.y - y)))
     rings = int(np.clip(turns // _TURNS_A_RING, _LEAST_RINGS, _MOST_RINGS))
-    # Rings stand for the rotationally symmetric terms of high degree.
-    terms = tuple(t for t in terms_up_to(highest) if t.m or t.n <= FREE_DEGREE)
+    terms = terms_up_to(highest)
     about = np.hypot(blocks.x, blocks.y)
     knots = int(np.clip(turns // _TURNS_A_KNOT, 4, _MOST_KNOTS))
     empty = PartModel(

@@ -20,7 +20,7 @@ from omsm_ros.core.adjustment.network import (
     estimate_scales,
     solve,
 )
-from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, HIGHEST_DEGREE, RINGS
+from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, HIGHEST_DEGREE, RINGS, SYMMETRIC
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Of some sixty families one in five hundred clean adjustments has one beyond: 4.2 σ each.
@@ -65,7 +65,7 @@ def start_scales(network: Network, walk: float | None) -> Scales:
     walk: declared standard deviation of the drift after one second [m]
     """
     bands = dict.fromkeys(range(FREE_DEGREE + 1, HIGHEST_DEGREE + 1), _BAND_START_M**2)
-    bands[RINGS] = _BAND_START_M**2
+    bands[RINGS] = bands[SYMMETRIC] = _BAND_START_M**2
     first = _WALK_START if not walk else walk**2
     return Scales(first, bands, _CELLS_START_M**2, np.ones(network.blocks.scans))
 
