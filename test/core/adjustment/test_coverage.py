@@ -25,7 +25,7 @@ def two_scans():
 
 
 def test_few_clean_machines_are_verified_and_covered():
-    """Of 4 machines no family is refuted, and PV, rms, lag and 48 terms are as far off as stated."""
+    """No family of 4 machines is refuted; PV, rms, lag and 48 terms are off as stated."""
     rows, found = of_two_scans(range(FEW_SEEDS))
     assert [f.verdict.code for f in found] == [VERIFIED] * FEW_SEEDS
     assert not any(f.refutations for f in found)
