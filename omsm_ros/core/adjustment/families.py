@@ -239,7 +239,8 @@ def _geometric(r: Ranges) -> list[Family]:
         _one("encoder_scale", "1", lambda v: v.motion, 1e-4, REFERENCE),
         _curve("straightness_x", "m", r.slide, r, lambda v, w: w(v.slide_x), 3e-7, BEYOND_CENTRE),
         _curve("straightness_z", "m", r.lift, r, lambda v, w: np.stack(
-            [v.across(bow, 0.0) for bow in w(v.motion)]), 1e-6, BEYOND_CENTRE),
+            [v.across(*way) for bow in w(v.motion) for way in ((bow, 0.0), (0.0, bow))]),
+            1e-6, BEYOND_CENTRE, 2),
         _curve("pitch", "m", r.lift, r, lambda v, w: w(v.motion), 3e-7, REFERENCE),
     ]  # fmt: skip
 
@@ -252,8 +253,12 @@ def _curve(
     columns: Callable[[ScanView, Callable[[FloatArray], FloatArray]], FloatArray],
     wide: float,
     shown_by: str,
+    ways: int = 1,
 ) -> Family:
-    """Return a family of an unknown curve between ``ends``: components of unit variance."""
+    """Return a family of an unknown curve between ``ends``: components of unit variance.
+
+    ways: directions in which each component acts
+    """
     nodes = np.linspace(*ends, 129) if ends[1] > ends[0] else np.array([ends[0], ends[0] + 1.0])
     length = r.lengths.get(name, (nodes[-1] - nodes[0]) / 2)
     parts = components(smooth(length), nodes)
@@ -261,7 +266,7 @@ def _curve(
     def over(position: FloatArray) -> FloatArray:
         return np.stack([np.interp(position, nodes, part) for part in parts])
 
-    return Family(name, unit, len(parts), lambda v: columns(v, over), wide, shown_by)
+    return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by)
 
 
 def _of_the_probe(r: Ranges) -> list[Family]:
