@@ -11,7 +11,6 @@ from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.readable import count, measured
-from omsm_ros.report.measurement.page import correlated_moves, figure_rows, settled
 
 
 def dofs(text: str) -> tuple[str, ...]:
@@ -71,6 +70,9 @@ _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 
 def form_rows(facts: Facts) -> list[tuple[str, str]]:
     """Return the rows that show a form."""
+    # Here, because the page loads what draws, which a correction does without.
+    from omsm_ros.report.measurement.page import correlated_moves, figure_rows
+
     removed, points = facts["removed"], facts["points"]
     rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
     rows += [(f"{n} held", why) for n, why in removed["held"].items()]
@@ -88,5 +90,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
 
 
 def _pose(facts: Facts, name: str) -> str:
+    from omsm_ros.report.measurement.page import settled
+
     value, spread = facts["pose"][name]["value"], settled(facts, name)
     return f"{measured(value, spread, _UNITS.get(name, 'rad'))} (k = 1)"

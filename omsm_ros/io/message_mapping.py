@@ -134,7 +134,12 @@ def calibration(message: Any) -> Calibration:
     }
     # The message does not name its schema; its id does.
     schemas = (SCHEMA, SCHEMA_1)
-    own = [s for s in schemas if content_id({**content, "schema": s}) == message.id]
+    try:
+        own = [s for s in schemas if content_id({**content, "schema": s}) == message.id]
+    except ValueError as err:
+        raise CalibrationError(
+            "calibration message holds a number that is not finite; identify or load it again"
+        ) from err
     if not own:
         raise CalibrationError(
             f"calibration message carries id {message.id!r}, which is not that of its content: "

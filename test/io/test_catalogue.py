@@ -87,7 +87,7 @@ def test_of_more_rows_than_are_listed_the_newest_are_and_the_others_counted(
     assert (listed, found.older) == (["c4", "c3", "c5"], 2)
     assert history(address, "m0").older == 0
     assert cli.main(["history", "--catalogue", address]) == 0
-    assert "2 older calibrations and measurements are not listed" in capsys.readouterr().out
+    assert "2 older calibrations and measurements are neither listed" in capsys.readouterr().out
 
 
 def test_a_figure_of_too_many_machines_is_refused(capsys, address, tmp_path):

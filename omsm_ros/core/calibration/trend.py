@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
@@ -62,5 +61,7 @@ def trend(times: FloatArray, values: FloatArray) -> LinearTrend | None:
     if len(known) > _MOST:
         known = known[np.argsort(times[known], kind="stable")]
         known = known[np.linspace(0, len(known) - 1, _MOST).round().astype(np.int64)]
+    from scipy import stats  # loaded when it is needed: it takes a second
+
     found = stats.theilslopes(values[known], times[known], alpha=0.95)
     return LinearTrend(float(found.slope), float(found.low_slope), float(found.high_slope))
