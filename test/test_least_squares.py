@@ -43,7 +43,7 @@ def test_a_direction_below_the_tolerance_is_left_out():
 
 
 def test_a_triangle_of_blocks_has_the_products_of_the_columns(monkeypatch):
-    monkeypatch.setattr("omsm_ros.linear_algebra._ROWS", 7)
+    monkeypatch.setattr("omsm_ros.linear_algebra.BLOCK_ROWS", 7)
     one, other = np.random.default_rng(3).normal(size=(2, 40, 3))
     found = triangle(one, other)
     columns = np.column_stack([one, other])

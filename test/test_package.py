@@ -39,6 +39,7 @@ OPTIONAL = {
     "websockets": "viewer",
     "nidaqmx": "devices",
     "sqlalchemy": "catalogue",
+    "pandas": "pandas",
 }
 
 

@@ -62,8 +62,11 @@ def test_calibrate_scan_correct_and_replay(cell, device):
         assert abs(row["phase_error_deg"]) < limit
         if row["frequency"] < 2:
             assert abs(row["gain_error"]) < 20e-6
-    page = (plan.out / "report.html").read_text()
+    page = (plan.out / "scan_report.html").read_text()
     assert page.count("data:image/png;base64,") >= 8
+    adjusted = summary["adjustment"]
+    figure, truth = adjusted["figures"]["peak_to_valley"], adjusted["truth"]["peak_to_valley"]
+    assert abs(figure["value"] - truth) < 3 * figure["standard_uncertainty"] + 5e-9
 
 
 def reconnected(cell):

@@ -121,7 +121,7 @@ def test_an_overridden_calibration_marks_every_cloud_by_its_frame(cell, true_cal
     for number in range(2):
         cloud = feed.answer(*blocks(first=number * COUNT))
         assert cloud.header.frame_id == "workpiece_overridden"
-    cell.wait("the warning", lambda: "does not match" in cell.operator.text("corrector", "message"))
+    cell.wait("the warning", lambda: "do not match" in cell.operator.text("corrector", "message"))
     own = replace(true_calibration, settings={"machine": "another"})
     answer = cell.call(
         LoadCalibration, "corrector/load_calibration", path=saved(cell, "own.json", own)

@@ -103,7 +103,7 @@ def test_it_begins_only_when_those_listen_who_have_to(cell, small_scan_blocks):
         cell.operator.create_subscription(kind, f"/omsm/{topic}", lambda _: None, SAMPLES_QOS)
     play(cell, record(cell.folder / "a.mcap", small_scan_blocks[:2]), wait_for="corrector")
     text = cell.operator.text
-    cell.wait("its reason", lambda: "corrector must listen" in text("player", "message"))
+    cell.wait("its reason", lambda: "corrector must subscribe" in text("player", "message"))
     assert cell.operator.value("player", "axes") == 0
 
 

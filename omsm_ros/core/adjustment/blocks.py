@@ -113,7 +113,7 @@ def _of_scan(
         "count": count * weight,
         "variance": per_reading**2 / (count * weight),
         "deviation": mean(view.deviation),
-        "turning": mean(view.sideways(-view.y, view.x)),
+        "turning": mean(view.lateral_error(-view.y, view.x)),
         "columns": _columns(view, families, begins, count),
         "noise": np.array([per_reading]),
     }

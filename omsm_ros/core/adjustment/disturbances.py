@@ -20,8 +20,8 @@ from omsm_ros.core.streams.blocks import FloatArray
 _LINE_OVER_NOISE, _MOST_LINES = 30.0, 3
 # Of the larger amplitude of both halves of a scan.
 _LASTING = 0.5
-# The part's own waves: whole multiples of the turn, and what changes from turn to turn beside them.
-_PART_HARMONICS, _BESIDE = 30, 0.12
+# The part's own waves: whole multiples of the turn, and what changes from turn to turn around them.
+_PART_HARMONICS, _SIDE_BAND = 30, 0.12
 # Neighbours of a line, whose median is the noise.
 _BINS = 400
 # Median absolute deviation to standard deviation of a normal distribution.
@@ -32,7 +32,7 @@ _STEP_LIMIT = 7.0
 # once or twice the removed error it then is.
 _FOLLOWS, _NEAR_WHOLE = 0.95, 0.1
 # Jumps of height and of angle as machines in need of repair make them.
-_KNOCK_M, _C_LOST_RAD = 1e-7, 1e-3
+_HEIGHT_STEP_M, _C_LOST_RAD = 1e-7, 1e-3
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _of_the_part(frequency: FloatArray, turning: float) -> FloatArray:
     multiple = frequency / turning
     nearest = np.round(multiple)
     return np.asarray(
-        (np.abs(multiple - nearest) < _BESIDE) & (nearest <= _PART_HARMONICS) | (multiple < 0.9)
+        (np.abs(multiple - nearest) < _SIDE_BAND) & (nearest <= _PART_HARMONICS) | (multiple < 0.9)
     )
 
 
@@ -141,7 +141,7 @@ def line_family(line: Line) -> Family:
 class Step:
     """A change from one turn to the next at ``time`` in scan ``scan`` [s].
 
-    kind: "knock" of the height, or "c_lost" of the angle;  deviate: in standard deviations
+    kind: "height_step" of the height, or "c_lost" of the angle;  deviate: in standard deviations
     """
 
     scan: int
@@ -170,7 +170,7 @@ def _height_step(solution: Solution, scan: int) -> Step:
     since = net.blocks.since[mine]
     left = (solution.residual() + net.of_drift(solution.values))[mine]
     window = (since > (knot - 1) * width) & (since < (knot + 2) * width)
-    return Step(scan, "knock", _break(since[window], left[window]), float(size[knot]))
+    return Step(scan, "height_step", _break(since[window], left[window]), float(size[knot]))
 
 
 def _break(time: FloatArray, values: FloatArray) -> float:
@@ -222,10 +222,10 @@ def step_family(step: Step) -> Family:
 
     def columns(v: ScanView) -> FloatArray:
         after = (v.since > step.time).astype(np.float64)
-        shape = after if step.kind == "knock" else after * v.sideways(-v.y, v.x)
+        shape = after if step.kind == "height_step" else after * v.lateral_error(-v.y, v.x)
         return np.asarray(shape[np.newaxis])
 
-    unit, wide = ("m", _KNOCK_M) if step.kind == "knock" else ("rad", _C_LOST_RAD)
+    unit, wide = ("m", _HEIGHT_STEP_M) if step.kind == "height_step" else ("rad", _C_LOST_RAD)
     name = f"{step.kind}@{step.scan}"
     return Family(name, unit, 1, only(step.scan, 1, columns), wide, REPEATED_TRACK)
 

@@ -1,4 +1,4 @@
-"""What do the scans say of each family, beside its declared size?
+"""Test each family of error sources against the scans and its declared size.
 
 For a family that takes part with prior covariance Σ and posterior covariance P, the posterior mean
 b is spread as Σ − P if the declaration is true: ``χ² = bᵀ (Σ − P)⁻¹ b``. For one that does not take
@@ -19,7 +19,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 # Of the prior variance: what the scans take less away from, they do not show.
 _LEAST_SHOWN = 0.1
-# Of a column's information: what of it the other columns leave, rounding aside.
+# Share of a column's information that the other columns must leave; less is rounding.
 _LEAST_LEFT = 1e-10
 # Effect of a column of zeros, over its noise: a speed that is the same in all scans.
 _NO_COLUMN = 1e-100
@@ -31,7 +31,7 @@ class Evidence:
 
     values, uncertainty: by the scans alone, of each column (size,) [unit]; where nothing is
         shown, 0 and the plausible size
-    chi_square, freedom: against the declared size, of the directions that the scans show
+    chi_square, dof: against the declared size, of the directions that the scans show
     effect: rms of the family's share of the heights [m], by ``values``
     gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``
         instead of the declared one; a family that could explain anything gains less (Occam)
@@ -45,7 +45,7 @@ class Evidence:
     values: FloatArray
     uncertainty: FloatArray
     chi_square: float
-    freedom: int
+    dof: int
     effect: float
     gain: float
     spread: FloatArray
@@ -54,23 +54,23 @@ class Evidence:
     @property
     def shown(self) -> bool:
         """True if the scans determine any direction of it."""
-        return self.freedom > 0
+        return self.dof > 0
 
     @property
     def deviate(self) -> float:
         """As many standard deviations as χ² is rare; large ones by their square root."""
-        if not self.freedom:
+        if not self.dof:
             return 0.0
-        log_tail = _log_tail(self.chi_square, self.freedom)
+        log_tail = _log_tail(self.chi_square, self.dof)
         return float(max(-special.ndtri_exp(log_tail - np.log(2.0)), 0.0))
 
 
-def _log_tail(chi_square: float, freedom: int) -> float:
-    tail = special.gammaincc(freedom / 2, chi_square / 2)
+def _log_tail(chi_square: float, dof: int) -> float:
+    tail = special.gammaincc(dof / 2, chi_square / 2)
     if tail > 1e-290:
         return float(np.log(tail))
     half = chi_square / 2
-    return float((freedom / 2 - 1) * np.log(half) - half - special.gammaln(freedom / 2))
+    return float((dof / 2 - 1) * np.log(half) - half - special.gammaln(dof / 2))
 
 
 def evidence_of(solution: Solution, family: Family) -> Evidence:
@@ -152,8 +152,8 @@ def _evidence(
     net = solution.network
     change = net.column(family.name) @ values
     effect = float(np.sqrt(np.average(change**2, weights=net.blocks.count)))
-    chi_square, freedom, gain = tested
+    chi_square, dof, gain = tested
     return Evidence(
-        family, values, uncertainty, chi_square, freedom, effect, gain, spread,
-        freedom < family.size,
+        family, values, uncertainty, chi_square, dof, effect, gain, spread,
+        dof < family.size,
     )  # fmt: skip

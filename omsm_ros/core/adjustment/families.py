@@ -205,7 +205,8 @@ def _dynamic(r: Ranges) -> list[Family]:
     found = [
         # A step test leaves less than 0.1 ms of lag unknown; the default covers its change.
         _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
-        _one("lateral_lag", "s", lambda v: v.sideways(v.x_rate, v.y_rate), 3e-4, OTHER_STAND_OFF),
+        _one("lateral_lag", "s", lambda v: v.lateral_error(v.x_rate, v.y_rate), 3e-4,
+             OTHER_STAND_OFF),
         _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, OTHER_SPEED),
         _one("motion_error", "m", lambda v: np.sign(v.motion_rate), 1e-7, OTHER_DIRECTION),
         _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
@@ -296,8 +297,8 @@ def _tilting(n: float) -> _Columns:
 
 def _radial(n: float) -> _Columns:
     def columns(v: ScanView) -> FloatArray:
-        along, beside = _waves(v.c, n)
-        return np.stack([v.across(along, beside), v.across(-beside, along)])
+        along, across = _waves(v.c, n)
+        return np.stack([v.across(along, across), v.across(-across, along)])
 
     return columns
 
@@ -355,8 +356,9 @@ def _of_each_scan(r: Ranges) -> list[Family]:
         _drift(r),
         _one("drift_rate", "m/s", lambda v: v.time, 1e-8, REPEATED_TRACK, _RATE_M_S),
         Family("decentre", "m", 2, lambda v: np.stack(
-            [v.sideways(1.0, 0.0), v.sideways(0.0, 1.0)]), 3e-5, REFERENCE, named=False),
-        Family("clocking", "rad", 1, lambda v: v.sideways(-v.y, v.x)[np.newaxis], 1e-3, REFERENCE,
+            [v.lateral_error(1.0, 0.0), v.lateral_error(0.0, 1.0)]), 3e-5, REFERENCE, named=False),
+        Family("clocking", "rad", 1, lambda v: v.lateral_error(-v.y, v.x)[np.newaxis], 1e-3,
+               REFERENCE,
                named=False),
     ]  # fmt: skip
     for k in range(len(r.clampings)):
@@ -368,10 +370,11 @@ def _of_each_scan(r: Ranges) -> list[Family]:
             found += [
                 _of_scan(k, "tilt", "rad", 2, lambda v: np.stack([-v.x, v.y]), 1e-3, _TILT_RAD),
                 _of_scan(k, "part_shift", "m", 2, lambda v: np.stack(
-                    [v.sideways(1.0, 0.0), v.sideways(0.0, 1.0)]), 3e-5, shift),
-                _of_scan(k, "part_turn", "rad", 1, lambda v: v.sideways(-v.y, v.x)[np.newaxis],
+                    [v.lateral_error(1.0, 0.0), v.lateral_error(0.0, 1.0)]), 3e-5, shift),
+                _of_scan(k, "part_turn", "rad", 1, lambda v: v.lateral_error(-v.y, v.x)[np.newaxis],
                          1e-3, turn),
-                _of_scan(k, "expansion", "1", 1, lambda v: v.sideways(v.x, v.y)[np.newaxis], 3e-5),
+                _of_scan(k, "expansion", "1", 1, lambda v: v.lateral_error(v.x, v.y)[np.newaxis],
+                         3e-5),
             ]  # fmt: skip
         if len(r.clampings) > 1:
             found.append(_different(k, r.radius))

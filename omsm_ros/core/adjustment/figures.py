@@ -27,7 +27,7 @@ POSE = ("piston", "tip", "tilt")
 _RIM = 96
 # Draws: a standard deviation to 4 %.
 _DRAWS = 300
-# Terms that are reported, and those that are fitted beside them.
+# Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
 
 
@@ -134,7 +134,8 @@ def effects_on_form(
 ) -> dict[str, float]:
     """Return by family what it may do to the form, rms over the part, k = 1 [m].
 
-    As far as the scans, and the size of the family, leave it open; all others are fitted beside it.
+    As far as the scans, and the size of the family, leave it open; all others are fitted
+    together with it.
     """
     made = _Made.of(solution, nominal, removed)
     # L P, with P the covariance of the parameters that take part.

@@ -259,7 +259,7 @@ def _hats_of(
 class Factor:
     """Cholesky root L of a positive matrix whose rows have different units: A = D⁻¹ L Lᵀ D⁻¹.
 
-    No ridge: a free form of 100 nm beside an uncertainty of 0.03 nm would be pulled by 1e-13.
+    No ridge: a free form of 100 nm with an uncertainty of 0.03 nm would be pulled by 1e-13.
     """
 
     root: FloatArray

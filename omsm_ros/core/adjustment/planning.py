@@ -179,7 +179,7 @@ def additions(first: ScanDesign) -> dict[str, ScanDesign]:
     """Return the scans that may be added to ``first``, by their codes.
 
     All but ``other_direction`` run back over the part at twice the speed, so that time and drift
-    are told from radius as well.
+    are separated from radius as well.
     """
     back = replace(first, start=first.end, end=first.start)
     fast = replace(back, rpm=2 * first.rpm)

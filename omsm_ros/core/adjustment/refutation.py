@@ -1,7 +1,7 @@
 """Fit, test every family, release what the scans refute, and fit again.
 
 The family that explains most is released first; those that explain as much as it does, and nothing
-beside it any more, are one group whose members these scans do not tell apart.
+together with it, are one group whose members these scans do not separate.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _DECLARED_LIMIT = 3.7
 _LEAST_GAIN = 10.0
 # Smaller than this no source matters to any accuracy asked of the method.
 _LEAST_EFFECT_M = 0.5e-9
-# Two explanations within this of each other in χ², or in their share of it, are not told apart.
+# Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
 _MOST_RELEASED = 8
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.

@@ -145,14 +145,14 @@ class ScanView:
         }
         return replace(self, **arrays)
 
-    def sideways(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
+    def lateral_error(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
         """Return the height error of points reported off by ``x``, ``y`` [m] of the part frame."""
         return np.asarray(-self.slope_x * x - self.slope_y * y, np.float64)
 
     def across(self, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
         """Return the height error of points reported off by ``x``, ``y`` [m] of the machine."""
         one = np.ones(len(self))
-        return self.sideways(*workpiece_xy(x * one, y * one, self.turned))
+        return self.lateral_error(*workpiece_xy(x * one, y * one, self.turned))
 
 
 def view_of(scan: ScanData, index: int, begin: float, nominal: Surface) -> ScanView:

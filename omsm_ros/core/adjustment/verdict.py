@@ -24,7 +24,7 @@ REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
 UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redundant", "uncertainty"
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
 
-# Periodic errors of encoder, probe and slides add to the walk that is found; of twenty drawn
+# Periodic errors of encoder, probe and slides add to the walk that is found; of ten drawn
 # machines whose declarations are true the largest ratio was 1.9.
 _WALK_RATIO = 3.0
 # What is smaller is found and corrected, with its uncertainty, and contradicts nothing: declared

@@ -9,6 +9,8 @@ from functools import lru_cache
 from types import NoneType, UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import numpy as np
+
 from omsm_ros.errors import CalibrationError, OmsmError
 
 Record = TypeVar("Record")
@@ -22,6 +24,8 @@ def to_json(value: Any) -> Any:
         return {name: item for name, item in found if item is not None and item not in ([], {}, "")}
     if isinstance(value, Mapping):
         return {str(key): to_json(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
     return [to_json(item) for item in value] if isinstance(value, tuple | list) else value
 
 

@@ -27,7 +27,7 @@ KINDS = {
     "spindle_6": {"more_spindle": ((6, 20e-9, 0.0),)},
     "spindle_2.5": {"more_spindle": ((2.5, 20e-9, 0.0),)},
     "settling": {"settling": 150e-9},
-    "knock": {"knock": 90e-9},
+    "height_step": {"height_step": 90e-9},
     "c_lost": {"c_lost": 5e-4},
     "hum": {"hum": 20e-9},
     "floor": {"floor": 20e-9},

@@ -151,7 +151,7 @@ class Machine:
         made = made + wrong.get("stretch", 0.0) * z
         made = made + wrong.get("backlash", 0.0) * np.sign(z_rate)
         made = made + wrong.get("settling", 0.0) * np.exp(-t / 15.0)
-        made = made + wrong.get("knock", 0.0) * (t > 0.4 * duration)
+        made = made + wrong.get("height_step", 0.0) * (t > 0.4 * duration)
         made = made + wrong.get("hum", 0.0) * np.sin(2 * np.pi * 50.0 * t + 1.0)
         made = made + wrong.get("floor", 0.0) * np.sin(2 * np.pi * 2.13 * t + 1.0)
         if "straightness" in wrong:

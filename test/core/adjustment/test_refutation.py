@@ -17,7 +17,7 @@ ONE_SCAN = [
     ("spindle_3", "spindle_axial/3", None),
     ("spindle_6", "spindle_axial/6", [20e-9, 0.0]),
     ("spindle_2.5", "spindle_axial/2.5", [20e-9, 0.0]),
-    ("knock", "knock@0", [90e-9]),
+    ("height_step", "height_step@0", [90e-9]),
     ("c_lost", "c_lost@0", [5e-4]),
 ]
 TWO_SCANS = [
