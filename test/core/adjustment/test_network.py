@@ -122,7 +122,7 @@ def test_score_of_a_family_equals_its_fit(small):
     estimate = free.values[here]
     chi_square = estimate @ np.linalg.solve(free.covariance_of(here), estimate)
     assert evidence.chi_square == pytest.approx(chi_square, rel=1e-3)
-    assert evidence.freedom == 2
+    assert evidence.dof == 2
 
 
 def test_white_noise_is_told_from_a_slow_form():
