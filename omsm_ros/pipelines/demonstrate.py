@@ -77,8 +77,13 @@ _EVALUATED = {
     "squareness": 1e-8,
     "pitch": 1e-6,
     "straightness_x": 2e-9,
+    "straightness_z": 2e-9,
     "probe_slope_square": 1e-8,
     "drift_walk": 0.2e-9,
+}
+_LENGTHS = {
+    "straightness_x": {"correlation_length": 0.01},
+    "straightness_z": {"correlation_length": 1e-3},
 }
 _RESULTS = (
     CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, SCAN_REPORT, OVERVIEW,
@@ -316,7 +321,7 @@ def _evaluated_sources() -> MachineSources:
                 value=size,
                 how=EVALUATED,
                 reason="the twin is built without this error",
-                parameters={"correlation_length": 0.01} if name == "straightness_x" else {},
+                parameters=_LENGTHS.get(name, {}),
             )
             for name, size in _EVALUATED.items()
         )

@@ -43,8 +43,11 @@ from omsm_ros.core.adjustment.scan_data import (
     view_of,
 )
 from omsm_ros.core.adjustment.verdict import (
+    POSITION_ONLY,
     Verdict,
     not_evaluated,
+    open_limit,
+    position_only,
     reasons_of,
     redundant,
     rests_on,
@@ -198,7 +201,10 @@ def _adjusted(
     enough = redundant(scans)
     verdict = verdict_of(
         contradictions,
-        not_evaluated(evidences, effects, priors, accuracy),
+        (
+            *not_evaluated(evidences, effects, priors, accuracy),
+            *position_only(scans, _plausible(solution), declared, open_limit(accuracy)),
+        ),
         rests_on(evidences, effects, declared),
         enough,
         2 * form.pv.uncertainty,
@@ -218,6 +224,14 @@ def _adjusted(
         nominal=surface,
         begin=begin,
     )
+
+
+def _plausible(solution: Solution) -> float:
+    """Return the rms that the bow of Z may have in the heights, of its plausible size [m]."""
+    net = solution.network
+    family = next(f for f in net.families if f.name == POSITION_ONLY)
+    variance = np.sum(np.atleast_2d(net.column(POSITION_ONLY).T * family.wide) ** 2, axis=0)
+    return float(np.sqrt(np.average(variance, weights=net.blocks.count)))
 
 
 def _network(

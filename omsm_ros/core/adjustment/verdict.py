@@ -12,7 +12,7 @@ import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
 from omsm_ros.core.adjustment.evidence import Evidence
-from omsm_ros.core.adjustment.families import Source, base_name
+from omsm_ros.core.adjustment.families import RECLOCKED, Source, base_name
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
 
@@ -114,6 +114,11 @@ _OPEN_SHARE = 0.5
 _OPEN_M = 20e-9
 
 
+def open_limit(accuracy: float | None) -> float:
+    """Return the effect on the heights beyond which an open source matters [m]."""
+    return _OPEN_M if accuracy is None else _OPEN_SHARE * accuracy
+
+
 def not_evaluated(
     evidences: Sequence[Evidence],
     effects: Mapping[str, float],
@@ -129,7 +134,7 @@ def not_evaluated(
     artefact that would show the family.
     """
     stated = {p.name: p for p in priors}
-    limit = _OPEN_M if accuracy is None else _OPEN_SHARE * accuracy
+    limit = open_limit(accuracy)
     found = []
     for one in evidences:
         family = one.family
@@ -145,6 +150,24 @@ def not_evaluated(
         if possible > limit:
             found.append(Reason(code, (family.name, family.shown_by), possible, limit))
     return tuple(found)
+
+
+# A function of place alone is form for scans that hold the part at one angle. The scans seem to
+# show it only as far as the part is smooth.
+POSITION_ONLY = "straightness_z"
+
+
+def position_only(
+    scans: Sequence[ScanData], effect: float, declared: Collection[str], limit: float
+) -> tuple[Reason, ...]:
+    """Return the bow of Z where it was not declared and no scan turned the part on the chuck.
+
+    effect: of its plausible size on the heights, rms [m];  limit: beyond which it matters [m]
+    """
+    turned = len({round(scan.clocking, 6) for scan in scans}) > 1
+    if turned or POSITION_ONLY in declared or not effect > limit:
+        return ()
+    return (Reason(NOT_EVALUATED, (POSITION_ONLY, RECLOCKED), effect, limit),)
 
 
 def rests_on(
