@@ -124,7 +124,7 @@ def test_messages_that_are_no_bytes_are_damage(place):
     with closing(sqlite3.connect(found)) as base, base:
         base.execute("UPDATE messages SET data = 5")
     said = refused(place, "predict", "rb", "--calibration", "cal.json")
-    assert "a message is 5, no bytes" in said
+    assert "a message is 5, not bytes" in said
 
 
 def test_a_step_test_is_no_scan_of_a_sphere(place):

@@ -5,12 +5,13 @@ import re
 from pathlib import Path
 
 import omsm_ros
+from omsm_ros.messages import templates
 
 from .judge import REMEDIES
 
 HOME = Path(omsm_ros.__file__).parent
 # Those of devices and wires are retried and counted; a twin's are for who writes one.
-ROOMS = ("cli", "core", "jobs", "nodes", "report", "storage", "viewing")
+ROOMS = ("cli", "core", "pipelines", "nodes", "report", "io", "live_page")
 # Of Python, or meant for a caller and worded where they are caught.
 OTHERS = {
     "ArgumentTypeError", "AttributeError", "BlockingIOError", "FileExistsError", "KeyError",
@@ -41,7 +42,10 @@ def messages():
             name = ast.unparse(node.exc.func).rsplit(".", 1)[-1]
             if name.endswith("Error") and name not in OTHERS and node.exc.args:
                 place = f"{path.relative_to(HOME)}:{node.lineno}"
-                yield place, wording(node.exc.args[0])
+                message = wording(node.exc.args[0])
+                # A code stands for its sentence, in which values are holes.
+                sentence = templates().get(message, message)
+                yield place, re.sub(r"\{[^{}]*\}", HOLE, sentence)
 
 
 def test_every_message_says_what_to_do():

@@ -67,7 +67,7 @@ class ScanData:
         if len(self.time) < LEAST_POINTS:
             raise DataError(f"scan of {len(self.time)} points, expected {LEAST_POINTS} or more")
         if not (np.diff(self.time) > 0).all():
-            raise DataError("time does not grow from point to point; sort the scan by time")
+            raise DataError("time does not grow from point to point; give the scan sorted by time")
 
     def __len__(self) -> int:
         return len(self.time)
