@@ -21,9 +21,9 @@ from omsm_ros.core.adjustment.network import Network, Solution, solve
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
-# Of adjustments whose scans agree, with any E_n beyond its limit.
+# Share of adjustments with agreeing scans in which any E_n exceeds its limit.
 _BY_CHANCE = 0.005
-# What declared errors without columns add to a term of one scan, k = 1 [m].
+# Declared errors without columns add this to a term of one scan, k = 1 [m].
 _UNMODELLED_M = 1e-9
 
 

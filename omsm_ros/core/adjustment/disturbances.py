@@ -1,7 +1,7 @@
 """Lines in time, steps from turn to turn, and heights that follow what the correction removed.
 
-They are looked for in the residuals of a first fit. What is found becomes a family of columns, and
-is tested as every other one.
+They are looked for in the residuals of a first fit. Each finding becomes a family of
+columns, and is tested as all others are.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 # Over its neighbours a bin of white noise is beyond 30 once in 10 000 scans of 250 000 points.
 _LINE_OVER_NOISE, _MOST_LINES = 30.0, 3
-# Of the larger amplitude of both halves of a scan.
+# Share of the larger amplitude that the smaller half of a scan must reach.
 _LASTING = 0.5
 # The part's own waves: whole multiples of the turn, and what changes from turn to turn around them.
 _PART_HARMONICS, _SIDE_BAND = 30, 0.12
@@ -26,7 +26,7 @@ _PART_HARMONICS, _SIDE_BAND = 30, 0.12
 _BINS = 400
 # Median absolute deviation to standard deviation of a normal distribution.
 _MAD = 1.4826
-# Of 1500 differences between turns of clean scans none is beyond 5.
+# The largest of 1500 differences between turns of clean scans was below 5.
 _STEP_LIMIT = 7.0
 # Share of the deviation that the removed error explains where its sign is wrong, and how near to
 # once or twice the removed error it then is.

@@ -17,7 +17,7 @@ from omsm_ros.core.adjustment.families import Family
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.streams.blocks import FloatArray
 
-# Of the prior variance: what the scans take less away from, they do not show.
+# The scans show a direction if they remove at least this share of its prior variance.
 _LEAST_SHOWN = 0.1
 # Share of a column's information that the other columns must leave; less is rounding.
 _LEAST_LEFT = 1e-10
@@ -117,13 +117,13 @@ def _of_absent(solution: Solution, family: Family) -> Evidence:
     left = own - explained.T @ explained
     scale = np.sqrt(np.maximum(np.diag(own), 1e-300))
     information, axes = np.linalg.eigh(left / scale / scale[:, np.newaxis])
-    # What is wider than anything plausible is not determined.
+    # A direction known less well than its plausible size is not determined.
     plausible = 1 / max(float(np.min(family.wide * scale)), _NO_COLUMN) ** 2
     shown = information > max(_LEAST_LEFT, plausible)
     moved = axes.T @ (score / scale)
     known = np.where(shown, information, 1.0)
     values = (axes @ np.where(shown, moved / known, 0.0)) / scale
-    # What is not shown is as open as the family's plausible size.
+    # A direction that is not shown keeps the plausible size of the family.
     variance = 1 / (np.maximum(information, 0.0) + plausible)
     uncertainty = np.sqrt(axes**2 @ variance) / scale
     spread = axes * np.sqrt(variance) / scale[:, np.newaxis]

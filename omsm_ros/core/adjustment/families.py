@@ -75,7 +75,7 @@ class Family:
 
 @dataclass(frozen=True, eq=False)
 class Ranges:
-    """What the columns are scaled by: the extent of all scans together.
+    """Extent of all scans together, by which the columns are scaled.
 
     speed: mean magnitude, speeds: of each, with sign [rad/s];  duration: of all [s]
     motion, distance, radius: half ranges [m]
@@ -333,7 +333,7 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
     ]
 
 
-# What a warming chuck moves a part that nobody touches by; as in verification.self_calibration.
+# Movement of a clamped part by a warming chuck, as in self_calibration.
 _SHIFT_M, _CLOCKING_RAD = 1e-6, 5e-7
 # A part clamped again by hand against a stop.
 _SHIFT_AGAIN_M, _CLOCKING_AGAIN_RAD = 3e-5, 1e-3
@@ -393,7 +393,8 @@ def only(k: int, size: int, columns: _Columns) -> _Columns:
     return lambda v: columns(v) if v.index == k else np.zeros((size, len(v)))
 
 
-# Of the duration of all scans: a clamp relaxes within a few turns, a body warms within minutes.
+# Time constants as shares of the duration of all scans: a clamp relaxes within a few turns, a
+# body warms within minutes.
 _FADING = (1 / 64, 1 / 16, 1 / 4)
 
 

@@ -70,13 +70,13 @@ class ScanDesign:
 
     @property
     def duration(self) -> float:
-        """Of the scan [s]."""
+        """Duration of the scan [s]."""
         return self.turns * 60 / abs(self.rpm)
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedUncertainty:
-    """What an adjustment of a set of scans will reach.
+    """Uncertainty that an adjustment of a set of scans will reach.
 
     form: standard uncertainty of the heights once the pose is removed, rms over the part [m]
     sources: of each family that takes part, standard uncertainty after the scans [unit]

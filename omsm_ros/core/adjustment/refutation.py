@@ -55,7 +55,7 @@ class Refutation:
 
     @property
     def name(self) -> str:
-        """Of the family that was released."""
+        """Name of the family that was released."""
         return self.evidence.family.name
 
 

@@ -49,7 +49,7 @@ class Reason:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What may be said of the heights.
+    """Verdict on the heights, with its reasons.
 
     code: of this module;  reasons: against green, none where it is verified
     rests_on: declared sources that these scans do not verify, name and standard uncertainty of

@@ -125,7 +125,7 @@ def test_score_of_a_family_equals_its_fit(small):
     assert evidence.dof == 2
 
 
-def test_white_noise_is_told_from_a_slow_form():
+def test_white_noise_is_separated_from_a_slow_form():
     random = np.random.default_rng(3)
     time = np.arange(20_000) / 1000
     height = 1e-7 * np.sin(2 * np.pi * time) + 12e-9 * random.standard_normal(len(time))

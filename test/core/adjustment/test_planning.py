@@ -62,7 +62,7 @@ def test_a_repeated_track_does_not_show_a_lag():
     assert max(faster.sources["lag_change"][0], reversed_.sources["lag_change"][0]) < 1e-6
 
 
-def test_beyond_the_centre_straightness_is_told_from_the_part():
+def test_beyond_the_centre_straightness_is_separated_from_the_part():
     """Odd parts of a bend look like no part that is scanned from both sides."""
     bent = [p for p in PRIORS if p.name != "squareness"]
     inside, beyond = (
