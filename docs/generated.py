@@ -38,6 +38,7 @@ def commands() -> str:
     for name, sub in words.choices.items():
         lines += [f"## omsm {name}", "", (sub.description or "").strip().capitalize() + ".", ""]
         lines += ["```text", sub.format_usage().strip(), "```", ""]
+        lines += _examples(name)
         rows = [_argument(a) for a in sub._actions if a.dest != "help"]
         lines += ["| argument | meaning |", "|---|---|", *rows, ""]
         if sub.epilog:
@@ -45,18 +46,28 @@ def commands() -> str:
     return "\n".join(lines) + "\n"
 
 
+def _examples(name: str) -> list[str]:
+    """Return the calls of a command that the page of commands lists, one a line."""
+    page = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    calls = re.findall(rf"^\| `(omsm {name}\b[^`]*)`", page, re.MULTILINE)
+    return ["```text", *(call.replace("\\|", "|") for call in calls), "```", ""]
+
+
 def _argument(action: argparse.Action) -> str:
     names = ", ".join(f"`{option}`" for option in action.option_strings)
     name = names or f"`{action.metavar or action.dest}`"
     if names and action.metavar:
         name += f" `{action.metavar}`"
-    text = " ".join((action.help or "").split())
+    text = " ".join((action.help or "file or folder to write").split())
+    notes = []
     if action.choices is not None and action.option_strings:
-        text += f" One of {', '.join(f'`{c}`' for c in action.choices)}."
+        notes.append(f"one of {', '.join(f'`{c}`' for c in action.choices)}")
     usual = action.default
     if action.option_strings and usual not in (None, "", False, argparse.SUPPRESS) and usual:
-        text += f" Default: `{usual}`."
-    return f"| {_cell(name)} | {_cell(text)} |"
+        parts = usual if isinstance(usual, list | tuple) else [usual]
+        shown = (f"{part:.6g}" if isinstance(part, float) else str(part) for part in parts)
+        notes.append(f"default `{','.join(shown)}`")
+    return f"| {_cell(name)} | {_cell('; '.join([text, *notes]))} |"
 
 
 def parameters() -> str:

@@ -19,18 +19,21 @@ from omsm_ros.core.kinematics.trajectories import (
     PLANNED_DWELL_S,
     SECOND_SHARE,
     plan_csv,
-    plan_gcode,
     plan_steps,
 )
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_limits, load_sources, load_surface
 from omsm_ros.io.files import save_text
+from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
 from omsm_ros.readable import quantity
 
 
 def _declare_plan(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("what", choices=("steps", "scans"), help="a step test, or scans of a part")
     sub.add_argument("--out", type=Path, required=True, metavar="DIR")
+    sub.add_argument(
+        "--dialect", choices=DIALECTS, default="linuxcnc", help="controller that reads the G-code"
+    )
     steps = sub.add_argument_group("steps")
     for name, kind, default, meaning in (
         ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
@@ -76,7 +79,7 @@ def _plan_steps(args: argparse.Namespace) -> Facts:
     )
     csv, gcode = args.out / "steps.csv", args.out / "steps.nc"
     save_text(csv, plan_csv(plan, args.sample_period))
-    save_text(gcode, plan_gcode(plan))
+    save_text(gcode, steps_gcode(plan, args.dialect))
     return {
         "edges": len(plan.starts),
         "heights": sorted(set(map(abs, plan.heights)), reverse=True),
@@ -137,7 +140,7 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
         args.accuracy,
         load_limits(args.limits) if args.limits else MachineLimits(),
     )
-    return plan_facts(sets, args.accuracy, args.out, nominal)
+    return plan_facts(sets, args.accuracy, args.out, nominal, args.dialect)
 
 
 def _scan_text(scan: Mapping[str, Any]) -> str:

@@ -17,8 +17,9 @@ from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.files import save_text
+from omsm_ros.io.gcode_file import scan_gcode
 from omsm_ros.pipelines.adjust import priors_of
-from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, RPM_RAD_S
+from omsm_ros.units import DEGREE_RAD, RPM_RAD_S
 
 # Points of a program: a planner joins segments of 2° within 0.1 nm of this mirror's curvature.
 _SEGMENT_RAD = 2 * DEGREE_RAD
@@ -87,7 +88,11 @@ def planned_sets(
 
 
 def plan_facts(
-    sets: Sequence[tuple[str, PlannedSet]], accuracy: float, out: Path, nominal: Surface
+    sets: Sequence[tuple[str, PlannedSet]],
+    accuracy: float,
+    out: Path,
+    nominal: Surface,
+    dialect: str = "linuxcnc",
 ) -> dict[str, Any]:
     """Write the programs of the best set into ``out``, and return what was planned.
 
@@ -99,7 +104,7 @@ def plan_facts(
         steps = np.arange(0.0, design.duration, _SEGMENT_RAD / abs(design.rpm * RPM_RAD_S))
         x, z, c = scan_path(design, nominal, steps)
         files[f"scan_{k + 1}.csv"] = _csv(steps, x, z, c)
-        files[f"scan_{k + 1}.nc"] = scan_gcode(steps, x, z, c, design)
+        files[f"scan_{k + 1}.nc"] = scan_gcode(steps, x, z, c, design, dialect)
     for file, text in files.items():
         save_text(out / file, text)
     return {
@@ -123,28 +128,3 @@ def plan_facts(
 def _csv(t: FloatArray, x: FloatArray, z: FloatArray, c: FloatArray) -> str:
     rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in zip(t, x, z, c, strict=True))
     return "t_s,x_m,z_m,c_rad\n" + "\n".join(rows) + "\n"
-
-
-def scan_gcode(
-    t: FloatArray, x: FloatArray, z: FloatArray, c: FloatArray, design: ScanDesign
-) -> str:
-    """Return a scan as G-code: inverse-time segments, millimetres and degrees.
-
-    Each segment takes the same time, so C turns steadily whatever X and Z do.
-    """
-    rate = 60 / float(np.median(np.diff(t)))
-    lines = [
-        f"; scan at {design.rpm:g} rpm, {len(t)} segments of {np.degrees(_SEGMENT_RAD):g} degrees",
-        f"; part turned on the chuck by {np.degrees(design.clocking):g} degrees",
-        "G21 ; millimetres",
-        "G90 ; absolute",
-        "G64 P0.0001 ; path tolerance",
-        f"G0 X{x[0] / MILLIMETRE_M:.7f}",
-        f"G0 Z{z[0] / MILLIMETRE_M:.7f} C{np.degrees(c[0]):.5f}",
-        "G93 ; inverse time",
-    ]
-    lines += [
-        f"G1 X{a / MILLIMETRE_M:.7f} Z{b / MILLIMETRE_M:.7f} C{np.degrees(d):.5f} F{rate:.4f}"
-        for a, b, d in zip(x[1:], z[1:], c[1:], strict=True)
-    ]
-    return "\n".join([*lines, "G94", "M2"]) + "\n"

@@ -13,7 +13,7 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, RPM_HZ, RPM_RAD_S
+from omsm_ros.units import RPM_HZ, RPM_RAD_S
 
 
 class AxisPositions(NamedTuple):
@@ -325,26 +325,3 @@ def plan_csv(plan: StepPlan, period: float) -> str:
     time = np.asarray(np.arange(round(plan.duration / period) + 1) * period, np.float64)
     rows = [f"{t:.6f},{z:.12e}" for t, z in zip(time, plan.z(time), strict=True)]
     return "\n".join(["time_s,z_m", *rows]) + "\n"
-
-
-def plan_gcode(plan: StepPlan) -> str:
-    """Return the plan as G-code in millimetres: each edge a G1 at its mean feed, then a G4 dwell.
-
-    Jerk is limited by the controller: set its S-curve so that an edge takes ``plan.rise``.
-    """
-    lines = [
-        "; step test for the identification of the measuring loop",
-        f"; {len(plan.starts)} edges, rise {plan.rise * 1e3:g} ms, set as S-curve time",
-        "G21 ; millimetres",
-        "G91 ; relative",
-    ]
-    now = 0.0
-    for start, height in zip(plan.starts, plan.heights, strict=True):
-        feed = abs(height) / plan.rise / MILLIMETRE_M * 60
-        lines.append(f"G4 P{start - now:.6f} ; rest, seconds")
-        lines.append(
-            f"G1 Z{height / MILLIMETRE_M:+.6f} F{feed:.4f} ; {height / MICROMETRE_M:+.3f} um"
-        )
-        now = start + plan.rise
-    lines += [f"G4 P{plan.duration - now:.6f}", "G90", "M2"]
-    return "\n".join(lines) + "\n"

@@ -18,13 +18,13 @@ from omsm_ros.core.kinematics.trajectories import (
     StepPlan,
     StepTest,
     plan_csv,
-    plan_gcode,
     plan_steps,
     s_curve,
 )
 from omsm_ros.core.surface.aspheres import Toroid
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.gcode_file import steps_gcode
 
 
 def integrated(phase: Fraction) -> Fraction:
@@ -251,7 +251,7 @@ def test_gcode_ends_each_edge_where_the_plan_does():
     """Its relative moves added up, its rests and feeds run through: the plateaus of the plan."""
     plan = plan_steps(sample_period=1e-3, second_step=3e-6, count=4)
     now = z = 0.0
-    for line in plan_gcode(plan).splitlines():
+    for line in steps_gcode(plan).splitlines():
         words = line.split(";")[0].split()
         if words[:1] == ["G4"]:
             now += float(words[1][1:])

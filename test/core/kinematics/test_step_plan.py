@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import StepPlan, plan_csv, plan_gcode, plan_steps
+from omsm_ros.core.kinematics.trajectories import StepPlan, plan_csv, plan_steps
 from omsm_ros.core.model_errors.families import low_pass_response
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.gcode_file import steps_gcode
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant
 
@@ -66,7 +67,7 @@ def test_csv_is_the_motion():
 
 
 def test_gcode_moves_add_up_to_nothing_and_last_as_planned():
-    text = plan_gcode(PLAN)
+    text = steps_gcode(PLAN)
     moves = [float(m) for m in re.findall(r"^G1 Z(\S+)", text, re.M)]
     feeds = [float(m) for m in re.findall(r"^G1 .* F(\S+)", text, re.M)]
     rests = [float(m) for m in re.findall(r"^G4 P(\S+)", text, re.M)]

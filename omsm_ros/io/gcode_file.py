@@ -1,0 +1,158 @@
+"""G-code of step tests and scans, in the dialect of a controller.
+
+Only ``linuxcnc`` has run on its controller. The others follow the programming manuals; run them
+dry first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from omsm_ros.core.kinematics.trajectories import StepPlan
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, MILLISECOND_S
+
+if TYPE_CHECKING:
+    from omsm_ros.core.adjustment import ScanDesign
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dialect:
+    """Words of a controller.
+
+    comment, metric, dwell: patterns and words;  dwell_unit: value of one in the dwell word [s]
+    dwell_decimals: 0 for a word without a decimal point;  frame, end: first and last lines
+    before_scan: path tolerance;  c_word: of the spindle;  c_relative: it takes increments, because
+    absolute angles are reduced to one turn;  decimals: of X and Z [mm]
+    note: what the controller must be set to
+    """
+
+    comment: str
+    metric: str
+    dwell: str
+    dwell_unit: float = 1.0
+    dwell_decimals: int = 6
+    frame: tuple[str, ...] = ()
+    before_scan: tuple[str, ...] = ()
+    c_word: str = "C{}"
+    c_relative: bool = False
+    decimals: int = 7
+    end: tuple[str, ...] = ("M30",)
+    note: str = ""
+
+    def remark(self, text: str) -> str:
+        """Return a comment; a bracket would end that of some controllers."""
+        return self.comment.format(text.translate({ord("("): "[", ord(")"): "]"}))
+
+    def rest(self, time: float) -> str:
+        """Return the block that waits for ``time`` [s]."""
+        return self.dwell.format(f"{time / self.dwell_unit:.{self.dwell_decimals}f}")
+
+
+DIALECTS = {
+    "linuxcnc": Dialect(
+        comment="; {}",
+        metric="G21",
+        dwell="G4 P{}",
+        before_scan=("G64 P0.0001",),
+        end=("M2",),
+    ),
+    "fanuc": Dialect(
+        comment="({})",
+        metric="G21",
+        dwell="G04 P{}",
+        dwell_unit=MILLISECOND_S,
+        dwell_decimals=0,
+        frame=("%", "O0001"),
+        c_word="H{}",
+        c_relative=True,
+        decimals=6,
+        end=("M30", "%"),
+        note="G-code system B or C, increment system IS-E, H: increment of C",
+    ),
+    "siemens": Dialect(
+        comment="; {}",
+        metric="G71",
+        dwell="G4 F{}",
+        before_scan=("G642", "CTOL=0.0001"),
+        c_word="C=IC({})",
+        c_relative=True,
+        note="SINUMERIK 840D; C is a rotary axis, not the spindle",
+    ),
+    "nanotech": Dialect(
+        comment="({})",
+        metric="G71",
+        dwell="G04 P{}",
+        note="dwell in seconds; C in position mode",
+    ),
+}
+
+
+def steps_gcode(plan: StepPlan, dialect: str = "linuxcnc") -> str:
+    """Return a step test in millimetres: each edge a relative G1 at its mean feed, then a rest.
+
+    Edges start at the times of the plan. Where a rest has whole milliseconds only, the move before
+    it is longer by the part of a millisecond, so that the dither within the sample period stays.
+    The controller limits the jerk: set its S-curve so that an edge takes ``plan.rise``.
+    """
+    words = DIALECTS[dialect]
+    lines = [
+        "step test for the identification of the measuring loop",
+        f"{len(plan.starts)} edges, rise {plan.rise * 1e3:g} ms, set as S-curve time",
+    ]
+    body = [words.metric, "G91"]
+    step = words.dwell_unit * 10.0**-words.dwell_decimals
+    ends = [*plan.starts[1:], plan.duration]
+    body.append(words.rest(plan.starts[0]))
+    for start, height, following in zip(plan.starts, plan.heights, ends, strict=True):
+        left = following - start - plan.rise
+        rest = np.floor(left / step + 1e-9) * step
+        feed = abs(height) / (following - start - rest) / MILLIMETRE_M * 60
+        # Six digits of the feed keep a move's duration within a microsecond.
+        body.append(
+            f"G1 Z{height / MILLIMETRE_M:.6f} F{feed:.6g} "
+            + words.remark(f"{height / MICROMETRE_M:+.3f} um")
+        )
+        body.append(words.rest(rest))
+    return _program(words, lines, [*body, "G90"])
+
+
+def scan_gcode(
+    t: FloatArray,
+    x: FloatArray,
+    z: FloatArray,
+    c: FloatArray,
+    design: ScanDesign,
+    dialect: str = "linuxcnc",
+) -> str:
+    """Return a scan as segments of inverse time, in millimetres and degrees.
+
+    Each segment takes the same time, so C turns steadily whatever X and Z do.
+    """
+    words = DIALECTS[dialect]
+    turned = np.round(np.degrees(c), 5)
+    per_minute = 60 / float(np.median(np.diff(t)))
+    lines = [
+        f"scan at {design.rpm:g} rpm, {len(t)} segments of {turned[1] - turned[0]:g} degrees",
+        f"part turned on the chuck by {np.degrees(design.clocking):g} degrees",
+    ]
+
+    def at(axis: str, value: float) -> str:
+        return f"{axis}{value / MILLIMETRE_M:.{words.decimals}f}"
+
+    moves = np.diff(turned) if words.c_relative else turned[1:]
+    body = [words.metric, "G90", *words.before_scan]
+    body += [f"G0 {at('X', x[0])}", f"G0 {at('Z', z[0])} C{turned[0]:.5f}", "G93"]
+    body += [
+        f"G1 {at('X', a)} {at('Z', b)} {words.c_word.format(f'{d:.5f}')} F{per_minute:.4f}"
+        for a, b, d in zip(x[1:], z[1:], moves, strict=True)
+    ]
+    return _program(words, lines, [*body, "G94"])
+
+
+def _program(words: Dialect, remarks: list[str], body: list[str]) -> str:
+    noted = [*remarks, *filter(None, [words.note])]
+    return "\n".join([*words.frame, *map(words.remark, noted), *body, *words.end]) + "\n"

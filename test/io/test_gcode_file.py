@@ -1,0 +1,89 @@
+"""G-code of each dialect, run through by a reader that knows that dialect only."""
+
+import re
+
+import numpy as np
+import pytest
+
+from omsm_ros import cli
+from omsm_ros.core.adjustment import ScanDesign
+from omsm_ros.core.kinematics.trajectories import plan_steps
+from omsm_ros.core.surface.nominal import PAPER_MIRROR
+from omsm_ros.io.gcode_file import DIALECTS, scan_gcode, steps_gcode
+from omsm_ros.pipelines.plan_scans import scan_path
+
+# How a block waits, as the manuals say: pattern and value of one in seconds.
+DWELL = {
+    "linuxcnc": (r"G4 P(\d+\.\d+)$", 1.0),
+    "fanuc": (r"G04 P(\d+)$", 1e-3),  # a decimal point is refused
+    "siemens": (r"G4 F(\d+\.\d+)$", 1.0),
+    "nanotech": (r"G04 P(\d+\.\d+)$", 1.0),
+}
+COMMENT = {
+    "linuxcnc": r";[^\n]*",
+    "siemens": r";[^\n]*",
+    "fanuc": r"\([^()\n]*\)",
+    "nanotech": r"\([^()\n]*\)",
+}
+LAST = {"linuxcnc": "M2", "fanuc": "%", "siemens": "M30", "nanotech": "M30"}
+
+
+def blocks(text, dialect):
+    """Return the blocks without their comments."""
+    assert text.isascii()
+    bare = re.sub(COMMENT[dialect], "", text)
+    return [line.strip() for line in bare.splitlines() if line.strip()]
+
+
+def edges(text, dialect):
+    """Yield start [s] and height [m] of each move, and the end of the program last."""
+    pattern, unit = DWELL[dialect]
+    now = 0.0
+    for block in blocks(text, dialect):
+        if waited := re.fullmatch(pattern, block):
+            now += float(waited[1]) * unit
+        elif moved := re.fullmatch(r"G1 Z(\S+) F(\S+)", block):
+            height, feed = (float(part) * 1e-3 for part in moved.groups())
+            yield now, height
+            now += abs(height) / feed * 60
+        else:
+            assert block in ("G21", "G71", "G91", "G90", "%", "O0001", "M2", "M30")
+    yield now, 0.0
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_edges_are_where_the_plan_has_them(dialect):
+    """To a microsecond, so that the dither within the sample period is there in milliseconds."""
+    plan = plan_steps(sample_period=1e-3, second_step=3e-6, count=6)
+    found = list(edges(steps_gcode(plan, dialect), dialect))
+    starts, heights = zip(*found[:-1], strict=True)
+    # Where the first edge is does not matter, to a millisecond.
+    assert starts[0] == pytest.approx(plan.starts[0], abs=1e-3)
+    np.testing.assert_allclose(np.diff(starts), np.diff(plan.starts), atol=1e-6)
+    np.testing.assert_allclose(heights, plan.heights, atol=1e-12)
+    assert found[-1][0] == pytest.approx(plan.duration, abs=1e-3)
+    assert blocks(steps_gcode(plan, dialect), dialect)[-1] == LAST[dialect]
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_a_scan_turns_steadily_to_its_end(dialect):
+    design = ScanDesign(rpm=30.0, start=1e-3, end=0.0, pitch=5e-4)
+    time = np.arange(0.0, design.duration, 2 / 180)
+    x, z, c = scan_path(design, PAPER_MIRROR, time)
+    text = blocks(scan_gcode(time, x, z, c, design, dialect), dialect)
+    word = {"fanuc": r"H(\S+)", "siemens": r"C=IC\((\S+)\)"}.get(dialect, r"C(\S+)")
+    moves = [re.fullmatch(rf"G1 X(\S+) Z(\S+) {word} F(\S+)", b) for b in text if b[:3] == "G1 "]
+    read = np.array([[float(v) for v in move.groups()] for move in moves])
+    at = np.cumsum(read[:, 2]) if dialect in ("fanuc", "siemens") else read[:, 2]
+    np.testing.assert_allclose(read[:, 0], x[1:] * 1e3, atol=6e-7)
+    np.testing.assert_allclose(read[:, 1], z[1:] * 1e3, atol=6e-7)
+    np.testing.assert_allclose(at, np.degrees(c[1:]), atol=2e-5)
+    # Inverse time: a segment takes 1/F minutes; the spindle turns at its speed.
+    assert 60 / read[0, 3] * len(read) == pytest.approx(time[-1], rel=1e-6)
+    assert text[text.index("G93") - 2].startswith("G0 X")
+    assert "G94" in text
+
+
+def test_the_command_writes_the_dialect(tmp_path):
+    assert cli.main(["plan", "steps", "--dialect", "fanuc", "--out", str(tmp_path)]) == 0
+    assert (tmp_path / "steps.nc").read_text().startswith("%\nO0001\n(step test")
