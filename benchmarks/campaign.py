@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks.offline import save_paper_calibration, write_spiral
 from benchmarks.row import Row, at_least, at_most, shown
-from omsm_ros.pipelines.campaign import DONE, Entry, load_campaign, run_campaign
+from omsm_ros.cli.campaign import DONE, Entry, load_campaign, run_campaign
 
 POINTS = 29_000
 _BAGS, _ALL_BAGS = 30, 100

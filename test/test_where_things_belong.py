@@ -206,7 +206,7 @@ def test_an_offline_command_is_added_in_cli(tmp_path):
     )
     (tmp_path / "omsm_ros" / "cli" / "weighing.py").write_text(
         "from omsm_ros.cli.command import CliCommand\n"
-        "def declare(parser):\n    parser.add_argument('grams', type=float)\n"
+        "def declare(add):\n    add('grams', float)\n"
         "COMMANDS = [CliCommand('weigh', declare,\n"
         "    lambda args: {'kg': args.grams / 1000}, print)]\n"
     )

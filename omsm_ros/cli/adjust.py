@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, number
+from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
@@ -15,46 +13,44 @@ from omsm_ros.io.descriptions import load_geometry, load_sources, load_surface
 from omsm_ros.messages.verdict import SOURCE_NAMES
 from omsm_ros.pipelines.adjust import adjust_bags, adjustment_facts, write_adjustment
 from omsm_ros.pipelines.correct import Admission
+from omsm_ros.quantities import ANGLE, UNCERTAINTY
 
 
-def _declare(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="of one part, two or more")
-    sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
-    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
-    sub.add_argument(
-        "--sources", type=Path, metavar="SOURCES.yaml", help="declared sources: the priors"
-    )
-    sub.add_argument(
+def _declare(add: Arguments) -> None:
+    add.bags("scans", nargs="+", metavar="SCAN", help="of one part, two or more")
+    add("--calibration", "CAL.json", required=True)
+    add("--out", "DIR", required=True)
+    add("--nominal", "SURFACE.yaml")
+    add("--geometry", "GEOMETRY.yaml", "from 'omsm align'")
+    add("--sources", "SOURCES.yaml", "declared sources: the priors")
+    add(
         "--clocking",
-        type=number(quantities.ANGLE),
+        ANGLE,
+        "angle by which the part is turned on the chuck in each scan [rad]",
         nargs="+",
         default=[],
-        help="angle by which the part is turned on the chuck in each scan [rad]",
     )
-    sub.add_argument(
+    add(
         "--clamping",
-        type=int,
+        int,
+        "number of the clamping of each scan, where the part was taken off",
         nargs="+",
         default=[],
-        help="number of the clamping of each scan, where the part was taken off",
     )
-    sub.add_argument("--accuracy", type=number(quantities.UNCERTAINTY), help="asked for, k = 2 [m]")
-    sub.add_argument(
-        "--tolerance", type=number(quantities.UNCERTAINTY), help="of the peak to valley [m]"
-    )
-    sub.add_argument(
+    add("--accuracy", UNCERTAINTY, "asked for, k = 2 [m]")
+    add("--tolerance", UNCERTAINTY, "of the peak to valley [m]")
+    add(
         "--accept",
+        str,
+        f"accept what was found of a source; names as in adjustment.json, such as "
+        f"{next(iter(SOURCE_NAMES))}",
         nargs="+",
         default=[],
         metavar="SOURCE",
-        help=f"accept what was found of a source; names as in adjustment.json, such as "
-        f"{next(iter(SOURCE_NAMES))}",
     )
-    sub.add_argument("--override", action="store_true", help="ignore a settings mismatch (logged)")
-    sub.add_argument("--no-report", action="store_true", help="no page")
-    add_polarity(sub)
+    add("--override", None, "ignore a settings mismatch (logged)")
+    add("--no-report", None, "no page")
+    add.polarity()
 
 
 def _adjust(args: argparse.Namespace) -> Facts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -19,8 +20,8 @@ TABLE_SUFFIX = ".csv"
 """Suffix of a table, in lower or upper case; other paths are bags."""
 
 
-OVERRIDE = "ignore a settings mismatch of the calibration (logged)"
-"""Help of ``--override``."""
+ADDRESS = "OMSM_CATALOGUE"
+"""Environment variable with the address of the default catalogue."""
 
 
 class UsageError(ConfigurationError):
@@ -66,25 +67,6 @@ def json_object(text: str) -> dict[str, object]:
         raise argparse.ArgumentTypeError(str(err)) from err
 
 
-def add_bags(sub: argparse.ArgumentParser, *names: str, **described: Any) -> None:
-    """Add arguments that name bags, and options that select the topics of one cell.
-
-    described: options of ``add_argument`` for each;  :func:`cell_of` returns the bag
-    """
-    for name in names:
-        sub.add_argument(name, type=Path, **described)
-    sub.add_argument(
-        "--namespace", default="", metavar="/CELL", help="namespace of the cell in a bag of several"
-    )
-    sub.add_argument(
-        "--topics",
-        type=_topics,
-        default={},
-        metavar="axes=/x/axes,…",
-        help="names of the cell's topics in the bag, if they are not the default ones",
-    )
-
-
 def _topics(text: str) -> dict[str, str]:
     known = {relative(topic): topic for topic in TOPIC_TYPES}
     found = dict(part.partition("=")[::2] for part in text.split(","))
@@ -111,44 +93,6 @@ def _asked_for(args: argparse.Namespace) -> bool:
     return bool(args.namespace or args.topics)
 
 
-def add_trigger(sub: argparse.ArgumentParser) -> None:
-    """Add the options for the trigger counters of axes and probe."""
-    sub.add_argument(
-        "--counter-offset",
-        type=number(COUNTER_OFFSET),
-        default=0,
-        metavar="SAMPLES",
-        help="axes' trigger count minus the distance's trigger count",
-    )
-    sub.add_argument(
-        "--stamp-tolerance",
-        type=number(STAMP_TOLERANCE),
-        default=TWO_DRIVERS_S,
-        metavar="S",
-        help="largest difference between the stamps of axes and probe for one trigger [s]",
-    )
-
-
-def add_polarity(sub: argparse.ArgumentParser) -> None:
-    """Add the option for the sign of the distance."""
-    sub.add_argument(
-        "--polarity",
-        type=int,
-        choices=(1, -1),
-        default=1,
-        help="1: the distance decreases as Z increases; -1: it increases",
-    )
-
-
-def add_by_stamps(sub: argparse.ArgumentParser) -> None:
-    """Add the option to join axes and probe by their stamps."""
-    sub.add_argument(
-        "--by-stamps",
-        action="store_true",
-        help="join probe and axes by their stamps: they share no trigger counter",
-    )
-
-
 def trigger_of(args: argparse.Namespace) -> CommonTrigger:
     """Return what is stated of the counters; ConfigurationError together with --by-stamps."""
     stated = (args.counter_offset, args.stamp_tolerance) != (0, TWO_DRIVERS_S)
@@ -168,8 +112,70 @@ def _unit(text: str) -> LengthUnits:
         raise argparse.ArgumentTypeError(str(err)) from err
 
 
-UNIT: dict[str, Any] = {
-    "type": _unit,
-    "metavar": "UNIT[,HEIGHT_UNIT]",
-    "help": "unit of files that do not state it, such as mm, or mm,nm",
-}
+class Arguments:
+    """Declares the arguments of a command: each call adds one, each method some that are shared."""
+
+    def __init__(self, parser: argparse._ActionsContainer) -> None:
+        self._parser = parser
+
+    def __call__(self, name: str, kind: Any, text: str | None = None, **more: Any) -> None:
+        """Add an argument with its help ``text``.
+
+        kind: a Quantity for a plausible number, the placeholder of a path, None for a flag, or a
+            function that parses the text;  more: as for ``add_argument``
+        """
+        if kind is None:
+            more["action"] = "store_true"
+        elif isinstance(kind, str):
+            more |= {"type": Path, "metavar": kind}
+        else:
+            more["type"] = number(kind) if isinstance(kind, Quantity) else kind
+        self._parser.add_argument(name, help=text, **more)
+
+    def group(self, title: str) -> Arguments:
+        """Return a group of arguments, which ``--help`` lists under its title."""
+        return Arguments(self._parser.add_argument_group(title))
+
+    def epilog(self, text: str) -> None:
+        """Add a text to the end of ``--help``."""
+        self._parser.epilog = text  # type: ignore[attr-defined]
+
+    def bags(self, *names: str, help: str | None = None, **more: Any) -> None:
+        """Add arguments that name bags, and options that select the topics of one cell.
+
+        :func:`cell_of` returns the bag.
+        """
+        for name in names:
+            self(name, Path, help, **more)
+        self("--namespace", str, "namespace of the cell in a bag of several", default="",
+             metavar="/CELL")  # fmt: skip
+        self("--topics", _topics, "names of the cell's topics in the bag, if they are not the "
+             "default ones", default={}, metavar="axes=/x/axes,…")  # fmt: skip
+
+    def trigger(self) -> None:
+        """Add what is stated of the trigger counters of axes and probe, or their lack."""
+        self("--counter-offset", COUNTER_OFFSET, "axes' trigger count minus the distance's trigger "
+             "count", default=0, metavar="SAMPLES")  # fmt: skip
+        self("--stamp-tolerance", STAMP_TOLERANCE, "largest difference between the stamps of axes "
+             "and probe for one trigger [s]", default=TWO_DRIVERS_S, metavar="S")  # fmt: skip
+        self("--by-stamps", None, "join probe and axes by their stamps: they share no trigger "
+             "counter")  # fmt: skip
+
+    def polarity(self) -> None:
+        """Add the sign of the distance."""
+        self("--polarity", int, "1: the distance decreases as Z increases; -1: it increases",
+             choices=(1, -1), default=1)  # fmt: skip
+
+    def override(self) -> None:
+        """Add ``--override``."""
+        self("--override", None, "ignore a settings mismatch of the calibration (logged)")
+
+    def unit(self) -> None:
+        """Add the unit of files that do not state it."""
+        self("--unit", _unit, "unit of files that do not state it, such as mm, or mm,nm",
+             metavar="UNIT[,HEIGHT_UNIT]")  # fmt: skip
+
+    def catalogue(self) -> None:
+        """Add ``--catalogue``, the database of calibrations and measurements."""
+        self("--catalogue", str, f"catalogue (database) to add the result to; default: ${ADDRESS}",
+             default=os.environ.get(ADDRESS, ""), metavar="FILE|URL")  # fmt: skip

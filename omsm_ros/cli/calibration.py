@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, add_by_stamps, add_trigger, cell_of, number, trigger_of
+from omsm_ros.cli.arguments import Arguments, cell_of, number, trigger_of
 from omsm_ros.cli.command import (
     CliCommand,
     Facts,
@@ -24,28 +23,26 @@ from omsm_ros.cli.command import (
 )
 from omsm_ros.core.calibration.calibration_set import calibration_set
 from omsm_ros.core.calibration.repeatability import (
+    CalibrationChange,
     Repeatability,
+    Spread,
     compare_calibrations,
     repeatability,
 )
 from omsm_ros.errors import CalibrationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.pipelines.verify_calibration import established_offset, path_check_of
-from omsm_ros.readable import quantity
+from omsm_ros.quantities import POSITION, TABLE_ANGLE, shown
+from omsm_ros.readable import measured, p_value_text, plain, quantity
 from omsm_ros.report.verdict import verdict_text
-from omsm_ros.units import DEGREE_RAD
+from omsm_ros.units import DEGREE_RAD, PPM
 
 
-def _declare_verify(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "bag", help="bag of a free path (chirp) on a fixed target")
-    sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
-    add_trigger(sub)
-    add_by_stamps(sub)
-    sub.add_argument(
-        "--find-offset",
-        action="store_true",
-        help="determine the counter offset from the motion, for --counter-offset",
-    )
+def _declare_verify(add: Arguments) -> None:
+    add.bags("bag", help="bag of a free path (chirp) on a fixed target")
+    add("--calibration", "CAL.json", required=True)
+    add.trigger()
+    add("--find-offset", None, "determine the counter offset from the motion, for --counter-offset")
 
 
 def _verify(args: argparse.Namespace) -> Facts:
@@ -90,32 +87,55 @@ def _show_verify(facts: Facts) -> None:
     say("rms    ", *(f"{quantity(facts[f'rms_{w}'], 'm'):>12}" for w in ("before", "after")))
 
 
-def _declare_compare(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("old", type=Path, metavar="OLD.json")
-    sub.add_argument("new", type=Path, metavar="NEW.json")
-    sub.add_argument(
+def _declare_compare(add: Arguments) -> None:
+    add("old", "OLD.json")
+    add("new", "NEW.json")
+    add(
         "more",
-        type=Path,
+        "MORE.json",
+        "three or more: test whether they repeat within their uncertainties",
         nargs="*",
-        metavar="MORE.json",
-        help="three or more: test whether they repeat within their uncertainties",
     )
 
 
 def _compare(args: argparse.Namespace) -> Facts:
     calibrations = [load_calibration(path) for path in (args.old, args.new, *args.more)]
     if len(calibrations) > 2:
-        return _repeatability_facts(repeatability(calibrations))
+        found = repeatability(calibrations)
+        arrays = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in asdict(found).items()
+        }
+        return arrays | {"text": repeatability_text(found)}
     change = compare_calibrations(*calibrations)
-    return asdict(change) | {"text": change.text()}
+    return asdict(change) | {"text": change_text(change)}
 
 
-def _repeatability_facts(found: Repeatability) -> Facts:
-    arrays = {
-        name: value.tolist() if isinstance(value, np.ndarray) else value
-        for name, value in asdict(found).items()
-    }
-    return arrays | {"text": found.text()}
+def change_text(change: CalibrationChange) -> str:
+    """Return in one line what changed between two calibrations."""
+    if not change.changed:
+        return f"the same ({p_value_text(change.p_value)})"
+    return (
+        f"changed: lag by {quantity(change.delay, 's', signed=True)} "
+        f"({change.delay_sigmas:.1f} sigma), static gain by "
+        f"{quantity(change.static_gain / PPM, 'ppm', signed=True)} "
+        f"({change.static_gain_sigmas:.1f} sigma), {p_value_text(change.p_value)}"
+    )
+
+
+def repeatability_text(found: Repeatability) -> str:
+    """Return in one line whether calibrations scatter more than they state."""
+    verdict = "as repeatable as stated" if found.repeatable else "scatter more than they state"
+    lag, gain = found.delay, found.static_gain
+    return (
+        f"{found.count} calibrations {verdict} ({p_value_text(found.p_value)}): "
+        f"lag {measured(lag.mean, lag.deviation, 's')}{_of_stated(lag)}, "
+        f"static gain {measured(gain.mean, gain.deviation, digits=6)}{_of_stated(gain)}"
+    )
+
+
+def _of_stated(spread: Spread) -> str:
+    return f" ({plain(spread.ratio)} of stated)" if spread.stated else ""
 
 
 _PLACED = re.compile(r"(?P<path>.+)@(?P<axis>[xzb])=(?P<position>[^@=]+)")
@@ -126,19 +146,16 @@ def _placed(text: str) -> tuple[Path, str, float]:
     found = _PLACED.fullmatch(text)
     if found is None:
         raise argparse.ArgumentTypeError(
-            f"{quantities.shown(text)} states no position, expected such as CAL.json@x=0.01 "
-            "(x, z or b)"
+            f"{shown(text)} states no position, expected such as CAL.json@x=0.01 (x, z or b)"
         )
-    kind = quantities.TABLE_ANGLE if found["axis"] == "b" else quantities.POSITION
+    kind = TABLE_ANGLE if found["axis"] == "b" else POSITION
     return Path(found["path"]), found["axis"], number(kind)(found["position"])
 
 
-def _declare_calset(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
-        "placed", type=_placed, nargs="+", metavar="CAL.json@x=POSITION",
-        help="calibrations and their positions: x or z in metres, b in radians",
-    )  # fmt: skip
-    sub.add_argument("--out", type=Path, required=True, metavar="SET.json")
+def _declare_calset(add: Arguments) -> None:
+    add("placed", _placed, "calibrations and their positions: x or z in metres, b in radians",
+        nargs="+", metavar="CAL.json@x=POSITION")  # fmt: skip
+    add("--out", "SET.json", required=True)
 
 
 def _calset(args: argparse.Namespace) -> Facts:

@@ -3,28 +3,332 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
+import hashlib
 import os
-from dataclasses import asdict
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from urllib.parse import quote
+from typing import Any
+from urllib.parse import quote, urlsplit
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros import __version__
+from omsm_ros.cli.arguments import ADDRESS, Arguments
 from omsm_ros.cli.command import (
-    ADDRESS,
     CliCommand,
     Facts,
-    declare_catalogue,
     progress_bar,
     say,
     table,
     written,
 )
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, FileError
+from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.io.files import REPORT, save_text
-from omsm_ros.pipelines.campaign import DONE, Entry, load_summary, run_campaign
-from omsm_ros.quantities import shown
+from omsm_ros.io.files import (
+    REPORT,
+    SUMMARY,
+    exception_text,
+    make_folder,
+    read_text,
+    save_json,
+    save_text,
+)
+from omsm_ros.io.json_and_yaml import check_form, ranged
+from omsm_ros.io.results import read_summary
+from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.quantities import PROCESSES, STAMP, shown
+
+DONE, REFUSED, CRASHED = "done", "refused", "crashed"
+STATE = "campaign.json"
+
+_SCHEMA = "omsm-campaign/1"
+_MAX_STATE_BYTES = 50_000_000
+# A process that the system killed for lack of memory may succeed once others have ended.
+_ATTEMPTS = 2
+_LOCAL_HOSTS = ("127.0.0.1", "::1", "localhost")
+
+_TEXT = {"type": "string"}
+_STATE_FORM = {
+    "type": "object",
+    "properties": {
+        "schema": {"const": _SCHEMA},
+        "entries": {
+            "type": "array",
+            "maxItems": 1_000_000,
+            "items": {
+                "type": "object",
+                "properties": {
+                    "bag": _TEXT,
+                    "folder": _TEXT,
+                    "fingerprint": _TEXT,
+                    "state": {"enum": [DONE, REFUSED, CRASHED]},
+                    "said": _TEXT,
+                    "recorded_ns": {**ranged(STAMP), "type": ["integer", "null"]},
+                },
+                "required": ["bag", "folder", "fingerprint", "state", "said"],
+            },
+        },
+    },
+    "required": ["schema", "entries"],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """State of one bag of a campaign.
+
+    bag: path below the campaign's folder;  folder: of its result, below that of the results
+    fingerprint: hash of bag, calibration and options
+    state: "done", "refused" (said: why) or "crashed" (said: by which signal)
+    recorded_ns: when the recording began [ns, ROS time], None if unknown
+    """
+
+    bag: str
+    folder: str
+    fingerprint: str
+    state: str
+    said: str
+    recorded_ns: int | None = None
+
+
+def run_campaign(
+    folder: Path,
+    calibration: Path,
+    out: Path,
+    options: Sequence[str] = (),
+    *,
+    jobs: int = 0,
+    scheduler: str = "",
+    progress: Progress = no_progress,
+) -> list[Entry]:
+    """Correct every bag below ``folder`` into ``out``; return the state of each, by name.
+
+    options: of ``omsm correct``, for every bag;  jobs: parallel processes, 0 = one per core
+    scheduler: address of a Dask scheduler whose workers share these folders, empty = this host
+
+    A bag that has a result of the same bag, calibration and options is skipped. Raises FileError
+    if there is no bag, or another campaign writes into ``out``.
+    """
+    found = bags_below(folder, out)
+    if not found:
+        raise FileError(
+            f"no bag below {str(folder)!r}; give a folder of .mcap files or rosbag2 bags; "
+            "convert other recordings with 'omsm import'"
+        )
+    sign = [load_calibration(calibration).id, *options, __version__]
+    with _locked(out):
+        earlier = {entry.bag: entry for entry in load_campaign(out)}
+        tasks = [_task(bag, folder, calibration, out, options, sign) for bag in found]
+        entries = {t.bag: earlier[t.bag] for t in tasks if _is_done(earlier.get(t.bag), t, out)}
+        waiting = [task for task in tasks if task.bag not in entries]
+        progress(len(entries), len(tasks))
+        with _executor(jobs or os.cpu_count() or 1, scheduler) as executor:
+            asked = {executor.submit(correct_one, task): task for task in waiting}
+            for future in as_completed(asked):
+                entry = _task_result(future, asked[future])
+                entries[entry.bag] = entry
+                _save(out, entries)
+                progress(len(entries), len(tasks))
+        _save(out, entries)
+    return [entries[task.bag] for task in tasks]
+
+
+def bags_below(folder: Path, out: Path) -> list[Path]:
+    """Return the bags below ``folder``, by name: folders of rosbag2 and bare .mcap files."""
+    if not folder.is_dir():
+        raise FileError(f"no folder {str(folder)!r}; give one that holds bags")
+    found = []
+    for place, folders, files in os.walk(folder):
+        here = Path(place)
+        folders[:] = sorted(f for f in folders if (here / f).resolve() != out.resolve())
+        if "metadata.yaml" in files:
+            found.append(here)
+            folders.clear()
+        else:
+            found += [here / name for name in files if name.endswith(".mcap")]
+    return sorted(found)
+
+
+def load_campaign(out: Path) -> list[Entry]:
+    """Return the states that an earlier run saved in ``out``; none without one."""
+    path = out / STATE
+    if not path.exists():
+        return []
+    text = read_text(path, _MAX_STATE_BYTES, FileError, "campaign")
+    content = json_and_yaml.object_of(text, FileError, f"campaign {str(path)!r}")
+    check_form(content, _STATE_FORM, FileError, f"campaign {str(path)!r}")
+    known = Entry.__dataclass_fields__
+    return [Entry(**{k: v for k, v in e.items() if k in known}) for e in content["entries"]]
+
+
+def load_summary(out: Path, entry: Entry) -> dict[str, Any]:
+    """Return the summary of a bag that is done; FileError if it is gone or damaged."""
+    return read_summary(out / entry.folder / SUMMARY)
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One bag to correct, as plain texts that can be sent to another host."""
+
+    bag: str
+    folder: str
+    fingerprint: str
+    path: str
+    command: tuple[str, ...]
+
+
+def correct_one(task: Task) -> Entry:
+    """Correct one bag in a process of its own; return its state."""
+    found = REFUSED, "not started"
+    for _ in range(_ATTEMPTS):
+        try:
+            done = subprocess.run(
+                [sys.executable, "-m", "omsm_ros.cli", *task.command],
+                stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
+            )  # fmt: skip
+        except OSError as err:
+            found = CRASHED, exception_text(err)
+            continue
+        if done.returncode == 0:
+            return Entry(task.bag, task.folder, task.fingerprint, DONE, "", _recorded(task.path))
+        last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        if done.returncode > 0:
+            found = REFUSED, last.removeprefix("omsm: ")
+            break
+        found = CRASHED, f"ended by {signal.Signals(-done.returncode).name}"
+    return Entry(task.bag, task.folder, task.fingerprint, *found)
+
+
+def _task_result(future: Future[Entry], task: Task) -> Entry:
+    """Return the state of a bag, also if every worker died that tried it."""
+    try:
+        return future.result()
+    except Exception as err:  # a scheduler raises errors of many kinds for lost workers
+        why = f"no worker finished it ({type(err).__name__})"
+        return Entry(task.bag, task.folder, task.fingerprint, CRASHED, why)
+
+
+def _state(file: Path) -> tuple[str, int, int]:
+    """Return name, size and time of a file; zeros for a dangling link.
+
+    The correction of the bag then reports the error of that bag.
+    """
+    try:
+        found = file.stat()
+    except OSError:
+        return file.name, 0, 0
+    return file.name, found.st_size, found.st_mtime_ns
+
+
+def _task(
+    bag: Path, folder: Path, calibration: Path, out: Path, options: Sequence[str], sign: list[str]
+) -> Task:
+    name = bag.relative_to(folder)
+    # A folder bag of the same stem has a result of that name.
+    taken = (bag.with_suffix("") / "metadata.yaml").is_file()
+    result = name.with_suffix("") if bag.is_file() and not taken else name
+    files = sorted(bag.rglob("*")) if bag.is_dir() else [bag]
+    states = [_state(file) for file in files]
+    fingerprint = hashlib.sha256(repr((states, sign)).encode()).hexdigest()
+    place = str((out / result).absolute())
+    command = ("correct", str(bag.absolute()), "--calibration", str(calibration.absolute()))
+    return Task(
+        str(name),
+        str(result),
+        fingerprint,
+        str(bag),
+        (*command, "--out", place, "--json", *options),
+    )
+
+
+def _is_done(entry: Entry | None, task: Task, out: Path) -> bool:
+    """Return True if the result of this task exists; failed ones are tried again."""
+    return (
+        entry is not None
+        and entry.state == DONE
+        and entry.fingerprint == task.fingerprint
+        and (out / task.folder / SUMMARY).is_file()
+    )
+
+
+def _recorded(path: str) -> int | None:
+    try:
+        with bags.BagReader(path) as bag:
+            return bag.recorded_ns
+    except FileError:
+        return None
+
+
+def _save(out: Path, entries: dict[str, Entry]) -> None:
+    content = [asdict(entries[name]) for name in sorted(entries)]
+    save_json(out / STATE, {"schema": _SCHEMA, "entries": content})
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Lock the folder, so that two campaigns never write into it."""
+    try:
+        make_folder(out)
+        lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as err:
+        raise FileError(
+            f"cannot write into {str(out)!r}: {exception_text(err)}; give another folder"
+        ) from err
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            raise FileError(
+                f"another campaign writes into {str(out)!r}; wait until it has ended"
+            ) from err
+        yield
+    finally:
+        os.close(lock)
+
+
+@contextmanager
+def _executor(jobs: int, scheduler: str) -> Iterator[Executor]:
+    if not scheduler:
+        # Threads that wait for processes: a killed process would break a process pool.
+        executor = ThreadPoolExecutor(jobs)
+        try:
+            yield executor
+        finally:
+            executor.shutdown(cancel_futures=True)
+        return
+    try:
+        address = urlsplit(scheduler)
+    except ValueError as err:
+        raise ConfigurationError(
+            f"scheduler {scheduler!r} is no address: {exception_text(err)}; write tcp://host:port"
+        ) from err
+    local = address.scheme == "tcp" and address.hostname in _LOCAL_HOSTS
+    if not (local or address.scheme == "tls"):
+        raise ConfigurationError(
+            f"scheduler {scheduler!r}: Dask runs any code it is sent, so on another host it must "
+            "be tls://host:port, with the certificates in Dask's own configuration"
+        )
+    try:
+        from distributed import Client
+    except ImportError as err:
+        raise ConfigurationError("--scheduler needs Dask: pip install distributed") from err
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError, TypeError) as err:
+        raise ConfigurationError(
+            f"no scheduler answers at {scheduler!r}: {exception_text(err)}; start one there with "
+            "'dask scheduler'"
+        ) from err
+    with client:
+        # If a worker dies, another one takes over its bag.
+        yield client.get_executor(pure=False, retries=3)
+
 
 _INDEX = "index.html"
 
@@ -33,24 +337,20 @@ _INDEX = "index.html"
 _DECIDED, _SHORTEST = ("--out", "--calibration"), 3
 
 
-def _declare_batch(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("folder", type=Path, metavar="FOLDER", help="folder of bags, at any depth")
-    sub.add_argument("--calibration", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument(
-        "--jobs",
-        type=number(quantities.PROCESSES),
-        default=0,
-        help="number of parallel processes; default: one per core",
-    )
-    sub.add_argument(
+def _declare_batch(add: Arguments) -> None:
+    add("folder", "FOLDER", "folder of bags, at any depth")
+    add("--calibration", "CAL.json", required=True)
+    add("--out", "DIR", required=True)
+    add("--jobs", PROCESSES, "number of parallel processes; default: one per core", default=0)
+    add(
         "--scheduler",
+        str,
+        "address of a Dask scheduler: tcp:// on this host, or tls://",
         default="",
         metavar="URL",
-        help="address of a Dask scheduler: tcp:// on this host, or tls://",
     )
-    declare_catalogue(sub)
-    sub.epilog = "Options of 'omsm correct' for every bag follow after '--'."
+    add.catalogue()
+    add.epilog("Options of 'omsm correct' for every bag follow after '--'.")
 
 
 def _batch(args: argparse.Namespace) -> Facts:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -11,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from omsm_ros.cli.arguments import Arguments
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.errors import printable
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -28,7 +28,7 @@ class CliCommand:
     """
 
     name: str
-    declare: Callable[[argparse.ArgumentParser], None]
+    declare: Callable[[Arguments], None]
     act: Callable[[argparse.Namespace], Facts]
     show: Callable[[Facts], None]
     refusal: Callable[[Facts], str] = lambda facts: ""
@@ -87,17 +87,3 @@ def table(rows: list[tuple[str, str]]) -> None:
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         say(f"{name:<{width}}  {value}")
-
-
-ADDRESS = "OMSM_CATALOGUE"
-"""Environment variable with the address of the default catalogue."""
-
-
-def declare_catalogue(sub: argparse.ArgumentParser) -> None:
-    """Add ``--catalogue``, the database of calibrations and measurements."""
-    sub.add_argument(
-        "--catalogue",
-        default=os.environ.get(ADDRESS, ""),
-        metavar="FILE|URL",
-        help=f"catalogue (database) to add the result to; default: ${ADDRESS}",
-    )

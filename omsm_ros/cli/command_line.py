@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from omsm_ros import __version__, quantities
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
-from omsm_ros.cli.arguments import OneLineParser, number
+from omsm_ros.cli.arguments import Arguments, OneLineParser, number
 from omsm_ros.cli.command import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
@@ -233,27 +233,26 @@ def parser_of(wanted: Collection[str]) -> argparse.ArgumentParser:
 
 def _declare(word: str, sub: argparse.ArgumentParser) -> None:
     if word == DEMO:
-        _declare_demo(sub)
+        _declare_demo(Arguments(sub))
         return
     command = _command(word)
     sub.set_defaults(run=command)
-    command.declare(sub)
+    command.declare(Arguments(sub))
 
 
-def _declare_demo(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
+def _declare_demo(add: Arguments) -> None:
+    add("--out", "DIR", default=Path("out/demo"))
     lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
-    sub.add_argument(
-        "--time-lapse", type=lapse, help="speed relative to real time; 20 if the device allows"
-    )
-    sub.add_argument("--device", default="six_channel", help="model of the emulated probe")
-    sub.add_argument("--disturbances", metavar="FILE", help="errors of the emulated machine")
-    sub.add_argument("--view", action="store_true", help="show the scan in a browser")
-    sub.add_argument("--seed", type=seed, default=1, help="seed of the twin's noise")
-    sub.add_argument(
+    add("--time-lapse", lapse, "speed relative to real time; 20 if the device allows")
+    add("--device", str, "model of the emulated probe", default="six_channel")
+    add("--disturbances", str, "errors of the emulated machine", metavar="FILE")
+    add("--view", None, "show the scan in a browser")
+    add("--seed", seed, "seed of the twin's noise", default=1)
+    add(
         "--experiment",
+        str,
+        "repeat an experiment of the paper on the twin: Fig. 9, 10, 11 or 8; needs no ROS",
         choices=("chirp", "circles", "vibration", "mirror"),
-        help="repeat an experiment of the paper on the twin: Fig. 9, 10, 11 or 8; needs no ROS",
     )
 
 

@@ -8,21 +8,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from omsm_ros import quantities
 from omsm_ros.cli.arguments import (
-    OVERRIDE,
     TABLE_SUFFIX,
-    add_bags,
-    add_by_stamps,
-    add_polarity,
-    add_trigger,
+    Arguments,
     cell_of,
     json_object,
-    number,
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import CliCommand, Facts, declare_catalogue, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
@@ -47,9 +41,8 @@ from omsm_ros.pipelines.correct import Admission, StampJoining
 from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.pipelines.measure import RegistrationOptions, measure
 from omsm_ros.pipelines.recording import Recording
+from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
 from omsm_ros.readable import measured, percent, plain, quantity
-
-CALIBRATION = {"type": Path, "required": True, "metavar": "CAL.json"}
 
 
 def sources_of(text: str | None) -> MachineSources:
@@ -66,64 +59,53 @@ def geometry_of(path: Path | None) -> Geometry:
     return load_geometry(path) if path else Geometry()
 
 
-def _declare_correct(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "bag")
-    sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument("--nominal", type=Path, metavar="SURFACE.yaml")
-    sub.add_argument("--geometry", type=Path, metavar="GEOMETRY.yaml", help="from 'omsm align'")
-    sub.add_argument(
+def _declare_correct(add: Arguments) -> None:
+    add.bags("bag")
+    add("--calibration", "CAL.json", required=True)
+    add("--out", "DIR", required=True)
+    add("--nominal", "SURFACE.yaml")
+    add("--geometry", "GEOMETRY.yaml", "from 'omsm align'")
+    add(
         "--pitch",
-        type=Path,
-        metavar="PITCH.csv",
-        help="measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry",
+        "PITCH.csv",
+        "measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry",
     )
-    sub.add_argument(
+    add(
         "--lateral-lag",
-        type=number(quantities.LAG),
-        help="latency of the probe against X and C [s]; default: of the calibration",
+        LAG,
+        "latency of the probe against X and C [s]; default: of the calibration",
     )
-    _declare_uncertain(sub)
-    sub.add_argument("--settings", type=json_object, metavar="JSON", help="settings of this scan")
-    add_by_stamps(sub)
-    sub.add_argument(
+    _declare_uncertain(add)
+    add("--settings", json_object, "settings of this scan", metavar="JSON")
+    add(
         "--delay",
-        type=number(quantities.STAMP_DELAY),
+        STAMP_DELAY,
+        "time from the probe's stamp to the middle of its exposure [s]",
         default=0.0,
-        help="time from the probe's stamp to the middle of its exposure [s]",
     )
-    sub.add_argument(
-        "--exposure",
-        type=number(quantities.EXPOSURE),
-        default=0.0,
-        help="exposure time of the probe [s]",
-    )
-    add_trigger(sub)
-    sub.add_argument("--no-report", action="store_true", help="write cloud and summary only")
-    add_polarity(sub)
-    sub.add_argument("--override", action="store_true", help=OVERRIDE)
-    declare_fit(sub, None)
-    declare_tolerance(sub)
-    declare_catalogue(sub)
+    add("--exposure", EXPOSURE, "exposure time of the probe [s]", default=0.0)
+    add.trigger()
+    add("--no-report", None, "write cloud and summary only")
+    add.polarity()
+    add.override()
+    declare_fit(add, None)
+    declare_tolerance(add)
+    add.catalogue()
 
 
-def _declare_uncertain(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
+def _declare_uncertain(add: Arguments) -> None:
+    add(
         "--sources",
+        str,
+        'uncertainty sources of the machine, or JSON such as {"encoder_noise": 4e-10}',
         metavar="SOURCES.yaml",
-        help='uncertainty sources of the machine, or JSON such as {"encoder_noise": 4e-10}',
     )
-    sub.add_argument(
+    add(
         "--accuracy",
-        type=number(quantities.BUDGET),
-        help="required expanded uncertainty, k = 2 [m], which the traffic light is based on",
+        BUDGET,
+        "required expanded uncertainty, k = 2 [m], which the traffic light is based on",
     )
-    sub.add_argument(
-        "--lateral",
-        type=number(quantities.UNCERTAINTY),
-        default=0.0,
-        help="standard uncertainty of x and y [m]",
-    )
+    add("--lateral", UNCERTAINTY, "standard uncertainty of x and y [m]", default=0.0)
 
 
 def _check_options(args: argparse.Namespace) -> None:
@@ -207,20 +189,14 @@ def _show_correct(summary: Facts) -> None:
     table([*rows, written(summary["files"].values(), summary["out"])])
 
 
-def _declare_predict(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "motion", help="a bag, or a planned motion as CSV time_s,z_m")
-    sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument(
-        "--budget",
-        type=number(quantities.BUDGET),
-        default=DEFAULT_BUDGET_M,
-        help="allowed residual error, k = 2 [m]",
-    )
-    sub.add_argument(
+def _declare_predict(add: Arguments) -> None:
+    add.bags("motion", help="a bag, or a planned motion as CSV time_s,z_m")
+    add("--calibration", "CAL.json", required=True)
+    add("--budget", BUDGET, "allowed residual error, k = 2 [m]", default=DEFAULT_BUDGET_M)
+    add(
         "--limits",
-        type=Path,
-        metavar="LIMITS.yaml",
-        help="limits of servo, probe, spindle and axes, as config/limits.yaml; default: the "
+        "LIMITS.yaml",
+        "limits of servo, probe, spindle and axes, as config/limits.yaml; default: the "
         "paper's machine",
     )
 
@@ -276,19 +252,12 @@ _NO_SPHERE = (
 _RESIDUAL_RATIO = 3.0
 
 
-def _declare_align(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "bag", help="a scan of a reference sphere")
-    sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument(
-        "--radius",
-        type=number(quantities.RADIUS),
-        required=True,
-        help="radius of the sphere [m], negative if convex",
-    )
-    sub.add_argument(
-        "--geometry", type=Path, metavar="GEOMETRY.yaml", help="known values to start from"
-    )
-    sub.add_argument("--out", type=Path, required=True, metavar="GEOMETRY.yaml")
+def _declare_align(add: Arguments) -> None:
+    add.bags("bag", help="a scan of a reference sphere")
+    add("--calibration", "CAL.json", required=True)
+    add("--radius", RADIUS, "radius of the sphere [m], negative if convex", required=True)
+    add("--geometry", "GEOMETRY.yaml", "known values to start from")
+    add("--out", "GEOMETRY.yaml", required=True)
 
 
 def _align(args: argparse.Namespace) -> Facts:
@@ -333,12 +302,10 @@ def _show_align(facts: Facts) -> None:
     table([*rows, written([facts["file"]])])
 
 
-def _declare_report(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("result", type=Path, metavar="DIR", help="result folder of 'omsm correct'")
-    sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument(
-        "--nominal", type=Path, metavar="SURFACE.yaml", help="nominal surface of the correction"
-    )
+def _declare_report(add: Arguments) -> None:
+    add("result", "DIR", "result folder of 'omsm correct'")
+    add("--calibration", "CAL.json", required=True)
+    add("--nominal", "SURFACE.yaml", "nominal surface of the correction")
 
 
 def _report(args: argparse.Namespace) -> Facts:

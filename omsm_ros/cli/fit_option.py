@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.quantities import LENGTH, TOLERANCE, shown
 from omsm_ros.readable import count, measured
 
 
@@ -25,7 +25,7 @@ def aperture(text: str) -> Aperture:
     """Parse an aperture R or R,X,Y [m]."""
     try:
         parts = [
-            quantities.LENGTH.checked(float(part), ConfigurationError, name)
+            LENGTH.checked(float(part), ConfigurationError, name)
             for part, name in zip(text.split(","), ("radius", "x", "y"), strict=False)
         ]
         if len(parts) != len(text.split(",")) or len(parts) == 2 or parts[0] <= 0:
@@ -35,33 +35,33 @@ def aperture(text: str) -> Aperture:
         raise argparse.ArgumentTypeError(str(err)) from err
     except ValueError as err:
         raise argparse.ArgumentTypeError(
-            f"aperture is {quantities.shown(text)}, expected R or R,X,Y in metres"
+            f"aperture is {shown(text)}, expected R or R,X,Y in metres"
         ) from err
 
 
-def declare_fit(sub: argparse.ArgumentParser, default: tuple[str, ...] | None) -> None:
+def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     """Add the options of a registration."""
-    sub.add_argument(
+    add(
         "--fit",
-        type=dofs,
+        dofs,
+        "pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power",
         default=default,
         metavar="PARAMETERS",
-        help="pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power",
     )
-    sub.add_argument(
+    add(
         "--aperture",
-        type=aperture,
+        aperture,
+        "disc of the part to evaluate [m]; default: all points",
         metavar="R[,X,Y]",
-        help="disc of the part to evaluate [m]; default: all points",
     )
 
 
-def declare_tolerance(sub: argparse.ArgumentParser) -> None:
+def declare_tolerance(add: Arguments) -> None:
     """Add the tolerance of a registered part."""
-    sub.add_argument(
+    add(
         "--tolerance",
-        type=number(quantities.TOLERANCE),
-        help="tolerance of the peak to valley of 99.5 %% of the part [m]; needs --fit",
+        TOLERANCE,
+        "tolerance of the peak to valley of 99.5 %% of the part [m]; needs --fit",
     )
 
 

@@ -7,8 +7,9 @@ from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omsm_ros.cli.command import CliCommand, Facts, declare_catalogue, say, table, written
-from omsm_ros.core.calibration.trend import LinearTrend
+from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.command import CliCommand, Facts, say, table, written
+from omsm_ros.core.calibration.repeatability import LinearTrend
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.json_and_yaml import unknown_as_null
 from omsm_ros.quantities import shown
@@ -24,20 +25,17 @@ _USUAL = "catalogue.sqlite"
 _NO_NAME = """(machine not named; identify and correct with --settings '{"machine": "…"}')"""
 
 
-def _declare_history(sub: argparse.ArgumentParser) -> None:
-    declare_catalogue(sub)
-    sub.add_argument("--machine", default="", help="list this machine only")
-    sub.add_argument(
+def _declare_history(add: Arguments) -> None:
+    add.catalogue()
+    add("--machine", str, "list this machine only", default="")
+    add(
         "--add",
-        type=Path,
+        "CAL.json|DIR",
+        "add earlier calibrations or result folders to the catalogue",
         nargs="+",
         default=[],
-        metavar="CAL.json|DIR",
-        help="add earlier calibrations or result folders to the catalogue",
     )
-    sub.add_argument(
-        "--plot", type=Path, metavar="FILE.png", help="draw lag, gain and form over time"
-    )
+    add("--plot", "FILE.png", "draw lag, gain and form over time")
 
 
 def _history(args: argparse.Namespace) -> Facts:

@@ -7,22 +7,18 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-from omsm_ros import __version__, quantities
+from omsm_ros import __version__
 from omsm_ros.cli.arguments import (
     TABLE_SUFFIX,
-    add_bags,
-    add_by_stamps,
-    add_trigger,
+    Arguments,
     cell_of,
     json_object,
-    number,
     refuse_cell,
     trigger_of,
 )
 from omsm_ros.cli.command import (
     CliCommand,
     Facts,
-    declare_catalogue,
     output_path_for,
     progress_bar,
     rejected,
@@ -39,21 +35,29 @@ from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.files import atomic_file
-from omsm_ros.io.model_file import load_model, save_model
 from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
 from omsm_ros.pipelines.identify import (
     SampledRecord,
     intended_use_of,
+    load_model,
     model_of,
     record_of_motion,
     record_of_table,
     run_of,
+    save_model,
     text_of_run,
     write_certificate,
     write_model_page,
 )
 from omsm_ros.pipelines.recording import Recording
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import (
+    DURATION,
+    MAX_DELAY_SAMPLES,
+    ORDER,
+    SAMPLE_PERIOD,
+    UNCERTAINTY,
+    shown,
+)
 from omsm_ros.readable import count, measured, percent, plain, quantity
 from omsm_ros.report.verdict import verdict_text
 
@@ -61,77 +65,66 @@ ENCODER = "encoder"
 _MAX_DELAY = 3
 
 
-def _declare(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "recording", help="bag of a motion on a fixed target, or a table RECORD.csv")
-    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument(
-        "--order", type=number(quantities.ORDER), default=0, help="number of poles; 0 = choose"
-    )
-    sub.add_argument(
+def _declare(add: Arguments) -> None:
+    add.bags("recording", help="bag of a motion on a fixed target, or a table RECORD.csv")
+    add("--out", "CAL.json", required=True)
+    add("--order", ORDER, "number of poles; 0 = choose", default=0)
+    add(
         "--input",
+        str,
+        "of a bag, 'encoder' or 'reference'; of a table, the input column",
         default=ENCODER,
-        help="of a bag, 'encoder' or 'reference'; of a table, the input column",
     )
-    sub.add_argument("--output", help="of a table, the output column")
-    sub.add_argument(
-        "--period", type=number(quantities.SAMPLE_PERIOD), help="of a table, the sample period [s]"
-    )
-    sub.add_argument(
+    add("--output", str, "of a table, the output column")
+    add("--period", SAMPLE_PERIOD, "of a table, the sample period [s]")
+    add(
         "--hold",
+        str,
+        "behaviour of the input between samples: 'band-limited' for a measured input; the "
+        "others, for a command signal, give a model instead of a calibration",
         choices=HOLDS,
         default=BAND_LIMITED,
-        help="behaviour of the input between samples: 'band-limited' for a measured input; the "
-        "others, for a command signal, give a model instead of a calibration",
     )
-    sub.add_argument(
+    add(
         "--max-delay",
-        type=number(quantities.MAX_DELAY_SAMPLES),
+        MAX_DELAY_SAMPLES,
+        f"of a held input, the longest delay to try; default {_MAX_DELAY}",
         metavar="SAMPLES",
-        help=f"of a held input, the longest delay to try; default {_MAX_DELAY}",
     )
-    sub.add_argument(
-        "--duration",
-        type=number(quantities.DURATION),
-        default=0.0,
-        help="use the first seconds only [s]; 0 = all",
-    )
-    sub.add_argument(
+    add("--duration", DURATION, "use the first seconds only [s]; 0 = all", default=0.0)
+    add(
         "--settings",
-        type=json_object,
+        json_object,
+        "settings of machine and probe that the calibration is valid for",
         default={},
         metavar="JSON",
-        help="settings of machine and probe that the calibration is valid for",
     )
-    _declare_use(sub)
-    add_trigger(sub)
-    add_by_stamps(sub)
-    sub.add_argument(
-        "--report", type=Path, metavar="DIR", help="write the certificate, or the model's page"
-    )
-    declare_catalogue(sub)
+    _declare_use(add)
+    add.trigger()
+    add("--report", "DIR", "write the certificate, or the model's page")
+    add.catalogue()
 
 
-def _declare_use(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument(
+def _declare_use(add: Arguments) -> None:
+    add(
         "--for",
-        dest="scan",
-        type=Path,
-        metavar="SCAN",
-        help="intended scan, a bag or a plan as CSV time_s,z_m, for the limits of the verdict; "
+        "SCAN",
+        "intended scan, a bag or a plan as CSV time_s,z_m, for the limits of the verdict; "
         "default: the paper's, 30 rpm over its mirror",
+        dest="scan",
     )
-    sub.add_argument(
+    add(
         "--accuracy",
-        type=number(quantities.UNCERTAINTY),
-        help="required expanded uncertainty of a height of that scan, k = 2 [m]",
+        UNCERTAINTY,
+        "required expanded uncertainty of a height of that scan, k = 2 [m]",
     )
-    sub.add_argument(
+    add(
         "--origin",
-        type=json_object,
+        json_object,
+        "entries of the certificate: machine, probe, probe_serial_number, target, "
+        "temperature_c, operator, laboratory, method",
         default={},
         metavar="JSON",
-        help="entries of the certificate: machine, probe, probe_serial_number, target, "
-        "temperature_c, operator, laboratory, method",
     )
 
 
@@ -313,15 +306,13 @@ def _show(facts: Facts) -> None:
     table(rows)
 
 
-def _declare_validate(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("model", type=Path, metavar="MODEL.json")
-    sub.add_argument(
-        "record", type=Path, metavar="RECORD.csv", help="another record of the same sample period"
-    )
-    sub.add_argument("--input", required=True, help="input column")
-    sub.add_argument("--output", required=True, help="output column")
-    sub.add_argument("--out", type=Path, metavar="RUN.csv", help="write the simulated output")
-    sub.add_argument("--report", type=Path, metavar="DIR", help="write a report")
+def _declare_validate(add: Arguments) -> None:
+    add("model", "MODEL.json")
+    add("record", "RECORD.csv", "another record of the same sample period")
+    add("--input", str, "input column", required=True)
+    add("--output", str, "output column", required=True)
+    add("--out", "RUN.csv", "write the simulated output")
+    add("--report", "DIR", "write a report")
 
 
 def _validate(args: argparse.Namespace) -> Facts:

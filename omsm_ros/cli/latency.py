@@ -6,8 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import add_bags, add_polarity, cell_of, json_object, number
+from omsm_ros.cli.arguments import Arguments, cell_of, json_object, number
 from omsm_ros.cli.command import (
     CliCommand,
     Facts,
@@ -17,7 +16,6 @@ from omsm_ros.cli.command import (
     table,
     written,
 )
-from omsm_ros.cli.correct import CALIBRATION
 from omsm_ros.core.adjustment.resolved_calibration import undetermined
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_CLOCKING_RAD,
@@ -29,48 +27,49 @@ from omsm_ros.core.calibration.latency import declared_latency, latency_summary
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.pipelines.study_scans import SelfCalibrationOptions, reversal_of, self_calibration_of
+from omsm_ros.quantities import (
+    ANGLE_UNCERTAINTY,
+    GAIN,
+    GAIN_UNCERTAINTY,
+    HARMONICS,
+    LAG,
+    TIME_UNCERTAINTY,
+)
 from omsm_ros.readable import measured, percent, quantity
 from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import RPM_RAD_S
 
 
-def _declare_selfcal(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "scans", nargs="+", metavar="SCAN", help="two or more scans of one part")
-    sub.add_argument(
-        "--calibration", type=Path, metavar="STEP.json", help="calibration from a step test"
-    )
-    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
-    sub.add_argument(
+def _declare_selfcal(add: Arguments) -> None:
+    add.bags("scans", nargs="+", metavar="SCAN", help="two or more scans of one part")
+    add("--calibration", "STEP.json", "calibration from a step test")
+    add("--out", "CAL.json", required=True)
+    add(
         "--harmonics",
-        type=number(quantities.HARMONICS),
+        HARMONICS,
+        "highest harmonic of the surface in a turn",
         default=DEFAULT_HARMONICS,
-        help="highest harmonic of the surface in a turn",
     )
-    sub.add_argument(
+    add(
         "--clocking",
-        type=number(quantities.ANGLE_UNCERTAINTY),
+        ANGLE_UNCERTAINTY,
+        "standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted",
         default=DEFAULT_CLOCKING_RAD,
-        help="standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted",
     )
-    add_polarity(sub)
-    sub.add_argument(
-        "--static-gain",
-        type=number(quantities.GAIN),
-        default=1.0,
-        help="static gain of the probe, used without a step test",
-    )
-    sub.add_argument(
+    add.polarity()
+    add("--static-gain", GAIN, "static gain of the probe, used without a step test", default=1.0)
+    add(
         "--gain-uncertainty",
-        type=number(quantities.GAIN_UNCERTAINTY),
+        GAIN_UNCERTAINTY,
+        "relative standard uncertainty of the static gain",
         default=UNINFORMATIVE_GAIN,
-        help="relative standard uncertainty of the static gain",
     )
-    sub.add_argument(
+    add(
         "--settings",
-        type=json_object,
+        json_object,
+        "settings of the calibration, used without a step test",
         default={},
         metavar="JSON",
-        help="settings of the calibration, used without a step test",
     )
 
 
@@ -152,12 +151,10 @@ def _latency_rows(latency: Facts) -> list[tuple[str, str]]:
     ]
 
 
-def _declare_reversal(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "clockwise", "counterclockwise")
-    sub.add_argument("--calibration", **CALIBRATION)
-    sub.add_argument(
-        "--out", type=Path, metavar="CAL.json", help="write the calibration with the latency"
-    )
+def _declare_reversal(add: Arguments) -> None:
+    add.bags("clockwise", "counterclockwise")
+    add("--calibration", "CAL.json", required=True)
+    add("--out", "CAL.json", "write the calibration with the latency")
 
 
 def _reversal(args: argparse.Namespace) -> Facts:
@@ -196,15 +193,13 @@ def _show_reversal(facts: Facts) -> None:
     )
 
 
-def _declare_latency(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("calibration", type=Path, metavar="CAL.json")
-    delay, spread = number(quantities.LAG), number(quantities.TIME_UNCERTAINTY)
-    sub.add_argument("--delay", type=delay, required=True, help="latency of the probe [s]")
-    sub.add_argument(
-        "--uncertainty", type=spread, required=True, help="its standard uncertainty, k = 1 [s]"
-    )
-    sub.add_argument("--reason", required=True, help="source of these figures")
-    sub.add_argument("--out", type=Path, required=True, metavar="CAL.json")
+def _declare_latency(add: Arguments) -> None:
+    add("calibration", "CAL.json")
+    delay, spread = number(LAG), number(TIME_UNCERTAINTY)
+    add("--delay", delay, "latency of the probe [s]", required=True)
+    add("--uncertainty", spread, "its standard uncertainty, k = 1 [s]", required=True)
+    add("--reason", str, "source of these figures", required=True)
+    add("--out", "CAL.json", required=True)
 
 
 def _latency(args: argparse.Namespace) -> Facts:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.core.kinematics.limits import MachineLimits
@@ -25,42 +23,41 @@ from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_limits, load_sources, load_surface
 from omsm_ros.io.files import save_text
 from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
+from omsm_ros.quantities import COUNT, DWELL, LENGTH, RISE, SAMPLE_PERIOD, SPEED, STEP, UNCERTAINTY
 from omsm_ros.readable import quantity
 
 
-def _declare_plan(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("what", choices=("steps", "scans"), help="a step test, or scans of a part")
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument(
-        "--dialect", choices=DIALECTS, default="linuxcnc", help="controller that reads the G-code"
-    )
-    steps = sub.add_argument_group("steps")
+def _declare_plan(add: Arguments) -> None:
+    add("what", str, "a step test, or scans of a part", choices=("steps", "scans"))
+    add("--out", "DIR", required=True)
+    add("--dialect", str, "controller that reads the G-code", choices=DIALECTS, default="linuxcnc")
+    steps = add.group("steps")
     for name, kind, default, meaning in (
-        ("--sample-period", quantities.SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
-        ("--step", quantities.STEP, 9.8e-6, "height of a step [m]"),
+        ("--sample-period", SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
+        ("--step", STEP, 9.8e-6, "height of a step [m]"),
         (
             "--second-step",
-            quantities.STEP,
+            STEP,
             None,
             "height of every other step [m]; 3/9.8 of --step by default",
         ),
         (
             "--count",
-            quantities.COUNT,
+            COUNT,
             PLANNED_COUNT,
             "number of steps up, and of steps down, from the middle",
         ),
         (
             "--dwell",
-            quantities.DWELL,
+            DWELL,
             PLANNED_DWELL_S,
             "time from edge to edge [s]; four times the dwell halves the undetected creep",
         ),
-        ("--rise", quantities.RISE, 20e-3, "rise time of an edge [s]"),
-        ("--half-range", quantities.STEP, 50e-6, "half the measuring range of the probe [m]"),
+        ("--rise", RISE, 20e-3, "rise time of an edge [s]"),
+        ("--half-range", STEP, 50e-6, "half the measuring range of the probe [m]"),
     ):
-        steps.add_argument(name, type=number(kind), default=default, help=meaning)
-    _declare_scans(sub.add_argument_group("scans"))
+        steps(name, kind, meaning, default=default)
+    _declare_scans(add.group("scans"))
 
 
 def _plan(args: argparse.Namespace) -> Facts:
@@ -109,19 +106,17 @@ def _show_plan(facts: Facts) -> None:
     )
 
 
-def _declare_scans(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--nominal", type=Path, metavar="SURFACE.yaml", help="surface of the part")
-    group.add_argument(
-        "--sources", type=Path, metavar="SOURCES.yaml", help="declared sources of the machine"
-    )
-    group.add_argument("--limits", type=Path, metavar="LIMITS.yaml", help="of machine and probe")
+def _declare_scans(add: Arguments) -> None:
+    add("--nominal", "SURFACE.yaml", "surface of the part")
+    add("--sources", "SOURCES.yaml", "declared sources of the machine")
+    add("--limits", "LIMITS.yaml", "of machine and probe")
     for name, kind, default, meaning in (
-        ("--accuracy", quantities.UNCERTAINTY, 20e-9, "expanded uncertainty asked for, k = 2 [m]"),
-        ("--radius", quantities.LENGTH, 12.7e-3, "radius of the part [m]"),
-        ("--feed", quantities.LENGTH, 1e-4, "radial feed of a turn [m]"),
-        ("--rpm", quantities.SPEED, 30.0, "spindle speed of the first scan [1/min]"),
+        ("--accuracy", UNCERTAINTY, 20e-9, "expanded uncertainty asked for, k = 2 [m]"),
+        ("--radius", LENGTH, 12.7e-3, "radius of the part [m]"),
+        ("--feed", LENGTH, 1e-4, "radial feed of a turn [m]"),
+        ("--rpm", SPEED, 30.0, "spindle speed of the first scan [1/min]"),
     ):
-        group.add_argument(name, type=number(kind), default=default, help=meaning)
+        add(name, kind, meaning, default=default)
 
 
 def _plan_scans(args: argparse.Namespace) -> Facts:

@@ -1,23 +1,22 @@
-"""Commands for recordings: inspect, import."""
+"""The command inspect: streams and faults of a bag, and its repair."""
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
-from omsm_ros.cli.arguments import add_bags, cell_of
+from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.pipelines.recording import Inspection, inspect_bag
 from omsm_ros.readable import quantity
 
 
-def _declare_inspect(sub: argparse.ArgumentParser) -> None:
-    add_bags(sub, "bag")
-    sub.add_argument(
+def _declare_inspect(add: Arguments) -> None:
+    add.bags("bag")
+    add(
         "--repair",
-        action="store_true",
-        help="copy the intact part of a damaged MCAP bag to <bag>.repaired.mcap; the bag itself "
+        None,
+        "copy the intact part of a damaged MCAP bag to <bag>.repaired.mcap; the bag itself "
         "is not changed",
     )
 
@@ -76,44 +75,4 @@ def _vibration(found: Facts | None) -> list[tuple[str, str]]:
     return [("vibration", f"on a height at most {said}; {raised}"), *rows]
 
 
-def _declare_import(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("files", type=Path, nargs="+", metavar="FILE")
-    sub.add_argument(
-        "--map", type=Path, required=True, metavar="MAP.yaml", help="columns, units, signs, period"
-    )
-    sub.add_argument("--out", type=Path, required=True, metavar="BAG.mcap")
-
-
-def _import(args: argparse.Namespace) -> Facts:
-    # Imported on demand, because 'inspect' does not need the readers of foreign tables.
-    from omsm_ros.io.tables.table import load_column_map
-    from omsm_ros.pipelines.import_recording import import_recording
-
-    mapped, form = load_column_map(args.map)
-    with progress_bar("importing", args.json, " samples") as progress:
-        found = import_recording(args.files, mapped, form, args.out, progress)
-    return {"bag": str(args.out), "files": [asdict(file) for file in found]}
-
-
-def _show_import(facts: Facts) -> None:
-    for file in facts["files"]:
-        kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
-        say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
-        for count, meaning in (
-            ("missing", "missing trigger numbers"),
-            ("invalid", "invalid probe readings"),
-            ("lost", "rows with an axis that is not a number"),
-            ("repeated_names", "repeated header lines"),
-            ("passed_over", "messages without any of the columns"),
-        ):
-            if file[count]:
-                say(f"    {meaning}: {file[count]}")
-    if any(file["own_clock"] for file in facts["files"]):
-        say("probe and axes have separate clocks: identify and correct with --by-stamps")
-    table([written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")])
-
-
-COMMANDS = (
-    CliCommand("inspect", _declare_inspect, _inspect, _show_inspect),
-    CliCommand("import", _declare_import, _import, _show_import),
-)
+COMMANDS = (CliCommand("inspect", _declare_inspect, _inspect, _show_inspect),)

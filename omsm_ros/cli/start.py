@@ -1,75 +1,32 @@
-"""Commands to begin with: twin, doctor, completion."""
+"""Commands to begin with: twin, completion."""
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from pathlib import Path
 
-from omsm_ros import quantities
-from omsm_ros.cli.arguments import number
+from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, say_lines
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.pipelines.examine_host import DOUBTFUL, FAULTY, FINE, examine_host
 from omsm_ros.pipelines.record_twin import record_twin
+from omsm_ros.quantities import FEED, RADIUS, SEED, SPEED
 from omsm_ros.twin.scenario import Scenario
 
-_MARKS = {FINE: "ok", DOUBTFUL: "??", FAULTY: "NO"}
 
-
-def _declare_doctor(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--port", default="", metavar="PATH", help="serial port that must exist")
-    sub.add_argument(
-        "--folder", type=Path, default=Path(), metavar="DIR", help="folder for recordings"
-    )
-
-
-def _doctor(args: argparse.Namespace) -> Facts:
-    return {"checks": [asdict(check) for check in examine_host(args.folder, args.port)]}
-
-
-def _show_doctor(facts: Facts) -> None:
-    for check in facts["checks"]:
-        say(f"{_MARKS[check['state']]}  {check['name']:<18} {check['found']}")
-        if check["remedy"]:
-            say(f"    {'':<18} → {check['remedy']}")
-
-
-def _faulty(facts: Facts) -> str:
-    names = [check["name"] for check in facts["checks"] if check["state"] == FAULTY]
-    return f"not ready: {', '.join(names)}; see the remedies above" if names else ""
-
-
-def _declare_twin(sub: argparse.ArgumentParser) -> None:
+def _declare_twin(add: Arguments) -> None:
     usual = Scenario()
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR")
-    sub.add_argument(
+    add("--out", "DIR", required=True)
+    add(
         "--radius",
-        type=number(quantities.RADIUS),
+        RADIUS,
+        "start radius of the spiral [m]; 0.002 scans for 40 s, 0.0127 the whole mirror",
         default=2e-3,
-        help="start radius of the spiral [m]; 0.002 scans for 40 s, 0.0127 the whole mirror",
     )
-    sub.add_argument(
-        "--rpm",
-        type=number(quantities.SPEED),
-        default=usual.spindle_speed,
-        help="spindle speed [rpm]",
-    )
-    sub.add_argument(
-        "--feed",
-        type=number(quantities.FEED),
-        default=usual.feed_per_turn,
-        help="feed per turn [m]",
-    )
-    sub.add_argument("--disturbances", type=Path, metavar="FILE", help="errors of the machine")
-    sub.add_argument(
-        "--seed", type=number(quantities.SEED), default=1, help="seed of noise and part"
-    )
-    sub.add_argument(
-        "--part",
-        type=number(quantities.SEED),
-        help="seed of the part alone, for several scans of one part",
-    )
+    add("--rpm", SPEED, "spindle speed [rpm]", default=usual.spindle_speed)
+    add("--feed", FEED, "feed per turn [m]", default=usual.feed_per_turn)
+    add("--disturbances", "FILE", "errors of the machine")
+    add("--seed", SEED, "seed of noise and part", default=1)
+    add("--part", SEED, "seed of the part alone, for several scans of one part")
 
 
 def _twin(args: argparse.Namespace) -> Facts:
@@ -88,8 +45,8 @@ def _show_twin(facts: Facts) -> None:
     say(f"{facts['scan']}: {facts['scan_samples']} samples of a scan of {facts['nominal']}")
 
 
-def _declare_completion(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+def _declare_completion(add: Arguments) -> None:
+    add("shell", str, choices=("bash", "zsh", "tcsh"))
 
 
 def _completion(args: argparse.Namespace) -> Facts:
@@ -129,6 +86,5 @@ def _show_completion(facts: Facts) -> None:
 
 COMMANDS = (
     CliCommand("twin", _declare_twin, _twin, _show_twin),
-    CliCommand("doctor", _declare_doctor, _doctor, _show_doctor, _faulty),
     CliCommand("completion", _declare_completion, _completion, _show_completion),
 )

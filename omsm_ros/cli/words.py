@@ -18,7 +18,7 @@ class Word(NamedTuple):
 # In the order of use.
 TASKS: dict[str, dict[str, Word]] = {
     "begin": {
-        "doctor": Word("start", "check whether this computer can run a cell, with remedies"),
+        "doctor": Word("doctor", "check whether this computer can run a cell, with remedies"),
         "demo": Word("", "calibrate and measure on the digital twin (needs ROS)"),
         "twin": Word("start", "write bags of the digital twin: a step test and a scan"),
         "completion": Word(
@@ -28,7 +28,7 @@ TASKS: dict[str, dict[str, Word]] = {
     "recordings": {
         "inspect": Word("recordings", "list the streams and faults of a bag, or repair it"),
         "import": Word(
-            "recordings",
+            "importing",
             "convert CSV, NumPy, MATLAB, HDF5 or TDMS files, or other ROS topics, to a bag",
         ),
     },
@@ -83,13 +83,15 @@ TASKS: dict[str, dict[str, Word]] = {
             "form", "fit the pose and evaluate the form: deviation, Zernike terms, texture"
         ),
         "compensate": Word("form", "compute offsets of the next cut from the measured form"),
-        "difference": Word("analysis", "compare two measurements of one part: E_n, maps, verdict"),
+        "difference": Word(
+            "difference", "compare two measurements of one part: E_n, maps, verdict"
+        ),
         "spectrum": Word(
-            "analysis",
+            "spectrum",
             "find spectral lines in scans of one part and their sources: part, vibration, aliased "
             "vibration, spindle",
         ),
-        "export": Word("analysis", "write a cloud or map in the format of another program"),
+        "export": Word("export", "write a cloud or map in the format of another program"),
     },
     "many scans": {
         "batch": Word(

@@ -10,7 +10,6 @@ import threading
 import time
 import tty
 from pathlib import Path
-from types import TracebackType
 
 from omsm_ros.errors import ConfigurationError, DeviceError
 
@@ -42,12 +41,7 @@ class TcpServer:
         self.plug()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.unplug()
 
     @property
@@ -185,12 +179,7 @@ class Pty:
             self.close()
             raise
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -13,7 +13,6 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 
 from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex, DataEnd, Footer
@@ -233,12 +232,7 @@ class BagWriter:
         message = message_mapping.acceleration_message(bag_messages(), block)
         self.write(ACCELERATION_TOPIC, block.stamp_ns, message)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             self.flush()
             if not self._failed:

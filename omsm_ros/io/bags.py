@@ -16,7 +16,6 @@ from itertools import groupby
 from pathlib import Path
 from struct import error as struct_error
 from struct import unpack_from
-from types import TracebackType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -237,12 +236,7 @@ class BagReader:
             self._reader.storage.metadata = metadata._replace(compression_mode=None)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stack.close()
 
     def topics(self) -> list[TopicSummary]:

@@ -23,7 +23,7 @@ from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceErr
 from omsm_ros.io import json_and_yaml
 from omsm_ros.io.files import read_text, save_text
 from omsm_ros.io.json_and_yaml import NUMBER, as_number, check_form, form
-from omsm_ros.io.table_file import load_columns
+from omsm_ros.io.tables.text_table import load_columns
 from omsm_ros.quantities import PITCH, POSITION, SAMPLE_PERIOD, TIME, shown
 
 MAX_YAML_BYTES = 100_000

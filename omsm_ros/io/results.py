@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any
 
 import numpy as np
@@ -69,16 +68,11 @@ class PlyWriter:
         padding = _PLY_HEADER_BYTES - len(text) - len("comment \nend_header\n")
         return text + b"comment " + b" " * padding + b"\nend_header\n"
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: Any, *rest: Any) -> None:
         if kind is None:
             self._stream.seek(0)
             self._stream.write(self._header())
-        self._file.__exit__(kind, error, trace)
+        self._file.__exit__(kind, *rest)
 
 
 def _header_lines(points: int) -> list[bytes]:

@@ -10,17 +10,19 @@ import numpy as np
 
 from omsm_ros import __version__
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
-from omsm_ros.core.estimation.sampled_model import FreeRun, SampledModel, free_run
+from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel, free_run
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
-from omsm_ros.core.identification.sampled_identification import identify_samples
+from omsm_ros.core.identification.sampled_identification import HOLDS, identify_samples
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
-from omsm_ros.errors import DataError, FileError
+from omsm_ros.errors import CalibrationError, DataError, FileError
+from omsm_ros.io import json_and_yaml
 from omsm_ros.io.descriptions import load_motion
-from omsm_ros.io.files import save_bytes
+from omsm_ros.io.files import read_text, save_bytes, save_json
 from omsm_ros.io.folders import result_folder
-from omsm_ros.io.table_file import first_line, load_columns
+from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
+from omsm_ros.io.tables.text_table import PLAIN, TextTable, load_columns
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.readable import date_text, quantity
 from omsm_ros.units import seconds_of
@@ -79,7 +81,9 @@ def _check_time(path: Path, period: float) -> None:
 
     A wrong period scales all frequencies by one factor, which no residual shows.
     """
-    named = {name: one for name in first_line(path) if (one := seconds_of(name)) is not None}
+    named = {
+        name: one for name in TextTable(path, PLAIN).names if (one := seconds_of(name)) is not None
+    }
     for name, second in named.items():
         try:
             (time,) = load_columns(path, (name,))
@@ -193,3 +197,51 @@ def write_model_page(
 
 def _today() -> str:
     return date_text(datetime.now(timezone.utc))
+
+
+_MAX_BYTES = 4_000_000
+
+# 20 poles.
+_COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 21}
+_COVARIANCE = {"type": "array", "items": NUMBER, "maxItems": 42**2}
+_DISCRETE = {
+    "numerator": _COEFFICIENTS,
+    "denominator": _COEFFICIENTS,
+    "delay_samples": {"type": "integer"},
+    "covariance": _COVARIANCE,
+}
+_CONTINUOUS = {
+    "numerator": _COEFFICIENTS,
+    "denominator": _COEFFICIENTS,
+    "delay": NUMBER,
+    "covariance": {**_COVARIANCE, "type": ["array", "null"]},
+}
+_PROPERTIES = {
+    "schema": {"const": SCHEMA},
+    "hold": {"enum": list(HOLDS)},
+    "sample_period": NUMBER,
+    "discrete": {**form(_DISCRETE, tuple(_DISCRETE)), "type": ["object", "null"]},
+    "continuous": {**form(_CONTINUOUS, tuple(_CONTINUOUS)), "type": ["object", "null"]},
+    "working_point": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2},
+    "valid_from": NUMBER,
+    "valid_up_to": NUMBER,
+    "certificate": {"type": "object"},
+}
+_FORM = form(_PROPERTIES, tuple(_PROPERTIES))
+
+
+def save_model(path: Path | str, model: SampledModel) -> None:
+    """Write ``MODEL.json`` (schema "omsm-model/1")."""
+    save_json(path, model.content())
+
+
+def load_model(path: Path | str) -> SampledModel:
+    """Read ``MODEL.json``; CalibrationError if it is malformed or cannot be computed with."""
+    what = f"model {str(path)!r}"
+    text = read_text(path, _MAX_BYTES, CalibrationError, "model")
+    content = json_and_yaml.object_of(text, CalibrationError, what)
+    check_form(content, _FORM, CalibrationError, what)
+    try:
+        return SampledModel.from_content(content)
+    except CalibrationError as err:
+        raise CalibrationError(f"{what}: {err}") from err

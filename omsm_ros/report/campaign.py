@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.trend import FEWEST, LinearTrend, outliers, trend
+from omsm_ros.core.calibration.repeatability import FEWEST, LinearTrend, outliers, trend
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.readable import NOTHING, count, date_text_of_stamp, days, percent, quantity
 from omsm_ros.report import style

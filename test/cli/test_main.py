@@ -209,7 +209,7 @@ def test_every_word_is_where_main_looks_for_it():
         assert {c.name for c in made} == {n for n, word in WORDS.items() if word.module == module}
 
 
-@pytest.mark.parametrize(("word", "modules"), [("--help", set()), ("export", {"analysis"})])
+@pytest.mark.parametrize(("word", "modules"), [("--help", set()), ("export", {"export"})])
 def test_only_what_is_asked_for_is_loaded(word, modules):
     block = (
         "import json, sys\n"

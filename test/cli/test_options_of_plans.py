@@ -9,7 +9,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.cli import command_line, start
-from omsm_ros.pipelines import examine_host
+from omsm_ros.cli import doctor as examine_host
 
 
 def run(capsys, *words):

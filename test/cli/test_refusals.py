@@ -8,10 +8,10 @@ from contextlib import contextmanager
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.cli import doctor as examine_host
 from omsm_ros.cli import recordings, start
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.pipelines import examine_host
 
 # Path components longer than any name can be, where nothing can be created.
 LONG = "/".join(["folder" * 50] * 10)

@@ -6,7 +6,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.cli import start
-from omsm_ros.pipelines.examine_host import HostCheck
+from omsm_ros.cli.doctor import HostCheck
 
 
 def test_omsm_alone_tells_what_to_do_next(capsys):

@@ -29,7 +29,7 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.descriptions import save_geometry
-from omsm_ros.io.model_file import save_model
+from omsm_ros.pipelines.identify import save_model
 from omsm_ros.twin.cell import blocks_of
 
 MODEL = SampledModel(

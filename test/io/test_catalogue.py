@@ -9,8 +9,7 @@ pytest.importorskip("sqlalchemy", reason="the extra 'catalogue' is not installed
 
 from omsm_ros import cli
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io.catalogue import Catalogue
-from omsm_ros.pipelines.history import history, keep_calibration
+from omsm_ros.pipelines.history import Catalogue, history, keep_calibration
 
 
 @pytest.fixture
@@ -40,7 +39,7 @@ def test_a_row_that_cannot_be_is_named(address, change, reported):
 
 
 def test_a_view_without_end_is_given_up(address, monkeypatch):
-    monkeypatch.setattr("omsm_ros.io.catalogue.WAIT_S", 0.2)
+    monkeypatch.setattr("omsm_ros.pipelines.history.WAIT_S", 0.2)
     with closing(sqlite3.connect(address)) as base, base:
         columns = [row[1] for row in base.execute("PRAGMA table_info(calibrations)")]
         base.execute("DROP TABLE calibrations")
@@ -70,7 +69,7 @@ def test_an_address_that_is_none_is_named_without_its_password(address):
 def test_of_more_rows_than_are_listed_the_newest_are_and_the_others_counted(
     capsys, address, true_calibration, monkeypatch
 ):
-    monkeypatch.setattr("omsm_ros.io.catalogue.MOST_ROWS", 3)
+    monkeypatch.setattr("omsm_ros.pipelines.history.MOST_ROWS", 3)
     monkeypatch.setattr("omsm_ros.pipelines.history.MOST_ROWS", 3)
     with closing(sqlite3.connect(address)) as base, base:
         base.execute("UPDATE calibrations SET added_at = '2026-01-01 00:00:00.000000'")

@@ -13,8 +13,13 @@ import pytest
 from certified import certified_by
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.io.catalogue import Catalogue, time_of
-from omsm_ros.pipelines.history import history, keep_calibration, keep_measurement
+from omsm_ros.pipelines.history import (
+    Catalogue,
+    history,
+    keep_calibration,
+    keep_measurement,
+    time_of,
+)
 
 pytest.importorskip("sqlalchemy", reason="the extra 'catalogue' is not installed")
 

@@ -8,7 +8,7 @@ import pytest
 from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError
-from omsm_ros.io.model_file import load_model, save_model
+from omsm_ros.pipelines.identify import load_model, save_model
 
 LINES = np.array([0.1, 1.0, 4.0])
 DISCRETE = Discrete(

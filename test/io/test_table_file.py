@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.table_file import load_columns
+from omsm_ros.io.tables.text_table import load_columns
 
 
 def written(tmp_path, text):
@@ -32,7 +32,7 @@ def test_columns_are_found_by_name_in_the_order_asked_for(tmp_path):
         ("u,y\n1,2\n3\n", "line 3: '3' is no row"),
         ("u,y\n1,2\n3,nan\n", "y has no reading in 1 of 2 rows"),
         ("u,y\n1,2\n3,1e300\n", "expected a number"),
-        ("", "0 columns 'u'"),
+        ("", "has no line of names"),
         ("u,y\n1,5,2,5\n3,5,4,5\n", "line 2: '1,5,2,5' is no row"),  # decimal commas
         ("u,y,t\n1,2,3\n3,4\n", "line 3: '3,4' is no row"),  # cut short
     ],

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from omsm_ros.errors import FileError
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.table_file import load_columns, rows_in
-from omsm_ros.io.tables.text_table import seconds_since_1970, shift_of
+from omsm_ros.io.tables.text_table import load_columns, rows_in, seconds_since_1970, shift_of
 
 TEXT = st.text(st.characters(codec="utf-8"), max_size=12)
 SCALAR = st.one_of(

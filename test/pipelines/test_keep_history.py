@@ -14,8 +14,7 @@ from omsm_ros import cli
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, calibration_file
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.io.catalogue import Catalogue
-from omsm_ros.pipelines.history import history, keep, keep_calibration, keep_measurement
+from omsm_ros.pipelines.history import Catalogue, history, keep, keep_calibration, keep_measurement
 
 pytest.importorskip("sqlalchemy", reason="SQLAlchemy is an optional package")
 DAY_NS = 86_400 * 10**9
@@ -154,7 +153,7 @@ def test_a_correction_does_not_fail_with_its_catalogue(
 
 
 def test_a_locked_file_is_waited_for_three_seconds_and_named(tmp_path, address, monkeypatch):
-    monkeypatch.setattr("omsm_ros.io.catalogue.WAIT_S", 0.2)
+    monkeypatch.setattr("omsm_ros.pipelines.history.WAIT_S", 0.2)
     folder = result(tmp_path / "a")
     with Catalogue(address):
         pass
@@ -184,7 +183,7 @@ def test_other_databases_are_refused(name):
 
 
 def test_a_password_is_never_shown(monkeypatch):
-    monkeypatch.setattr("omsm_ros.io.catalogue.WAIT_S", 1)
+    monkeypatch.setattr("omsm_ros.pipelines.history.WAIT_S", 1)
     pytest.importorskip("psycopg", reason="psycopg is an optional package")
     with (
         pytest.raises(FileError) as refused,

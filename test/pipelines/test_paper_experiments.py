@@ -10,8 +10,7 @@ from omsm_ros import cli
 from omsm_ros.core.calibration.verification import excited_bands
 from omsm_ros.errors import FileError
 from omsm_ros.pipelines import paper_experiments
-from omsm_ros.pipelines.paper_experiments import run_experiment
-from omsm_ros.report.experiments import ExperimentPage
+from omsm_ros.pipelines.paper_experiments import ExperimentPage, run_experiment
 from omsm_ros.twin.scenario import Scenario
 
 

@@ -21,10 +21,10 @@ from omsm_ros.core.ripple.scan_signal import PATH, TIME, ScanSignal
 from omsm_ros.core.ripple.source_hypotheses import KINDS, PART, VIBRATION
 from omsm_ros.core.ripple.spectral_line import SpectralLine
 from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.pipelines import paper_experiments as experiment_figures
 from omsm_ros.report import campaign, style
 from omsm_ros.report import campaign as campaign_page
 from omsm_ros.report import difference as difference_figures
-from omsm_ros.report import experiments as experiment_figures
 from omsm_ros.report import spectrum as spectrum_figures
 
 DAY_NS = 86_400 * 10**9

@@ -11,8 +11,8 @@ from page_tables import PageTables, says, value_of
 
 from omsm_ros.core.ripple import source_hypotheses
 from omsm_ros.core.ripple.source_hypotheses import KINDS, PART
-from omsm_ros.report.experiments import Compared, ExperimentPage
-from omsm_ros.report.experiments import render as render_experiment
+from omsm_ros.pipelines.paper_experiments import Compared, ExperimentPage
+from omsm_ros.pipelines.paper_experiments import render as render_experiment
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.spectrum import SpectrumPage
 from omsm_ros.report.spectrum import render as render_spectrum

@@ -1,4 +1,4 @@
-"""Repeatability of calibrations, and change of a machine between two of them.
+"""Repeatability and trend of calibrations, and change of a machine between two of them.
 
 Two identified responses are compared over their common valid band with both covariances. The
 result is the change and its significance in standard deviations.
@@ -9,16 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import CalibrationError
-from omsm_ros.readable import measured, p_value_text, plain, quantity
-from omsm_ros.units import PPM
 
 # Evenly over the common band; covariances have fewer independent directions than that.
 _LINES = 30
@@ -30,6 +28,13 @@ _COMPARED_PART = 1 / 3
 _RANK_TOLERANCE = 1e-2
 # Below it a response is the static gain and nothing else.
 _LEAST_BAND_HZ = 0.1
+
+
+def _stats() -> Any:
+    """Return ``scipy.stats``, loaded when it is needed: it takes a second."""
+    from scipy import stats
+
+    return stats
 
 
 @dataclass(frozen=True)
@@ -53,17 +58,6 @@ class CalibrationChange:
     p_value: float
     changed: bool
 
-    def text(self) -> str:
-        """Return one line for a reader."""
-        if not self.changed:
-            return f"the same ({p_value_text(self.p_value)})"
-        return (
-            f"changed: lag by {quantity(self.delay, 's', signed=True)} "
-            f"({self.delay_sigmas:.1f} sigma), static gain by "
-            f"{quantity(self.static_gain / PPM, 'ppm', signed=True)} "
-            f"({self.static_gain_sigmas:.1f} sigma), {p_value_text(self.p_value)}"
-        )
-
 
 def compare_calibrations(old: Calibration, new: Calibration) -> CalibrationChange:
     """Return what changed between two calibrations of one machine, independent of each other.
@@ -78,7 +72,7 @@ def compare_calibrations(old: Calibration, new: Calibration) -> CalibrationChang
     gain_change = new.static_gain - old.static_gain
     gain_sigma = math.hypot(*(c.static_gain_uncertainty for c in (old, new)))
     gain_sigmas = abs(gain_change) / gain_sigma if gain_sigma else 0.0
-    p_value = float(stats.chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
+    p_value = float(_stats().chi2.sf(statistic + gain_sigmas**2, known + (gain_sigma > 0)))
     delay = new.dynamics.low_frequency_delay - old.dynamics.low_frequency_delay
     sigma = math.hypot(*(c.low_frequency_delay_noise for c in (old, new)))
     worst = int(np.argmax(np.abs(ratio)))
@@ -163,20 +157,6 @@ class Repeatability:
     p_value: float
     repeatable: bool
 
-    def text(self) -> str:
-        """Return one line for a reader."""
-        verdict = "as repeatable as stated" if self.repeatable else "scatter more than they state"
-        lag, gain = self.delay, self.static_gain
-        return (
-            f"{self.count} calibrations {verdict} ({p_value_text(self.p_value)}): "
-            f"lag {measured(lag.mean, lag.deviation, 's')}{_of_stated(lag)}, "
-            f"static gain {measured(gain.mean, gain.deviation, digits=6)}{_of_stated(gain)}"
-        )
-
-
-def _of_stated(spread: Spread) -> str:
-    return f" ({plain(spread.ratio)} of stated)" if spread.stated else ""
-
 
 def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
     """Compare the scatter of independent ``calibrations`` of one machine with their uncertainty.
@@ -234,4 +214,61 @@ def _chance(off: FloatArray, covariance: FloatArray, static_gain: Spread) -> flo
     statistic, known = sum(value for value, _ in found), found[0][1] * free
     if static_gain.stated:
         statistic, known = statistic + free * static_gain.ratio**2, known + free
-    return float(stats.chi2.sf(statistic, known))
+    return float(_stats().chi2.sf(statistic, known))
+
+
+# Iglewicz and Hoaglin, How to Detect and Handle Outliers, 1993: 3.5 of the modified z-score.
+_LIMIT = 3.5
+# The median absolute deviation of a normal distribution is 0.6745 of its standard deviation.
+_NORMAL = 0.6745
+# A median and its spread are not reliable for fewer values.
+FEWEST = 5
+# Limits the number of slopes between two points to half a million, a few megabytes.
+_MOST = 1000
+
+
+def outliers(values: FloatArray) -> BoolArray:
+    """Return True for each of ``values`` (n,) that lies far from the others; NaN never does.
+
+    The criterion is the modified z-score ``0.6745 |v − median| / MAD`` > 3.5. Fewer than five
+    values have no outliers. Where half the values are equal, the mean deviation replaces the MAD.
+    """
+    found = np.zeros(len(values), np.bool_)
+    known = np.isfinite(values)
+    if np.sum(known) < FEWEST:
+        return found
+    away = np.abs(values[known] - np.median(values[known]))
+    spread = np.median(away) / _NORMAL or np.mean(away) * np.sqrt(np.pi / 2)
+    found[known] = away > _LIMIT * spread if spread > 0 else False
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class LinearTrend:
+    """The slope of values over time [unit/s], with the ends of its 95 % interval."""
+
+    slope: float
+    low: float
+    high: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether zero lies outside the interval."""
+        return self.low > 0 or self.high < 0
+
+
+def trend(times: FloatArray, values: FloatArray) -> LinearTrend | None:
+    """Return the slope of ``values`` (n,) over ``times`` [s] (n,) after Theil and Sen.
+
+    It is the median of all slopes between two points: a third of the points may be wrong. More
+    than 1000 points are thinned evenly to 1000. None for fewer than five known values, or where
+    all were taken at one time.
+    """
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(times))
+    if len(known) < FEWEST or np.ptp(times[known]) <= 0:
+        return None
+    if len(known) > _MOST:
+        known = known[np.argsort(times[known], kind="stable")]
+        known = known[np.linspace(0, len(known) - 1, _MOST).round().astype(np.int64)]
+    found = _stats().theilslopes(values[known], times[known], alpha=0.95)
+    return LinearTrend(float(found.slope), float(found.low_slope), float(found.high_slope))

@@ -18,7 +18,7 @@ from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.io import json_and_yaml
 from omsm_ros.io.files import atomic_file, open_regular, read_text
-from omsm_ros.io.table_file import rows_in
+from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.units import LengthUnits, metres_in, name_and_unit, needed, refuse_other
 

@@ -16,7 +16,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import atomic_file, open_regular
-from omsm_ros.io.table_file import rows_in
+from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.units import LengthUnits, refuse_other
 

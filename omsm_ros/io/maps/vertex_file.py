@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import atomic_file, exception_text, open_regular
-from omsm_ros.io.table_file import rows_in
+from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import CLOUD_POINTS, shown
 from omsm_ros.units import NOT_USED, LengthUnits, needed
 

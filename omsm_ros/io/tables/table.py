@@ -39,6 +39,7 @@ class TableForm:
     lines_before: before the line of names;  lines_after: between it and the first numbers
     named: whether a text has a line of names; without one its columns are [0], [1], …
     missing: texts that mean "no reading";  zone: of dates without one, "Z" or "+01:00"
+    comment: beginning of lines that are left out, empty = no line is
     """
 
     delimiter: str = ","
@@ -48,6 +49,7 @@ class TableForm:
     named: bool = True
     missing: tuple[str, ...] = ()
     zone: str = ""
+    comment: str = ""
 
 
 class ForeignTable(ABC):

@@ -6,18 +6,19 @@ import codecs
 import csv
 import io
 import re
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import open_regular
-from omsm_ros.io.table_file import rows_in
 from omsm_ros.io.tables.table import ForeignTable, TableForm
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.units import NANOSECONDS_PER_S, WORDS
 
 EXPECTED = "expected a date after ISO 8601, as 2026-11-21T14:03:05.125+01:00"
@@ -86,9 +87,10 @@ _GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)
 class TextTable(ForeignTable):
     """A table of lines below a line of names; read piece by piece."""
 
-    def __init__(self, path: Path, form: TableForm) -> None:
+    def __init__(self, path: Path, form: TableForm, remedy: str = "") -> None:
+        """remedy: for every line that is no row; empty: what the map of the columns lacks."""
         super().__init__(path)
-        self._form = form
+        self._form, self._stated_remedy = form, remedy
         self._encoding = self._probed()
         _, lines = next(self._lines(), (1, []))
         self._top = lines[:_HEAD_LINES]
@@ -111,15 +113,22 @@ class TextTable(ForeignTable):
 
     def hint(self, names: Sequence[str]) -> str:
         """Return the place of the line of names, or the delimiter of its cells."""
-        for number, line in enumerate(self._top):
-            for mark in (self._form.delimiter, *_DELIMITERS):
-                if set(names) <= {cell.strip().strip('"') for cell in line.split(mark)}:
-                    if mark != self._form.delimiter:
-                        return f"line {number + 1} has them: write delimiter: {mark!r} into the map"
-                    return f"line {number + 1} has them: write lines_before_names: {number}"
+        if found := self.place_of(names):
+            number, mark = found
+            if mark != self._form.delimiter:
+                return f"line {number + 1} has them: write delimiter: {mark!r} into the map"
+            return f"line {number + 1} has them: write lines_before_names: {number}"
         if self._form.named and all(_is_number(name) for name in self.names):
             return "its first line holds numbers: name its columns by place, from [0]"
         return ""
+
+    def place_of(self, names: Sequence[str]) -> tuple[int, str] | None:
+        """Return the first line that has ``names``, from 0, and its delimiter; None without one."""
+        for number, line in enumerate(self._top):
+            for mark in (self._form.delimiter, *_DELIMITERS):
+                if set(names) <= {cell.strip().strip('"') for cell in line.split(mark)}:
+                    return number, mark
+        return None
 
     def _probed(self) -> str:
         """Return the encoding of the file; FileError if it is not text."""
@@ -196,8 +205,8 @@ class TextTable(ForeignTable):
         try:
             return rows.read(kept)
         except ValueError:
-            # Joined logs repeat their line of names.
-            lines_with = [pair for pair in lines_with if pair[1].strip() != self._head]
+            if not self._stated_remedy:  # joined logs repeat their line of names
+                lines_with = [pair for pair in lines_with if pair[1].strip() != self._head]
             self.repeated_names += len(kept) - len(lines_with)
             try:
                 return rows.read([line for _, line in lines_with])
@@ -206,6 +215,8 @@ class TextTable(ForeignTable):
 
     def _check_foot(self, lines: list[str], first_number: int) -> None:
         """Raise FileError for a line below the table that is no sample, such as "mean;4.5"."""
+        if self._stated_remedy:
+            return  # a cell that is no number raised there
         known = {"", *(text.lower() for text in self._form.missing)}
         low = max(0, len(lines) - _FOOT_LINES)
         for number, line in enumerate(lines[low:], first_number + low):
@@ -230,11 +241,13 @@ class TextTable(ForeignTable):
                 bad = middle
         number, line = lines[good]
         return FileError(
-            f"{self}, line {number}: {shown(line.strip())} is no row; "
+            f"{self}, line {number}: {shown(line.strip())} is no row of numbers; "
             f"{self._remedy(number, line, rows)}"
         )
 
     def _remedy(self, number: int, line: str, rows: _Rows) -> str:
+        if self._stated_remedy:
+            return self._stated_remedy
         cells = self._cells(line)
         of_units = number == self._first_row + 1 and not any(map(_is_number, cells))
         if of_units and self._form.named and len(cells) == len(self.names):
@@ -316,7 +329,7 @@ class _Rows:
             cells=len(self._table.names),
             delimiter=mark,
             usecols=self._numeric,
-            comments=None,
+            comments=self._form.comment or None,
         )
         try:
             return read()
@@ -347,3 +360,103 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def rows_in(
+    lines: Iterable[str],
+    what: str,
+    remedy: str,
+    *,
+    above: int = 0,
+    cells: int | None = None,
+    **layout: Any,
+) -> FloatArray:
+    """Return the numbers of lines of text, (lines, columns); (0, …) of none.
+
+    above: number of lines of the file above these;  cells: in each line, None if unknown
+    layout: delimiter, comments, usecols, max_rows, converters of numpy.loadtxt
+
+    Raises FileError, which calls the text ``what`` and names the ``remedy``, for the first other
+    line.
+    """
+    seen = [above, ""]
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of an empty text; the caller reports it
+            return np.loadtxt(_rows(lines, seen, cells, layout), ndmin=2, **layout)
+    except (ValueError, OSError) as err:
+        # numpy takes one line at a time, so the error is in the last one.
+        line = shown(str(seen[1]).strip())
+        raise FileError(f"{what}, line {seen[0]}: {line} is no row of numbers; {remedy}") from err
+
+
+def _rows(
+    lines: Iterable[str], seen: list[Any], cells: int | None, layout: Mapping[str, Any]
+) -> Iterator[str]:
+    """Yield lines that are not blank, and note in ``seen`` number and text of the last one.
+
+    Raises ValueError for a line with another number of ``cells``: numpy ignores additional cells,
+    and a decimal comma makes one.
+    """
+    mark = layout.get("delimiter")
+    marks = -1 if cells is None or mark is None else cells - 1
+    for number, line in enumerate(lines, seen[0] + 1):
+        seen[0], seen[1] = number, line
+        if marks > 0 and line.count(mark) == marks:  # as nearly all are
+            yield line
+        elif line and not line.isspace():
+            if cells is not None:
+                _check_cells(line, mark, cells, layout.get("comments", "#") or ())
+            yield line
+
+
+def _check_cells(line: str, mark: str | None, cells: int, comments: str | Iterable[str]) -> None:
+    for sign in comments:
+        line = line.split(sign)[0]
+    found = line.split(mark)
+    while len(found) > cells and not found[-1].strip():
+        found.pop()
+    if line.strip() and len(found) != cells:
+        raise ValueError(f"it has {len(found)} cells, not {cells}")
+
+
+PLAIN = TableForm(comment="#")
+"""A table of our own documents: a first line of names, commas, decimal points."""
+
+_ROWS = (
+    "below the names stand numbers with decimal points, between commas, as many as there are "
+    "names; delete other lines"
+)
+
+
+def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
+    """Read the columns ``names`` of a CSV file, each (n,) in the units of the file.
+
+    Raises FileError for a file without these columns, or with invalid numbers.
+    """
+    table = TextTable(Path(path), PLAIN, _ROWS)
+    for name in names:
+        if table.names.count(name) != 1:
+            place = table.place_of(names)
+            hint = "name columns as that line does, each once"
+            if place and place[1] != PLAIN.delimiter:
+                hint = f"line {place[0] + 1} has them between {place[1]!r}: write commas, and "
+                hint += "decimal points"
+            elif place and place[0]:
+                hint = f"line {place[0] + 1} has them: delete the lines above it"
+            raise FileError(
+                f"{table} has {table.names.count(name)} columns {shown(name)} in its first line "
+                f"{shown(table.names)}; {hint}"
+            )
+    pieces = list(table.pieces(names, ()))
+    columns = [np.concatenate([piece[name] for piece in pieces] or [[]]) for name in names]
+    if len(columns[0]) < 2:
+        raise FileError(f"{table} has {len(columns[0])} lines of numbers; record more")
+    for name, column in zip(names, columns, strict=True):
+        if np.any(gone := np.isnan(column)):
+            raise FileError(
+                f"{table}: {name} has no reading in {int(np.sum(gone))} of {len(gone)} rows, "
+                f"first in row {int(np.argmax(gone)) + 1}; cut the record there"
+            )
+        SIGNAL.checked_all(column, FileError, f"{table}: {name}")
+    return columns

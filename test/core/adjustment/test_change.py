@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from omsm_ros.cli.calibration import change_text
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.repeatability import compare_calibrations
 from omsm_ros.core.identification.identify import identify
@@ -31,7 +32,7 @@ def calibrated(seed, later=0.0, count=10):
 def test_an_unchanged_machine_is_the_same(seed):
     change = compare_calibrations(calibrated(1), calibrated(seed, count=3))
     assert not change.changed
-    assert change.text().startswith("the same")
+    assert change_text(change).startswith("the same")
 
 
 def test_a_probe_that_got_later_is_seen_in_a_short_test():
@@ -39,7 +40,7 @@ def test_a_probe_that_got_later_is_seen_in_a_short_test():
     assert change.changed
     assert change.delay == pytest.approx(20e-6, abs=8e-6)
     assert change.delay_sigmas > 4
-    assert "changed: lag by +" in change.text()
+    assert "changed: lag by +" in change_text(change)
 
 
 def with_gain(calibration, gain):

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from omsm_ros.cli.calibration import change_text, repeatability_text
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.calibration.repeatability import (
@@ -98,7 +99,7 @@ def test_without_a_stated_uncertainty_nothing_is_known_of_the_gain() -> None:
     assert found.static_gain == pytest.approx(0.5)
     assert found.static_gain_sigmas == 0.0
     assert not found.changed
-    assert found.text().startswith("the same")
+    assert change_text(found).startswith("the same")
 
 
 def test_one_stated_uncertainty_is_enough_to_judge_the_gain() -> None:
@@ -122,7 +123,7 @@ def test_undetected_error_in_both_alike_does_not_excuse_a_change() -> None:
 
 
 def test_a_change_is_reported_with_sign_and_sigmas() -> None:
-    text = compare_calibrations(late(), late(LAG - 20e-6, 1.0001)).text()
+    text = change_text(compare_calibrations(late(), late(LAG - 20e-6, 1.0001)))
     assert text.startswith("changed: lag by -20.0 µs (7.1 sigma), static gain by +100 ppm (17.7")
 
 
@@ -196,7 +197,7 @@ def test_order_of_a_series_does_not_matter() -> None:
     series = [late(LAG + k * LAG_U, 1.0 + k**2 * GAIN_U) for k in (0, 2, -1, 1)]
     found, turned = repeatability(series), repeatability(series[::-1])
     assert turned.p_value == pytest.approx(found.p_value, rel=1e-9)
-    assert turned.text() == found.text()
+    assert repeatability_text(turned) == repeatability_text(found)
 
 
 def test_a_gain_that_scatters_alone_is_found() -> None:
@@ -205,4 +206,4 @@ def test_a_gain_that_scatters_alone_is_found() -> None:
     assert not found.repeatable
     assert found.delay.ratio == pytest.approx(0.0, abs=1e-9)
     assert found.static_gain.ratio == pytest.approx(5.0)
-    assert "scatter more than they state" in found.text()
+    assert "scatter more than they state" in repeatability_text(found)

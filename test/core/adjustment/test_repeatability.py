@@ -8,6 +8,7 @@ import pytest
 from certified import certified_by
 from scipy import stats
 
+from omsm_ros.cli.calibration import repeatability_text
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.calibration.repeatability import repeatability
@@ -55,7 +56,7 @@ def test_an_unchanged_twin_repeats_as_well_as_it_states():
     found = repeatability([calibrated(seed) for seed in range(COUNT)])
     assert found.repeatable
     assert found.count == COUNT
-    assert found.text().startswith("6 calibrations as repeatable as stated")
+    assert repeatability_text(found).startswith("6 calibrations as repeatable as stated")
     # The standard deviation of six is known to 32 %: three of its sigmas.
     assert 0.2 < found.delay.ratio < 2.0
     assert 0.2 < found.static_gain.ratio < 2.0
@@ -69,7 +70,7 @@ def test_a_probe_whose_delay_wanders_does_not_repeat():
     wandering = [calibrated(seed, later=20e-6 * (seed % 2)) for seed in range(COUNT)]
     found = repeatability(wandering)
     assert not found.repeatable
-    assert "scatter more" in found.text()
+    assert "scatter more" in repeatability_text(found)
     # Half at 0, half at 20 µs: 10 µs apart from their mean, n - 1.
     assert found.delay.deviation == pytest.approx(10e-6 * np.sqrt(6 / 5), rel=0.35)
 
@@ -99,8 +100,8 @@ def test_scatter_of_the_response_is_that_of_its_lag():
 def test_without_a_stated_gain_uncertainty_its_ratio_is_unknown():
     found = repeatability([replace(c, certificate=Certificate()) for c in drawn(3)])
     assert np.isnan(found.static_gain.ratio)
-    assert "nan" not in found.text()
-    assert found.text().count("of stated") == 1
+    assert "nan" not in repeatability_text(found)
+    assert repeatability_text(found).count("of stated") == 1
     assert 0 < found.p_value <= 1
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.calibration.trend import outliers, trend
+from omsm_ros.core.calibration.repeatability import outliers, trend
 
 
 def test_one_part_in_forty_that_is_off_stands_out():

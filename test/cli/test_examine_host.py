@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
-from omsm_ros.pipelines import examine_host as host
-from omsm_ros.pipelines.examine_host import DOUBTFUL, FAULTY, FINE
+from omsm_ros.cli import doctor as host
+from omsm_ros.cli.doctor import DOUBTFUL, FAULTY, FINE
 
 
 @pytest.fixture

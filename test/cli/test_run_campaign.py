@@ -11,11 +11,11 @@ from itertools import islice
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.cli import campaign as campaign
+from omsm_ros.cli.campaign import CRASHED, DONE, REFUSED, Entry, load_campaign, run_campaign
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, calibration_file
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.pipelines import campaign as campaign
-from omsm_ros.pipelines.campaign import CRASHED, DONE, REFUSED, Entry, load_campaign, run_campaign
 
 OPTIONS = ("--no-report",)
 

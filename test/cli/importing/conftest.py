@@ -1,10 +1,10 @@
-"""Fixtures of the pipeline tests."""
+"""The importer of the files of a folder."""
 
 import pytest
 
+from omsm_ros.cli.importing import import_recording
 from omsm_ros.io import bags
 from omsm_ros.io.tables.table import load_column_map
-from omsm_ros.pipelines.import_recording import import_recording
 from omsm_ros.pipelines.recording import Recording
 
 

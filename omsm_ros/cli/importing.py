@@ -1,15 +1,18 @@
-"""Convert a recording of another program to a bag."""
+"""The command import: convert recordings of other programs to a bag."""
 
 from __future__ import annotations
 
+import argparse
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
+from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.core.streams.imported_columns import (
     AXES,
@@ -29,8 +32,7 @@ from omsm_ros.core.streams.imported_columns import (
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import atomic_bag
-from omsm_ros.io.tables.open_tables import open_tables
-from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
+from omsm_ros.io.tables.table import ForeignTable, TableForm, load_column_map, stated_unit
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import shown
 from omsm_ros.units import DATE
@@ -138,11 +140,13 @@ def import_recording(
             for table in open_tables(path, written, mapped.names((*AXES, *PROBE))):
                 opened.callback(table.close)
                 sources.append(_Source(table, mapped))
-        _import(sources, mapped, out, progress)
+        _write_bag(sources, mapped, out, progress)
         return [source.found for source in sources]
 
 
-def _import(sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: Progress) -> None:
+def _write_bag(
+    sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: Progress
+) -> None:
     chains: dict[tuple[str, ...], list[_Source]] = {}
     for source in sources:
         chains.setdefault(source.channels, []).append(source)
@@ -335,3 +339,90 @@ class _Source:
         time = self._mapped.columns.get("time")
         dates = [n for n in names if time is not None and time.unit == DATE and n == time.name]
         return self._table.pieces(names, dates)
+
+
+def _declare_import(add: Arguments) -> None:
+    add("files", "FILE", nargs="+")
+    add("--map", "MAP.yaml", "columns, units, signs, period", required=True)
+    add("--out", "BAG.mcap", required=True)
+
+
+def _import(args: argparse.Namespace) -> Facts:
+    mapped, form = load_column_map(args.map)
+    with progress_bar("importing", args.json, " samples") as progress:
+        found = import_recording(args.files, mapped, form, args.out, progress)
+    return {"bag": str(args.out), "files": [asdict(file) for file in found]}
+
+
+def _show_import(facts: Facts) -> None:
+    for file in facts["files"]:
+        kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
+        say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
+        for count, meaning in (
+            ("missing", "missing trigger numbers"),
+            ("invalid", "invalid probe readings"),
+            ("lost", "rows with an axis that is not a number"),
+            ("repeated_names", "repeated header lines"),
+            ("passed_over", "messages without any of the columns"),
+        ):
+            if file[count]:
+                say(f"    {meaning}: {file[count]}")
+    if any(file["own_clock"] for file in facts["files"]):
+        say("probe and axes have separate clocks: identify and correct with --by-stamps")
+    table([written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")])
+
+
+COMMANDS = (CliCommand("import", _declare_import, _import, _show_import),)
+
+
+_ARRAYS = (".npy", ".npz", ".mat", ".h5", ".hdf5")
+_BAGS = (".mcap", ".bag", ".db3")
+
+
+def open_tables(path: Path, form: TableForm, wanted: Sequence[str]) -> list[ForeignTable]:
+    """Return the tables of a recording that have some of the columns ``wanted``.
+
+    A file has one table; a bag has one for each topic. Raises FileError if it cannot be read, or
+    has none of the columns.
+    """
+    suffix = path.suffix.lower()
+    if suffix in _BAGS or (path / "metadata.yaml").is_file():
+        return _topics(path.parent if suffix == ".db3" else path, wanted)
+    table = _table(path, suffix, form)
+    if not any(table.names.count(name) == 1 for name in wanted):
+        table.close()
+        hint = table.hint(wanted) or "name the columns as it does, each once"
+        held = table.names[:20] or "no column of numbers at all"
+        raise FileError(f"{table} has none of the columns {list(wanted)}, but {held}; {hint}")
+    return [table]
+
+
+def _table(path: Path, suffix: str, form: TableForm) -> ForeignTable:
+    # Imported when needed: some are optional packages, and all take time to load.
+    if suffix in _ARRAYS:
+        from omsm_ros.io.tables.array_table import ArrayTable
+
+        return ArrayTable(path)
+    if suffix == ".tdms":
+        from omsm_ros.io.tables.array_table import TdmsTable
+
+        return TdmsTable(path)
+    from omsm_ros.io.tables.text_table import TextTable
+
+    return TextTable(path, form)
+
+
+def _topics(path: Path, wanted: Sequence[str]) -> list[ForeignTable]:
+    from omsm_ros.io.tables.topic_table import ForeignBag
+
+    bag = ForeignBag(path)
+    topics = bag.topics()
+    found: list[ForeignTable] = [t for t in topics if set(t.names) & set(wanted)]
+    if not found:
+        bag.close()
+        held = [name for t in topics for name in t.names if name.startswith("/")]
+        raise FileError(
+            f"bag {str(path)!r} has none of the columns {list(wanted)}, but {held[:20]}; "
+            "name them by topic and field"
+        )
+    return found

@@ -1,13 +1,16 @@
-"""Write a cloud or map in the format of another program."""
+"""The command export: write a cloud or map in the format of another program."""
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.comparison.resampling import on_grid
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
@@ -20,6 +23,8 @@ from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
 from omsm_ros.io.maps.x3p_file import write_x3p
 from omsm_ros.io.results import CloudFile
+from omsm_ros.quantities import SPACING
+from omsm_ros.readable import count, quantity
 from omsm_ros.units import LengthUnits
 
 AS_POINTS = (".csv", ".xyz", ".h5", ".hdf5", ".ply", ".pcd")
@@ -116,3 +121,35 @@ def _write_map(
         "resampling": method,
         "interpolation_error": error,
     }
+
+
+def _declare_export(add: Arguments) -> None:
+    add("source", Path, "a result folder, a cloud or a map of any format")
+    add(
+        "--out",
+        "FILE",
+        "points: .csv .xyz .h5 .ply .pcd; a map: .x3p, .dat (grid sag)",
+        required=True,
+    )
+    add.unit()
+    add("--spacing", SPACING, "grid spacing for scattered points [m]")
+
+
+def _export(args: argparse.Namespace) -> Facts:
+    return {"source": str(args.source), **export(args.source, args.out, args.unit, args.spacing)}
+
+
+def _show_export(facts: Facts) -> None:
+    rows = [("points", count(facts["points"]))]
+    if "resampling" in facts:
+        spacing = " × ".join(quantity(part, "m", 4) for part in facts["spacing"])
+        rows += [
+            ("map", f"{facts['columns']} × {facts['rows']} pixels of {spacing}, "
+                    f"{count(facts['missing'])} without a height"),
+            ("resampling", facts["resampling"]),
+            ("resampling error", f"at most {quantity(facts['interpolation_error'], 'm', 2)} rms"),
+        ]  # fmt: skip
+    table([*rows, written([facts["file"]])])
+
+
+COMMANDS = (CliCommand("export", _declare_export, _export, _show_export),)

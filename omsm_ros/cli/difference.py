@@ -1,7 +1,8 @@
-"""Compare two measurements of one part, also of another instrument: ``difference.json``."""
+"""Compare two measurements of one part, also of another instrument: the command difference."""
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone
@@ -10,6 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.fit_option import dofs
 from omsm_ros.core.comparison.agreement import (
     COVERAGE_FACTOR,
     FIGURES,
@@ -18,7 +22,7 @@ from omsm_ros.core.comparison.agreement import (
     figures_of,
 )
 from omsm_ros.core.comparison.compare import Comparison, SideSummary, compare_measurements_of_part
-from omsm_ros.core.comparison.matching import SEATED
+from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, ordered_dofs
 from omsm_ros.core.comparison.resampling import RADIUS_CELLS, TREND_DEGREE
 from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.correction.systematic import ScanFields
@@ -26,13 +30,16 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.surface.deviation import deviation
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import DIFFERENCE, REPORT, SUMMARY, SYSTEMATIC, save_json, save_text
-from omsm_ros.io.folders import read_result
+from omsm_ros.io.folders import read_result, result_folder
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import load_fields
 from omsm_ros.pipelines.form import registered
-from omsm_ros.readable import date_text
+from omsm_ros.quantities import SPACING, UNCERTAINTY
+from omsm_ros.readable import count, date_text, figure, percent, plain, quantity
 from omsm_ros.units import LengthUnits
 
 MAP = "difference.csv"
@@ -212,3 +219,109 @@ def _terms(agreement: ComparisonAgreement | None) -> dict[str, Any] | None:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _dof_argument(text: str) -> tuple[str, ...]:
+    """Parse the degrees of freedom in which the second measurement is moved onto the first."""
+    if text == "auto":
+        return tuple(name for name in MATCHING_PARAMETERS if name != "power")
+    try:
+        return ordered_dofs(tuple(filter(None, text.split(","))))
+    except ConfigurationError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def _declare_difference(add: Arguments) -> None:
+    add("a", Path, "a result folder, a cloud or a map of any format")
+    add("b", Path, "another of the same part, moved onto the first")
+    add("--out", "DIR", required=True)
+    add(
+        "--fit",
+        _dof_argument,
+        f"pose parameters to fit, of {','.join(MATCHING_PARAMETERS)}; 'auto': all but power "
+        f"that the surface determines; default {','.join(SEATED)}",
+        default=SEATED,
+        metavar="PARAMETERS",
+    )
+    add("--nominal", "SURFACE.yaml", "surface to subtract from both first")
+    add(
+        "--register",
+        dofs,
+        "register each to the nominal surface first, as 'omsm form' does: 'auto', or of "
+        "piston,tip,tilt,x,y,clocking,power",
+        metavar="PARAMETERS",
+    )
+    add(
+        "--uncertainty",
+        UNCERTAINTY,
+        "standard uncertainty of the heights of a file that states none [m]",
+    )
+    add(
+        "--drift",
+        UNCERTAINTY,
+        "standard deviation of the drift at the end of a scan [m]; default: from its sources, "
+        "or estimated from the difference",
+    )
+    add.unit()
+    add("--spacing", SPACING, "spacing of the compared grid [m]")
+    add(
+        "--correlation-length",
+        SPACING,
+        "correlation length of errors of unknown form [m]; default: half the radius",
+    )
+
+
+def _difference(args: argparse.Namespace) -> Facts:
+    if args.register and args.nominal is None:
+        raise ConfigurationError("--register needs the surface; give --nominal SURFACE.yaml")
+    options = ComparisonOptions(
+        dofs=args.fit,
+        uncertainty=args.uncertainty,
+        drift=args.drift,
+        units=args.unit,
+        spacing=args.spacing,
+        length=args.correlation_length,
+        register=args.register,
+    )
+    nominal = load_surface(args.nominal) if args.nominal else None
+    found, facts = compare_measurements(args.a, args.b, options, nominal)
+    with result_folder(args.out, (MAP, REPORT, DIFFERENCE)) as out:
+        write_difference(out, found, facts)
+    files = {"difference": DIFFERENCE, "map": MAP, "report": REPORT}
+    return {**facts, "files": files, "out": str(args.out)}
+
+
+def _show_difference(facts: Facts) -> None:
+    found = facts["difference"]
+    rows = [("verdict", facts["verdict"])]
+    rows += [("because", text) for text in facts["reasons"]]
+    rows += [("but", text) for text in facts["reservations"]]
+    rows += [
+        ("difference", f"{_length(found['peak_to_valley'])} PV, "
+                       f"{_length(found['robust_peak_to_valley'])} PV of 99.5 %, "
+                       f"{_length(found['rms'])} rms"),
+        ("uncertainty", "not evaluated" if found["uncertainty"] is None else
+                        f"{_length(found['uncertainty'])} rms (k = 1)"),
+        ("grid", f"{count(found['places'])} places, {_length(facts['resampling']['spacing'])} "
+                 f"apart, on {percent(found['shared_area'], 3)} of the smaller area"),
+    ]  # fmt: skip
+    for name, n in facts["e_n"].items():
+        words = (
+            "not evaluated"
+            if n["e_n"] is None
+            else f"{plain(n['e_n'])} (U {_length(n['expanded'])})"
+        )
+        label = f"E_n of {figure(name)}"
+        rows.append((label, f"{words}: {_length(n['a'])} and {_length(n['b'])}"))
+    if facts["within"] is not None:
+        rows.append(("points", f"|E_n| < 1 on {percent(facts['within'], 3)} of the area"))
+    for name in ("a", "b"):
+        rows += [(f"note on {name.upper()}", text) for text in facts[name]["notes"]]
+    table([*rows, written(facts["files"].values(), facts["out"])])
+
+
+def _length(value: float) -> str:
+    return quantity(value, "m", 4)
+
+
+COMMANDS = (CliCommand("difference", _declare_difference, _difference, _show_difference),)

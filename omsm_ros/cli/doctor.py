@@ -1,7 +1,8 @@
-"""Check whether this computer can run a cell: Python, packages, ROS, ports, clock, disk."""
+"""The command doctor: check whether this computer can run a cell, with remedies."""
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import math
 import os
@@ -9,10 +10,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.command import CliCommand, Facts, say
 from omsm_ros.errors import FEWEST_OPEN_FILES, MORE_FILES, open_files
 from omsm_ros.instruments.transport import serial_ports
 
@@ -201,3 +204,30 @@ def _disk(folder: Path) -> HostCheck:
     if hours < _ENOUGH_HOURS:
         return HostCheck("disk", DOUBTFUL, found, "free some space, or record elsewhere")
     return HostCheck("disk", FINE, found)
+
+
+_MARKS = {FINE: "ok", DOUBTFUL: "??", FAULTY: "NO"}
+
+
+def _declare_doctor(add: Arguments) -> None:
+    add("--port", str, "serial port that must exist", default="", metavar="PATH")
+    add("--folder", "DIR", "folder for recordings", default=Path())
+
+
+def _doctor(args: argparse.Namespace) -> Facts:
+    return {"checks": [asdict(check) for check in examine_host(args.folder, args.port)]}
+
+
+def _show_doctor(facts: Facts) -> None:
+    for check in facts["checks"]:
+        say(f"{_MARKS[check['state']]}  {check['name']:<18} {check['found']}")
+        if check["remedy"]:
+            say(f"    {'':<18} → {check['remedy']}")
+
+
+def _faulty(facts: Facts) -> str:
+    names = [check["name"] for check in facts["checks"] if check["state"] == FAULTY]
+    return f"not ready: {', '.join(names)}; see the remedies above" if names else ""
+
+
+COMMANDS = (CliCommand("doctor", _declare_doctor, _doctor, _show_doctor, _faulty),)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from omsm_ros.cli import main
+from omsm_ros.cli.form import Scan, show_surface
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import Sphere
 from omsm_ros.errors import DataError
-from omsm_ros.pipelines.surface_tools import Scan, show_surface
 
 SCAN = Scan(0.01, 1e-4, 30.0)
 

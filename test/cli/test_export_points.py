@@ -10,11 +10,11 @@ import pytest
 
 from omsm_ros.cli import main
 from omsm_ros.cli.command_line import BAD_INPUT, DONE
+from omsm_ros.cli.export import AS_MAP, AS_POINTS, export
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.errors import FileError
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import PlyWriter
-from omsm_ros.pipelines.export_points import AS_MAP, AS_POINTS, export
 
 
 def height(x, y):

@@ -1,0 +1,78 @@
+"""The command spectrum: lines in scans of one part, and their sources."""
+
+from __future__ import annotations
+
+import argparse
+
+from omsm_ros.cli.arguments import Arguments, cell_of, json_object
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
+from omsm_ros.io.calibration_file import load_calibration
+from omsm_ros.io.descriptions import load_surface
+from omsm_ros.pipelines.correct import Admission
+from omsm_ros.pipelines.publish import publish_spectra
+from omsm_ros.pipelines.spectrum import SpectrumOptions
+from omsm_ros.quantities import FREQUENCY
+from omsm_ros.readable import plain, quantity
+
+
+def _declare_spectrum(add: Arguments) -> None:
+    add.bags("scans", nargs="+", metavar="SCAN", help="bags of one part")
+    add("--calibration", "CAL.json", "correct the scans with it first")
+    add("--out", "DIR", required=True)
+    add("--nominal", "SURFACE.yaml", "surface to subtract first")
+    add(
+        "--stop",
+        FREQUENCY,
+        "remove this band from the heights, with zero phase; may be repeated",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("FROM_HZ", "TO_HZ"),
+    )
+    add("--settings", json_object, "settings of these scans", metavar="JSON")
+    add.polarity()
+    add("--no-report", None, "write results without a report")
+    add.override()
+
+
+def _spectrum(args: argparse.Namespace) -> Facts:
+    options = SpectrumOptions(
+        calibration=load_calibration(args.calibration) if args.calibration else None,
+        admission=Admission(args.settings, args.override),
+        nominal=load_surface(args.nominal) if args.nominal else None,
+        stop=tuple((low, high) for low, high in args.stop),
+        polarity=args.polarity,
+    )
+    with progress_bar("reading", args.json) as progress:
+        bags = [cell_of(path, args) for path in args.scans]
+        facts = publish_spectra(
+            bags, options, args.out, report=not args.no_report, progress=progress
+        )
+    return {**facts, "out": str(args.out)}
+
+
+def _show_spectrum(facts: Facts) -> None:
+    for scan in facts["scans"]:
+        say(f"{scan['name']}: {scan['samples']['analysed']} points, "
+              f"{quantity(scan['noise']['rms'], 'm')} rms without its lines")  # fmt: skip
+        table([_peak_row(peak) for peak in scan["peaks"]] or [("", "no line beyond 3 σ")])
+        if stopped := scan["band_stop"]:
+            say(f"band stop, zero phase: {quantity(stopped['rms_before'], 'm')} → "
+                  f"{quantity(stopped['rms_after'], 'm')} rms")  # fmt: skip
+    table([written(facts["files"].values(), facts["out"])])
+
+
+def _peak_row(peak: Facts) -> tuple[str, str]:
+    where = quantity(peak["frequency"], "Hz", 5)
+    if peak["frequency"] is None:
+        where = quantity(peak["wavelength_along_path"], "m", 4)
+    true = peak["true_frequency"]
+    what = f"{peak['kind']} ({quantity(true, 'Hz', 5)})" if true else peak["kind"]
+    if peak["true_wavelength"]:
+        what += f" ({quantity(peak['true_wavelength'], 'm', 4)})"
+    why = "; ".join([*peak["evidence"], *([peak["needs"]] if peak["needs"] else [])])
+    size = quantity(peak["amplitude"], "m")
+    return f"  {where}", f"{size}, {plain(peak['significance'])} σ: {what}: {why}"
+
+
+COMMANDS = (CliCommand("spectrum", _declare_spectrum, _spectrum, _show_spectrum),)
