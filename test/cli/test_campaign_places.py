@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.cli import campaign as campaign
+from omsm_ros.cli import campaign
 from omsm_ros.cli import main
 from omsm_ros.cli.campaign import DONE, Entry, bags_below, load_campaign, run_campaign
 from omsm_ros.errors import ConfigurationError, FileError

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import command_line, start
-from omsm_ros.cli import doctor as examine_host
+from omsm_ros.cli import command_line, doctor, start
 
 
 def run(capsys, *words):
@@ -167,9 +166,9 @@ def test_doctor_looks_for_the_port_that_is_named(capsys, monkeypatch):
 
     def examine(folder, port):
         asked.append((str(folder), port))
-        return [examine_host._serial(port)]
+        return [doctor._serial(port)]
 
-    monkeypatch.setattr(start, "examine_host", examine)
+    monkeypatch.setattr(doctor, "examine_host", examine)
     status, out, err = run(capsys, "doctor", "--port", "/dev/ttyNONE", "--folder", "/data")
     assert status == 2
     assert "no /dev/ttyNONE" in out

@@ -8,8 +8,7 @@ from contextlib import contextmanager
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import doctor as examine_host
-from omsm_ros.cli import recordings, start
+from omsm_ros.cli import doctor, recordings
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 
@@ -102,7 +101,7 @@ def test_a_library_that_may_open_no_more_files_is_no_defect(capsys, monkeypatch)
 
 
 def test_doctor_names_the_limit_of_open_files(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(start, "examine_host", lambda *_: [examine_host._open_files()])
+    monkeypatch.setattr(doctor, "examine_host", lambda *_: [doctor._open_files()])
     assert cli.main(["doctor"]) == 0
     capsys.readouterr()
     with open_files_at_most(0) as most:
@@ -117,9 +116,9 @@ def test_doctor_names_the_limit_of_open_files(capsys, monkeypatch, tmp_path):
 
 
 def test_discovery_is_not_tried_with_too_few_files(monkeypatch):
-    monkeypatch.setattr(examine_host, "open_files", lambda: 12)
-    monkeypatch.setattr(examine_host.subprocess, "run", None)
-    check = examine_host._discovery()
+    monkeypatch.setattr(doctor, "open_files", lambda: 12)
+    monkeypatch.setattr(doctor.subprocess, "run", None)
+    check = doctor._discovery()
     assert (check.state, check.found) == ("faulty", "not evaluated: too few open files")
     assert "ulimit" in check.remedy
 

@@ -11,7 +11,7 @@ from itertools import islice
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import campaign as campaign
+from omsm_ros.cli import campaign
 from omsm_ros.cli.campaign import CRASHED, DONE, REFUSED, Entry, load_campaign, run_campaign
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, calibration_file

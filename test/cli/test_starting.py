@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli import start
+from omsm_ros.cli import doctor
 from omsm_ros.cli.doctor import HostCheck
 
 
@@ -24,7 +24,7 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
         HostCheck("disk", "fine", "room"),
         HostCheck("ROS 2", "faulty", "rclpy without omsm_msgs", "build it"),
     ]
-    monkeypatch.setattr(start, "examine_host", lambda folder, port: checks)
+    monkeypatch.setattr(doctor, "examine_host", lambda folder, port: checks)
     assert cli.main(["doctor", "--folder", str(tmp_path)]) == 2
     out, err = capsys.readouterr()
     assert "NO  ROS 2" in out
