@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.cli import campaign
-from omsm_ros.cli import main
+from omsm_ros.cli import campaign, main
 from omsm_ros.cli.campaign import DONE, Entry, bags_below, load_campaign, run_campaign
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io.calibration_file import save_calibration
