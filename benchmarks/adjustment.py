@@ -86,7 +86,7 @@ def scan_data(
     made: Recording, calibration: Calibration, latency: float, begin: float, clocking: float
 ) -> ScanData:
     """Correct one scan, and return it as the adjustment takes it."""
-    corrector = Corrector(calibration, CorrectionOptions(lateral_lag=latency))
+    corrector = Corrector(calibration, CorrectionOptions(probe_latency=latency))
     parts = []
     for axes, distance in blocks_of(made):
         corrector.push_axes(axes)

@@ -210,7 +210,7 @@ def _correlation(covariance: np.ndarray) -> np.ndarray:
     return covariance / np.outer(scale, scale)
 
 
-def lateral_lag() -> list[Row]:
+def probe_latency() -> list[Row]:
     """Return the error of a latency of 0.34 ms from scans of opposite spindle directions."""
     latency = 0.34e-3
     prompt = TransferFunction(np.ones(1), np.array([1.0, 1 / (2 * np.pi * 5000)]))
@@ -224,16 +224,16 @@ def lateral_lag() -> list[Row]:
     scans = []
     for speed, seed in ((30.0, 1), (-30.0, 2)):
         made = scan(speed, seed, cell)
-        points = corrected(calibration, made.axes, made.distance, lateral_lag=0.0)
+        points = corrected(calibration, made.axes, made.distance, probe_latency=0.0)
         scans.append(read_scan(made.axes, points))
     found = reversal(scans, calibration)
     error = abs(found.lag - latency)
-    put_right = corrected(calibration, made.axes, made.distance, lateral_lag=found.lag)
+    put_right = corrected(calibration, made.axes, made.distance, probe_latency=found.lag)
     before, after = (_surface_rms(points) / cell.probe.noise for points in (points, put_right))
     return [
-        at_most("lateral lag, error / stated uncertainty", error / found.uncertainty, "1", 2.0),
-        at_most("lateral lag, stated uncertainty", found.uncertainty / MICROSECOND_S, "us", 1.0),
-        at_most("lateral lag corrected: surface rms / probe noise", after, "1", 2.0, before),
+        at_most("probe latency, error / stated uncertainty", error / found.uncertainty, "1", 2.0),
+        at_most("probe latency, stated uncertainty", found.uncertainty / MICROSECOND_S, "us", 1.0),
+        at_most("probe latency corrected: surface rms / probe noise", after, "1", 2.0, before),
     ]
 
 
@@ -247,7 +247,7 @@ STUDIES: tuple[Callable[[], list[Row]], ...] = (
     accuracy_with_identified_dynamics,
     discretisation,
     honesty,
-    lateral_lag,
+    probe_latency,
 )
 
 

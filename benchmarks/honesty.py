@@ -93,5 +93,5 @@ def _judged(calibration: Calibration, motion: KnownMotion) -> Found:
     return Found(
         float(np.sqrt(np.mean(error[used] ** 2))),
         budget["dynamics"],
-        budget["could_hide"],
+        budget["undetected_model_error"],
     )

@@ -64,7 +64,7 @@ def _points(made: Recording, known: Calibration, **options: object) -> SurfacePo
 
 def _pair(seed: int, errors: Disturbances, known: Calibration) -> list[ScanColumns]:
     scans = (_scan(rpm, 1000 * seed + k, errors) for k, rpm in enumerate((30.0, 60.0)))
-    return [read_scan(s.axes, _points(s, known, lateral_lag=0.0)) for s in scans]
+    return [read_scan(s.axes, _points(s, known, probe_latency=0.0)) for s in scans]
 
 
 def _error_left(known: Calibration, share: float) -> float:

@@ -113,7 +113,7 @@ def _measured(total: int) -> Iterator[Row]:
     view = LiveView()
     with _page(view) as page:
         _add(view, 0, _PAPER_POINTS)
-        _wait(page, f"livePage.frames > 0 && livePage.told.points === {_PAPER_POINTS}")
+        _wait(page, f"livePage.frames > 0 && livePage.latest.points === {_PAPER_POINTS}")
         drawing = np.array(page.evaluate(_PAN))
         name = f"live page, {_PAPER_POINTS} points moved by hand"
         yield at_least(f"{name}: frames a second", page.evaluate(_FRAMES), "1/s", 20.0)
@@ -122,7 +122,7 @@ def _measured(total: int) -> Iterator[Row]:
         begin = time.process_time()
         _add(view, _PAPER_POINTS, total)
         took = time.process_time() - begin
-        _wait(page, f"livePage.told.points === {total}")
+        _wait(page, f"livePage.latest.points === {total}")
         after = _resident(), page.evaluate(_HEAP_MIB)
         text = f"live page, {total} points: "
         yield at_most(f"{text}memory grown, server", after[0] - before[0], "MiB", 30.0)

@@ -39,7 +39,9 @@ def commands() -> str:
         lines += [f"## omsm {name}", "", (sub.description or "").strip().capitalize() + ".", ""]
         lines += ["```text", sub.format_usage().strip(), "```", ""]
         lines += _examples(name)
-        rows = [_argument(a) for a in sub._actions if a.dest != "help"]
+        rows = [
+            _argument(a) for a in sub._actions if a.dest != "help" and a.help != argparse.SUPPRESS
+        ]
         lines += ["| argument | meaning |", "|---|---|", *rows, ""]
         if sub.epilog:
             lines += [sub.epilog, ""]

@@ -128,7 +128,7 @@ def correct(
     from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
     from omsm_ros.core.correction.surface_points import join_points
 
-    options = CorrectionOptions(polarity=polarity, lateral_lag=latency, surface=nominal)
+    options = CorrectionOptions(polarity=polarity, probe_latency=latency, surface=nominal)
     corrector, parts = Corrector(calibration.core, options), []
     for axes, distance in recording.blocks():
         corrector.push_axes(axes)

@@ -207,7 +207,7 @@ PER_TURN = Quantity("waves a turn", "", 1, 10_000, "negative turns against it", 
 SPIRAL_PLACES = Quantity("places a turn", "", 3, 10_000, "360 is usual", whole=True)
 PERIOD = Quantity("period", "m", 1e-9, 100.0, "give it in metres")
 CORRELATION_TIME = Quantity("correlation time", "s", 1e-3, 1e7, "give it in seconds")
-LAG = Quantity("lateral lag", "s", 0.0, 1.0, "give it in seconds")
+LAG = Quantity("probe latency", "s", 0.0, 1.0, "give it in seconds")
 
 COUNTER_OFFSET = Quantity(
     "counter offset", "samples", -(2**53), 2**53, "give it in samples", whole=True

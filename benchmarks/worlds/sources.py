@@ -128,7 +128,7 @@ SOURCES = (
         lambda m, v, s: m.plus("loop", effects.line(143.7, 2**0.5 * abs(v), s.exposure)),
     ),
     Source("static_gain", 1e-4, "1", _add("probe", lambda v: lambda now, d: v * d)),
-    Source("lateral_lag", 1e-5, "s", _set("latency", LATENCY_S)),
+    Source("probe_latency", 1e-5, "s", _set("latency", LATENCY_S)),
     Source("lag_change", 3e-7, "s", _add("structure", lambda v: effects.lagging(lambda now: v))),
     Source("motion_error", 0.5e-9, "m", _add("structure", lambda v: effects.playing(2 * abs(v)))),
     Source("tilt", 2e-5, "rad", _pass),
@@ -235,7 +235,7 @@ def drawn(seed: int, radius: float, share: float = 1.0) -> Shop:
 def declared(left_out: str = "") -> dict[str, object]:
     """Return the sources as a careful shop states them, but for those named ``left_out``.
 
-    ``latency``: from the middle of an exposure to its trigger [s]; ``lateral_lag`` is how well it
+    ``latency``: from the middle of an exposure to its trigger [s]; ``probe_latency`` is how well it
     is known. ``abbe_arm`` [m] belongs to ``pitch``.
     """
     rows = [source.row() for source in SOURCES if source.name != left_out]

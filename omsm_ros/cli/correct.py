@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from argparse import SUPPRESS
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -71,10 +72,11 @@ def _declare_correct(add: Arguments) -> None:
         "measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry",
     )
     add(
-        "--lateral-lag",
+        "--probe-latency",
         LAG,
         "latency of the probe against X and C [s]; default: of the calibration",
     )
+    add("--lateral-lag", LAG, SUPPRESS, dest="probe_latency")  # its former name
     _declare_uncertain(add)
     add("--settings", json_object, "settings of this scan", metavar="JSON")
     add(
@@ -133,7 +135,7 @@ def _correct(args: argparse.Namespace) -> Facts:
     options = CorrectionOptions(
         polarity=args.polarity,
         accept_other_rate=args.override,
-        lateral_lag=args.lateral_lag,
+        probe_latency=args.probe_latency,
         geometry=geometry_of(args.geometry),
         pitch=load_pitch(args.pitch) if args.pitch else None,
         trigger=trigger_of(args),

@@ -173,7 +173,7 @@ def compensate_form(
         "rms_after": found.after,
         "largest_offset": float(np.max(np.abs(found.offset[known]))),
         "largest_uncertainty": float(np.max(found.uncertainty[known])),
-        "surer_than_zero": float(np.mean(sure)),
+        "significant_share": float(np.mean(sure)),
         "warnings": _warnings(float(np.mean(sure)), found.before, found.after),
         "sign": "add offset_m to the height of the surface that is cut, along z, positive away from"
         " the part; x and y are those of the nominal surface",

@@ -92,7 +92,7 @@ def _selfcal(args: argparse.Namespace) -> Facts:
         "residual": found.residual,
         "left_on_this_surface": found.followed,
         "disagreement": found.agreement.disagreement,
-        "not_told": [*map(str, undetermined(found))],
+        "unidentifiable": [*map(str, undetermined(found))],
         "speeds_rpm": [speed / RPM_RAD_S for speed in found.speeds],
         "samples": [account.as_dict() for account in accounts],
         "calibration": str(path),
@@ -131,7 +131,7 @@ def _show_selfcal(facts: Facts) -> None:
             ("residual error", f"{quantity(facts['left_on_this_surface'], 'm')} rms on this "
                                "surface (k = 1)"),
             ("scans differ by", f"{quantity(facts['disagreement'], 'm')} rms beyond noise"),
-            *(("not identifiable", text) for text in facts["not_told"]),
+            *(("not identifiable", text) for text in facts["unidentifiable"]),
             written([facts["calibration"]]),
         ]
     )  # fmt: skip

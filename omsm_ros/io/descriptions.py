@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from omsm_ros.core.correction.machine_sources import MachineSources, StatedSource
-from omsm_ros.core.correction.source_kinds import KINDS
+from omsm_ros.core.correction.source_kinds import FORMER_NAMES, KINDS
 from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.streams.blocks import FloatArray
@@ -135,6 +135,7 @@ def load_sources(path: Path | str) -> MachineSources:
 def _stated(item: Mapping[str, Any]) -> StatedSource:
     own = {name: item[name] for name in (*_OWN, "distribution") if name in item}
     unit = own.pop("unit")
+    own["source"] = FORMER_NAMES.get(own["source"], own["source"])
     stated = StatedSource(**own, parameters={k: v for k, v in item.items() if k in _PARAMETERS})
     expected = KINDS[stated.source].quantity.unit or "1" if stated.source in KINDS else "m"
     if unit != expected:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omsm_ros.core.correction.source_kinds import FORMER_NAMES
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints, pack_points
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.streams.blocks import FloatArray
@@ -218,11 +219,13 @@ _FORM = group(
 def read_summary(path: Path) -> dict[str, Any]:
     """Return the content of ``summary.json``: lengths [m], times [s], stamps [ns].
 
-    Raises FileError if it is missing, too large, no JSON, or has values of other types than
-    ``omsm correct`` writes.
+    Files of schema 1 have former names of sources. Raises FileError if it is missing, too large,
+    no JSON, or has values of other types than ``omsm correct`` writes.
     """
     summary = read_result(path, "summary")
     check_form(summary, _FORM, FileError, f"summary {str(path)!r}")
+    for source in (summary.get("budget") or {}).get("sources", []):
+        source["source"] = FORMER_NAMES.get(source["source"], source["source"])
     return summary
 
 
@@ -340,6 +343,10 @@ def save_fields(path: Path | str, fields: ScanFields) -> None:
     save_bytes(path, content.getvalue())
 
 
+def _today(names: Iterable[object]) -> tuple[str, ...]:
+    return tuple(FORMER_NAMES.get(str(name), str(name)) for name in names)
+
+
 def load_fields(path: Path | str) -> ScanFields:
     """Read ``systematic.npz``; FileError if it is something else."""
     what = f"fields {str(path)!r}"
@@ -357,13 +364,7 @@ def load_fields(path: Path | str) -> ScanFields:
             if np.iscomplexobj(fields) or every.ndim:
                 raise ValueError("a field is complex, or its spacing is no single number")
             values = fields.astype(np.float64)
-        found = ScanFields(
-            tuple(map(str, names)),
-            values,
-            int(every),
-            tuple(map(str, bounds)),
-            tuple(map(str, aligned)),
-        )
+        found = ScanFields(_today(names), values, int(every), _today(bounds), _today(aligned))
     except Exception as err:  # numpy raises many kinds
         raise FileError(
             f"{what} are damaged: {exception_text(err)}; correct the scan again"

@@ -48,7 +48,7 @@ TEMPLATES = {
 
 SOURCE_NAMES = {
     "lag_change": "change of the structural lag since the step test",
-    "lateral_lag": "latency of the probe",
+    "probe_latency": "latency of the probe",
     "lag_asymmetry": "lag that differs between up and down",
     "motion_error": "backlash",
     "lag_speed": "lag that depends on the speed",

@@ -23,7 +23,7 @@ _FROM_CALIBRATION = _NOT_REQUESTED = -1.0
 _GEOMETRY_FIELDS = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}
 _SOURCE_FIELDS: dict[str, Quantity] = {
     "static_gain": quantities.GAIN_UNCERTAINTY,
-    "lateral_lag": quantities.TIME_UNCERTAINTY,
+    "probe_latency": quantities.TIME_UNCERTAINTY,
     "pitch": quantities.ANGLE_UNCERTAINTY,
 }
 
@@ -61,7 +61,7 @@ PARAMETERS = (
     Parameter("override", False, "ignore a mismatch of settings (shown in each cloud's frame)"),
     Parameter("polarity", 1, "+1: distance falls as z rises; -1: reversed", choices=(1, -1)),
     Parameter(
-        "lateral_lag",
+        "probe_latency",
         _FROM_CALIBRATION,
         "of the probe against X and C [s]; -1 = as calibrated",
         quantities.LAG,
@@ -103,11 +103,11 @@ PARAMETERS = (
 
 def options_of(values: Mapping[str, Any]) -> CorrectionOptions:
     """Return the options of the correction."""
-    lag = values["lateral_lag"]
+    lag = values["probe_latency"]
     return CorrectionOptions(
         polarity=values["polarity"],
         accept_other_rate=values["override"],
-        lateral_lag=None if lag == _FROM_CALIBRATION else lag,
+        probe_latency=None if lag == _FROM_CALIBRATION else lag,
         trigger=trigger_of(values),
         geometry=Geometry(**{f.name: values[f"geometry.{f.name}"] for f in fields(Geometry)}),
     )

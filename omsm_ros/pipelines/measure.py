@@ -297,7 +297,7 @@ def summarise(
 ) -> dict[str, Any]:
     """Return the content of ``summary.json``; lengths in metres."""
     summary: dict[str, Any] = {
-        "schema": "omsm-summary/1",
+        "schema": "omsm-summary/2",
         "bag": str(bag),
         "calibration": calibration.id,
         **_places(calibration),
@@ -326,7 +326,9 @@ def summarise(
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
     summary["warnings"] += _mismatch_text(done, judgement.options.surface)
-    if (late := excess_latency_text(calibration, judgement.options.lateral_lag or 0.0)) is not None:
+    if (
+        late := excess_latency_text(calibration, judgement.options.probe_latency or 0.0)
+    ) is not None:
         summary["warnings"].append(str(late))
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
     return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)

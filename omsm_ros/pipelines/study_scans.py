@@ -35,8 +35,8 @@ from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.readable import counts_text
 
-# The lateral lag is what these tasks estimate, so it must not be corrected before.
-_UNCORRECTED_LAG = CorrectionOptions(lateral_lag=0.0)
+# The probe latency is what these tasks estimate, so it must not be corrected before.
+_UNCORRECTED_LAG = CorrectionOptions(probe_latency=0.0)
 
 
 def reversal_of(

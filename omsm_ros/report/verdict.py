@@ -99,7 +99,7 @@ def _latency(calibration: Calibration | None) -> list[str]:
     remedy = text_of("correction.latency_remedy", {})
     return [
         f"the share of probe latency in the lag of {quantity(lag, 's', 4)} is unknown; X and C "
-        f"must be delayed by it (lateral_lag in the budget): {remedy}"
+        f"must be delayed by it (probe_latency in the budget): {remedy}"
     ]
 
 

@@ -111,7 +111,7 @@ def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
     assert rms[0] > 3 * rms[1]
     assert rms[1] == pytest.approx(4e-9 / np.sqrt(2), rel=0.35)
     assert facts["warnings"] == []
-    assert facts["surer_than_zero"] > 0.8
+    assert facts["significant_share"] > 0.8
 
 
 def test_offsets_below_their_uncertainty_are_warned_of(folder, tmp_path, capsys):

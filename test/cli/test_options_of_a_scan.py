@@ -69,8 +69,8 @@ def test_the_centre_of_the_spindle_moves_the_points(corrected, tmp_path):
     np.testing.assert_array_equal(before["sample"], after["sample"])
 
 
-def test_a_lateral_lag_turns_the_points_by_what_the_spindle_does_meanwhile(corrected):
-    before, after = corrected()[1], corrected("--lateral-lag", 2e-3)[1]
+def test_a_probe_latency_turns_the_points_by_what_the_spindle_does_meanwhile(corrected):
+    before, after = corrected()[1], corrected("--probe-latency", 2e-3)[1]
     _, here, there = np.intersect1d(before["sample"], after["sample"], return_indices=True)
     angles = [np.arctan2(c["y"][i], c["x"][i]) for c, i in ((before, here), (after, there))]
     turned = np.angle(np.exp(1j * (angles[1] - angles[0])))

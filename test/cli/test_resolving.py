@@ -96,7 +96,7 @@ def test_selfcal_divides_the_lag_and_correct_uses_it(capsys, tmp_path, late_pair
     assert sizes["resolved"][0] < 1.2 * noise
     # The correction itself causes this error, and the budget includes it.
     assert sizes["unresolved"][0] > 5 * noise
-    assert sizes["unresolved"][1]["lateral_lag"] > sizes["unresolved"][0] / 2
+    assert sizes["unresolved"][1]["probe_latency"] > sizes["unresolved"][0] / 2
 
 
 def test_selfcal_without_a_step_test_says_what_it_cannot_tell(capsys, tmp_path, late_pair):
@@ -106,7 +106,7 @@ def test_selfcal_without_a_step_test_says_what_it_cannot_tell(capsys, tmp_path, 
     found = facts(capsys, *arguments)
     assert found["latency"]["share"] is None
     assert abs(found["lag"] - 0.3397e-3) < 3 * found["lag_uncertainty"] < 6e-6
-    assert any(text.startswith("latency") for text in found["not_told"])
+    assert any(text.startswith("latency") for text in found["unidentifiable"])
     assert cli.main(arguments) == 0
     assert "not identifiable" in capsys.readouterr().out
 

@@ -74,7 +74,7 @@ def test_what_is_done_is_not_done_again(shop, tmp_path, monkeypatch):
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
     assert sorted(started) == ["b.mcap", "torn.mcap"]
     started.clear()
-    run_campaign(shop / "bags", shop / "cal.json", tmp_path, (*OPTIONS, "--lateral-lag", "1e-4"))
+    run_campaign(shop / "bags", shop / "cal.json", tmp_path, (*OPTIONS, "--probe-latency", "1e-4"))
     assert len(started) == 4
 
 
@@ -175,7 +175,7 @@ def test_a_scheduler_beyond_this_host_needs_tls(shop, tmp_path, address):
 @pytest.mark.soak
 def test_two_dask_workers_give_the_same_though_one_is_killed(shop, tmp_path):
     distributed = pytest.importorskip("distributed", reason="Dask is an optional package")
-    options = (*OPTIONS, "--lateral-lag", "1e-4")
+    options = (*OPTIONS, "--probe-latency", "1e-4")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
     ) as cluster:

@@ -26,7 +26,7 @@ _FLAGS = {
     "import": ["--map", "--out"],
     "predict": ["--calibration", "--budget", "--limits"],
     "correct": [
-        "--calibration", "--out", "--nominal", "--geometry", "--lateral-lag", "--sources",
+        "--calibration", "--out", "--nominal", "--geometry", "--probe-latency", "--sources",
         "--lateral", "--settings", "--by-stamps", "--delay", "--exposure", "--polarity",
         "--override", "--counter-offset", "--stamp-tolerance", "--fit", "--aperture",
         "--tolerance", "--accuracy", "--pitch", "--namespace", "--topics",

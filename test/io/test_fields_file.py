@@ -81,3 +81,13 @@ def test_a_damaged_number_is_refused_without_a_warning(tmp_path):
     np.savez(path, names=np.array(["tilt"]), fields=wrong, every=1)
     with pytest.raises(FileError, match="hold values that are not finite; correct the scan again"):
         load_fields(path)
+
+
+def test_sources_have_the_names_of_today_also_in_files_of_before(tmp_path):
+    """The file is written by numpy alone, as version 1 wrote it."""
+    path = tmp_path / "systematic.npz"
+    former = np.array(["could_hide", "lateral_lag", "tilt"])
+    np.savez(path, names=former, fields=np.eye(3), every=4, bounds=former[:1])
+    found = load_fields(path)
+    assert found.names == ("undetected_model_error", "probe_latency", "tilt")
+    assert found.bounds == ("undetected_model_error",)

@@ -33,6 +33,11 @@ def test_what_is_stated_arrives(tmp_path):
     assert wave.reason == "ball"
 
 
+def test_a_source_may_have_its_former_name(tmp_path):
+    late = "{source: lateral_lag, value: 3.0e-6, unit: s, how: declared, reason: data sheet}"
+    assert load(tmp_path, late).point_uncertainties() == {"probe_latency": 3e-6}
+
+
 @pytest.mark.parametrize(
     ("item", "says"),
     [

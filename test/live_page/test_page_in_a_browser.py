@@ -68,7 +68,7 @@ def test_points_are_drawn_counted_and_reported_again_after_a_restart(page):
     port = int(first.address.rsplit(":", 1)[1].strip("/"))
     view.add_points(spiral(254_000))
     page.goto(first.address)
-    wait_for(page, "livePage.frames > 0 && livePage.told.points === 254000")
+    wait_for(page, "livePage.frames > 0 && livePage.latest.points === 254000")
     assert "254 000" in page.inner_text("#numbers")
     drawn = page.evaluate("livePage.layers[0].reduce((n, v) => n + !Number.isNaN(v), 0)")
     place, _ = view._map.since(0)
@@ -126,7 +126,7 @@ def test_an_hour_without_growing(page):
         if second % 60 == 59 and second > seconds / 2:
             held.append((held_bytes(), page.evaluate(HEAP)))
             print(second + 1, held[-1], flush=True)
-    wait_for(page, f"livePage.told.points === {1000 * seconds}")
+    wait_for(page, f"livePage.latest.points === {1000 * seconds}")
     assert page.troubles == []
     server.stop()
     # Messages on their way come and go: the least is what is kept.

@@ -141,18 +141,18 @@ DEFAULTS = {parameter.name: parameter.default for parameter in OF_CORRECTOR}
 def test_the_corrector_corrects_as_its_parameters_say():
     usual = options_of(DEFAULTS)
     assert usual.polarity == 1
-    assert usual.lateral_lag is None  # as calibrated
+    assert usual.probe_latency is None  # as calibrated
     assert usual.geometry == Geometry()
     assert accuracy_of(DEFAULTS) is None
     places = {f"geometry.{f.name}": i * 1e-3 for i, f in enumerate(fields(Geometry))}
     reported = DEFAULTS | places | {
-        "polarity": -1, "override": True, "lateral_lag": 0.0, "counter_offset": -7,
+        "polarity": -1, "override": True, "probe_latency": 0.0, "counter_offset": -7,
         "stamp_tolerance": 5e-3, "accuracy": 1e-8,
     }  # fmt: skip
     options = options_of(reported)
     assert options.polarity == -1
     assert options.accept_other_rate
-    assert options.lateral_lag == 0.0  # known to be none, which is not: not stated
+    assert options.probe_latency == 0.0  # known to be none, which is not: not stated
     assert [getattr(options.geometry, f.name) for f in fields(Geometry)] == [*places.values()]
     assert (options.trigger.counter_offset, options.trigger.stamp_tolerance) == (-7, 5e-3)
     assert trigger_of(reported) == options.trigger

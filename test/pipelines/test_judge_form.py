@@ -222,10 +222,10 @@ def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path
     u, v = (np.float64(cloud[name][::10]) / RADIUS for name in ("x", "y"))
     fields = 80e-9 * (u**2 - v**2)[np.newaxis]
     found = {}
-    for name, bounds in (("real", ()), ("bound", ("lateral_lag",))):
+    for name, bounds in (("real", ()), ("bound", ("probe_latency",))):
         known = tmp_path / name
         shutil.copytree(folder, known)
-        save_fields(known / SYSTEMATIC, ScanFields(("lateral_lag",), fields, 10, bounds))
+        save_fields(known / SYSTEMATIC, ScanFields(("probe_latency",), fields, 10, bounds))
         words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
         found[name] = json.loads(form(known, tmp_path / f"out_{name}", *words)[1].read_text())
     rms, pv = (found["bound"]["deviation"][name] for name in ("rms", "peak_to_valley"))

@@ -150,7 +150,7 @@ def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small
     [
         ("corrector", "geometry.centre_x:=1.0e6", "centre_x"),
         ("corrector", "geometry.beam_x:=.nan", "beam_x"),
-        ("corrector", "lateral_lag:=1.0e9", "lateral_lag"),
+        ("corrector", "probe_latency:=1.0e9", "probe_latency"),
         ("corrector", "sources.probe_noise:=-1.0", "probe_noise"),
         ("corrector", "settings:='[1]'", "settings"),
         ("corrector", "calibration:=/dev/zero", "no regular file"),

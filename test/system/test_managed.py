@@ -90,7 +90,7 @@ def test_a_parameter_acts_or_is_refused_with_the_reason(cell, true_calibration):
         ("polarity", 999, "999"),
         ("polarity", -1, "deactivate and cleanup"),
         ("geometry.centre_x", 1e6, "10"),
-        ("lateral_lag", float("nan"), "lateral_lag"),
+        ("probe_latency", float("nan"), "probe_latency"),
         ("calibration", "/etc/passwd", "deactivate and cleanup"),
         ("autostart", False, "read"),
         ("calibraton", "x.json", "did you mean 'calibration'"),
@@ -208,7 +208,7 @@ def test_two_interrupts_end_a_node_well(node, after, tmp_path):
         "cell_emulator": ["-p", f"link:={tmp_path / 'port'}"],
         "confocal_driver": ["-p", "port:=/dev/null"]
         + [w for a in "xyzbc" for w in ("-p", f"{a}.counts_per_unit:=1.0e10")],
-        "corrector": ["-p", "lateral_lag:=0.0"],
+        "corrector": ["-p", "probe_latency:=0.0"],
     }[node]
     process = subprocess.Popen(
         [sys.executable, "-m", "omsm_ros.nodes.start", node, "--ros-args", *given],

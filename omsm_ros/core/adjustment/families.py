@@ -205,7 +205,7 @@ def _dynamic(r: Ranges) -> list[Family]:
     found = [
         # A step test leaves less than 0.1 ms of lag unknown; the default covers its change.
         _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
-        _one("lateral_lag", "s", lambda v: v.lateral_error(v.x_rate, v.y_rate), 3e-4,
+        _one("probe_latency", "s", lambda v: v.lateral_error(v.x_rate, v.y_rate), 3e-4,
              OTHER_STAND_OFF),
         _one("lag_asymmetry", "s", lambda v: np.abs(v.motion_rate), 1e-4, OTHER_SPEED),
         _one("motion_error", "m", lambda v: np.sign(v.motion_rate), 1e-7, OTHER_DIRECTION),

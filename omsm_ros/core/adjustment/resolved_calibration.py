@@ -239,7 +239,7 @@ def _entries(found: SelfCalibration) -> dict[str, object]:
             }
             for values, spreads in zip(found.own, found.own_uncertainty, strict=True)
         ],
-        "not_told": [*map(str, undetermined(found))],
+        "unidentifiable": [*map(str, undetermined(found))],
     }
 
 

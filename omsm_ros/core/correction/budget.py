@@ -293,7 +293,7 @@ def excess_noise_reasons(budget: Mapping[str, float]) -> Iterator[TrafficLightRe
 def _latency(
     calibration: Calibration, heights: Mapping[str, float], accuracy: float | None
 ) -> Iterator[TrafficLightReason]:
-    share = 2 * heights.get("lateral_lag", 0.0)
+    share = 2 * heights.get("probe_latency", 0.0)
     resolved = calibration.latency.resolved
     if not resolved and (accuracy is None or share > _NEGLIGIBLE_SHARE * accuracy):
         yield _reason("latency", uncertainty=share)

@@ -62,7 +62,7 @@ class CorrectionOptions:
     accept_other_rate: correct data of another sample period than the calibration's
     max_pending: time that a sample waits for its partner [s]; the newest block always waits
     sources: uncertainties of single points; None takes those of the calibration's certificate
-    lateral_lag: latency of the probe [s], by which X, Y, B and C are delayed; None takes that of
+    probe_latency: latency of the probe [s], by which X, Y, B and C are delayed; None takes that of
         the calibration's certificate
     geometry: of the probe
     systematic: sources of the whole scan that are added to the uncertainty of each point; those
@@ -77,7 +77,7 @@ class CorrectionOptions:
     accept_other_rate: bool = False
     max_pending: float = 10.0
     sources: ErrorSources | None = None
-    lateral_lag: float | None = None
+    probe_latency: float | None = None
     geometry: Geometry = field(default_factory=Geometry)
     systematic: tuple[SystematicSource, ...] = ()
     surface: Surface | None = None
@@ -89,8 +89,8 @@ class CorrectionOptions:
             raise ConfigurationError("correction.polarity", polarity=self.polarity)
         if self.static_gain is not None:
             GAIN.checked(self.static_gain, ConfigurationError, "static_gain")
-        if self.lateral_lag is not None:
-            LAG.checked(self.lateral_lag, ConfigurationError, "lateral_lag")
+        if self.probe_latency is not None:
+            LAG.checked(self.probe_latency, ConfigurationError, "probe_latency")
         WAIT.checked(self.max_pending, ConfigurationError, "max_pending")
 
 
@@ -318,7 +318,7 @@ def _as_slice(chosen: BoolArray) -> BoolArray | slice:
 
 def latency_in_use(calibration: Calibration, options: CorrectionOptions) -> float:
     """Return the delay of X, Y, B and C [s]: the stated one, else the calibration's latency."""
-    stated = options.lateral_lag
+    stated = options.probe_latency
     return calibration.latency.delay_s if stated is None else stated
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
-from omsm_ros.core.correction.source_kinds import KINDS, source_of
+from omsm_ros.core.correction.source_kinds import FORMER_NAMES, KINDS, source_of
 from omsm_ros.core.correction.systematic import DECLARED, EVALUATED, SystematicSource
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, covariance_parts
 from omsm_ros.core.kinematics.kinematics import Geometry
@@ -24,8 +24,8 @@ DISTRIBUTIONS = {"normal": 1.0, "uniform": 1 / math.sqrt(3.0), "arcsine": 1 / ma
 
 POINT_SOURCES = tuple(field.name for field in fields(ErrorSources))
 # Sources of single readings that are also common to all points.
-_ALSO_SYSTEMATIC = ("static_gain", "lateral_lag", "motion_error", "pitch")
-_OF_CALIBRATION = ("dynamics", "could_hide")
+_ALSO_SYSTEMATIC = ("static_gain", "probe_latency", "motion_error", "pitch")
+_OF_CALIBRATION = ("dynamics", "undetected_model_error")
 # Sources of single readings that can be stated, and all that are independent between points.
 _STATED_RANDOM = tuple(name for name in POINT_SOURCES if name not in _ALSO_SYSTEMATIC)
 RANDOM = (*_STATED_RANDOM, SCAN_SCATTER)
@@ -129,7 +129,8 @@ NOTHING_STATED = MachineSources()
 def declared_sources(sizes: Mapping[str, object]) -> MachineSources:
     """Return standard uncertainties declared by name, without further parameters."""
     stated = []
-    for name, size in sizes.items():
+    for given, size in sizes.items():
+        name = FORMER_NAMES.get(given, given)
         quantity = KINDS[name].quantity if name in KINDS else UNCERTAINTY
         value = quantity.checked(size, ConfigurationError, name)
         stated.append(StatedSource(source=name, value=value, reason="declared without a reason"))
@@ -164,8 +165,8 @@ def upper_bounds(calibration: Calibration, stated: MachineSources) -> tuple[str,
     These are the model error that the step test cannot detect and, without a test of the latency,
     the lag.
     """
-    open_lag = not calibration.latency.resolved and not stated.of("lateral_lag")
-    return ("could_hide", "lateral_lag") if open_lag else ("could_hide",)
+    open_lag = not calibration.latency.resolved and not stated.of("probe_latency")
+    return ("undetected_model_error", "probe_latency") if open_lag else ("undetected_model_error",)
 
 
 def origin_of(
@@ -174,7 +175,7 @@ def origin_of(
     """Return EVALUATED or DECLARED for a source of single points, and the reason."""
     if said := stated.of(name):
         return said[0].how, said[0].reason
-    if name == "lateral_lag":
+    if name == "probe_latency":
         latency = calibration.latency
         return EVALUATED if latency.source != "declared" else DECLARED, latency.reason
     return EVALUATED, Notice("correction.from_certificate")

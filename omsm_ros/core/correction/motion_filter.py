@@ -62,13 +62,13 @@ class MotionFilters:
         cls,
         calibration: Calibration,
         sample_period: float,
-        lateral_lag: float = 0.0,
+        probe_latency: float = 0.0,
         order: int = DEFAULT_ORDER,
     ) -> MotionFilters:
         """Return the filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
         rate = np.append(0.0, g.numerator)
-        delay = TransferFunction(np.ones(1), np.ones(1), lateral_lag)
+        delay = TransferFunction(np.ones(1), np.ones(1), probe_latency)
         noise, undetected = (
             [(f, filter_history(part)) for f in sensitivity_filters(part, sample_period)]
             for part in covariance_parts(calibration)
@@ -77,7 +77,7 @@ class MotionFilters:
             height=discretise(g, sample_period, order),
             dynamics=[f for f, _ in noise + undetected],
             rate=derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles()),
-            lateral=discretise(delay, sample_period, order) if lateral_lag > 0 else None,
+            lateral=discretise(delay, sample_period, order) if probe_latency > 0 else None,
             forgotten=forgetting_samples(g, sample_period),
             undetected=len(undetected),
             pasts=tuple(past for _, past in noise + undetected),

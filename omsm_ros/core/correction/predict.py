@@ -175,7 +175,7 @@ class Prediction:
 
     peak_to_valley, rms: of the dynamic error (1 - G) z without correction [m]
     residual: largest standard uncertainty after the correction [m], k = 1
-    residual_hidden: its part from undetected model error [m], k = 1; a key of summary.json
+    residual_undetected: its part from undetected model error [m], k = 1; a key of summary.json
     outside_band_fraction: share of the mean square velocity above the valid band [1]
     speed_factor: of the path within all limits, at most 100; 0 if it may not be run at any speed
     safe: True if no limit is exceeded;  binding: name of the limit that is reached first
@@ -186,7 +186,7 @@ class Prediction:
     peak_to_valley: float
     rms: float
     residual: float
-    residual_hidden: float
+    residual_undetected: float
     outside_band_fraction: float
     speed_factor: float
     safe: bool
@@ -225,7 +225,7 @@ def predict_error(
         peak_to_valley=spread,
         rms=float(np.std(error)),
         residual=dynamics.value,
-        residual_hidden=undetected,
+        residual_undetected=undetected,
         outside_band_fraction=_outside_fraction(calibration, path),
         speed_factor=binding.speed_factor,
         safe=binding.speed_factor >= 1,

@@ -188,7 +188,7 @@ def static_gain(p: ScanPoints, parameters: Parameters) -> FloatArray:
     return -p.distance / parameters["gain"]
 
 
-def lateral_lag(p: ScanPoints, _: Parameters) -> FloatArray:
+def probe_latency(p: ScanPoints, _: Parameters) -> FloatArray:
     """Return the rate of Z: delayed points lie further along the path."""
     return p.z_rate
 
@@ -331,12 +331,15 @@ _PERIOD = {"period": quantities.PERIOD}
 _CORRELATED = {"correlation_length": quantities.PERIOD}
 _LENGTH_OPTIONAL = ("correlation_length",)
 
+# Names in files of earlier versions.
+FORMER_NAMES = {"lateral_lag": "probe_latency", "could_hide": "undetected_model_error"}
+
 KINDS: dict[str, SourceKind] = {
     "dynamics": SourceKind(_SHARE, dynamics),
-    "could_hide": SourceKind(_SHARE, undetected_error),
+    "undetected_model_error": SourceKind(_SHARE, undetected_error),
     "static_gain": SourceKind(_SHARE, static_gain, {"gain": quantities.GAIN}),
-    "lateral_lag": SourceKind(_SECONDS, lateral_lag),
-    "lag_change": SourceKind(_SECONDS, lateral_lag),
+    "probe_latency": SourceKind(_SECONDS, probe_latency),
+    "lag_change": SourceKind(_SECONDS, probe_latency),
     "motion_error": SourceKind(_METRES, backlash),
     "tilt": SourceKind(_RADIANS, tilt),
     "decentre": SourceKind(_METRES, decentre, needs_slope=True),

@@ -179,7 +179,7 @@ def _polynomial_slopes(
 # of all sources (0.2 %, because a figure may not depend on the largest sources).
 _LEFT_OUT_OF_ONE, _LEFT_OUT_OF_ALL = 1e-2, 4e-6
 # Sources of the calibration, which are the same errors in every scan that it corrects.
-_OF_THE_CALIBRATION = ("dynamics", "could_hide", "lateral_lag", "static_gain")
+_OF_THE_CALIBRATION = ("dynamics", "undetected_model_error", "probe_latency", "static_gain")
 # Interpolation between fewer points a turn would lose an error with two waves a turn.
 _LEAST_POINTS_PER_TURN = 12
 

@@ -2,8 +2,8 @@
 
 ``height = H(z) + distance / g``. The covariance Σ = L Lᵀ of the parameters of G is propagated
 through the filter: the variance of H(z) is ``Σ_r |F_r z|²``, where ``F_r = Σ_j L_jr ∂G/∂θ_j`` is
-again a transfer function. A lateral lag that is wrong by δ moves the point along the path; where Z
-follows the surface this is a height error of ``δ dH(z)/dt``.
+again a transfer function. A probe latency that is wrong by δ moves the point along the path. Where
+Z follows the surface, this is a height error of ``δ dH(z)/dt``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ErrorSources:
     probe_noise: of a reading [m];  probe_resolution: step of a reading [m]
     encoder_noise: of z [m];  encoder_resolution: step of z [m]
     static_gain: of the calibration's static gain [1]
-    lateral_lag: of the delay of X, Y, B and C [s]; it shifts the points along the path
+    probe_latency: of the delay of X, Y, B and C [s]; it shifts the points along the path
     motion_error: of non-linear parts of the motion, such as backlash [m]
     discretisation: of H against G on this motion [m]
     vibration: of the probe against the part while the spindle turns, rms [m]
@@ -63,7 +63,7 @@ class ErrorSources:
     encoder_noise: float = _source()
     encoder_resolution: float = _source()
     static_gain: float = _source(GAIN_UNCERTAINTY)
-    lateral_lag: float = _source(TIME_UNCERTAINTY)
+    probe_latency: float = _source(TIME_UNCERTAINTY)
     motion_error: float = _source()
     discretisation: float = _source()
     vibration: float = _source()
@@ -85,7 +85,7 @@ class ErrorSources:
             probe_noise=calibration.certificate.residual.noise_m or 0.0,
             static_gain=calibration.static_gain_uncertainty,
             motion_error=calibration.certificate.model_errors.motion_error_m or 0.0,
-            lateral_lag=calibration.latency.unshared_s,
+            probe_latency=calibration.latency.unshared_s,
         )
 
 
@@ -110,8 +110,8 @@ def contributions(
     scatter: dict[str, FloatArray | float] = {**reading_variances(sources, noise_gain, static_gain)}
     return {
         "dynamics": dynamics,
-        "could_hide": undetected,
-        "lateral_lag": (sources.lateral_lag * z_rate) ** 2,
+        "undetected_model_error": undetected,
+        "probe_latency": (sources.probe_latency * z_rate) ** 2,
         "static_gain": (scale * distance) ** 2,
         **scatter,
         "motion_error": sources.motion_error**2,

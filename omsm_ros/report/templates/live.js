@@ -21,7 +21,7 @@ class LivePage {
       button.setAttribute("aria-pressed", Number(button.dataset.layer) === this.layer);
   }
 
-  // After a loss it connects again by itself, and is told everything anew.
+  // After a loss it connects again by itself, and gets everything anew.
   connect(pause) {
     const place = new URL("live", location.href);
     place.protocol = place.protocol.replace("http", "ws");
@@ -84,32 +84,32 @@ class LivePage {
 
   // --- everything else
 
-  state(told) {
-    this.grid = told.grid;
-    this.told = told;
+  state(view) {
+    this.grid = view.grid;
+    this.latest = view;
     const light = document.getElementById("light");
-    light.className = `light ${told.light.colour}`;
+    light.className = `light ${view.light.colour}`;
     light.querySelector("strong").textContent =
-      { green: "All is well", amber: "With reservations", red: "Not to be trusted" }[told.light.colour];
-    list(light.querySelector("ul"), told.light.reasons);
-    document.querySelector("button[data-layer='0']").textContent = told.compared ? "Deviation" : "Height";
-    this.numbers(told);
-    const calibration = told.calibration;
+      { green: "All is well", amber: "With reservations", red: "Not to be trusted" }[view.light.colour];
+    list(light.querySelector("ul"), view.light.reasons);
+    document.querySelector("button[data-layer='0']").textContent = view.compared ? "Deviation" : "Height";
+    this.numbers(view);
+    const calibration = view.calibration;
     document.getElementById("calibration").textContent = calibration.id
       ? `${calibration.id.slice(0, 12)}: ${calibration.verdict}, lag ${(1e6 * calibration.delay).toFixed(1)} µs, `
         + `up to ${calibration.valid_up_to.toFixed(1)} Hz`
       : "none yet";
-    this.tables(told.nodes);
-    series(document.getElementById("series"), told.series);
-    document.getElementById("vibration").hidden = !told.spectrum;
-    if (told.spectrum) spectrum(document.getElementById("spectrum"), told.spectrum);
+    this.tables(view.nodes);
+    series(document.getElementById("series"), view.series);
+    document.getElementById("vibration").hidden = !view.spectrum;
+    if (view.spectrum) spectrum(document.getElementById("spectrum"), view.spectrum);
     if (this.fresh) this.redraw(false);
   }
 
-  numbers(told) {
-    const last = told.series.length ? told.series[told.series.length - 1] : null;
-    const entries = [["points", told.points.toLocaleString("en").replaceAll(",", " ")]];
-    if (told.left_out) entries.push(["without a place", String(told.left_out)]);
+  numbers(view) {
+    const last = view.series.length ? view.series[view.series.length - 1] : null;
+    const entries = [["points", view.points.toLocaleString("en").replaceAll(",", " ")]];
+    if (view.left_out) entries.push(["without a place", String(view.left_out)]);
     if (last) entries.push(
       ["dynamic error, last second", `${(1e9 * (last[2] - last[1])).toPrecision(3)} nm PV`],
       ["standard uncertainty", `${(1e9 * last[3]).toPrecision(3)} nm`]);
@@ -119,8 +119,8 @@ class LivePage {
       item.append(element("dt", name), element("dd", value));
       return item;
     }));
-    document.getElementById("reduction").textContent = told.grid
-      ? `A reduction: each cell of ${(1e6 * told.grid.pitch).toFixed(0)} µm shows the mean of its points; `
+    document.getElementById("reduction").textContent = view.grid
+      ? `A reduction: each cell of ${(1e6 * view.grid.pitch).toFixed(0)} µm shows the mean of its points; `
         + "cells without a point show their neighbours'. Drag, pinch or turn the wheel to enlarge."
       : "No points yet.";
   }
@@ -241,8 +241,8 @@ function series(canvas, rows) {
   ], "nm", "seconds ago", false);
 }
 
-function spectrum(canvas, told) {
-  chart(canvas, told.frequency.slice(1), [{ values: told.amplitude.slice(1), colour: "#0072B2" }],
+function spectrum(canvas, found) {
+  chart(canvas, found.frequency.slice(1), [{ values: found.amplitude.slice(1), colour: "#0072B2" }],
     "m/s²/√Hz", "Hz", true);
 }
 

@@ -1,4 +1,4 @@
-"""The lateral lag, recovered from two scans of the twin in opposite directions."""
+"""The probe latency, recovered from two scans of the twin in opposite directions."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def scan(
 ) -> ScanColumns:
     spiral = Spiral(surface, start_radius=12.7e-3, feed_per_turn=feed, spindle_speed=speed)
     recording = record(replace(cell, seed=seed), spiral, surface)
-    corrector = Corrector(known, CorrectionOptions(lateral_lag=0.0))
+    corrector = Corrector(known, CorrectionOptions(probe_latency=0.0))
     corrector.push_axes(recording.axes)
     corrector.push_distance(recording.distance)
     return read_scan(recording.axes, join_points([corrector.finish()]))

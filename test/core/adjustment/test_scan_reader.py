@@ -27,7 +27,7 @@ def recording() -> Recording:
 
 @pytest.fixture(scope="module")
 def points(recording: Recording) -> SurfacePoints:
-    corrector = Corrector(unit_calibration(1e-3), CorrectionOptions(lateral_lag=0.0))
+    corrector = Corrector(unit_calibration(1e-3), CorrectionOptions(probe_latency=0.0))
     corrector.push_axes(recording.axes)
     corrector.push_distance(recording.distance)
     return join_points([corrector.finish()])

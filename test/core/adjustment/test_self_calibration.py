@@ -60,7 +60,7 @@ def corrected(recording: Recording, known: Calibration, **options: object) -> Su
 
 
 def scanned(recording: Recording, known: Calibration) -> ScanColumns:
-    return read_scan(recording.axes, corrected(recording, known, lateral_lag=0.0))
+    return read_scan(recording.axes, corrected(recording, known, probe_latency=0.0))
 
 
 def step_test(latency: float, off: float = 0.0) -> Calibration:

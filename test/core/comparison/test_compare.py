@@ -162,7 +162,7 @@ def turned_field(scan_of, size):
     step = 1e-6
     x, y = points.x[::5], points.y[::5]
     field = (form(x - step * y, y + step * x) - form(x, y)) / step
-    return ScanFields(("lateral_lag",), size * field[np.newaxis], 5, (), ("lateral_lag",))
+    return ScanFields(("probe_latency",), size * field[np.newaxis], 5, (), ("probe_latency",))
 
 
 def test_each_direction_of_a_calibration_is_one_error_in_both():
@@ -170,8 +170,8 @@ def test_each_direction_of_a_calibration_is_one_error_in_both():
 
     def known(m, *turns):
         rows = np.concatenate([turned_field(m, size).fields for size in turns])
-        names = ("could_hide",) * len(turns)
-        return ScanFields(names, rows, 5, (), ("could_hide",))
+        names = ("undetected_model_error",) * len(turns)
+        return ScanFields(names, rows, 5, (), ("undetected_model_error",))
 
     def explained(*of_both):
         sides = [
@@ -207,8 +207,8 @@ def test_an_error_that_both_share_is_subtracted():
         ]  # fmt: skip
         found = compare_measurements_of_part(*sides)
         spread[ids] = {(t.n, t.m): t.uncertainty for t in found.agreement.terms}
-        assert found.common == (("lateral_lag",) if ids == ("one", "one") else ())
-        assert found.sides[0].sources["lateral_lag"] > 1e-9
+        assert found.common == (("probe_latency",) if ids == ("one", "one") else ())
+        assert found.sides[0].sources["probe_latency"] > 1e-9
     # 3 µm of u v turned by 2 mrad is 6 nm of u² − v², in each of the two.
     radius = found.agreement.aperture[0]
     expected = np.sqrt(2) * 3e-6 * size * (radius / RADIUS) ** 2

@@ -186,8 +186,8 @@ def measurement(sample, **known):
         ({}, ESTIMATED),
         ({"drift": 0.0}, STATED),
         ({"drift": 5e-9}, STATED),
-        ({"fields": Known("lateral_lag")}, ESTIMATED),
-        ({"fields": Known("lateral_lag", "drift_walk")}, STATED),
+        ({"fields": Known("probe_latency")}, ESTIMATED),
+        ({"fields": Known("probe_latency", "drift_walk")}, STATED),
     ],
 )
 def test_a_drift_is_stated_or_in_the_fields_or_estimated(known, says):

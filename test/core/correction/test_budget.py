@@ -112,19 +112,19 @@ def test_what_a_step_test_could_not_show_is_a_row_of_its_own(
         undetected=np.array([False, True]),
     )
     found = scan_budget(known, NO_ERRORS, {}, Geometry(), NOTHING_STATED, trace)
-    assert found.heights == pytest.approx({"could_hide": 1e-6 * np.std(trace.y)})
+    assert found.heights == pytest.approx({"undetected_model_error": 1e-6 * np.std(trace.y)})
     assert "dynamics" in not_evaluated(found)
 
 
 def test_an_open_lag_is_an_upper_bound_and_one_that_was_measured_is_not(
     true_calibration: Calibration,
 ) -> None:
-    assert budget(true_calibration).bounds == ("could_hide", "lateral_lag")
-    said = MachineSources((stated("lateral_lag", 1e-6),))
-    assert budget(true_calibration, said).bounds == ("could_hide",)
+    assert budget(true_calibration).bounds == ("undetected_model_error", "probe_latency")
+    said = MachineSources((stated("probe_latency", 1e-6),))
+    assert budget(true_calibration, said).bounds == ("undetected_model_error",)
     lag = true_calibration.dynamics.low_frequency_delay
     known = with_latency(true_calibration, declared_latency(lag, 0.0, 1e-6, "light switch"))
-    assert budget(known).bounds == ("could_hide",)
+    assert budget(known).bounds == ("undetected_model_error",)
 
 
 def test_several_statements_of_one_source_are_one_row(true_calibration: Calibration) -> None:

@@ -219,13 +219,13 @@ def test_latency_is_assumed_only_where_it_is_known() -> None:
     late = with_latency(CALIBRATION, declared_latency(lag, 0.7 * lag, 1e-6, "data sheet"))
     assert latency_in_use(CALIBRATION, CorrectionOptions()) == 0.0
     assert latency_in_use(late, CorrectionOptions()) == 0.7 * lag
-    assert latency_in_use(late, CorrectionOptions(lateral_lag=0.0)) == 0.0
+    assert latency_in_use(late, CorrectionOptions(probe_latency=0.0)) == 0.0
 
 
 def test_a_late_probe_looks_where_the_spindle_was(quiet_scan: Recording) -> None:
     lag = 0.34e-3
     now, _ = run([quiet_scan.axes], [quiet_scan.distance])
-    then, _ = run([quiet_scan.axes], [quiet_scan.distance], CorrectionOptions(lateral_lag=lag))
+    then, _ = run([quiet_scan.axes], [quiet_scan.distance], CorrectionOptions(probe_latency=lag))
     now_at = {int(k): complex(x, y) for k, x, y in zip(now.sample, now.x, now.y, strict=True)}
     start = np.array([now_at[int(k)] for k in then.sample])
     turned = np.angle((then.x + 1j * then.y) / start)

@@ -62,7 +62,7 @@ def test_one_stream_may_not_change_its_rate(scan: Recording) -> None:
         {"static_gain": 0.0},
         {"static_gain": np.nan},
         {"max_pending": 0.0},
-        {"lateral_lag": -1e-3},
+        {"probe_latency": -1e-3},
     ],
     ids=lambda wrong: next(iter(wrong)),
 )

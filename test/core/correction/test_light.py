@@ -52,7 +52,7 @@ def settled(true_calibration: Calibration) -> Calibration:
     return with_latency(true_calibration, declared_latency(3e-4, 0.0, 1e-7, "trigger of the maker"))
 
 
-HEIGHTS = {"dynamics": 3e-9, "lateral_lag": 4e-9}
+HEIGHTS = {"dynamics": 3e-9, "probe_latency": 4e-9}
 
 
 def light(calibration: Calibration, sources: MachineSources, **more: object) -> TrafficLight:
@@ -107,7 +107,7 @@ def test_red_when_what_is_known_is_too_much(settled: Calibration) -> None:
     found = light(settled, all_but(), accuracy=9e-9)
     assert (found.level, str(found.word)) == (RED, "accuracy not supported by data")
     assert "10.0 nm (k = 2) exceeds the accuracy of 9.00 nm" in str(found.reasons[0].what)
-    assert "lateral lag, which alone contributes 8.00 nm" in str(found.reasons[0].remedy)
+    assert "probe latency, which alone contributes 8.00 nm" in str(found.reasons[0].remedy)
 
 
 def test_red_for_a_rejected_calibration_and_amber_without_a_certificate(

@@ -59,7 +59,7 @@ def test_a_uniform_motion_comes_out_late_by_the_lag_from_the_first_sample() -> N
 def test_axes_pass_unless_the_lag_is_latency() -> None:
     (run,) = new().push(uniform(0, 100))
     assert np.array_equal(run.values[[X, Y, B, C]], uniform(0, 100).values[[0, 1, 3, 4]])
-    (late,) = new(lateral_lag=0.4e-3).push(uniform(0, 100))
+    (late,) = new(probe_latency=0.4e-3).push(uniform(0, 100))
     shift = SPEED[[0, 1, 3, 4]] * 0.4e-3
     delayed = run.values[[X, Y, B, C]] - shift[:, np.newaxis]
     assert np.allclose(late.values[[X, Y, B, C]], delayed, rtol=0, atol=1e-12)
@@ -73,7 +73,7 @@ def test_a_spindle_that_begins_anew_on_every_turn_is_delayed_alike(
 ) -> None:
     """Also one that makes a whole turn from sample to sample, where nothing begins anew."""
     once = speed > 1000
-    counting, anew = new(lateral_lag=0.4e-3), new(lateral_lag=0.4e-3)
+    counting, anew = new(probe_latency=0.4e-3), new(probe_latency=0.4e-3)
     both: list[list[SampleRun]] = [[], []]
     for first in range(0, 400, length):
         run = uniform(first + 10, length)
@@ -128,14 +128,14 @@ def test_an_axis_that_is_no_number_splits_the_run() -> None:
 
 
 def test_settling_covers_the_lateral_delay_too() -> None:
-    filters = MotionFilters.of(CALIBRATION, 1e-3, lateral_lag=80e-3)
+    filters = MotionFilters.of(CALIBRATION, 1e-3, probe_latency=80e-3)
     assert filters.settling_samples() > 80
 
 
 def test_however_the_stream_is_cut_the_same_samples_settle() -> None:
     whole = uniform(0, 300)
-    (at_once,) = new(lateral_lag=0.4e-3).push(whole)
-    cut = new(lateral_lag=0.4e-3)
+    (at_once,) = new(probe_latency=0.4e-3).push(whole)
+    cut = new(probe_latency=0.4e-3)
     bounds = [0, 5, 13, 14, 40, 41, 60, 200, 300]
     runs = [run for a, b in pairwise(bounds) for run in cut.push(whole.part(a, b))]
     assert np.array_equal(np.concatenate([run.reasons for run in runs]), at_once.reasons)

@@ -64,11 +64,12 @@ def test_directions_of_the_calibration_stay_what_they_are() -> None:
     rng = np.random.default_rng(3)
     of_one, of_other = (rng.normal(size=(3, 200)) * [[1e-9], [3e-9], [1e-14]] for _ in range(2))
     slow, fast = (
-        scan_fields({"tilt": rows[:2], "could_hide": rows}, 7) for rows in (of_one, of_other)
+        scan_fields({"tilt": rows[:2], "undetected_model_error": rows}, 7)
+        for rows in (of_one, of_other)
     )
     for found, rows in ((slow, of_one), (fast, of_other)):
-        assert found.aligned == ("could_hide",)
-        own = found.fields[[name == "could_hide" for name in found.names]]
+        assert found.aligned == ("undetected_model_error",)
+        own = found.fields[[name == "undetected_model_error" for name in found.names]]
         np.testing.assert_array_equal(own, rows)
         assert found.names.count("tilt") == 2
         assert not any(np.allclose(row, rows[0], atol=0) for row in found.fields[:2])
@@ -114,9 +115,9 @@ def test_a_calibration_of_which_nothing_counts_is_left_out_as_a_whole() -> None:
 
 
 def test_upper_bounds_are_those_of_the_sources_that_are_left() -> None:
-    every = {"lateral_lag": waves(1.0), "drift": waves(2.0), "tilt": waves(1e-9)}
-    found = scan_fields(every, 1, bounds=("tilt", "lateral_lag", "beam"))
-    assert found.bounds == ("lateral_lag",)
+    every = {"probe_latency": waves(1.0), "drift": waves(2.0), "tilt": waves(1e-9)}
+    found = scan_fields(every, 1, bounds=("tilt", "probe_latency", "beam"))
+    assert found.bounds == ("probe_latency",)
 
 
 def test_unit_sign_and_order_of_the_fields_do_not_matter() -> None:
@@ -131,9 +132,9 @@ def test_unit_sign_and_order_of_the_fields_do_not_matter() -> None:
 
 
 def test_between_two_points_a_field_is_a_straight_line() -> None:
-    found = scan_fields({"could_hide": np.array([[0.0, 4.0, 2.0]])}, 4)
+    found = scan_fields({"undetected_model_error": np.array([[0.0, 4.0, 2.0]])}, 4)
     assert found.at(0, 12)[0].tolist() == [0, 1, 2, 3, 4, 3.5, 3, 2.5, 2, 2, 2, 2]
     assert found.at(3, 2)[0].tolist() == [3, 4]
-    one = scan_fields({"could_hide": np.array([[7.0]])}, 4)
+    one = scan_fields({"undetected_model_error": np.array([[7.0]])}, 4)
     # A single point has no scatter, so nothing of it counts as one.
     assert one.at(0, 3).shape[1] == 3

@@ -19,7 +19,7 @@ PERIOD, OPEN, VALID_FROM = 1e-3, 1e-4, 0.015
 AMPLITUDE = 0.5e-3
 TIME = np.arange(120_000) * PERIOD
 # The lag is mechanical: no term of its own here.
-OPTIONS = CorrectionOptions(lateral_lag=0.0, sources=ErrorSources())
+OPTIONS = CorrectionOptions(probe_latency=0.0, sources=ErrorSources())
 
 
 LAG_NOISE = 1e-6
@@ -70,13 +70,15 @@ def test_noise_and_undetected_error_are_two_terms_of_the_budget():
     assert budget["dynamics"] == pytest.approx(
         LAG_NOISE * 2 * np.pi * AMPLITUDE / np.sqrt(2), rel=0.02
     )
-    assert budget["could_hide"] == pytest.approx(OPEN * AMPLITUDE / np.sqrt(2), rel=0.03)
+    assert budget["undetected_model_error"] == pytest.approx(
+        OPEN * AMPLITUDE / np.sqrt(2), rel=0.03
+    )
     total = corrected(
         replace(with_noise(), certificate=certified_by({"valid_from": VALID_FROM})), z
     ).budget
-    assert total["could_hide"] == 0.0
+    assert total["undetected_model_error"] == 0.0
     assert total["dynamics"] == pytest.approx(
-        np.hypot(budget["dynamics"], budget["could_hide"]), rel=0.02
+        np.hypot(budget["dynamics"], budget["undetected_model_error"]), rel=0.02
     )
 
 
@@ -94,8 +96,8 @@ def test_the_prediction_states_the_undetected_error_and_the_dwell_that_would_rev
     )
     path = ScanPath(z=z, sample_period=PERIOD)
     found = predict_error(with_noise(), path, 50e-9, unlimited)
-    assert found.residual_hidden == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
-    assert found.residual == pytest.approx(found.residual_hidden, rel=0.01)
+    assert found.residual_undetected == pytest.approx(OPEN * AMPLITUDE, rel=0.05)
+    assert found.residual == pytest.approx(found.residual_undetected, rel=0.01)
     assert "cannot detect, mostly slow relaxation (creep) of 10.5 s" in found.message
     # 100 nm against 50 nm: four times as long.
     assert "rests of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message

@@ -62,7 +62,7 @@ def test_every_kind_has_fields_in_proportion_to_its_size(name: str, points: Scan
     assert np.all(np.isfinite(one))
     assert np.allclose(two, 2 * one)
     # Only what comes from a calibration is nothing without one.
-    assert np.any(one) or name in ("dynamics", "could_hide")
+    assert np.any(one) or name in ("dynamics", "undetected_model_error")
 
 
 POSES = {

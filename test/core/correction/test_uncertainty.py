@@ -213,7 +213,7 @@ def test_contributions_by_hand() -> None:
         static_gain=0.1,
         discretisation=5.0,
         pitch=2e-6,
-        lateral_lag=1e-3,
+        probe_latency=1e-3,
     )
     found = contributions(
         sources,
@@ -234,14 +234,14 @@ def test_contributions_by_hand() -> None:
     # A tenth of a metre off, a pitch of 2 µrad is 200 nm.
     assert found["pitch"] == pytest.approx((200e-9) ** 2, rel=1e-6, abs=0)
     assert found["dynamics"] == pytest.approx([7.0, 8.0])
-    assert found["could_hide"] == pytest.approx([5.0, 6.0])
-    assert found["lateral_lag"] == pytest.approx([81e-6, 100e-6])
+    assert found["undetected_model_error"] == pytest.approx([5.0, 6.0])
+    assert found["probe_latency"] == pytest.approx([81e-6, 100e-6])
 
 
 def test_probe_latency_adds_its_uncertainty_times_the_speed() -> None:
     lag = 5e-6
     known = calibration(np.zeros((7, 7)))
-    points = correct(known, Z, DISTANCE, ErrorSources(lateral_lag=lag))
+    points = correct(known, Z, DISTANCE, ErrorSources(probe_latency=lag))
     moved = Z[points.sample] - points.dynamic_error
     speed = abs(np.gradient(moved, PERIOD))
     inner = slice(5, -5)
@@ -268,7 +268,7 @@ def test_the_certificate_tells_noise_and_gain() -> None:
     )
     # Any part of the lag may be latency.
     lag = G.low_frequency_delay / np.sqrt(3)
-    expected = ErrorSources(probe_noise=11e-9, static_gain=3e-5, lateral_lag=lag)
+    expected = ErrorSources(probe_noise=11e-9, static_gain=3e-5, probe_latency=lag)
     assert ErrorSources.of(known) == expected
 
 

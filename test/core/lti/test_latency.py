@@ -34,7 +34,7 @@ def test_without_a_word_any_part_of_the_lag_may_be_latency() -> None:
     # The root of the mean square of a uniform distribution from 0 to the lag.
     anywhere = np.random.default_rng(1).uniform(0.0, LAG, 100_000)
     assert found.uncertainty_s == pytest.approx(np.sqrt(np.mean(anywhere**2)), rel=0.01)
-    assert ErrorSources.of(KNOWN).lateral_lag == found.unshared_s
+    assert ErrorSources.of(KNOWN).probe_latency == found.unshared_s
 
 
 def test_no_lag_leaves_nothing_open() -> None:
@@ -45,7 +45,7 @@ def test_what_is_declared_counts_with_its_uncertainty() -> None:
     made = with_latency(KNOWN, declared_latency(LAG, LAG / 2, 5e-6, "data sheet, 0.3 ms exposure"))
     found = made.latency
     assert (found.source, found.resolved, found.share) == (DECLARED, True, pytest.approx(0.5))
-    assert ErrorSources.of(made).lateral_lag == 5e-6
+    assert ErrorSources.of(made).probe_latency == 5e-6
     assert made.id != KNOWN.id
 
 
