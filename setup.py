@@ -44,7 +44,7 @@ setup(
         "devices": ["pyads", "nidaqmx"],
         "campaign": ["distributed"],
         "completion": ["shtab"],
-        "pandas": ["pandas"],
+        "pandas": ["pandas", "xarray"],
         "catalogue": ["sqlalchemy>=2", "psycopg[binary]>=3.1"],
     },
     # Bags are read where ROS is not installed, too, so the texts of our interfaces travel with the

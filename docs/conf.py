@@ -14,7 +14,14 @@ from omsm_ros import __version__  # noqa: E402
 project = "omsm_ros"
 author = "The omsm_ros developers"
 version = release = __version__
-extensions = ["myst_parser"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+# Notebooks run when the manual is made; one that fails is a warning, which fails the make.
+nb_execution_mode = "cache"
+nb_execution_timeout = 300
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
 html_theme = "furo"
 html_title = f"omsm_ros {release}"
 html_static_path: list[str] = []
@@ -22,7 +29,7 @@ exclude_patterns = ["_*"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 # Pygments does not know our YAML comments and G-code; such a block is shown without colours.
-suppress_warnings = ["misc.highlighting_failure"]
+suppress_warnings = ["misc.highlighting_failure", "myst-nb.lexer"]  # the latter without a kernel
 
 
 def outside_as_text(app, name, source):

@@ -27,33 +27,42 @@ def _sentence(code: str, values: Mapping[str, Any]) -> str:
 
 errors.write_texts_with(_sentence)
 
-_PUBLIC = (
+# The public names, here alone; a test holds them.
+__all__ = [
     "Adjusted",
     "Calibration",
+    "Difference",
     "Form",
+    "Plan",
     "Points",
+    "Prediction",
     "Recording",
     "Spectrum",
     "adjust",
     "correct",
+    "difference",
     "form",
     "identify",
     "load",
+    "plan",
+    "predict",
     "read",
     "simulate",
     "spectrum",
     "surface",
-)
+]
 
 
 def __getattr__(name: str) -> Any:
     """Return a name of the Python interface, which is loaded now."""
-    if name in _PUBLIC:
+    if name in __all__:
         # By its name, so that the package itself depends on none of its rooms.
         return getattr(importlib.import_module("omsm_ros.api"), name)
+    if name == "twin":
+        return importlib.import_module("omsm_ros.twin")
     raise AttributeError(f"module 'omsm_ros' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
     """Return the public names, those of the interface too."""
-    return sorted({*globals(), *_PUBLIC})
+    return sorted({*globals(), *__all__})

@@ -1,14 +1,19 @@
 """Results of the Python interface: small frozen objects, all quantities in SI units.
 
-They print in a few lines, ``plot()`` returns a matplotlib figure, ``to_dict()`` values.
+Each prints in a few lines and shows a table in a notebook. ``plot()`` returns matplotlib axes,
+``to_dict()`` values, ``to_pandas()`` and ``to_xarray()`` tables; ``save()`` writes what
+``omsm.load()`` reads.
 """
 
 from __future__ import annotations
 
 import html
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,25 +23,32 @@ from omsm_ros.core.calibration.calibration import Calibration as _Calibration
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
 from omsm_ros.core.lti.transfer_function import TransferFunction, to_control
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, Status
-from omsm_ros.errors import DataError
-from omsm_ros.readable import expanded, measured, plain, quantity
+from omsm_ros.errors import ConfigurationError, DataError, FileError
+from omsm_ros.readable import expanded, figure, measured, plain, quantity
 
 if TYPE_CHECKING:
     import control
+    import pandas
+    import xarray
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from omsm_ros.core.adjustment import Adjustment
-    from omsm_ros.core.form.analyse import FormResult
     from omsm_ros.core.kinematics.kinematics import Surface
 
 _BLOCK = 20_000
+_ORIGIN = "omsm_ros result"
 
 
 class _Result:
-    """Text of a result for terminals and notebooks."""
+    """What all results share: text, tables, axes and files."""
+
+    _along = "sample"
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield name and value of each printed line."""
+        """Yield name and value of each printed line, at most 15."""
+        raise NotImplementedError
+
+    def _figure(self) -> Figure:
         raise NotImplementedError
 
     def __str__(self) -> str:
@@ -44,12 +56,64 @@ class _Result:
         width = max(len(name) for name, _ in rows)
         return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
 
+    __repr__ = __str__
+
     def _repr_html_(self) -> str:
         cells = "".join(
             f"<tr><th style='text-align:left'>{html.escape(n)}</th><td>{html.escape(v)}</td></tr>"
             for n, v in self.rows()
         )
         return f"<table>{cells}</table>"
+
+    def plot(self) -> Axes:
+        """Draw the result, and return its first axes; their ``figure`` has ``savefig``."""
+        return self._figure().axes[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the arrays and values by name."""
+        # Only results have fields, which their classes declare as dataclasses.
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+
+    def _columns(self) -> dict[str, NDArray[Any]]:
+        return {k: v for k, v in self.to_dict().items() if isinstance(v, np.ndarray)}
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return the arrays as a table; without arrays, one row of the values. Needs pandas."""
+        import pandas as pd
+
+        return pd.DataFrame(self._columns() or {k: [v] for k, v in self.to_dict().items()})
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return the arrays as a dataset along ``sample``, ``point`` or ``line``. Needs xarray."""
+        import xarray as xr
+
+        return xr.Dataset({k: (self._along, v) for k, v in self._columns().items()})
+
+    def save(self, path: Path | str) -> None:
+        """Write the result as ``.npz``; ``omsm.load`` reads it."""
+        from omsm_ros.io.files import save_bytes
+
+        if Path(path).suffix != ".npz":
+            raise ConfigurationError(f"{str(path)!r}: a {type(self).__name__} is saved as .npz")
+        arrays = self._columns()
+        rest = {k: v for k, v in self.to_dict().items() if k not in arrays}
+        head = json.dumps({"origin": _ORIGIN, "kind": type(self).__name__, "values": rest})
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, head=np.array(head), **arrays)
+        save_bytes(path, buffer.getvalue())
+
+
+def load_saved(path: Path) -> Any:
+    """Return the result that ``save`` wrote to an ``.npz``; raise FileError for another file."""
+    try:
+        with np.load(path) as held:  # numpy refuses pickles by default
+            arrays = dict(held)
+        head = json.loads(str(arrays.pop("head")))
+        kind = {k.__name__: k for k in (Recording, Points, Form, Adjusted, Difference, Spectrum,
+                                        Plan, Prediction)}[head["kind"]]  # fmt: skip
+        return kind(**arrays, **head["values"])
+    except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError) as err:
+        raise FileError(f"{str(path)!r} is not a saved result of omsm_ros") from err
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,20 +191,33 @@ class Recording(_Result):
         yield "recording", f"{len(self)} samples, {quantity(len(self) * self.period, 's')}"
         yield "from", self.name
 
-    def plot(self) -> Figure:
-        """Draw position and distance over time."""
-        from omsm_ros.report import style
+    def _figure(self) -> Figure:
+        return _over_time(self.time, {"z": self.z, "distance": self.distance})
 
-        made, axes = style.figure(9.2, 4.5, 2, 1, sharex=True)
-        for ax, name in zip(axes[:, 0], ("z", "distance"), strict=True):
-            ax.plot(self.time, getattr(self, name) / 1e-6, linewidth=0.8)
-            style.label(ax, y="µm", title=name)
-        style.label(axes[-1, 0], x="time [s]")
-        return made
+    def save(self, path: Path | str) -> None:
+        """Write a bag ``.mcap`` that the commands read, or ``.npz``."""
+        if Path(path).suffix != ".mcap":
+            return super().save(path)
+        from omsm_ros.io.bag_writer import BagWriter
+        from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the arrays by name."""
-        return {name: getattr(self, name) for name in ("z", "distance", "x", "c", "period")}
+        with BagWriter(Path(path), [AXES_TOPIC, DISTANCE_TOPIC]) as bag:
+            for axes, distance in self.blocks():
+                bag.write_axes(axes)
+                bag.write_distance(distance)
+        return None
+
+
+def _over_time(time: FloatArray, curves: Mapping[str, FloatArray]) -> Figure:
+    """Draw ``curves`` (n,) [m] over time [s], one below the other, in µm."""
+    from omsm_ros.report import style
+
+    made, axes = style.figure(9.2, 4.5, len(curves), 1, sharex=True)
+    for ax, (name, values) in zip(axes[:, 0], curves.items(), strict=True):
+        ax.plot(time, values / 1e-6, linewidth=0.8)
+        style.label(ax, y="µm", title=name)
+    style.label(axes[-1, 0], x="time [s]")
+    return made
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -151,19 +228,36 @@ class Calibration(_Result):
 
     @classmethod
     def from_control(
-        cls, system: control.TransferFunction, period: float, delay: float = 0.0
+        cls,
+        system: control.TransferFunction | control.StateSpace,
+        period: float,
+        delay: float = 0.0,
+        static_gain: float = 1.0,
     ) -> Calibration:
-        """Return a calibration without certificate from a python-control system.
+        """Return a calibration without uncertainty and certificate from python-control.
 
-        system: continuous, in rad/s, of gain one at zero frequency;  period, delay: [s]
+        system: continuous, in rad/s; its gain at zero frequency multiplies ``static_gain``
+        period: of the samples [s];  delay: of the probe [s], in addition to the system
+
+        Raises ConfigurationError for a system that is sampled, or has no finite static gain.
         """
-        numerator, denominator = (np.ravel(v[0][0])[::-1] for v in (system.num, system.den))
-        dynamics = TransferFunction(numerator / denominator[0], denominator / denominator[0], delay)
+        import control as package
+
+        rational = package.tf(system)
+        numerator, denominator = (
+            np.ravel(v[0][0])[::-1].astype(np.float64) for v in (rational.num, rational.den)
+        )
+        if rational.isdtime(strict=True) or not numerator[0] * denominator[0]:
+            raise ConfigurationError(
+                "the system must be continuous, with a static gain that is not zero or infinite"
+            )
+        gain = float(numerator[0] / denominator[0])
+        dynamics = TransferFunction(numerator / numerator[0], denominator / denominator[0], delay)
         size = len(numerator) + len(denominator)
         return cls(
             _Calibration(
                 dynamics=dynamics,
-                static_gain=1.0,
+                static_gain=static_gain * gain,
                 sample_period=period,
                 valid_up_to=0.5 / period,
                 covariance=np.zeros((size, size)),
@@ -186,7 +280,7 @@ class Calibration(_Result):
         return self.core.certificate.verdict or ""
 
     def response(self, frequency: ArrayLike) -> NDArray[np.complex128]:
-        """Return G at ``frequency`` [Hz], of its shape."""
+        """Return G at ``frequency`` [Hz], of its shape; G(0) = 1, without the static gain."""
         return self.core.dynamics.response(np.asarray(frequency, np.float64))
 
     def to_control(self, delay_order: int = 3) -> control.TransferFunction:
@@ -203,14 +297,13 @@ class Calibration(_Result):
         for reason in self.core.certificate.reasons[:5]:
             yield "reason", str(reason)
 
-    def plot(self) -> Figure:
-        """Draw gain, phase and the error of a motion before and after the correction."""
+    def _figure(self) -> Figure:
         from omsm_ros.report.response_figures import bode
 
         return bode(self.core, None, self.core.sample_period)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the figures of the calibration, SI units."""
+        """Return the figures of the calibration, SI units; powers of s ascend."""
         return {
             "id": self.core.id,
             "verdict": self.verdict,
@@ -224,7 +317,7 @@ class Calibration(_Result):
         }
 
     def save(self, path: Path | str) -> None:
-        """Write ``CAL.json``."""
+        """Write ``CAL.json``, which commands and nodes read."""
         from omsm_ros.io.calibration_file import save_calibration
 
         save_calibration(path, self.core)
@@ -232,9 +325,10 @@ class Calibration(_Result):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Points(_Result):
-    """Corrected surface points, arrays (n,).
+    """Surface points, arrays (n,).
 
-    x, y: in the frame of the workpiece [m];  height: [m];  uncertainty: standard [m]
+    x, y: in the frame of the workpiece [m];  height: [m]
+    uncertainty: standard [m], NaN where the file of another instrument states none
     dynamic_error: that was removed [m];  sample: trigger count;  counted: samples by reason
     """
 
@@ -244,7 +338,9 @@ class Points(_Result):
     uncertainty: FloatArray
     dynamic_error: FloatArray
     sample: NDArray[np.int64]
-    counted: Mapping[str, Any]
+    counted: Mapping[str, Any] = field(default_factory=dict)
+
+    _along = "point"
 
     def __len__(self) -> int:
         return len(self.x)
@@ -253,78 +349,80 @@ class Points(_Result):
         """Yield the printed lines."""
         yield "points", str(len(self))
         for stream, account in self.counted.items():
-            left = {k: v for k, v in account["counted"].items() if v}
-            yield f"samples of {stream}", f"{account['received']} received; left out: {left or 0}"
+            left = [f"{count} {why}" for why, count in account["counted"].items() if count]
+            lost = f", without {', '.join(left)}" if left else ""
+            yield f"samples of {stream}", f"{account['received']} received{lost}"
         error = self.dynamic_error - self.dynamic_error.mean()
         yield "removed error", f"{quantity(float(np.ptp(error)), 'm')} PV"
-        yield "uncertainty", f"{quantity(float(np.median(self.uncertainty)), 'm')} (median, k = 1)"
+        if np.any(np.isfinite(self.uncertainty)):
+            middle = float(np.nanmedian(self.uncertainty))
+            yield "uncertainty", f"{quantity(middle, 'm')} (median, k = 1)"
 
-    def plot(self, nominal: Surface | None = None) -> Figure:
-        """Draw the deviation from ``nominal``, or the heights, as a map."""
-        from omsm_ros.report.measurement.figures import deviation_map
-
+    def plot(self, nominal: Surface | None = None) -> Axes:
+        """Draw the deviation from ``nominal``, or the heights, as a map; return its axes."""
         height = self.height if nominal is None else self.height - nominal.height(self.x, self.y)
-        return deviation_map(self.x, self.y, height - height.mean(), unit="nm", title="height [nm]")
+        return _map(self.x, self.y, height - np.mean(height), "height").axes[0]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the arrays by name."""
-        names = ("x", "y", "height", "uncertainty", "dynamic_error", "sample")
-        return {name: getattr(self, name) for name in names}
 
-    def to_pandas(self) -> Any:
-        """Return a ``pandas.DataFrame`` of the points; needs pandas."""
-        import pandas as pd
+def _map(x: FloatArray, y: FloatArray, height: FloatArray, title: str) -> Figure:
+    from omsm_ros.report.measurement.figures import UNITS_M, deviation_map
 
-        return pd.DataFrame(self.to_dict())
+    size = float(np.ptp(height))
+    unit = next((u for u, length in UNITS_M.items() if size < 3000 * length), "mm")
+    return deviation_map(x, y, height, unit=unit, title=f"{title} [{unit}]", quantity=title)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Form(_Result):
-    """Form of a registered part: figures with uncertainty, and the deviation map.
+    """Form of a registered part.
 
-    figures: value and standard uncertainty [m] by name;  core: the whole result
+    figures: value and standard uncertainty by name [m], null: not evaluated
+    zernike: likewise by "Z(n, m)", each one at the rim [m]
+    x, y: in the part's frame [m];  deviation: of the registered part [m], each (n,)
     """
 
-    core: FormResult
+    figures: Mapping[str, Sequence[float | None]]
+    zernike: Mapping[str, Sequence[float | None]]
+    x: FloatArray
+    y: FloatArray
+    deviation: FloatArray
 
-    @property
-    def figures(self) -> dict[str, tuple[float | None, float | None]]:
-        """Value and standard uncertainty [m] of each figure, None: not evaluated."""
-        return {name: (v.value, v.uncertainty) for name, v in self.core.deviation.items()}
+    _along = "point"
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Yield the printed lines."""
         for name in ("peak_to_valley_best_fit", "rms_best_fit", "robust_peak_to_valley"):
             if name in self.figures:
-                yield name.replace("_", " "), expanded(*self.figures[name], "m")
-        yield "points", str(len(self.core.map.x))
+                yield figure(name), expanded(self.figures[name][0], self.figures[name][1], "m")
+        largest = sorted(self.zernike.items(), key=lambda term: -abs(term[1][0] or 0.0))
+        for name, value in largest[:4]:
+            yield name, expanded(value[0], value[1], "m", signed=True)
+        yield "points", str(len(self.x))
 
-    def plot(self) -> Figure:
-        """Draw the deviation of the registered part."""
-        from omsm_ros.report.measurement.figures import deviation_map
-
-        found = self.core.map
-        return deviation_map(found.x, found.y, found.deviation, unit="nm", title="deviation [nm]")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return value and uncertainty of each figure."""
-        return {name: v.entry() for name, v in self.core.deviation.items()}
+    def _figure(self) -> Figure:
+        return _map(self.x, self.y, self.deviation, "deviation")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Adjusted(_Result):
     """Scans of one part, adjusted together: form, sources declared and found, verdict.
 
-    facts: as in ``adjustment.json``;  core: the whole result
+    facts: as in ``adjustment.json``
+    x, y: of the part [m];  height, uncertainty: form deviation and its standard [m], each (n,)
     """
 
-    core: Adjustment
     facts: Mapping[str, Any]
+    x: FloatArray
+    y: FloatArray
+    height: FloatArray
+    uncertainty: FloatArray
+
+    _along = "point"
 
     @property
     def verdict(self) -> str:
         """``verified``, ``not_verified``, ``contradicted`` or ``too_uncertain``."""
-        return self.core.verdict.code
+        return str(self.facts["verdict"]["code"])
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Yield the printed lines."""
@@ -335,15 +433,45 @@ class Adjusted(_Result):
         for text in next_steps(self.facts)[:8]:
             yield "", text
 
-    def plot(self) -> Figure:
-        """Draw the form deviation."""
+    def _figure(self) -> Figure:
         from omsm_ros.report.adjustment import form_map
 
-        return form_map(self.core)
+        return form_map(SimpleNamespace(form=self))  # type: ignore[arg-type]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the content of ``adjustment.json``."""
-        return dict(self.facts)
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Difference(_Result):
+    """Two measurements of one part, the second moved onto the first and subtracted.
+
+    facts: as in ``difference.json``;  x, y: of the compared places [m]
+    difference: b - a [m];  uncertainty: of it, standard [m], NaN where unknown; each (n,)
+    """
+
+    facts: Mapping[str, Any]
+    x: FloatArray
+    y: FloatArray
+    difference: FloatArray
+    uncertainty: FloatArray
+
+    _along = "point"
+
+    @property
+    def verdict(self) -> str:
+        """Whether both agree within their uncertainties."""
+        return str(self.facts["verdict"])
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Yield the printed lines."""
+        yield "verdict", self.verdict
+        for reason in self.facts["reasons"][:3]:
+            yield "", reason
+        yield "difference", f"{quantity(float(np.sqrt(np.mean(self.difference**2))), 'm')} rms"
+        for name, found in list(self.facts["e_n"].items())[:6]:
+            e_n = "not evaluated" if found["e_n"] is None else plain(found["e_n"])
+            yield f"E_n of {figure(name)}", e_n
+
+    def _figure(self) -> Figure:
+        return _map(self.x, self.y, self.difference, "difference")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -355,6 +483,8 @@ class Spectrum(_Result):
 
     frequency: FloatArray
     density: FloatArray
+
+    _along = "line"
 
     def rms(self, low: float = 0.0, high: float = np.inf) -> float:
         """Return the root mean square between two frequencies."""
@@ -369,15 +499,81 @@ class Spectrum(_Result):
         yield "highest line at", plain(float(self.frequency[peak]))
         yield "rms", plain(self.rms(float(self.frequency[1])))
 
-    def plot(self) -> Figure:
-        """Draw the density over frequency, both axes logarithmic."""
+    def _figure(self) -> Figure:
         from omsm_ros.report import style
 
         made, axes = style.figure(9.2, 4.0)
-        axes[0, 0].loglog(self.frequency[1:], self.density[1:], linewidth=0.8)
+        axes[0, 0].plot(self.frequency[1:], self.density[1:], linewidth=0.8)
+        style.logarithmic(axes[0, 0].xaxis)
+        style.logarithmic(axes[0, 0].yaxis)
         style.label(axes[0, 0], x="frequency", y="density")
         return made
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return frequency and density."""
-        return {"frequency": self.frequency, "density": self.density}
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Plan(_Result):
+    """A planned step test or scan.
+
+    z, x: positions [m];  c: angle of the spindle [rad], each (n,);  period: of the samples [s]
+    programs: text of the G-code by dialect
+    """
+
+    z: FloatArray
+    x: FloatArray
+    c: FloatArray
+    period: float
+    programs: Mapping[str, str]
+
+    @property
+    def time(self) -> FloatArray:
+        """Time of each position [s], (n,)."""
+        return np.arange(len(self.z), dtype=np.float64) * self.period
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Yield the printed lines."""
+        yield "duration", quantity(len(self.z) * self.period, "s")
+        yield "travel of Z", quantity(float(np.ptp(self.z)), "m")
+        speed = float(np.max(np.abs(np.diff(self.z)))) / self.period
+        yield "fastest Z", quantity(speed, "m/s")
+        if np.any(self.c):
+            turn = (self.c[-1] - self.c[0]) / (2 * np.pi) / (len(self.z) - 1) / self.period
+            yield "spindle", f"{60 * turn:.4g} rpm"
+
+    def gcode(self, dialect: str = "linuxcnc") -> str:
+        """Return the program for ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``."""
+        if dialect not in self.programs:
+            raise ConfigurationError(f"dialect {dialect!r} is none of {', '.join(self.programs)}")
+        return self.programs[dialect]
+
+    def _figure(self) -> Figure:
+        return _over_time(self.time, {"z": self.z})
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Prediction(_Result):
+    """Dynamic error that a motion will have, and how fast it may run.
+
+    error: without correction, after the filter has settled [m], (n,);  period: [s]
+    residual: largest standard uncertainty after the correction [m]
+    speed_factor: of this motion within all limits;  binding: the first limit;  message: reason
+    """
+
+    error: FloatArray
+    period: float
+    residual: float
+    speed_factor: float
+    binding: str
+    message: str
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Yield the printed lines."""
+        rms = quantity(float(np.std(self.error)), "m")
+        yield "dynamic error", f"{quantity(float(np.ptp(self.error)), 'm')} PV, {rms} rms"
+        yield "after correction", f"{quantity(self.residual, 'm')} (k = 1)"
+        yield "maximum speed", f"{plain(self.speed_factor)} × this motion, by {self.binding}"
+        yield "reason", self.message
+
+    def _figure(self) -> Figure:
+        return _over_time(
+            np.arange(float(len(self.error))) * self.period, {"dynamic error": self.error}
+        )

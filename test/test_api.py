@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import omsm_ros as omsm
-from omsm_ros import api
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.errors import ConfigurationError, DataError, FileError
 from omsm_ros.pipelines.record_twin import write_recording
 from omsm_ros.twin.plant import PAPER_DYNAMICS
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 
 PUBLIC = {
-    "Adjusted", "Calibration", "Form", "Points", "Recording", "Spectrum", "adjust", "correct",
-    "form", "identify", "load", "read", "simulate", "spectrum", "surface",
+    "Adjusted", "Calibration", "Difference", "Form", "Plan", "Points", "Prediction", "Recording",
+    "Spectrum", "adjust", "correct", "difference", "form", "identify", "load", "plan", "predict",
+    "read", "simulate", "spectrum", "surface",
 }  # fmt: skip
 
 
@@ -31,7 +31,7 @@ def points(identified):
 
 
 def test_the_public_names_stay():
-    assert set(api.__all__) == PUBLIC
+    assert set(omsm.__all__) == PUBLIC
     assert set(dir(omsm)) >= PUBLIC
     assert all(getattr(omsm, name).__doc__ for name in PUBLIC)
     with pytest.raises(AttributeError, match="nothing_of_ours"):
@@ -85,8 +85,15 @@ def test_a_control_system_goes_out_and_back(identified):
     np.testing.assert_allclose(
         system(2j * np.pi * frequency), identified.response(frequency), rtol=1e-9
     )
-    back = omsm.Calibration.from_control(control.tf([3.0], [2e-3, 3.0]), 1e-3)
-    assert back.lag == pytest.approx(2e-3 / 3, rel=1e-12)
+    back = omsm.Calibration.from_control(system, identified.core.sample_period)
+    np.testing.assert_allclose(back.response(frequency), system(2j * np.pi * frequency), rtol=1e-9)
+    given = omsm.Calibration.from_control(control.ss(control.tf([6.0], [2e-3, 3.0])), 1e-3)
+    assert given.lag == pytest.approx(2e-3 / 3, rel=1e-12)
+    assert given.core.static_gain == pytest.approx(2.0)
+    assert given.verdict == ""
+    for refused in (control.tf([1.0], [1.0, 0.5], 1e-3), control.tf([1.0], [1.0, 0.0])):
+        with pytest.raises(ConfigurationError, match="continuous"):
+            omsm.Calibration.from_control(refused, 1e-3)
 
 
 def test_the_spectrum_holds_the_mean_square():
@@ -97,15 +104,99 @@ def test_the_spectrum_holds_the_mean_square():
     assert line.rms(45, 55) == pytest.approx(0.5**0.5, rel=1e-3)
 
 
-def test_results_print_in_a_few_lines_and_draw(identified, points):
-    form = omsm.form(points, api.surface("off_axis_paraboloid", parent_focal_length=25.4e-3,
-                                         off_axis_distance=50.8e-3))  # fmt: skip
-    for result in (identified, points, form, omsm.simulate("scan"), omsm.spectrum(points.x, 1.0)):
+@pytest.fixture(scope="module")
+def results(identified, points):
+    mirror = omsm.surface("off_axis_paraboloid", parent_focal_length=25.4e-3,
+                          off_axis_distance=50.8e-3)  # fmt: skip
+    fast = omsm.twin("scan", seed=2, part=1, rpm=60, radius=1e-3)
+    scans = [omsm.twin("scan", radius=1e-3), fast]
+    return (
+        identified,
+        scans[0],
+        points,
+        omsm.form(points, mirror, fit=("piston", "tip", "tilt")),
+        omsm.adjust(scans, identified, nominal=mirror),
+        omsm.difference(points, omsm.correct(fast, identified), nominal=mirror),
+        omsm.spectrum(points.x, 1.0),
+        omsm.plan(mirror, radius=1e-3),
+        omsm.predict(omsm.plan(mirror, radius=1e-3), identified),
+    )
+
+
+def test_results_print_in_a_few_lines_and_draw(results):
+    assert {type(result).__name__ for result in results} == {n for n in PUBLIC if n[0].isupper()}
+    for result in results:
         lines = str(result).splitlines()
         assert 0 < len(lines) <= 15
+        assert repr(result) == str(result)
         assert result._repr_html_().count("<tr>") == len(lines)
-        assert result.plot().axes
+        assert result.plot().figure.axes
         assert result.to_dict()
+
+
+def test_what_is_saved_is_loaded(results, tmp_path):
+    """Each result reads back with the same arrays and the same text."""
+    for result in results:
+        kind = "json" if isinstance(result, omsm.Calibration) else "npz"
+        result.save(tmp_path / f"a.{kind}")
+        back = omsm.load(tmp_path / f"a.{kind}")
+        assert type(back) is type(result)
+        assert str(back) == str(result)
+        for name, values in result.to_dict().items():
+            if isinstance(values, np.ndarray):
+                assert np.array_equal(getattr(back, name), values, equal_nan=True)
+    np.savez(tmp_path / "foreign.npz", x=np.zeros(3))
+    for broken in ("foreign.npz", "missing.npz"):
+        with pytest.raises(FileError, match="not a saved result"):
+            omsm.load(tmp_path / broken)
+    with pytest.raises(ConfigurationError, match=r"\.npz"):
+        results[2].save(tmp_path / "points.txt")
+
+
+def test_tables_hold_the_arrays(results):
+    pandas = pytest.importorskip("pandas")
+    xarray = pytest.importorskip("xarray")
+    for result in results:
+        assert isinstance(result.to_pandas(), pandas.DataFrame)
+        assert isinstance(result.to_xarray(), xarray.Dataset)
+    points = results[2]
+    assert np.array_equal(points.to_pandas()["height"], points.height)
+    assert points.to_xarray()["x"].dims == ("point",)
+
+
+def test_files_of_the_commands_are_read(results, tmp_path):
+    """A bag, a cloud and a table of another instrument."""
+    scan, points = results[1], results[2]
+    scan.save(tmp_path / "scan.mcap")
+    assert np.array_equal(omsm.read(tmp_path / "scan.mcap").z, scan.z)
+    table = np.column_stack([points.x, points.y, points.height])[:5] * 1e3
+    np.savetxt(tmp_path / "m.csv", table, delimiter=",", header="x_mm,y_mm,z_mm", comments="")
+    back = omsm.load(tmp_path / "m.csv")
+    np.testing.assert_allclose(back.height, points.height[:5], rtol=1e-12)
+    assert np.all(np.isnan(back.uncertainty))
+    (tmp_path / "log.csv").write_text("time [ms];z [mm];gap [um]\n0;1,5;25\n1;1,5;50\n2;1,5;25\n")
+    still = "".join(f"  {axis}: {{constant: 0}}\n" for axis in "xybc")
+    (tmp_path / "map.yaml").write_text(
+        'delimiter: ";"\ndecimal: ","\ncolumns:\n  time: {name: "time [ms]", unit: ms}\n'
+        '  z: {name: "z [mm]", unit: mm}\n'
+        '  distance: {name: "gap [um]", unit: um, sign: -1}\n' + still
+    )
+    found = omsm.read(tmp_path / "log.csv", tmp_path / "map.yaml")
+    np.testing.assert_allclose(found.distance, [-25e-6, -50e-6, -25e-6])
+    np.testing.assert_allclose(found.z, 1.5e-3)
+
+
+def test_a_plan_is_the_motion_of_its_program(results):
+    plan = results[7]
+    assert plan.gcode("linuxcnc").endswith("M2\n")
+    assert np.ptp(plan.c) == pytest.approx(2 * np.pi * 30 / 60 * plan.time[-1])
+    with pytest.raises(ConfigurationError, match="none of linuxcnc"):
+        plan.gcode("heidenhain")
+    # Its lag makes the error that is predicted: lag times the speed of Z, but for the settling.
+    error = results[8].error
+    expected = results[0].lag * np.gradient(plan.z, plan.period)[-len(error) :]
+    inner = slice(50, -50)
+    assert np.std(error[inner] - expected[inner]) < 0.01 * np.std(expected[inner])
 
 
 def test_what_cannot_be_is_refused():
@@ -113,11 +204,6 @@ def test_what_cannot_be_is_refused():
         omsm.Recording(z=np.zeros(3), distance=np.zeros(4), period=1e-3)
     with pytest.raises(ConfigurationError, match="unknown"):
         omsm.simulate("waltz")
-
-
-def test_a_saved_calibration_is_loaded(identified, tmp_path):
-    identified.save(tmp_path / "cal.json")
-    assert omsm.load(tmp_path / "cal.json").core.id == identified.core.id
 
 
 def test_the_step_test_is_that_of_the_twin():

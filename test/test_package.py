@@ -40,6 +40,7 @@ OPTIONAL = {
     "nidaqmx": "devices",
     "sqlalchemy": "catalogue",
     "pandas": "pandas",
+    "xarray": "pandas",
 }
 
 

@@ -138,11 +138,11 @@ def text_of_run(record: SampledRecord, run: FreeRun) -> str:
     return "\n".join(["time_s,input,output,model", *lines]) + "\n"
 
 
-PAGE, MARKDOWN, MODEL_PAGE = "certificate.html", "certificate.md", "model.html"
+PAGE, MODEL_PAGE = "certificate.html", "model.html"
 
 
 def write_certificate(out: Path, identified: Identification, *, source: str = "") -> Path:
-    """Write certificate.html, certificate.md and its plots into ``out``; return the page's path.
+    """Write certificate.html into ``out``; return its path.
 
     source: name of the recording, as the page states it
     """
@@ -150,9 +150,7 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     from omsm_ros.report.certificate.page import (
         CertificatePage,
         certificate_figures_of,
-        picture_name,
         render,
-        render_markdown,
     )
 
     calibration = identified.calibration
@@ -163,12 +161,8 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
         version=__version__,
         figures=certificate_figures_of(calibration, fitted_record(identified)),
     )
-    files = {picture_name(name): picture for name, picture in certificate.figures.items()}
-    files[MARKDOWN] = render_markdown(certificate).encode("utf-8", "replace")
-    files[PAGE] = render(certificate).encode("utf-8", "replace")
-    with result_folder(out, (MARKDOWN, PAGE)) as folder:
-        for name, content in files.items():
-            save_bytes(folder / name, content)
+    with result_folder(out, (PAGE,)) as folder:
+        save_bytes(folder / PAGE, render(certificate).encode("utf-8", "replace"))
     return out / PAGE
 
 

@@ -35,6 +35,12 @@ def scan_path(design: ScanDesign, nominal: Surface, time: FloatArray) -> tuple[F
     return x, nominal.height(place.real, place.imag), c
 
 
+def program_times(design: ScanDesign) -> FloatArray:
+    """Return the times of the points of a program (n,) [s]."""
+    step = _SEGMENT_RAD / abs(design.rpm * RPM_RAD_S)
+    return np.arange(0.0, design.duration, step, dtype=np.float64)
+
+
 def within_limits(
     design: ScanDesign, nominal: Surface, limits: MachineLimits, accuracy: float
 ) -> list[str]:
@@ -101,7 +107,7 @@ def plan_facts(
     name, best = sets[0]
     files = {}
     for k, design in enumerate(best.designs):
-        steps = np.arange(0.0, design.duration, _SEGMENT_RAD / abs(design.rpm * RPM_RAD_S))
+        steps = program_times(design)
         x, z, c = scan_path(design, nominal, steps)
         files[f"scan_{k + 1}.csv"] = _csv(steps, x, z, c)
         files[f"scan_{k + 1}.nc"] = scan_gcode(steps, x, z, c, design, dialect)

@@ -1,10 +1,7 @@
-"""The certificate of a calibration as a page to file: HTML in one piece, or Markdown."""
+"""The certificate of a calibration as a page to file: HTML in one piece."""
 
 from __future__ import annotations
 
-import html
-import re
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -378,78 +375,3 @@ def sections(page: CertificatePage) -> list[Section]:
         ),
     ]
     return present(every, page.figures)
-
-
-# Characters that Markdown would interpret in a text from a file.
-_SPECIAL = re.compile(r"([\\`*_{}\[\]#|~!$])")
-
-
-def picture_name(figure: str) -> str:
-    """Return the name of the file of ``figure``, in the folder of the Markdown."""
-    return f"certificate_{figure}.png"
-
-
-def markdown_text(value: str) -> str:
-    """Return ``value`` on one line, every sign of it shown as it is."""
-    one_line = html.escape(" ".join(value.split(" ")), quote=False).splitlines()
-    return _SPECIAL.sub(r"\\\1", " ".join(one_line))
-
-
-def render_markdown(certificate: CertificatePage) -> str:
-    """Return the page as Markdown with GitHub's tables; all text from outside is escaped."""
-    return "\n".join(_markdown_lines(certificate)).rstrip() + "\n"
-
-
-def _markdown_lines(certificate: CertificatePage) -> Iterator[str]:
-    verdict = verdict_on_calibration(certificate.calibration)
-    yield "# Calibration certificate"
-    yield ""
-    yield markdown_text(certificate.issue)
-    yield ""
-    yield f"**{markdown_text(verdict.word)}**"
-    yield ""
-    yield from (f"- {markdown_text(reason)}" for reason in verdict.reasons)
-    yield ""
-    rows = [(h.name, h.value, h.detail) for h in headlines(certificate.calibration)]
-    yield from _markdown_table(Table("", ("value", ""), rows))
-    if BAND in certificate.figures:
-        yield from _markdown_picture(BAND)
-    for section in sections(certificate):
-        yield from _markdown_section(section)
-
-
-def _markdown_section(section: Section) -> Iterator[str]:
-    yield f"## {markdown_text(section.title)}"
-    yield ""
-    for name in section.figures:
-        yield from _markdown_picture(name)
-    for table in section.tables:
-        if table.title:
-            yield f"### {markdown_text(table.title)}"
-            yield ""
-        yield from _markdown_table(table)
-    if section.note:
-        yield markdown_text(section.note)
-        yield ""
-
-
-def _markdown_picture(name: str) -> Iterator[str]:
-    yield f"![{name}]({picture_name(name)})"
-    yield ""
-    yield f"*{markdown_text(CAPTIONS[name])}*"
-    yield ""
-
-
-def _markdown_table(table: Table) -> Iterator[str]:
-    if all(len(row) == 1 for row in table.rows):
-        yield from (f"- {markdown_text(row[0])}" for row in table.rows)
-    else:
-        width = len(table.rows[0])
-        yield _markdown_row(("", *table.columns) if table.columns else ("",) * width)
-        yield "|" + "---|" * width
-        yield from (_markdown_row(row) for row in table.rows)
-    yield ""
-
-
-def _markdown_row(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(markdown_text(cell) for cell in cells) + " |"

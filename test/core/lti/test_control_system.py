@@ -1,15 +1,10 @@
-from pathlib import Path
-
 import control
 import numpy as np
 import pytest
-from scipy import signal
 from scipy.integrate import trapezoid
 
-from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.lti.transfer_function import TransferFunction, to_control
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_EQ_12
 
 FREQUENCY = np.geomspace(0.1, 500, 50)
@@ -42,26 +37,3 @@ def test_a_delay_is_approximated_where_it_matters():
     )
     with pytest.raises(ConfigurationError, match="delay_order"):
         to_control(late, 0)
-
-
-def test_the_how_to_runs_as_it_stands(tmp_path, monkeypatch, capsys):
-    """The step response of G_m overshoots by what its own samples say."""
-    numerator, denominator = PAPER_DYNAMICS.numerator, PAPER_DYNAMICS.denominator
-    size = len(numerator) + len(denominator)
-    calibration = Calibration(
-        dynamics=PAPER_DYNAMICS,
-        static_gain=1.0,
-        sample_period=1e-3,
-        valid_up_to=100.0,
-        covariance=np.zeros((size, size)),
-    )
-    save_calibration(tmp_path / "cal.json", calibration)
-    monkeypatch.chdir(tmp_path)
-    text = (Path(__file__).parents[3] / "docs" / "control.md").read_text(encoding="utf-8")
-    exec(text.split("```python\n")[1].split("```")[0], {})
-    overshoot, margins = capsys.readouterr().out.splitlines()
-    said = float(overshoot.split()[1]) / 100
-    time = np.linspace(0.0, 10e-3, 1001)
-    _, moved = signal.step((numerator[::-1], denominator[::-1]), T=time)
-    assert said == pytest.approx(np.max(moved) - 1, abs=1e-3)
-    assert "margins" in margins

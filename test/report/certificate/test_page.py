@@ -20,7 +20,6 @@ from omsm_ros.report.certificate.page import (
     CAPTIONS,
     CertificatePage,
     render,
-    render_markdown,
     sections,
     verdict_on_calibration,
 )
@@ -115,7 +114,6 @@ class TestOlderCertificates:
             rest = Certificate.from_content({k: v for k, v in content.items() if k != name})
             altered = bare(replace(calibration, certificate=rest))
             assert Page(render(altered)).text
-            assert render_markdown(altered)
 
     def test_an_entry_of_another_kind_is_refused(self, calibration):
         content = calibration.certificate.content()
