@@ -17,7 +17,6 @@ from omsm_ros.pipelines.identify import PAGE, write_certificate
 from omsm_ros.twin.cell import blocks_of
 
 
-
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory, step_test):
     path = tmp_path_factory.mktemp("bags") / "steps.mcap"
