@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.errors import ConfigurationError, DataError, FileError
+from omsm_ros.interface_calibration import Calibration
 from omsm_ros.interface_results import (
     Adjusted,
-    Calibration,
     Difference,
     Form,
     Plan,

@@ -17,17 +17,13 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from omsm_ros.core.calibration.calibration import Calibration as _Calibration
-from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
-from omsm_ros.core.lti.transfer_function import TransferFunction, to_control
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError, DataError, FileError
-from omsm_ros.readable import expanded, figure, measured, plain, quantity
+from omsm_ros.readable import expanded, figure, plain, quantity
 
 if TYPE_CHECKING:
-    import control
     import pandas
     import xarray
     from matplotlib.axes import Axes
@@ -39,7 +35,7 @@ _BLOCK = 20_000
 _ORIGIN = "omsm_ros result"
 
 
-class _Result:
+class Result:
     """What all results share: text, tables, axes and files."""
 
     _along = "sample"
@@ -109,35 +105,21 @@ def load_saved(path: Path) -> Any:
         with np.load(path) as held:  # numpy refuses pickles by default
             arrays = dict(held)
         head = json.loads(str(arrays.pop("head")))
-        kind = {k.__name__: k for k in (Recording, Points, Form, Adjusted, Difference, Spectrum,
-                                        Plan, Prediction)}[head["kind"]]  # fmt: skip
+        kind = {k.__name__: k for k in Result.__subclasses__()}[head["kind"]]
         return kind(**arrays, **head["values"])
     except (OSError, ValueError, KeyError, TypeError, EOFError, AttributeError) as err:
         raise FileError(f"{str(path)!r} is not a saved result of omsm_ros") from err
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recording(_Result):
+class Recording(Result):
     """Axes and probe of one recording, sampled by one trigger.
 
-    Parameters
-    ----------
-    z, distance
-        Position of the encoder and reading of the probe [m], each (n,); NaN where lost.
-    period
-        Sample period [s].
-    x, c
-        Position of X [m] and angle of the spindle [rad], each (n,); zero where not given.
-    name
-        Where it is from.
+    z, distance: of the encoder and the probe [m], each (n,), NaN where lost;  period: [s]
+    x, c: position of X [m], angle of the spindle [rad], (n,);  name: where it is from
 
-    Raises
-    ------
-    DataError
-        For arrays of different shape.
+    Raises DataError for arrays of different shape.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> t = np.arange(1000) * 1e-3
     >>> print(Recording(z=1e-6 * np.sin(t), distance=-1e-6 * np.sin(t), period=1e-3))
@@ -187,7 +169,6 @@ class Recording(_Result):
             )
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         yield "recording", f"{len(self)} samples, {quantity(len(self) * self.period, 's')}"
         yield "from", self.name
 
@@ -221,110 +202,7 @@ def _over_time(time: FloatArray, curves: Mapping[str, FloatArray]) -> Figure:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Calibration(_Result):
-    """Identified dynamics from encoder to probe; ``core`` is what files and nodes share."""
-
-    core: _Calibration
-
-    @classmethod
-    def from_control(
-        cls,
-        system: control.TransferFunction | control.StateSpace,
-        period: float,
-        delay: float = 0.0,
-        static_gain: float = 1.0,
-    ) -> Calibration:
-        """Return a calibration without uncertainty and certificate from python-control.
-
-        system: continuous, in rad/s; its gain at zero frequency multiplies ``static_gain``
-        period: of the samples [s];  delay: of the probe [s], in addition to the system
-
-        Raises ConfigurationError for a system that is sampled, or has no finite static gain.
-        """
-        import control as package
-
-        rational = package.tf(system)
-        numerator, denominator = (
-            np.ravel(v[0][0])[::-1].astype(np.float64) for v in (rational.num, rational.den)
-        )
-        if rational.isdtime(strict=True) or not numerator[0] * denominator[0]:
-            raise ConfigurationError(
-                "the system must be continuous, with a static gain that is not zero or infinite"
-            )
-        gain = float(numerator[0] / denominator[0])
-        dynamics = TransferFunction(numerator / numerator[0], denominator / denominator[0], delay)
-        size = len(numerator) + len(denominator)
-        return cls(
-            _Calibration(
-                dynamics=dynamics,
-                static_gain=static_gain * gain,
-                sample_period=period,
-                valid_up_to=0.5 / period,
-                covariance=np.zeros((size, size)),
-            )
-        )
-
-    @property
-    def lag(self) -> float:
-        """Lag of the probe at low frequency [s]."""
-        return self.core.dynamics.low_frequency_delay
-
-    @property
-    def lag_uncertainty(self) -> float:
-        """Standard uncertainty of :attr:`lag` [s]."""
-        return low_frequency_delay_uncertainty(self.core.dynamics, self.core.covariance)
-
-    @property
-    def verdict(self) -> str:
-        """Verdict of the certificate, empty without one."""
-        return self.core.certificate.verdict or ""
-
-    def response(self, frequency: ArrayLike) -> NDArray[np.complex128]:
-        """Return G at ``frequency`` [Hz], of its shape; G(0) = 1, without the static gain."""
-        return self.core.dynamics.response(np.asarray(frequency, np.float64))
-
-    def to_control(self, delay_order: int = 3) -> control.TransferFunction:
-        """Return G as a python-control system in rad/s, its delay as a Padé approximant."""
-        return to_control(self.core.dynamics, delay_order)
-
-    def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
-        yield "calibration", self.core.id[:12]
-        yield "verdict", self.verdict or "no certificate"
-        yield "lag", measured(self.lag, self.lag_uncertainty, "s")
-        yield "static gain", plain(self.core.static_gain, 6)
-        yield "valid up to", quantity(self.core.valid_up_to, "Hz")
-        for reason in self.core.certificate.reasons[:5]:
-            yield "reason", str(reason)
-
-    def _figure(self) -> Figure:
-        from omsm_ros.report.response_figures import bode
-
-        return bode(self.core, None, self.core.sample_period)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the figures of the calibration, SI units; powers of s ascend."""
-        return {
-            "id": self.core.id,
-            "verdict": self.verdict,
-            "lag": self.lag,
-            "lag_uncertainty": self.lag_uncertainty,
-            "static_gain": self.core.static_gain,
-            "valid_up_to": self.core.valid_up_to,
-            "numerator": list(self.core.dynamics.numerator),
-            "denominator": list(self.core.dynamics.denominator),
-            "delay": self.core.dynamics.delay,
-        }
-
-    def save(self, path: Path | str) -> None:
-        """Write ``CAL.json``, which commands and nodes read."""
-        from omsm_ros.io.calibration_file import save_calibration
-
-        save_calibration(path, self.core)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Points(_Result):
+class Points(Result):
     """Surface points, arrays (n,).
 
     x, y: in the frame of the workpiece [m];  height: [m]
@@ -346,7 +224,6 @@ class Points(_Result):
         return len(self.x)
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         yield "points", str(len(self))
         for stream, account in self.counted.items():
             left = [f"{count} {why}" for why, count in account["counted"].items() if count]
@@ -373,7 +250,7 @@ def _map(x: FloatArray, y: FloatArray, height: FloatArray, title: str) -> Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Form(_Result):
+class Form(Result):
     """Form of a registered part.
 
     figures: value and standard uncertainty by name [m], null: not evaluated
@@ -390,7 +267,6 @@ class Form(_Result):
     _along = "point"
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         for name in ("peak_to_valley_best_fit", "rms_best_fit", "robust_peak_to_valley"):
             if name in self.figures:
                 yield figure(name), expanded(self.figures[name][0], self.figures[name][1], "m")
@@ -404,7 +280,7 @@ class Form(_Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Adjusted(_Result):
+class Adjusted(Result):
     """Scans of one part, adjusted together: form, sources declared and found, verdict.
 
     facts: as in ``adjustment.json``
@@ -425,7 +301,6 @@ class Adjusted(_Result):
         return str(self.facts["verdict"]["code"])
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         from omsm_ros.report.adjustment import headline, next_steps
 
         yield "result", headline(self.facts)
@@ -440,7 +315,7 @@ class Adjusted(_Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Difference(_Result):
+class Difference(Result):
     """Two measurements of one part, the second moved onto the first and subtracted.
 
     facts: as in ``difference.json``;  x, y: of the compared places [m]
@@ -461,7 +336,6 @@ class Difference(_Result):
         return str(self.facts["verdict"])
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         yield "verdict", self.verdict
         for reason in self.facts["reasons"][:3]:
             yield "", reason
@@ -475,7 +349,7 @@ class Difference(_Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Spectrum(_Result):
+class Spectrum(Result):
     """One-sided power spectral density.
 
     frequency: [Hz], or [1/m] along a path, (m,);  density: [unit²/Hz], or [unit²·m], (m,)
@@ -493,7 +367,6 @@ class Spectrum(_Result):
         return float(np.sqrt(np.sum(self.density[inside]) * step))
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         peak = int(np.argmax(self.density[1:])) + 1
         yield "spectrum", f"{len(self.frequency)} lines up to {plain(self.frequency[-1])}"
         yield "highest line at", plain(float(self.frequency[peak]))
@@ -511,7 +384,7 @@ class Spectrum(_Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Plan(_Result):
+class Plan(Result):
     """A planned step test or scan.
 
     z, x: positions [m];  c: angle of the spindle [rad], each (n,);  period: of the samples [s]
@@ -530,7 +403,6 @@ class Plan(_Result):
         return np.arange(len(self.z), dtype=np.float64) * self.period
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         yield "duration", quantity(len(self.z) * self.period, "s")
         yield "travel of Z", quantity(float(np.ptp(self.z)), "m")
         speed = float(np.max(np.abs(np.diff(self.z)))) / self.period
@@ -550,7 +422,7 @@ class Plan(_Result):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Prediction(_Result):
+class Prediction(Result):
     """Dynamic error that a motion will have, and how fast it may run.
 
     error: without correction, after the filter has settled [m], (n,);  period: [s]
@@ -566,7 +438,6 @@ class Prediction(_Result):
     message: str
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        """Yield the printed lines."""
         rms = quantity(float(np.std(self.error)), "m")
         yield "dynamic error", f"{quantity(float(np.ptp(self.error)), 'm')} PV, {rms} rms"
         yield "after correction", f"{quantity(self.residual, 'm')} (k = 1)"

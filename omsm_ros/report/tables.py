@@ -134,9 +134,9 @@ def latency_text(calibration: Calibration) -> str:
 
 
 def calibration_table(calibration: Calibration) -> Table:
-    """Return the identified parameters and the tests of the identification."""
+    """Return the main figures of a calibration; its certificate has the others."""
     certificate, dynamics = calibration.certificate, calibration.dynamics
-    residual, response = certificate.residual, certificate.response
+    response = certificate.response
     gain = measured(calibration.static_gain, certificate.static_gain.uncertainty, digits=6)
     delay = measured(dynamics.low_frequency_delay, response.low_frequency_delay_uncertainty_s, "s")
     rows = [
@@ -145,16 +145,8 @@ def calibration_table(calibration: Calibration) -> Table:
         ("static gain, probe per encoder", gain),
         ("low-frequency delay", delay),
         ("latency of the probe in it", latency_text(calibration)),
-        ("chi-square per degree of freedom", plain(residual.chi_square)),
-        ("residual, rms", quantity(residual.rms_m, "m")),
-        ("residual, test of whiteness, p", plain(residual.whiteness_p)),
-        ("residual, test of independence, p", plain(residual.independence_p)),
-        ("edges used", count(residual.edges)),
         ("sample period", quantity(calibration.sample_period, "s")),
     ]
-    for number, mode in enumerate(dynamics.modes(), start=1):
-        text = f"{quantity(mode.frequency, 'Hz')}, damping {plain(mode.damping)}"
-        rows.append((f"mode {number}", text))
     rows.append(("id", calibration.id[:16]))
     return Table("Calibration", (), [row for row in rows if row[1] != NOTHING])
 
@@ -162,12 +154,6 @@ def calibration_table(calibration: Calibration) -> Table:
 def mapping_table(title: str, values: Mapping[str, object]) -> Table:
     """Return a mapping of JSON values, one row per key."""
     return Table(title, (), [(str(key), _json_text(value)) for key, value in values.items()])
-
-
-def remarks_table(calibration: Calibration) -> Table:
-    """Return reasons and warnings of the identification."""
-    remarks = [*calibration.certificate.reasons, *calibration.certificate.warnings]
-    return Table("Remarks of the calibration", (), [(str(remark),) for remark in remarks])
 
 
 def _json_text(value: object) -> str:

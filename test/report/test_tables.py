@@ -69,22 +69,13 @@ class TestCalibrationTable:
         assert rows["static gain, probe per encoder"] == "0.9921260 ± 0.0000034"
         assert rows["low-frequency delay"] == "339.7 µs ± 1.1 µs"
         assert rows["valid up to"] == "100 Hz"
-        assert rows["chi-square per degree of freedom"] == "1.01"
         assert rows["verdict"] == "accepted"
-        # Eq. 12: 804 Hz of damping 0.19, and a real pole at 49 761 rad/s.
-        assert rows["mode 1"] == "804 Hz, damping 0.192"
-        assert rows["mode 2"] == "7.92 kHz, damping 1.00"
 
     def test_leaves_out_what_the_certificate_does_not_say(self, certified):
         rows = dict(tables.calibration_table(replace(certified, certificate=Certificate())).rows)
         assert "verdict" not in rows
         assert "edges used" not in rows
         assert rows["low-frequency delay"] == "339.7 µs"
-
-    def test_remarks_are_reasons_and_warnings(self, certified):
-        certificate = {"reasons": ["one"], "warnings": ["two", "three"]}
-        table = tables.remarks_table(replace(certified, certificate=certified_by(certificate)))
-        assert [*table.rows] == [("one",), ("two",), ("three",)]
 
 
 def test_a_mapping_keeps_its_names_and_writes_its_values_as_json():

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.kinematics.kinematics import Surface
@@ -31,8 +31,6 @@ Limits = tuple[float, float]
 # Share of the pixels within the colour range, so that outliers do not set it.
 _SHOWN_SHARE = 0.998
 _BREAK_AT_GAPS = 4
-_LEFT_OF_THE_AXIS = 0.002
-_SMALLEST_SHOWN_M = 1e-3 * NANOMETRE_M
 # Left, bottom, width, height relative to the figure.
 _MAP_PLACE = (0.125, 0.13, 0.66, 0.765)
 _BAR_PLACE = (0.815, 0.19, 0.026, 0.645)
@@ -189,30 +187,6 @@ def _draw_envelope(
     axes.margins(x=0.01)
 
 
-def error_histogram(
-    before: FloatArray, after: FloatArray, weights: FloatArray, *, left: str = "after"
-) -> Figure:
-    """Draw the share of the area over the size of the error, before and after, on one log axis.
-
-    before, after: errors (n,) [m];  weights: area of each point;  left: name of the second
-    """
-    made, axes = style.figure(6.1, 3.7)
-    ax = axes[0, 0]
-    shown = np.abs(np.concatenate([before, after]))
-    low = max(float(np.quantile(shown, _LEFT_OF_THE_AXIS)), _SMALLEST_SHOWN_M)
-    edges = np.geomspace(low, max(2 * float(shown.max()), 10 * low), 120)
-    for value, colour, text in ((before, style.BEFORE, "before"), (after, style.AFTER, left)):
-        size = np.clip(np.abs(value), edges[0], edges[-1])
-        share = np.histogram(size, edges, weights=weights)[0] / np.sum(weights)
-        ax.stairs(100 * share, edges, fill=True, color=colour, alpha=0.75, label=text)
-    ax.set_xscale("log")
-    ax.xaxis.set_major_formatter(EngFormatter(unit="m"))
-    ax.set_xlim(edges[0], edges[-1])
-    style.label(ax, x="size of the error", y="share of the area [%]", title="Size of the error")
-    style.legend_above(ax)
-    return made
-
-
 def overview_figure(
     x: FloatArray,
     y: FloatArray,
@@ -263,12 +237,6 @@ def surface_figures(
     true_height, true_error_left: of each point [m], (n,), known on the twin only
     """
     made = {"dynamic_error": _error_trace(cloud, true_error_left)}
-    if true_error_left is not None:
-        made["error_histogram"] = style.png(
-            error_histogram(
-                cloud.dynamic_error, true_error_left, cloud.area, left="after (true error)"
-            )
-        )
     if nominal is None:
         return {**made, **_height_maps(cloud)}
     heights = {"raw": cloud.raw_height, "corrected": cloud.height}

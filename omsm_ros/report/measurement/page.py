@@ -242,56 +242,30 @@ class Caption:
 
 
 MAPS = {
-    "raw_map": Caption("Before the correction: encoder plus probe. Scale in micrometres.", False),
-    "corrected_map_same_scale": Caption(
-        "After the correction, on the scale of the map before.", False
-    ),
-    "corrected_map": Caption("After the correction, enlarged. Scale in nanometres.", False),
+    "raw_map": Caption("Before the correction: encoder plus probe, in micrometres.", False),
+    "corrected_map_same_scale": Caption("After it, on the scale of the map before.", False),
+    "corrected_map": Caption("After it, enlarged, in nanometres.", False),
     "height_map": Caption("Corrected height; no nominal surface was given.", False),
-    "error_map": Caption("Dynamic error that the correction removed at each point.", False),
+    "error_map": Caption("Dynamic error that was removed.", False),
 }
 PROFILES = {
-    "profile_x": Caption("Through the centre, mean over a band of 1/200 of the aperture."),
-    "profile_y": Caption("Through the centre, mean over a band of 1/200 of the aperture."),
-    "profile_diagonal": Caption(
-        "On this line the error of a lag is largest for a surface that is tilted or curved along x."
-    ),
-    "profile_radius": Caption("Mean over each ring: rotationally symmetric error, such as rings."),
+    "profile_x": Caption("Through the centre, mean over 1/200 of the aperture."),
+    "profile_y": Caption("Through the centre, mean over 1/200 of the aperture."),
+    "profile_diagonal": Caption("A lag's error is largest here if the part is tilted along x."),
+    "profile_radius": Caption("Mean of each ring: rotationally symmetric error."),
 }
-ERRORS = {
-    "dynamic_error": Caption("Before in micrometres, after in nanometres: different scales."),
-    "error_histogram": Caption("Before and after on one logarithmic axis."),
-}
+ERRORS = {"dynamic_error": Caption("Before in µm, after in nm: different scales.")}
 DYNAMICS = {
-    "bode": Caption(
-        "Gain, phase, and the error of a sinusoidal motion. Grey: above the frequency up to which "
-        "the calibration is valid."
-    ),
+    "bode": Caption("Grey: above the frequency up to which the calibration is valid."),
     "step_response": Caption("One edge of the step test, and the residual of the model."),
 }
 FORM = {
-    "form_lines": Caption(
-        "Deviation along the normal after removal of the pose, mean over a band of 1/50 of the "
-        "radius. Shaded: expanded uncertainty (k = 2), including that of the pose."
-    ),
-    "form_rings": Caption(
-        "Mean of each ring, and mean over the outer third of the radius around. Shaded: k = 2."
-    ),
-    "zernike_terms": Caption(
-        "Zernike terms of the deviation, normalised to 1 at the rim, with expanded uncertainty "
-        "(k = 2). Grey: not larger than the uncertainty."
-    ),
-    "psd_radial": Caption(
-        "Two-sided density of the windowed points, including noise; the sum of 2πf S Δf is their "
-        "mean square in this band. Shaded: k = 2."
-    ),
-    "psd_direction": Caption(
-        "Density over the direction of the waves, for all frequencies; the integral over half a "
-        "turn is the mean square. Shaded: k = 2."
-    ),
-    "psd_areal": Caption(
-        "Density over both frequencies; its sum times the area of a block is the mean square."
-    ),
+    "form_lines": Caption("Along the normal, pose removed, mean over 1/50 of the radius; k = 2."),
+    "form_rings": Caption("Mean of each ring, and around the outer third of the radius; k = 2."),
+    "zernike_terms": Caption("Terms, 1 at the rim, k = 2. Grey: within the uncertainty."),
+    "psd_radial": Caption("Two-sided, with noise; the sum of 2πf S Δf is the mean square; k = 2."),
+    "psd_direction": Caption("Over the direction of the waves; half a turn is the mean square."),
+    "psd_areal": Caption("Its sum times the area of a block is the mean square."),
 }
 CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
 
@@ -411,13 +385,7 @@ def _records(report: Report) -> list[tables.Table]:
     ]
     if report.calibration is not None:
         found.append(tables.calibration_table(report.calibration))
-        found.append(tables.remarks_table(report.calibration))
-        found.append(
-            tables.mapping_table("Settings of the calibration", report.calibration.settings)
-        )
-    settings = part(summary, "settings") or {}
-    if report.calibration is None or settings != dict(report.calibration.settings):
-        found.append(tables.mapping_table("Settings", settings))
+    found.append(tables.mapping_table("Settings", part(summary, "settings") or {}))
     found.append(provenance_table(summary))
     found.append(tables.mapping_table("Versions", part(summary, "versions") or {}))
     return [table for table in found if table.rows]

@@ -15,6 +15,7 @@ import matplotlib
 import numpy as np
 from matplotlib.image import imsave
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.area_weights import area_weights
@@ -24,8 +25,6 @@ from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 MAX_PIXELS = 400
 _POINTS_PER_PIXEL = 2
-# A distance [pixels] beyond any image.
-_FAR = 10_000
 # Quantile of the steps between filled pixels that is the distance between tracks: along straight
 # tracks half of the steps are one pixel, the others cross to the next track.
 _CROSSING = 0.65
@@ -73,62 +72,26 @@ def _pixel(position: FloatArray, pitch: float) -> tuple[IntArray, int]:
 
 
 def _close_gaps(total: FloatArray, count: FloatArray) -> FloatArray:
-    away, reach = _near(count > 0)
-    spread = [smoothed(part, reach / 2) for part in (total, count)]
+    filled = count > 0
+    away, reach = ndimage.distance_transform_edt(~filled), _reach(filled)
+    # A Gaussian that ends at 4 sigma, with nothing beyond the edges.
+    spread = [ndimage.gaussian_filter(part, reach / 2, mode="constant") for part in (total, count)]
     with np.errstate(invalid="ignore", divide="ignore"):
         image = np.where(count > 0, total / count, spread[0] / spread[1])
     return np.where(away <= reach, image, np.nan)
 
 
-def _near(filled: NDArray[np.bool_]) -> tuple[FloatArray, float]:
-    """Return pixels to the nearest filled one, exact up to the reach of a gap to be closed."""
+def _reach(filled: NDArray[np.bool_]) -> float:
+    """Return the width of a gap between tracks that is to be closed [pixels]."""
     steps = np.concatenate([_steps(filled), _steps(filled.T)])
-    if not len(steps):
-        return distances(filled, 2), 1.5
     # A hole of any size is crossed once per row, so it hardly changes the quantile.
-    between = float(np.quantile(steps, _CROSSING))
-    reach = max(0.55 * between, 1.5)
-    return distances(filled, int(np.ceil(reach))), reach
+    return max(0.55 * float(np.quantile(steps, _CROSSING)), 1.5) if len(steps) else 1.5
 
 
 def _steps(filled: NDArray[np.bool_]) -> IntArray:
     """Return pixels from each filled one of an image to the next filled one of its row."""
     row, column = np.nonzero(filled)
     return np.diff(column)[np.diff(row) == 0]
-
-
-def distances(filled: NDArray[np.bool_], within: int) -> FloatArray:
-    """Return pixels to the nearest filled one of an image (rows, columns) that has one.
-
-    First along the columns, then the least sum of squares over the neighbouring columns. Exact up
-    to ``within``, elsewhere an upper bound.
-    """
-    rows, columns = filled.shape
-    row = np.arange(rows)[:, np.newaxis]
-    before = np.maximum.accumulate(np.where(filled, row, -_FAR), axis=0)
-    after = np.minimum.accumulate(np.where(filled, row, _FAR)[::-1], axis=0)[::-1]
-    along = np.minimum(row - before, after - row).astype(np.float64) ** 2
-    nearest = along.copy()
-    for shift in range(1, min(within + 1, columns)):
-        left, right = slice(None, -shift), slice(shift, None)
-        nearest[:, left] = np.minimum(nearest[:, left], along[:, right] + shift**2)
-        nearest[:, right] = np.minimum(nearest[:, right], along[:, left] + shift**2)
-    return np.sqrt(nearest)
-
-
-def smoothed(image: FloatArray, sigma: float) -> FloatArray:
-    """Return the image filtered by a Gaussian of ``sigma`` pixels, cut off at 4 sigma."""
-    rows, columns = (_gaussian(size, sigma) for size in image.shape)
-    return np.asarray(rows @ image @ columns, np.float64)
-
-
-def _gaussian(size: int, sigma: float) -> FloatArray:
-    """Return the filter matrix (size, size) of one line of pixels."""
-    cut = int(4 * sigma + 0.5)
-    weights = np.exp(-0.5 * (np.arange(max(size, cut + 1)) / sigma) ** 2)
-    weights[cut + 1 :] = 0.0
-    apart = abs(np.subtract.outer(np.arange(size), np.arange(size)))
-    return np.asarray((weights / (2 * weights.sum() - weights[0]))[apart])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

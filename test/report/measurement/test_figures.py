@@ -147,27 +147,6 @@ class TestDynamicError:
         assert {"before [µm]", "time [s]"} <= texts(figure)
 
 
-class TestErrorHistogram:
-    def test_both_add_up_to_the_whole_area(self):
-        random = np.random.default_rng(1)
-        before, after = random.normal(0, 1e-6, 5000), random.normal(0, 1e-9, 5000)
-        weights = random.uniform(0.1, 2.0, 5000)
-        axes = figures.error_histogram(before, after, weights).get_axes()[0]
-        shares = [patch.get_data().values for patch in axes.patches]
-        assert [share.sum() for share in shares] == pytest.approx([100, 100])
-
-    def test_weighs_by_area(self):
-        before = np.r_[np.full(10, 1e-6), np.full(10, 1e-8)]
-        weights = np.r_[np.full(10, 3.0), np.full(10, 1.0)]
-        axes = figures.error_histogram(before, before, weights).get_axes()[0]
-        values = axes.patches[0].get_data().values
-        assert values[values > 0] == pytest.approx([25, 75])
-
-    def test_no_error_at_all_is_drawn(self):
-        nothing = np.zeros(10)
-        style.png(figures.error_histogram(nothing, nothing, np.ones(10)), dpi=40)
-
-
 def test_the_overview_has_two_maps_in_two_units_and_a_bode_plot(cloud, deviations, certified):
     figure = figures.overview_figure(
         cloud.x, cloud.y, deviations["raw"], deviations["corrected"], certified, Plant().dynamics

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import ndimage
 
 from omsm_ros.errors import DataError
-from omsm_ros.report.measurement.surface_map import MAX_PIXELS, distances, rasterise, smoothed
+from omsm_ros.report.measurement.surface_map import MAX_PIXELS, rasterise
 
 
 def spiral(points, turns, radius=1e-2):
@@ -110,22 +109,3 @@ def test_an_oblong_part_has_square_pixels():
 def test_nothing_and_nan_are_refused(values):
     with pytest.raises(DataError, match="a map needs"):
         rasterise(np.zeros(len(values)), np.zeros(len(values)), values)
-
-
-@pytest.mark.parametrize("share", [0.001, 0.02, 0.5])
-@pytest.mark.parametrize("within", [1, 4, 100])
-def test_distances_are_those_of_scipy_as_far_as_they_are_asked_for(share, within):
-    filled = np.random.default_rng(3).random((61, 47)) < share
-    filled[30, 20] = True
-    true = ndimage.distance_transform_edt(~filled)
-    found = distances(filled, within)
-    near = true <= within
-    assert np.array_equal(found[near], true[near])
-    assert np.all(found[~near] >= true[~near])
-
-
-@pytest.mark.parametrize("sigma", [0.75, 3.0, 40.0])
-def test_gaps_are_filled_with_the_gaussian_of_scipy(sigma):
-    image = np.random.default_rng(4).normal(size=(50, 33))
-    expected = ndimage.gaussian_filter(image, sigma, mode="constant")
-    assert np.allclose(smoothed(image, sigma), expected, rtol=0, atol=1e-14)
