@@ -90,6 +90,7 @@ class Calibration(Result):
         return to_control(self.core.dynamics, delay_order)
 
     def rows(self) -> Iterator[tuple[str, str]]:
+        """Yield the printed lines."""
         yield "calibration", self.core.id[:12]
         yield "verdict", self.verdict or "no certificate"
         yield "lag", measured(self.lag, self.lag_uncertainty, "s")

@@ -110,7 +110,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     if "calibration" in names:
         assert is_right(names["calibration"])
-    if name == "textures-and-vibration":  # the marks' image and the folded vibration
+    if name == "textures-and-vibration":  # the marks' image and the aliased vibration
         assert "371.7 Hz" in said
         assert "320.0 Hz" in said
     if name == "own-csv":  # the digits of the text cost less than the noise
