@@ -25,8 +25,8 @@ from benchmarks.drawn_machine import (
 from benchmarks.row import Row, between, shown
 from omsm_ros.core.calibration.calibration import Calibration, with_latency
 from omsm_ros.core.calibration.latency import declared_latency
-from omsm_ros.core.correction.budget import scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.machine_sources import scan_budget
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.systematic import ScanFields, scan_fields
 from omsm_ros.core.correction.uncertainty import ErrorSources

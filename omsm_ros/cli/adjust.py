@@ -14,6 +14,7 @@ from omsm_ros.messages.verdict import SOURCE_NAMES
 from omsm_ros.pipelines.adjust import adjust_bags, adjustment_facts, write_adjustment
 from omsm_ros.pipelines.correct import Admission
 from omsm_ros.quantities import ANGLE, UNCERTAINTY
+from omsm_ros.report.verdict import headline, next_steps
 
 
 def _declare(add: Arguments) -> None:
@@ -79,13 +80,13 @@ def _adjust(args: argparse.Namespace) -> Facts:
 
 def _show(facts: Facts) -> None:
     # Here, because the page's module loads what draws.
-    from omsm_ros.report.adjustment import headline, next_steps, source_table, tested_text
+    from omsm_ros.report.adjustment import source_table, tested_text
 
     table(
         [
             ("result", headline(facts)),
             ("verdict", facts["verdict"]["text"]),
-            *(("", text) for text in next_steps(facts)),
+            *(("", text) for text in next_steps(facts["verdict"])),
             *((name, f"{'' if declared.startswith('not') else 'declared '}{declared}, found {found}"
                + (f": {status}" if status else ""))
               for name, declared, found, _, status in source_table(facts).rows),

@@ -44,6 +44,7 @@ from omsm_ros.pipelines.measure import RegistrationOptions, measure
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
 from omsm_ros.readable import measured, percent, plain, quantity
+from omsm_ros.report.verdict import headline, next_steps
 
 
 def sources_of(text: str | None) -> MachineSources:
@@ -105,7 +106,7 @@ def _declare_uncertain(add: Arguments) -> None:
     add(
         "--accuracy",
         BUDGET,
-        "required expanded uncertainty, k = 2 [m], which the traffic light is based on",
+        "required expanded uncertainty, k = 2 [m], which the verdict is based on",
     )
     add("--lateral", UNCERTAINTY, "standard uncertainty of x and y [m]", default=0.0)
 
@@ -182,9 +183,11 @@ def _show_correct(summary: Facts) -> None:
         reasons = "".join(f", {count} {name}" for name, count in account["counted"].items())
         text = f"{account['received']} received, {account['corrected']} corrected{reasons}"
         rows.append((stream, text))
-    if light := summary.get("light"):  # absent if no sample was corrected
-        rows.append((light["level"], light["word"]))
-        rows += [("", f"{r['what']}: {r['remedy']}".rstrip(": ")) for r in light["reasons"]]
+    if summary.get("figures"):
+        rows.append(("form deviation", headline(summary)))
+    if verdict := summary.get("verdict"):  # absent if no sample was corrected
+        rows.append(("verdict", verdict["text"]))
+        rows += [("", text) for text in next_steps(verdict)]
     rows += [("warning", text) for text in summary.get("warnings", [])]
     if "form" in summary:
         rows += form_rows(summary["form"])

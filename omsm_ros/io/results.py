@@ -170,11 +170,12 @@ _LIMIT = {
     "name": TEXT, "unit": TEXT, "value": NUMBER_OR_NULL, "allowed": NUMBER_OR_NULL,
     "speed_factor": _NUMBER,
 }  # fmt: skip
-_LIGHT = {
-    "level": {"enum": ["green", "amber", "red"]},
-    "word": TEXT,
-    "reasons": rows({"what": TEXT, "remedy": TEXT}),
+_VERDICT = {
+    "code": {"enum": ["verified", "not_verified", "contradicted", "too_uncertain", "invalid"]},
+    "text": TEXT,
+    "reasons": rows({"text": TEXT}),
 }
+_VALUE = group({"value": _NUMBER, "standard_uncertainty": NUMBER_OR_NULL})
 _FORM = group(
     {},
     bag=TEXT,
@@ -205,14 +206,10 @@ _FORM = group(
     deviation=or_none(group({}, raw=or_none(_DEVIATION), corrected=or_none(_DEVIATION))),
     uncertainty=group({}, median=NUMBER_OR_NULL, largest=NUMBER_OR_NULL),
     budget=or_none(group({}, sources=rows(_SOURCE))),
-    light=or_none(group(_LIGHT)),
-    form=or_none(
-        group(
-            {},
-            deviation=each(FIGURE),
-            conformity=or_none(group(CONFORMITY)),
-        )
-    ),
+    verdict=or_none(group(_VERDICT, add=or_none(group({"text": TEXT, "reached": NUMBER_OR_NULL})))),
+    figures=or_none(group({}, peak_to_valley=_VALUE, rms=_VALUE, removed=TEXTS)),
+    conformity=or_none(group(CONFORMITY)),
+    form=or_none(group({}, deviation=each(FIGURE))),
 )
 
 

@@ -383,11 +383,12 @@ def _traffic_light_entry(
         reasons.append("no message of any node yet")
     against = _against(calibration)
     reasons += [against] * bool(against)
-    measured = [n["values"] for n in nodes if n["values"].get("light") in ("amber", "red")]
+    measured = [n["values"] for n in nodes if n["values"].get("verdict", "verified") != "verified"]
     for values in measured:
-        reasons += [f"measurement: {why}" for why in values.get("light_reasons", "").split("; ")]
+        reasons.append(f"measurement: {values.get('verdict_text', '')}")
+        reasons += [f"measurement: {why}" for why in values.get("verdict_next", "").split("; ")]
     red = worst == "ERROR" or any(n["silent"] for n in nodes) or _is_rejected(calibration)
-    red = red or any(values["light"] == "red" for values in measured)
+    red = red or any(values["verdict"] != "not_verified" for values in measured)
     colour = "red" if red else "amber" if reasons else "green"
     return {"colour": colour, "reasons": reasons[:20]}
 

@@ -1,4 +1,4 @@
-"""Sentences about the correction: uncertainty budget, traffic light, prediction, counter offset."""
+"""Sentences about the correction: uncertainty budget, prediction, counter offset."""
 
 from __future__ import annotations
 
@@ -42,90 +42,12 @@ _SOURCES = {
     "drift_walk": "drift as a random walk",
     "drift": "drift with a correlation time",
 }
-# Groups of sources of which one has to be stated, with the way to find it.
-_GROUPS = {
-    "drift": (
-        "drift",
-        "hold the probe on one place of the part for the duration of the scan, or scan twice, and "
-        "state drift, drift_rate or drift_walk",
-    ),
-    "centre": (
-        "centre of the spindle",
-        "scan a reference sphere, run 'omsm align', and state centre_x with its uncertainty",
-    ),
-    "spindle": (
-        "spindle",
-        "measure its error motion with a ball and a capacitive sensor, and state spindle_axial",
-    ),
-    "straightness": (
-        "straightness of X",
-        "scan an optical flat along X, and state straightness_x",
-    ),
-    "linearity": (
-        "linearity of the probe",
-        "step Z through the range of the probe on a flat, and state probe_linearity",
-    ),
-    "slope_error": (
-        "slope error of the probe",
-        "scan a reference sphere, and state probe_slope",
-    ),
-    "z_scale": (
-        "scale of Z",
-        "compare Z with a laser interferometer, or take it from the scale's certificate, and "
-        "state encoder_scale",
-    ),
-    "vibration": (
-        "vibration",
-        "hold the probe on the axis of the turning part for some turns, and state vibration, the "
-        "rms of the part that does not repeat with the turn",
-    ),
-    "lag_change": (
-        "change since the step test",
-        "repeat the step test after the scan, run 'omsm compare' on both, and state lag_change, "
-        "the difference of their lags",
-    ),
-    "z_pitch": (
-        "pitch of Z",
-        "measure it with an autocollimator along Z, give the arm in the geometry, and state pitch",
-    ),
-}
-
 TEMPLATES: dict[str, str] = {
     **{f"correction.source_{name}": text for name, text in _SOURCES.items()},
-    **{f"correction.{name}": f"{what} not evaluated" for name, (what, _) in _GROUPS.items()},
-    **{f"correction.{name}_remedy": remedy for name, (_, remedy) in _GROUPS.items()},
-    # Traffic light
-    "correction.green": (
-        "calibration valid up to {valid_up_to:Hz}, uncertainty below {accuracy:m} (k = 2)"
-    ),
-    "correction.amber": "calibration valid up to {valid_up_to:Hz}, uncertainty budget incomplete",
-    "correction.red": "accuracy not supported by data",
-    "correction.rejected": "the calibration was rejected",
-    "correction.no_certificate": "the calibration has no certificate",
-    "correction.identify_remedy": "identify again",
-    "correction.too_large": (
-        "uncertainty {uncertainty:m} (k = 2) exceeds the accuracy of {accuracy:m} asked for"
-    ),
-    "correction.too_large_remedy": ("begin with {largest:words}, which alone contributes {part:m}"),
-    "correction.latency": (
-        "latency of the probe not separated from the lag, which contributes {uncertainty:m} (k = 2)"
-    ),
-    "correction.latency_remedy": (
-        "scan the part at two spindle speeds and run 'omsm selfcal', or in both directions and run "
-        "'omsm reversal', or declare it with 'omsm latency'"
-    ),
-    "correction.pose": "pose of the part not evaluated ({missing:list})",
-    "correction.pose_remedy": (
-        "register the part to its nominal surface (--fit auto, or 'omsm form'), or state them"
-    ),
-    "correction.pose_fitted_remedy": "these are fixed; state them, or fit them too (--fit auto)",
     "correction.noisier": (
         "heights of this scan scatter by {scatter:m}, the stated sources of single readings by "
-        "{stated:m}"
-    ),
-    "correction.noisier_remedy": (
-        "compare exposure, intensity and vibration with those of the step test; if the scan is as "
-        "it should be, state probe_noise"
+        "{stated:m}; compare exposure, intensity and vibration with those of the step test, or "
+        "state probe_noise"
     ),
     # Where the figure of a source comes from
     "correction.from_samples": "from sample to sample of this scan",

@@ -7,6 +7,8 @@ TEMPLATES = {
     "verdict.not_verified": "not verified",
     "verdict.contradicted": "contradicted by the scans",
     "verdict.too_uncertain": "uncertainty too large",
+    "verdict.invalid": "measurement not valid",
+    "verdict.rejected": "the calibration was rejected; identify again",
     "verdict.refuted": (
         "{names}: found {value:plain/2} standard deviations from the declared value; check the "
         "declaration, or accept the found value with {opt.accept}"
@@ -39,9 +41,13 @@ TEMPLATES = {
     ),
     "verdict.add_other_speed": "scan the part again at twice the speed, from the centre outward",
     "verdict.add_other_direction": "scan the part again with the spindle reversed",
-    "verdict.add_reclocked": "turn the part on the chuck by 80°, and scan it again",
+    "verdict.add_reclocked": (
+        "turn the part on the chuck by 80°, and scan it again at twice the speed"
+    ),
     "verdict.add_repeated_track": "scan the part again in the same way",
-    "verdict.add_beyond_centre": "scan the part again to beyond the centre",
+    "verdict.add_beyond_centre": (
+        "scan the part again at twice the speed, from beyond the centre outward"
+    ),
     "verdict.add_other_stand_off": "scan the part again at another stand-off of the probe",
     "verdict.add_reference_artefact": "measure a reference artefact",
 }

@@ -20,7 +20,6 @@ from std_msgs.msg import Header, String
 
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.budget import TrafficLight
 from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.counter_offset import LiveOffset
 from omsm_ros.core.correction.predict import Prediction
@@ -42,7 +41,8 @@ from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
-from omsm_ros.pipelines.measure import live_traffic_light, with_sources
+from omsm_ros.pipelines.measure import live_verdict, with_sources
+from omsm_ros.report.verdict import next_steps
 
 # A motion has paused after this time without a block, or the duration of three blocks [s].
 PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
@@ -55,12 +55,13 @@ _DELAYED_MS = 1000.0
 _LOSSES = ("unmatched", "late", "overdue")
 
 
-def light_values(light: TrafficLight) -> dict[str, object]:
+def verdict_values(verdict: Mapping[str, Any]) -> dict[str, object]:
     """Return the verdict as values of a report; it does not change the level of the node."""
     return {
-        "light": light.level,
-        "light_word": str(light.word),
-        "light_reasons": "; ".join(map(str, light.reasons)),
+        "verdict": verdict["code"],
+        "verdict_text": verdict["text"],
+        "verdict_next": "; ".join(next_steps(verdict)),
+        "verdict_uncertainty_m": verdict["uncertainty"],
     }
 
 
@@ -465,10 +466,10 @@ class CorrectorNode(ManagedNode):
         report.values["calibration"] = self._in_force_id()
         # Without a point there is nothing to assess.
         if self._state.published and self._corrector and self._topic.calibration is not None:
-            light = live_traffic_light(
+            verdict = live_verdict(
                 self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
             )
-            report.values |= light_values(light)
+            report.values |= verdict_values(verdict)
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._worker.waiting
         if self._frame != self.values["workpiece_frame"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,23 +10,29 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.adjustment import (
+    NOT_VERIFIED,
+    VERIFIED,
     Adjustment,
+    Figure,
+    FormMap,
     Reason,
     ScanData,
     Source,
     SourceFinding,
+    Verdict,
     adjust,
 )
 from omsm_ros.core.adjustment.adjust import corrected_heights
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
-from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
+from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
-from omsm_ros.core.streams.blocks import Account, AxisBlock, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import Account, AxisBlock
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io.files import REPORT, save_json, save_text
 from omsm_ros.io.results import PlyWriter
@@ -35,11 +41,13 @@ from omsm_ros.messages import sentence
 from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.recording import Recording, scan_data
 from omsm_ros.readable import number
 from omsm_ros.units import RPM_RAD_S
 
 SCHEMA = "omsm-adjustment/1"
+INVALID = "invalid"
+"""Verdict code of heights that a rejected calibration corrected."""
 ADJUSTMENT, ADJUSTED_CLOUD = "adjustment.json", "adjusted.ply"
 # Between two scans whose stamps do not say how far they lie apart, as the part is approached anew.
 _PAUSE_S = 20.0
@@ -51,6 +59,7 @@ class AdjustedScan:
 
     bag: where it is from;  data: for the adjustment;  points: as corrected
     account: of every sample;  began_ns: ROS time of its first sample, None if it is not known
+    doubts: mismatches with the calibration, which was used all the same
     """
 
     bag: str
@@ -58,6 +67,7 @@ class AdjustedScan:
     points: SurfacePoints
     account: Account
     began_ns: int | None
+    doubts: tuple[str, ...] = ()
 
 
 def read_scan(
@@ -86,36 +96,13 @@ def read_scan(
             if points is not None and len(points):
                 parts.append(points)
         account, period, began = scan.account, scan.sample_period, scan.recorded_ns
+        doubts = tuple(map(str, scan.reasons))
     if not parts:
         raise BagError(f"{str(bag)!r} gives no surface point; look at it with 'omsm inspect'")
-    made = join_points(parts)
-    z, c = _axes_at(axes, made.sample)
-    known = np.isfinite(z) & np.isfinite(c) & np.isfinite(made.height)
-    made, z, c = made.part(known), z[known], np.unwrap(c[known])
-    data = ScanData(
-        time=(made.sample - made.sample[0]) * period,
-        x=made.x,
-        y=made.y,
-        height=made.height,
-        distance=made.height - z + made.dynamic_error,
-        motion=z,
-        removed=made.dynamic_error,
-        c=c,
-        clocking=clocking,
-        clamping=clamping,
+    data, made = scan_data(axes, parts, period, clocking, clamping)
+    return AdjustedScan(
+        bag=str(bag), data=data, points=made, account=account, began_ns=began, doubts=doubts
     )
-    return AdjustedScan(bag=str(bag), data=data, points=made, account=account, began_ns=began)
-
-
-def _axes_at(blocks: Sequence[AxisBlock], samples: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Return z [m] and c [rad] at the trigger counts ``samples``, NaN where there is none."""
-    counts = np.concatenate([b.first_sample + np.arange(len(b), dtype=np.int64) for b in blocks])
-    z, c = (np.concatenate([getattr(b, name) for b in blocks]) for name in "zc")
-    order = np.argsort(counts, kind="stable")
-    counts, z, c = counts[order], z[order], c[order]
-    place = np.minimum(np.searchsorted(counts, samples), len(counts) - 1)
-    there = counts[place] == samples
-    return np.where(there, z[place], np.nan), np.where(there, c[place], np.nan)
 
 
 def on_one_clock(scans: Sequence[AdjustedScan]) -> list[AdjustedScan]:
@@ -288,21 +275,12 @@ def adjustment_facts(
 
     tolerance: of the peak to valley [m], None: conformity is not assessed
     """
-    form = found.form
-    spread = np.sqrt(np.maximum(np.diag(form.term_covariance), 0.0))
+    doubts = dict.fromkeys(doubt for scan in scans for doubt in scan.doubts)
     facts: dict[str, Any] = {
         "schema": SCHEMA,
         "calibration": calibration.id,
-        "verdict": _verdict_entry(found, len(scans)),
-        "figures": {
-            "peak_to_valley": _figure(form.pv.value, form.pv.uncertainty),
-            "rms": _figure(form.rms.value, form.rms.uncertainty),
-            "removed": list(form.removed),
-            "terms": [
-                {"n": t.n, "m": t.m, **_figure(value, size)}
-                for t, value, size in zip(form.terms, form.coefficients, spread, strict=True)
-            ],
-        },
+        "verdict": verdict_entry(found.verdict, calibration, len(scans), doubts),
+        "figures": figures_entry(found.form),
         "scans": [_scan_entry(scan) for scan in scans],
         "sources": [_source_entry(source) for source in found.sources],
         "agreement": [
@@ -313,9 +291,28 @@ def adjustment_facts(
         "drift_walk": found.drift_walk,
     }
     if tolerance is not None:
-        judged = conformity(UncertainValue(form.pv.value, form.pv.uncertainty), tolerance)
-        facts["conformity"] = None if judged is None else asdict(judged)
+        facts["conformity"] = conformity_entry(found.form.pv, tolerance)
     return facts
+
+
+def conformity_entry(pv: Figure, tolerance: float) -> dict[str, Any] | None:
+    """Return whether the peak to valley holds the ``tolerance`` [m] within its uncertainty."""
+    judged = conformity(UncertainValue(pv.value, pv.uncertainty), tolerance)
+    return None if judged is None else asdict(judged)
+
+
+def figures_entry(form: FormMap) -> dict[str, Any]:
+    """Return PV, rms and Zernike terms of the form with their uncertainties, lengths in metres."""
+    spread = np.sqrt(np.maximum(np.diag(form.term_covariance), 0.0))
+    return {
+        "peak_to_valley": _figure(form.pv.value, form.pv.uncertainty),
+        "rms": _figure(form.rms.value, form.rms.uncertainty),
+        "removed": list(form.removed),
+        "terms": [
+            {"n": t.n, "m": t.m, **_figure(value, size)}
+            for t, value, size in zip(form.terms, form.coefficients, spread, strict=True)
+        ],
+    }
 
 
 def _figure(value: float, uncertainty: float) -> dict[str, float]:
@@ -352,20 +349,35 @@ def _source_entry(source: SourceFinding) -> dict[str, Any]:
     }
 
 
-def _verdict_entry(found: Adjustment, scans: int) -> dict[str, Any]:
-    verdict = found.verdict
+def verdict_entry(
+    verdict: Verdict, calibration: Calibration, scans: int = 1, doubts: Iterable[str] = ()
+) -> dict[str, Any]:
+    """Return a verdict as JSON values: code, text, reasons, and the scan to add that helps most.
+
+    doubts: sentences about the recordings, with which nothing is verified
+    """
+    code = verdict.code
+    against = [{"code": "recording", "text": text} for text in doubts]
+    if against and code == VERIFIED:
+        code = NOT_VERIFIED
+    if calibration.certificate.verdict == REJECTED:
+        code = INVALID
+        against = [{"code": INVALID, "text": sentence("verdict.rejected", {})}, *against]
     entry: dict[str, Any] = {
-        "code": verdict.code,
-        "text": sentence(f"verdict.{verdict.code}", {"scans": scans}),
+        "code": code,
+        "text": sentence(f"verdict.{code}", {"scans": scans}),
         "reasons": [
-            {
-                "code": reason.code,
-                "names": list(reason.names),
-                "value": number(reason.value),
-                "limit": number(reason.limit),
-                "text": sentence(f"verdict.{reason.code}", _values(reason)),
-            }
-            for reason in _grouped(verdict.reasons)
+            *(
+                {
+                    "code": reason.code,
+                    "names": list(reason.names),
+                    "value": number(reason.value),
+                    "limit": number(reason.limit),
+                    "text": sentence(f"verdict.{reason.code}", _values(reason)),
+                }
+                for reason in _grouped(verdict.reasons)
+            ),
+            *against,
         ],
     }
     if verdict.add:

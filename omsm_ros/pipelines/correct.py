@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -37,11 +38,16 @@ from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
-from omsm_ros.errors import BagError, ConfigurationError, Notice
+from omsm_ros.errors import BagError, ConfigurationError, DataError, Notice
 from omsm_ros.io.results import PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording
+from omsm_ros.pipelines.recording import (
+    MAX_PATH_SAMPLES,
+    SCAN_TOPICS,
+    Recording,
+    scan_data,
+)
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import quantity
 
@@ -256,6 +262,8 @@ def _variance(fields: ScanFields, first: int, count: int) -> FloatArray:
     return np.asarray(np.sum(fields.at(first, count) ** 2, axis=0), np.float64)
 
 
+# A quarter of an hour at 1 kHz, whose adjustment needs 1 GB; longer scans are not adjusted.
+_MOST_ADJUSTED = 1_000_000
 # More than the pixels of a figure; the numbers of a summary come from all points.
 MOST_DRAWN = 2**19
 
@@ -275,6 +283,7 @@ class Correction:
     recorded_ns: when the recording began [ns, ROS time], None if unknown
     temperatures: as recorded (n,) [°C], in their order; NaN: implausible
     sample_period: [s];  faults: findings from counters and stamps of the recording
+    scan: for its adjustment; None if it is too long, too short, or its counter began anew
     """
 
     account: dict[str, Any]
@@ -291,6 +300,7 @@ class Correction:
     recorded_ns: int | None
     temperatures: FloatArray
     faults: tuple[str, ...] = ()
+    scan: ScanData | None = None
 
 
 def correct_bag(
@@ -349,6 +359,9 @@ class _RunningResults:
         self.largest = 0.0
         self.drawn = EvenSelection(MOST_DRAWN)
         self.path = ScanPathReader(MAX_PATH_SAMPLES)
+        self._blocks: list[AxisBlock] = []
+        self._points: list[SurfacePoints] = []
+        self._kept = 0
 
     def see(self, block: AxisBlock | DistanceBlock | None) -> None:
         if block is None:
@@ -357,6 +370,8 @@ class _RunningResults:
         if isinstance(block, AxisBlock) and np.any(here := np.isfinite(block.z)):
             low, high = self._z
             self._z = (min(low, block.z[here].min()), max(high, block.z[here].max()))
+        if isinstance(block, AxisBlock) and self._kept <= _MOST_ADJUSTED:
+            self._blocks.append(block)
         (self._axes if isinstance(block, AxisBlock) else self._distance).add(block)
 
     def faults(self, scan: CorrectedScan) -> tuple[str, ...]:
@@ -395,12 +410,23 @@ class _RunningResults:
         if not len(points):
             return
         self.largest = max(self.largest, float(points.uncertainty.max()))
+        self._kept += len(points)
+        if self._kept <= _MOST_ADJUSTED:
+            self._points.append(points)
+        else:
+            self._points, self._blocks = [], []
         x, y, error = points.x, points.y, points.dynamic_error
         self._running["error"].add(x, y, error)
         if self._nominal is not None:
             corrected = deviation(x, y, points.height, self._nominal)
             self._running["corrected"].add(x, y, corrected)
             self._running["raw"].add(x, y, corrected + error)
+
+    def scan(self, period: float) -> ScanData | None:
+        try:
+            return scan_data(self._blocks, self._points, period)[0] if self._points else None
+        except DataError:
+            return None
 
     def statistics(self) -> dict[str, FormStatistics]:
         if not len(self.drawn):
@@ -435,4 +461,5 @@ def _correction(scan: CorrectedScan, found: _RunningResults) -> Correction:
         recorded_ns=scan.recorded_ns,
         temperatures=scan.temperatures,
         faults=found.faults(scan),
+        scan=found.scan(scan.sample_period),
     )

@@ -51,9 +51,9 @@ from omsm_ros.pipelines.measure import Judgement, with_sources
 from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report import response_figures, style
-from omsm_ros.report.adjustment import headline
 from omsm_ros.report.measurement.figures import levelled, overview_figure, surface_figures
 from omsm_ros.report.measurement.surface_map import CloudView
+from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
@@ -269,9 +269,10 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = planned_test_of(plan.scenario, plan.disturbances)
-    judgement = Judgement(options, out=plan.out, fitted=_REGISTERING.dofs)
+    judgement = Judgement(options, out=plan.out)
     summary = measurement.summarise(plan.bag, done, calibration, judgement)
     measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
+    measurement.add_verdict(summary, done, calibration, judgement)
     summary["files"] |= {"scan_report": SCAN_REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimated error by the true one

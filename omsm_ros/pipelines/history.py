@@ -298,10 +298,8 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
         "calibration": str(summary.get("calibration", "")),
         "received": _count(_part(summary, "samples", "distance", "received")),
         "corrected": _count(_part(summary, "samples", "distance", "corrected")),
-        "deviation_rms": _number(_part(summary, "deviation", "corrected", "rms_area_weighted")),
-        "deviation_peak_to_valley": _number(
-            _part(summary, "deviation", "corrected", "peak_to_valley")
-        ),
+        "deviation_rms": _number(_part(summary, "figures", "rms", "value")),
+        "deviation_peak_to_valley": _number(_part(summary, "figures", "peak_to_valley", "value")),
         "dynamic_error_rms": _number(_part(summary, "dynamic_error_before", "rms")),
         "uncertainty_median": _number(_part(summary, "uncertainty", "median")),
     }

@@ -12,19 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from omsm_ros import __version__
+from omsm_ros.core.adjustment import Verdict, adjust
+from omsm_ros.core.adjustment.families import OTHER_SPEED
+from omsm_ros.core.adjustment.figures import POSE
+from omsm_ros.core.adjustment.verdict import verdict_of
 from omsm_ros.core.calibration.calibration import Calibration, age_at, excess_latency_text
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.calibration.latency import latency_summary
-from omsm_ros.core.correction.budget import (
-    ScanBudget,
-    TrafficLight,
-    TrafficLightReason,
-    excess_noise_reasons,
-    scan_budget,
-    traffic_light_of,
-)
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.machine_sources import NOTHING_STATED, RANDOM, MachineSources
+from omsm_ros.core.correction.machine_sources import (
+    NOTHING_STATED,
+    RANDOM,
+    MachineSources,
+    excess_noise,
+    scan_budget,
+    with_assumed,
+)
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fields
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
@@ -33,10 +36,17 @@ from omsm_ros.core.lti.discretisation import discretisation_error, discretise
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import mismatch
-from omsm_ros.errors import DataError
+from omsm_ros.core.surface.posed import Pose, PosedSurface
+from omsm_ros.errors import DataError, Notice
 from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.results import save_fields
 from omsm_ros.io.topics import AnyBag
+from omsm_ros.pipelines.adjust import (
+    conformity_entry,
+    figures_entry,
+    priors_of,
+    verdict_entry,
+)
 from omsm_ros.pipelines.correct import Admission, Correction, StampJoining, correct_bag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
@@ -45,13 +55,6 @@ if TYPE_CHECKING:
     from omsm_ros.pipelines.correct import Correction
 
 
-# A fitted degree of freedom removes these sources from the deviations; the uncertainty of the fit
-# is part of the form's uncertainty.
-_POSE_DOFS: Mapping[str, tuple[str, ...]] = {
-    "tilt": ("tip", "tilt"),
-    "decentre": ("x", "y"),
-    "clocking": ("clocking",),
-}
 # With a smaller share of corrected samples the map may miss defects of the surface.
 _LEAST_SHARE_CORRECTED = 0.95
 
@@ -62,12 +65,12 @@ def with_sources(
     stated: MachineSources,
     nominal: Surface | None,
 ) -> CorrectionOptions:
-    """Return ``options`` with the ``stated`` uncertainty sources and the surface ``nominal``."""
+    """Return ``options`` with the ``stated`` and assumed sources, and the surface ``nominal``."""
     known = options.sources or ErrorSources.of(calibration)
     return replace(
         options,
         sources=replace(known, **stated.point_uncertainties()),
-        systematic=stated.scan_sources(),
+        systematic=with_assumed(stated).scan_sources(),
         surface=nominal,
     )
 
@@ -79,19 +82,17 @@ class Judgement:
     options: of its correction;  stated: uncertainty sources of the machine
     accuracy: required expanded uncertainty, k = 2 [m]
     out: folder for the fields of its systematic errors, None to keep none
-    fitted: degrees of freedom of the pose that are fitted to the nominal surface, or "auto"
     """
 
     options: CorrectionOptions
     stated: MachineSources = NOTHING_STATED
     accuracy: float | None = None
     out: Path | None = None
-    fitted: Sequence[str] = ()
 
-    def of(
+    def budget(
         self, done: Correction, calibration: Calibration, discretisation: float
     ) -> dict[str, Any]:
-        """Return ``budget`` and ``light`` for ``summary.json``.
+        """Return ``budget`` for ``summary.json``.
 
         discretisation: rms of the digital filter's error on the scan's path [m]
         """
@@ -103,82 +104,142 @@ class Judgement:
             {"discretisation": discretisation}
             | {n: size for n, size in done.budget.items() if size or n == SCAN_SCATTER},
             options.geometry,
-            self.stated,
+            with_assumed(self.stated),
             trace.with_slopes(options.surface) if len(trace) else trace,
         )
         if self.out is not None and len(trace) and resolves_per_turn_waves(trace):
             kept = scan_fields(budget.fields, done.trace.every, budget.bounds)
             save_fields(self.out / SYSTEMATIC, kept)
-        return {"budget": budget.entry(), "light": self._light(budget, done, calibration).entry()}
+        return budget.entry()
 
-    def _light(
-        self, budget: ScanBudget, done: Correction, calibration: Calibration
-    ) -> TrafficLight:
-        counts = _POSE_DOFS if self.options.surface is not None else {}
-        fitted = [
-            name
-            for name, dofs in _POSE_DOFS.items()
-            if "auto" in self.fitted or set(dofs) <= set(self.fitted)
-        ]
-        return traffic_light_of(
-            calibration,
-            {name: size for name, size in budget.heights.items() if name not in fitted},
-            self.stated,
-            accuracy=self.accuracy,
-            pose_open=[name for name in counts if name not in fitted],
-            registered=bool(fitted),
-            doubts=tuple(_losses(done)),
+
+# Turns without which a scan determines neither form nor drift.
+_LEAST_TURNS = 3.0
+# Beyond this a pose is not linear, and the surface is moved before the scan is adjusted.
+_SMALL_ANGLE_RAD, _SMALL_SHIFT_M = 1e-4, 1e-5
+
+
+def add_verdict(
+    summary: dict[str, Any],
+    done: Correction,
+    calibration: Calibration,
+    judgement: Judgement,
+    tolerance: float | None = None,
+) -> None:
+    """Add ``verdict`` and ``figures`` of a single scan to its summary: its adjustment alone.
+
+    tolerance: of the peak to valley [m], None: conformity is not assessed
+
+    The pose that ``summary["form"]`` aligned is removed; without it piston, tip and tilt. A scan
+    that is no spiral is not adjusted: its heights are not verified, and its figures are those of
+    the registration.
+    """
+    scan, form = done.scan, summary.get("form")
+    doubts = [*done.faults, *map(str, _losses(done))]
+    if scan is None or scan.turns < _LEAST_TURNS:
+        systematic = summary["budget"]["systematic"]
+        verdict = untested_verdict(2 * systematic, judgement.accuracy)
+        if form is not None:
+            summary["figures"] = _registered_figures(form)
+    else:
+        nominal = judgement.options.surface
+        found = adjust(
+            [scan],
+            priors_of(judgement.stated, judgement.options.geometry.abbe_arm, calibration),
+            nominal=nominal if form is None or nominal is None else _posed(nominal, form["pose"]),
+            accuracy=judgement.accuracy,
+            removed=POSE if form is None else _aligned(form["removed"]),
         )
+        verdict = found.verdict
+        if nominal is not None:
+            summary["figures"] = figures_entry(found.form)
+            if tolerance is not None:
+                summary["conformity"] = conformity_entry(found.form.pv, tolerance)
+    summary["verdict"] = verdict_entry(verdict, calibration, doubts=doubts)
 
 
-def live_traffic_light(
+def untested_verdict(expanded: float, accuracy: float | None) -> Verdict:
+    """Return the verdict on heights of one scan that was not adjusted.
+
+    expanded: uncertainty of the heights, k = 2 [m];  accuracy: asked for [m], None: none
+    """
+    return verdict_of((), (), (), False, expanded, accuracy, (OTHER_SPEED, float("nan")))
+
+
+# Degrees of freedom that an adjustment can remove; all of a pose, but no power.
+_DOFS = ("piston", "tip", "tilt", "x", "y", "clocking")
+
+
+def _aligned(removed: Mapping[str, Any]) -> list[str]:
+    """Return the degrees of freedom that were fitted, or held because form looks like them.
+
+    The figures are those after best-fit alignment, which no held pose makes uncertain.
+    """
+    return [name for name in _DOFS if name in removed["fitted"] or name in removed["held"]]
+
+
+def _posed(nominal: Surface, pose: Mapping[str, Mapping[str, float]]) -> Surface:
+    """Return the surface where the registration found the part, unless it is near enough."""
+    found = Pose(**{name: float(pose[name]["value"] or 0.0) for name in _DOFS})
+    angles, shifts = (found.tip, found.tilt, found.clocking), (found.x, found.y)
+    small = max(map(abs, angles)) < _SMALL_ANGLE_RAD and max(map(abs, shifts)) < _SMALL_SHIFT_M
+    return nominal if small else PosedSurface(nominal, found)
+
+
+def _registered_figures(form: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        name: {"value": given["value"], "standard_uncertainty": given["uncertainty"]}
+        for name in ("peak_to_valley", "rms")
+        if (given := form["deviation"].get(name)) is not None and given["value"] is not None
+    }
+    return {**found, "removed": form["removed"]["fitted"], "terms": []} if len(found) == 2 else {}
+
+
+def live_verdict(
     corrector: Corrector,
     calibration: Calibration,
     stated: MachineSources,
     accuracy: float | None,
-) -> TrafficLight:
-    """Return the traffic light of the points so far, by their uncertainty."""
-    shared = {name: size for name, size in corrector.budget.items() if name not in RANDOM}
-    return traffic_light_of(
-        calibration,
-        shared,
-        stated,
-        accuracy=accuracy,
-        pose_open=(),
-        doubts=(*excess_noise_reasons(corrector.budget), *_without_slopes(corrector, stated)),
-    )
+) -> dict[str, Any]:
+    """Return the verdict on the points so far, and their uncertainty (k = 2, rms) [m]."""
+    shared = [size for name, size in corrector.budget.items() if name not in RANDOM]
+    expanded = 2 * sum(size**2 for size in shared) ** 0.5
+    noise = excess_noise(corrector.budget)
+    doubts = [*([str(noise)] if noise else []), *_without_slopes(corrector, stated)]
+    verdict = untested_verdict(expanded, accuracy)
+    return verdict_entry(verdict, calibration, doubts=doubts) | {"uncertainty": expanded}
 
 
-def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[TrafficLightReason]:
+def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[str]:
     lateral = {s.name for s in stated.scan_sources() if s.needs_slope and s.standard_uncertainty}
     missing = sorted(lateral - set(corrector.budget))
     if missing and corrector.trace.seen:
-        yield TrafficLightReason(
-            f"{', '.join(missing)} not in the uncertainty of the points: slopes are unknown",
-            "give the corrector the part's surface (parameter 'nominal')",
+        yield (
+            f"{', '.join(missing)} not in the uncertainty of the points: slopes are unknown; give "
+            "the corrector the part's surface (parameter 'nominal')"
         )
 
 
-def _losses(done: Correction) -> Iterator[TrafficLightReason]:
-    yield from map(TrafficLightReason, done.faults)
-    yield from excess_noise_reasons(done.budget)
+def _losses(done: Correction) -> Iterator[str | Notice]:
+    if (noise := excess_noise(done.budget)) is not None:
+        yield noise
     for text in done.reasons:
-        yield TrafficLightReason(
-            f"the calibration was used although {text}",
-            "identify with the settings of the scan, and correct with that calibration",
+        yield (
+            f"the calibration was used although {text}; identify with the settings of the scan, "
+            "and correct with that calibration"
         )
     if beyond := done.account["axes"]["counted"].get("beyond"):
-        yield TrafficLightReason(
-            f"{beyond} samples lie beyond the range of the calibration set",
-            "calibrate there, too, and make a new set with 'omsm calset'",
+        yield (
+            f"{beyond} samples lie beyond the range of the calibration set; calibrate there, too, "
+            "and make a new set with 'omsm calset'"
         )
     for name, stream in done.account.items():
         lost = stream["received"] - stream["corrected"]
         if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
             share = 100 * lost / stream["received"]
-            yield TrafficLightReason(
-                f"{name}: {lost} samples ({share:.1f} %) gave no point",
-                "see the account of the samples; scan slower if the probe lost its target",
+            yield (
+                f"{name}: {lost} samples ({share:.1f} %) gave no point; see the account of the "
+                "samples; scan slower if the probe lost its target"
             )
 
 
@@ -218,27 +279,22 @@ def measure(
     lateral: standard uncertainty of x and y [m]; needs ``nominal`` for the slope
     by_stamps: see :func:`omsm_ros.pipelines.correct.correct_bag`
     stated: uncertainty sources;  accuracy: required expanded uncertainty, k = 2 [m]
-    register: options of a registration to ``nominal``; None: no registration
-    report: False writes no report, which takes longer than everything else
+    register: options of a registration to ``nominal``, or None;  report: False writes no report
 
     Raises CalibrationError for a calibration that does not match the scan, unless overridden.
     """
     used = with_sources(options or CorrectionOptions(), calibration, stated, nominal)
     done = correct_bag(
-        bag,
-        calibration,
-        out / CLOUD,
-        options=used,
-        admission=admission,
-        nominal=nominal,
-        lateral=lateral,
-        by_stamps=by_stamps,
-        progress=progress,
-    )
-    fitted = register.dofs if register is not None else ()
-    summary = summarise(bag, done, calibration, Judgement(used, stated, accuracy, out, fitted))
-    if register is not None and nominal is not None and done.statistics:
-        add_form(out, summary, nominal, register)
+        bag, calibration, out / CLOUD, options=used, admission=admission, nominal=nominal,
+        lateral=lateral, by_stamps=by_stamps, progress=progress,
+    )  # fmt: skip
+    tolerance = register.tolerance if register is not None else None
+    judgement = Judgement(used, stated, accuracy, out)
+    summary = summarise(bag, done, calibration, judgement)
+    if done.statistics:
+        if register is not None and nominal is not None:
+            add_form(out, summary, nominal, register)
+        add_verdict(summary, done, calibration, judgement, tolerance)
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
@@ -284,12 +340,9 @@ def add_form(
         out,
         register.dofs,
         register.aperture,
-        tolerance=register.tolerance,
     )
     summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
-    if register.tolerance is not None:
-        summary["form"]["conformity"] = facts["conformity"]
 
 
 def summarise(
@@ -331,7 +384,8 @@ def summarise(
     ) is not None:
         summary["warnings"].append(str(late))
     of_filter = judged.get("discretisation", {}).get("rms", 0.0)
-    return summary | judged | _figures_of_merit(done) | judgement.of(done, calibration, of_filter)
+    budget = judgement.budget(done, calibration, of_filter)
+    return summary | judged | _figures_of_merit(done) | {"budget": budget}
 
 
 def conditions(done: Correction, calibration: Calibration) -> dict[str, Any]:

@@ -10,9 +10,13 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.calibration.calibration import settings_with
+from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.kinematics.scan_path import ScanPath, ScanPathReader
-from omsm_ros.core.streams.blocks import Block
+from omsm_ros.core.streams.blocks import AxisBlock, Block, FloatArray, IntArray
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.streams.stamps import check_period
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
@@ -260,3 +264,45 @@ def _inspect(topic: bags.TopicSummary, watch: StreamWatch | None) -> StreamInspe
         restarts=watch.restarts,
         invalid=watch.invalid,
     )
+
+
+def scan_data(
+    axes: Sequence[AxisBlock],
+    parts: Sequence[SurfacePoints],
+    period: float,
+    clocking: float = 0.0,
+    clamping: int = 0,
+) -> tuple[ScanData, SurfacePoints]:
+    """Return points with the motion of the axes, time from zero, and the points that have one.
+
+    clocking: angle by which the part is turned on the chuck [rad];  clamping: its number
+    Raises DataError for points that do not make a scan.
+    """
+    made = join_points(parts)
+    z, c = _axes_at(axes, made.sample)
+    known = np.isfinite(z) & np.isfinite(c) & np.isfinite(made.height)
+    made, z, c = made.part(known), z[known], np.unwrap(c[known])
+    data = ScanData(
+        time=(made.sample - made.sample[0]) * period if len(made) else np.empty(0),
+        x=made.x,
+        y=made.y,
+        height=made.height,
+        distance=made.height - z + made.dynamic_error,
+        motion=z,
+        removed=made.dynamic_error,
+        c=c,
+        clocking=clocking,
+        clamping=clamping,
+    )
+    return data, made
+
+
+def _axes_at(blocks: Sequence[AxisBlock], samples: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return z [m] and c [rad] at the trigger counts ``samples``, NaN where there is none."""
+    counts = np.concatenate([b.first_sample + np.arange(len(b), dtype=np.int64) for b in blocks])
+    z, c = (np.concatenate([getattr(b, name) for b in blocks]) for name in "zc")
+    order = np.argsort(counts, kind="stable")
+    counts, z, c = counts[order], z[order], c[order]
+    place = np.minimum(np.searchsorted(counts, samples), len(counts) - 1)
+    there = counts[place] == samples
+    return np.where(there, z[place], np.nan), np.where(there, c[place], np.nan)

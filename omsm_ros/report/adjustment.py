@@ -13,17 +13,9 @@ from omsm_ros.readable import NOTHING, count, expanded, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study
 from omsm_ros.report.tables import Table
-from omsm_ros.report.verdict import PageVerdict
+from omsm_ros.report.verdict import headline, page_verdict
 from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
 
-_LEVELS = {
-    "verified": "good",
-    "not_verified": "care",
-    "contradicted": "bad",
-    "too_uncertain": "bad",
-}
-_CONFORMITY = {"holds": "tolerance held", "fails": "tolerance exceeded"}
-_OPEN = "conformity open: the tolerance lies within the uncertainty"
 CAPTIONS = {
     "map": "Form deviation from the nominal surface, pose removed; mean of each cell.",
     "uncertainty": "Standard uncertainty (k = 1) of the map, all sources together.",
@@ -47,16 +39,11 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
         figures["sources"] = sources(facts)
     if found.agreement:
         figures["agreement"] = agreement(found)
-    verdict = facts["verdict"]
     return fill_study(
         StudyPage(
             title=f"{title}: {headline(facts)}",
             subtitle="; ".join(_scan_text(scan) for scan in facts["scans"]),
-            verdict=PageVerdict(
-                _LEVELS[verdict["code"]],
-                verdict["text"][:1].upper() + verdict["text"][1:],
-                tuple(next_steps(facts)),
-            ),
+            verdict=page_verdict(facts["verdict"]),
             sections=(
                 Section(
                     "Form", ("map", "uncertainty", "profiles"), (_truth(facts), _figures(facts))
@@ -74,26 +61,6 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
             footer=f"calibration {facts['calibration'][:12]}",
         )
     )
-
-
-def headline(facts: Mapping[str, Any]) -> str:
-    """Return the result in one line: "PV 175 nm ± 12 nm (k = 2), tolerance held"."""
-    pv = facts["figures"]["peak_to_valley"]
-    text = f"PV {expanded(pv['value'], pv['standard_uncertainty'], 'm')}"
-    if (judged := facts.get("conformity")) is not None:
-        text += f", {_CONFORMITY.get(judged['verdict'], _OPEN)}"
-    return text
-
-
-def next_steps(facts: Mapping[str, Any]) -> list[str]:
-    """Return the reasons against green and the scan that helps most; what agrees where green."""
-    verdict = facts["verdict"]
-    found = [reason["text"] for reason in verdict["reasons"]]
-    if (add := verdict.get("add")) is not None:
-        found.append(f"{add['text']}: then U = {quantity(add['reached'], 'm', 2)} (rms, k = 2)")
-    if verdict["code"] == "verified":
-        found.append("the scans agree, and no declared source is refuted")
-    return found
 
 
 def _scan_text(scan: Mapping[str, Any]) -> str:

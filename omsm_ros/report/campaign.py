@@ -47,8 +47,11 @@ class Series:
 
 TEMPERATURE = Series("Temperature", ("conditions", "temperature", "mean"), "°C")
 SERIES = (
-    Series("Deviation from nominal, rms by area", ("deviation", "corrected", "rms_area_weighted")),
-    Series("Deviation, peak to valley", ("deviation", "corrected", "peak_to_valley")),
+    Series("Form deviation, rms", ("figures", "rms", "value")),
+    Series("Form deviation, PV", ("figures", "peak_to_valley", "value")),
+    Series(
+        "U of the PV (k = 1)", ("figures", "peak_to_valley", "standard_uncertainty"), judged=False
+    ),
     Series("Dynamic error removed, rms", ("dynamic_error_before", "rms")),
     Series("Standard uncertainty, median", ("uncertainty", "median")),
     Series("Scatter beyond what is stated, rms", ("uncertainty_budget", "scan_scatter")),
@@ -197,7 +200,7 @@ def _row(
         cells.append((text, one is not None and bool(one.outlying[place])))
     verdict = None
     if measurement.state == "done":
-        verdict = verdict_on_measurement(measurement.summary, calibration)
+        verdict = verdict_on_measurement(measurement.summary)
     stream = part(measurement.summary, "samples", "distance") or {}
     received, corrected = stream.get("received", 0), stream.get("corrected", 0)
     return {
@@ -265,7 +268,7 @@ def draw(machines: Sequence[HistoryLike]) -> bytes:
         lag.plot([], [], "o", color=colour, label=style.named(machine.machine) or "not named")
     style.label(lag, y="µs", title="Low-frequency delay, k = 2")
     style.label(gain, title="Static gain, k = 2")
-    style.label(form, y="nm", title="Deviation from nominal, rms by area", x="recorded (UTC)")
+    style.label(form, y="nm", title="Form deviation, rms", x="recorded (UTC)")
     for panel in (lag, gain, form):
         locator = AutoDateLocator()
         panel.xaxis.set_major_locator(locator)

@@ -11,11 +11,6 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
 
 _OPEN = "not evaluated"
-_FIGURE_NAMES = {
-    "peak_to_valley": "peak to valley",
-    "rms": "rms over the points",
-    "rms_area_weighted": "rms over the area",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,20 +35,15 @@ def part(mapping: Mapping[str, Any], *path: str) -> Any:
 
 
 def error_table(summary: Mapping[str, object]) -> Table:
-    """Return deviation and dynamic error before and after the correction."""
+    """Return the dynamic error before and after the correction, and the uncertainty of heights.
+
+    The deviation from nominal is no row: without its pose it is a figure of the set-up.
+    """
     rows = []
-    for key, name in _FIGURE_NAMES.items():
-        both = [part(summary, "deviation", side, key) for side in ("raw", "corrected")]
-        rows.append((f"deviation from nominal, {name}", *(quantity(v, "m") for v in both)))
     for key in ("peak_to_valley", "rms"):
         both = [part(summary, f"dynamic_error_{side}", key) for side in ("before", "after")]
         label = f"dynamic error, {key.replace('_', ' ')}"
         rows.append((label, *(quantity(v, "m") for v in both)))
-    for key in ("rms_before_fit", "rms"):
-        value = part(summary, "form", "deviation", key)
-        label = {"rms_before_fit": "before the fit", "rms": "registered"}[key]
-        found = () if value is None else (measured(value["value"], value["uncertainty"], "m"),)
-        rows += [(f"deviation from nominal along the normal, rms, {label}", "", *found)]
     for key in ("median", "largest"):
         value = part(summary, "uncertainty", key)
         rows.append((f"standard uncertainty of a height, {key}", "", quantity(value, "m")))

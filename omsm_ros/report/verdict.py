@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED, Certificate
-from omsm_ros.errors import text_of
-from omsm_ros.readable import count, percent, quantity
+from omsm_ros.readable import count, expanded, quantity
 from omsm_ros.report.tables import part
-
-# With a smaller share of corrected samples the map may miss defects of the surface.
-_LEAST_SHARE_CORRECTED = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,79 +30,67 @@ def verdict_text(calibration: Calibration) -> str:
     return f"{certificate.verdict}, valid {start} {high}"
 
 
-def verdict_on_measurement(
-    summary: Mapping[str, object], calibration: Calibration | None
-) -> PageVerdict:
-    """Return the verdict from certificate, account of samples, traffic light and warnings.
+_LEVELS = {"verified": "good", "not_verified": "care"}
+"""Level of a page by the code of its verdict; of all other codes "bad"."""
 
-    Only warnings of the measurement (``summary["warnings"]``) count; those of an accepted
-    certificate do not.
+
+def page_verdict(verdict: Mapping[str, Any], more: Iterable[str] = ()) -> PageVerdict:
+    """Return a verdict, as adjustment and summary hold it, for a page.
+
+    more: further reasons, with which nothing is verified
     """
-    certificate = calibration.certificate if calibration else Certificate()
-    stated = certificate.verdict
-    against = _accounting(summary)
-    if stated == REJECTED:
-        against += ["the calibration was rejected", *map(str, certificate.reasons)]
-    if against:
-        return PageVerdict("bad", "Measurement not valid", tuple(against))
-    warnings = [*map(str, part(summary, "warnings") or ())]
-    if light := part(summary, "light"):
-        return _of_light(light, warnings)
-    doubts = [*warnings, *_losses(summary), *_latency(calibration)]
-    if calibration is None or not stated:
-        missing = "the calibration has no certificate" if calibration else "no calibration is given"
-        return PageVerdict("unknown", "Validity not assessed", (missing, *doubts))
-    if doubts:
-        return PageVerdict("care", "Valid with reservations", tuple(doubts))
-    return PageVerdict(
-        "good",
-        "Valid",
-        (f"calibration {verdict_text(calibration)}", "every sample accounted for"),
-    )
-
-
-def _of_light(light: Mapping[str, Any], warnings: Sequence[str]) -> PageVerdict:
-    """Return the verdict by the traffic light; with warnings at most amber."""
-    level = {"green": "good", "amber": "care", "red": "bad"}[light["level"]]
-    if warnings and level == "good":
+    level, text = _LEVELS.get(verdict["code"], "bad"), verdict["text"]
+    steps = [*more, *next_steps(verdict)]
+    if more and level == "good":
         level = "care"
-    word = light["word"][:1].upper() + light["word"][1:]
-    reasons = [
-        f"{r['what']}: {r['remedy']}" if r["remedy"] else r["what"] for r in light["reasons"]
-    ]
-    return PageVerdict(level, word, (*warnings, *reasons) or ("every source was evaluated",))
+    return PageVerdict(level, text[:1].upper() + text[1:], tuple(steps))
 
 
-def _streams(summary: Mapping[str, object]) -> Mapping[str, Any]:
-    return part(summary, "samples") or {}
+def next_steps(verdict: Mapping[str, Any]) -> list[str]:
+    """Return the scan that helps most and the reasons against green; what agrees where green."""
+    found = []
+    if (add := verdict.get("add")) is not None:
+        reached = add["reached"]
+        then = "" if reached is None else f": then U = {quantity(reached, 'm', 2)} (rms, k = 2)"
+        found.append(f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
+    found += [reason["text"] for reason in verdict["reasons"]]
+    if verdict["code"] == "verified":
+        found.append("the scans agree, and no declared source is refuted")
+    return found
+
+
+def verdict_on_measurement(summary: Mapping[str, Any]) -> PageVerdict:
+    """Return the verdict of a scan's summary, with the warnings of the measurement.
+
+    Samples without account make it invalid; a summary of an earlier version holds no verdict.
+    """
+    warnings = [*map(str, part(summary, "warnings") or ())]
+    if against := _accounting(summary):
+        return PageVerdict("bad", "Measurement not valid", tuple(against))
+    verdict = part(summary, "verdict")
+    if not verdict:
+        return PageVerdict("unknown", "Not verified", ("correct the scan again", *warnings))
+    return page_verdict(verdict, warnings)
 
 
 def _accounting(summary: Mapping[str, object]) -> list[str]:
     found = []
-    for name, stream in _streams(summary).items():
+    streams: Mapping[str, Any] = part(summary, "samples") or {}
+    for name, stream in streams.items():
         seen = stream["corrected"] + stream.get("pending", 0) + sum(stream["counted"].values())
         if seen != stream["received"]:
             found.append(f"{name}: {count(abs(stream['received'] - seen))} samples unaccounted for")
     return found
 
 
-def _latency(calibration: Calibration | None) -> list[str]:
-    """Return the remedy for a lag of unknown origin, mechanical or latency."""
-    if calibration is None or calibration.latency.resolved:
-        return []
-    lag = calibration.dynamics.low_frequency_delay
-    remedy = text_of("correction.latency_remedy", {})
-    return [
-        f"the share of probe latency in the lag of {quantity(lag, 's', 4)} is unknown; X and C "
-        f"must be delayed by it (probe_latency in the budget): {remedy}"
-    ]
+_CONFORMITY = {"holds": "tolerance held", "fails": "tolerance exceeded"}
+_OPEN = "conformity open: the tolerance lies within the uncertainty"
 
 
-def _losses(summary: Mapping[str, object]) -> list[str]:
-    found = []
-    for name, stream in _streams(summary).items():
-        lost = stream["received"] - stream["corrected"]
-        if lost > (1 - _LEAST_SHARE_CORRECTED) * stream["received"]:
-            share = percent(lost / stream["received"])
-            found.append(f"{name}: {count(lost)} samples ({share}) gave no point")
-    return found
+def headline(facts: Mapping[str, Any]) -> str:
+    """Return the result in one line: "PV 175 nm ± 12 nm (k = 2), tolerance held"."""
+    pv = facts["figures"]["peak_to_valley"]
+    text = f"PV {expanded(pv['value'], pv['standard_uncertainty'], 'm')}"
+    if (judged := facts.get("conformity")) is not None:
+        text += f", {_CONFORMITY.get(judged['verdict'], _OPEN)}"
+    return text

@@ -62,7 +62,7 @@ def test_a_set_is_made_and_corrected_with(capsys, tmp_path, scan, calibrations):
     account = summary["samples"]["axes"]
     assert account["counted"]["beyond"] > 0
     assert account["received"] == account["corrected"] + sum(account["counted"].values())
-    assert any("beyond the range" in reason["what"] for reason in summary["light"]["reasons"])
+    assert any("beyond the range" in reason["text"] for reason in summary["verdict"]["reasons"])
     assert cli.main(["calset", *placed, "--out", str(out)]) == 0
     assert "at x = 1.90 mm" in capsys.readouterr().out
 
@@ -92,7 +92,7 @@ def test_sources_of_no_name_are_refused(capsys, tmp_path, scan, calibrations):
     assert not (tmp_path / "r").exists()
 
 
-def test_sources_in_a_file_reach_points_budget_and_light(capsys, tmp_path, scan, calibrations):
+def test_sources_in_a_file_reach_points_budget_and_verdict(capsys, tmp_path, scan, calibrations):
     files = {"machine.yaml": SOURCES, "mirror.yaml": MIRROR}
     for name, text in files.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
@@ -113,8 +113,8 @@ def test_sources_in_a_file_reach_points_budget_and_light(capsys, tmp_path, scan,
     assert rows["discretisation"]["status"] == "evaluated"
     before, after = (s["uncertainty"]["median"] for s in (silent, reported))
     assert after == pytest.approx(np.hypot(before, 1e-5 * 1.75e-3), rel=0.03)
-    assert reported["light"]["level"] == "red"
-    assert silent["light"]["level"] == "amber"
-    said = [reason["what"] for reason in reported["light"]["reasons"]]
-    assert any("(decentre)" in what for what in said)
+    said = [
+        [reason["code"] for reason in found["verdict"]["reasons"]] for found in (silent, reported)
+    ]
+    assert ["uncertainty" in codes for codes in said] == [False, True]
     assert (tmp_path / "result" / "systematic.npz").is_file()

@@ -165,8 +165,8 @@ def test_a_pitch_that_was_measured_elsewhere_is_reported(capsys, tmp_path, scan_
         table = tmp_path / f"{name}.csv"
         table.write_text(f"z_m,pitch_rad\n{low},1e-6\n{high},2e-6\n")
         out = ["--out", tmp_path / name, "--no-report", "--pitch", table]
-        reasons = facts(capsys, *words, *out)["light"]["reasons"]
-        reported[name] = [r["what"] for r in reasons if "pitch was measured" in r["what"]]
+        reasons = facts(capsys, *words, *out)["verdict"]["reasons"]
+        reported[name] = [r["text"] for r in reasons if "pitch was measured" in r["text"]]
     assert reported["here"] == []
     assert "from 5.00 m to 6.00 m" in reported["elsewhere"][0]
 

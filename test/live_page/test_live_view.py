@@ -112,15 +112,17 @@ def test_the_light_of_the_measurement_is_part_of_it(clock, true_calibration):
     """A cell that runs well does not say that its numbers are good."""
     view = LiveView(monotonic=clock)
     view.set_calibration(true_calibration)
-    said = {"light": "amber", "light_reasons": "drift not evaluated; pitch not evaluated"}
+    said = {"verdict": "not_verified", "verdict_text": "not verified", "verdict_next": "next: scan"}
     view.add_state("/omsm/corrector", "OK", "correcting", said)
     assert view.state()["light"] == {
         "colour": "amber",
-        "reasons": ["measurement: drift not evaluated", "measurement: pitch not evaluated"],
+        "reasons": ["measurement: not verified", "measurement: next: scan"],
     }
-    view.add_state("/omsm/corrector", "OK", "correcting", said | {"light": "red"})
+    view.add_state("/omsm/corrector", "OK", "correcting", said | {"verdict": "contradicted"})
     assert view.state()["light"]["colour"] == "red"
-    view.add_state("/omsm/corrector", "OK", "correcting", {"light": "green", "light_reasons": ""})
+    view.add_state(
+        "/omsm/corrector", "OK", "correcting", {"verdict": "verified", "verdict_next": ""}
+    )
     assert view.state()["light"] == {"colour": "green", "reasons": []}
 
 

@@ -7,8 +7,8 @@ import pytest
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.errors import FileError
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, sources_of
-from omsm_ros.nodes.corrector_node import light_values
-from omsm_ros.pipelines.measure import live_traffic_light, with_sources
+from omsm_ros.nodes.corrector_node import verdict_values
+from omsm_ros.pipelines.measure import live_verdict, with_sources
 
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 FILE = """\
@@ -35,22 +35,20 @@ def test_a_parameter_is_stated_before_the_file(tmp_path):
         sources_of(DEFAULTS | {"sources_file": str(tmp_path / "none.yaml")})
 
 
-def test_the_light_follows_what_is_corrected(tmp_path, true_calibration, small_scan):
+def test_the_verdict_follows_what_is_corrected(tmp_path, true_calibration, small_scan):
     reported = values(tmp_path, accuracy=1e-9)
     stated = sources_of(reported)
     corrector = Corrector(
         true_calibration, with_sources(CorrectionOptions(), true_calibration, stated, None)
     )
-    before = live_traffic_light(corrector, true_calibration, stated, accuracy_of(DEFAULTS))
-    assert before.level == "amber"
+    before = live_verdict(corrector, true_calibration, stated, accuracy_of(DEFAULTS))
+    assert before["code"] == "not_verified"
     corrector.push_axes(small_scan.axes)
     corrector.push_distance(small_scan.distance)
-    after = live_traffic_light(corrector, true_calibration, stated, accuracy_of(reported))
+    after = live_verdict(corrector, true_calibration, stated, accuracy_of(reported))
     # A walk of 1 nm in a second is one of 6 nm in forty, and half of that on the mean.
-    assert 5e-9 < after.uncertainty / 2 < 0.1e-6
-    assert after.level == "red"
-    shown = light_values(after)
-    assert shown["light"] == "red"
-    assert "exceeds the accuracy of 1.00 nm asked for" in shown["light_reasons"]
-    assert "drift not evaluated" not in shown["light_reasons"]
-    assert "pose" not in shown["light_reasons"]
+    assert 5e-9 < after["uncertainty"] / 2 < 0.1e-6
+    shown = verdict_values(after)
+    assert shown["verdict"] != "verified"
+    assert "larger than the accuracy of 1.0 nm asked for" in shown["verdict_next"]
+    assert "scan the part again at twice the speed" in shown["verdict_next"]

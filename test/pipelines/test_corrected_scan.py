@@ -191,13 +191,13 @@ def test_trigger_numbers_missing_from_both_streams_take_the_green_away(
         for axes, distance in small_scan_blocks[:8] + small_scan_blocks[10:20]:
             bag.write_axes(axes)
             bag.write_distance(distance)
-    said = light_reasons(path, true_calibration, tmp_path)
+    said = reasons_of(path, true_calibration, tmp_path)
     assert [s for s in said if "200 trigger numbers are missing (800 to 999)" in s]
     stream, _ = inspect_bag(path).streams
     assert (stream.gaps, stream.missing) == (1, 200)
 
 
-def light_reasons(path, calibration, folder):
-    light = measure(path, calibration, folder / "out", report=False)["light"]
-    assert light["level"] != "green"
-    return [reason["what"] for reason in light["reasons"]]
+def reasons_of(path, calibration, folder):
+    verdict = measure(path, calibration, folder / "out", report=False)["verdict"]
+    assert verdict["code"] != "verified"
+    return [reason["text"] for reason in verdict["reasons"]]

@@ -141,9 +141,7 @@ def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     assert "holds" in capsys.readouterr().out
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == 7
-    for text in (
-        *("Form of the part", "By the evaluated sources", "Uncertainty budget incomplete", "Sku"),
-    ):
+    for text in (*("Form of the part", "Not verified", "Uncertainty budget incomplete", "Sku"),):
         assert text in page
     curves = json.loads((tmp_path / "curves.json").read_text())
     psd = curves["psd"]

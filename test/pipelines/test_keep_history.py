@@ -35,7 +35,7 @@ def result(folder, bag="scan.mcap", rms=17e-9):
         "settings": {"machine": "lathe 1"},
         "versions": {"omsm_ros": "0.1.0"},
         "samples": {"distance": {"received": 100, "corrected": 98, "counted": {"settling": 2}}},
-        "deviation": {"corrected": {"rms_area_weighted": rms, "peak_to_valley": 5 * rms}},
+        "figures": {"rms": {"value": rms}, "peak_to_valley": {"value": 5 * rms}},
         "uncertainty": {"median": 1e-8},
     }
     (folder / "summary.json").write_text(json.dumps(summary))

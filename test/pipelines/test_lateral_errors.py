@@ -11,7 +11,7 @@ from omsm_ros.core.correction.systematic import ScanTrace
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines.correct import add_lateral_errors, correct_bag
-from omsm_ros.pipelines.measure import live_traffic_light, with_sources
+from omsm_ros.pipelines.measure import live_verdict, with_sources
 
 from .test_corrected_scan import write
 
@@ -79,7 +79,7 @@ def test_points_too_far_apart_for_the_turns_say_so(tmp_path, small_scan, true_ca
     assert "--nominal" in found.warnings[0]
 
 
-def test_live_without_a_surface_the_light_says_what_is_not_in_the_points(
+def test_live_without_a_surface_the_verdict_says_what_is_not_in_the_points(
     small_scan, true_calibration
 ):
     for surface, reported in ((None, True), (PAPER_MIRROR, False)):
@@ -87,7 +87,7 @@ def test_live_without_a_surface_the_light_says_what_is_not_in_the_points(
         corrector = Corrector(true_calibration, options)
         corrector.push_axes(small_scan.axes)
         corrector.push_distance(small_scan.distance)
-        reasons = live_traffic_light(corrector, true_calibration, SAID, None).reasons
-        found = [r for r in reasons if "parameter 'nominal'" in str(r.remedy)]
+        reasons = live_verdict(corrector, true_calibration, SAID, None)["reasons"]
+        found = [r["text"] for r in reasons if "parameter 'nominal'" in r["text"]]
         assert bool(found) == reported
-        assert all("centre_x, decentre" in str(reason.what) for reason in found)
+        assert all("centre_x, decentre" in text for text in found)

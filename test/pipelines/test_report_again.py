@@ -98,8 +98,8 @@ def test_a_folder_without_a_measurement_is_refused(tmp_path, true_calibration):
     [
         (["dynamic_error_before"], 1e-9, "dynamic_error_before is 1e-09, expected names and"),
         (["deviation", "corrected"], {"rms": 1e-9}, "peak_to_valley is required"),
-        (["light", "level"], "blue", "light.level is 'blue', expected one of"),
-        (["light", "reasons", 0], 100, r"light.reasons[0] is 100, expected names and values"),
+        (["verdict", "code"], "green", "verdict.code is 'green', expected one of"),
+        (["verdict", "reasons", 0], 100, r"verdict.reasons[0] is 100, expected names and values"),
         (["budget", "sources", 0], {"source": "tilt"}, "says is required"),
         (["prediction", "limits", 0, "speed_factor"], None, "is None, expected a number"),
         (["samples", "axes", "received"], -1, "samples.axes.received is -1, expected 0 to"),

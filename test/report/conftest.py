@@ -75,6 +75,21 @@ def summary():
         "dynamic_error_after": {"peak_to_valley": 8.7e-9, "rms": 1.2e-9},
         "deviation": {"raw": {**form, "rms": 184e-9}, "corrected": form},
         "uncertainty": {"median": 11e-9, "largest": 12.5e-9},
+        "figures": {
+            "peak_to_valley": {"value": 175e-9, "standard_uncertainty": 22e-9},
+            "rms": {"value": 20.9e-9, "standard_uncertainty": 3e-9},
+            "removed": ["piston", "tip", "tilt"],
+        },
+        "verdict": {
+            "code": "not_verified",
+            "text": "not verified",
+            "reasons": [{"code": "not_redundant", "text": "one speed cannot show a lag"}],
+            "add": {
+                "code": "other_speed",
+                "text": "scan again faster",
+                "reached": 4e-9,
+            },
+        },
         "settings": {"probe": "exposure 1 ms", "spindle_speed": 30},
         "versions": {"omsm_ros": "0.1.0"},
     }

@@ -114,7 +114,7 @@ def test_every_term_is_a_bar_of_its_e_n_and_beyond_one_it_is_red():
 
 
 def bag(k, rms, days=None):
-    summary = {"deviation": {"corrected": {"rms_area_weighted": rms, "peak_to_valley": 5 * rms}}}
+    summary = {"figures": {"rms": {"value": rms}, "peak_to_valley": {"value": 5 * rms}}}
     return campaign_page.CampaignEntry(
         f"{k}.mcap", "done", "", None if days is None else int(days * DAY_NS), "", summary
     )

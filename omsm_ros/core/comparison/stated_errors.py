@@ -150,7 +150,7 @@ class ComparedMeasurement:
     common: standard uncertainty that neighbouring heights have in common, without ``fields`` [m];
         None: that of the points
     drift: standard deviation of the drift at the end of the scan [m]; None: not stated, unless one
-        of the fields is a drift
+        of the fields is a drift or a walk
     calibration: id of the calibration that corrected the points; empty: unknown
     pose: effects of errors of the pose that was removed; None: no pose was removed
     """
@@ -168,7 +168,9 @@ class ComparedMeasurement:
         """Origin of the size of the drift."""
         if self.points.sample is None:
             return AT_ONCE
-        in_fields = self.fields is not None and any(n.startswith(DRIFT) for n in self.fields.names)
+        # A steady rate does not say how large a walk is.
+        names = set() if self.fields is None else set(self.fields.names)
+        in_fields = not names.isdisjoint((DRIFT, "drift_walk"))
         return STATED if self.drift is not None or in_fields else ESTIMATED
 
     @property

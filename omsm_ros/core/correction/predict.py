@@ -301,7 +301,18 @@ def _longer_rest(
     plateau = calibration.certificate.undetected.plateau_s
     if plateau is None or not undetected**2 > 0.5 * residual**2:
         return None
-    return float(plateau * (2 * residual / budget) ** 2)
+    return _cautious(plateau * (2 * residual / budget) ** 2, 2, np.ceil)
+
+
+def _cautious(value: float, digits: int, way: Callable[[float], float]) -> float:
+    """Return ``value`` rounded to ``digits`` up or down, so that advice is on the safe side."""
+    if value <= 0:
+        return value
+    scale = 10.0 ** (np.floor(np.log10(value)) - digits + 1)
+    # A value that is already round is not moved by its last bit.
+    nearest = round(value / scale)
+    exact = abs(value / scale - nearest) < 1e-9
+    return float(f"{(nearest if exact else way(value / scale)) * scale:.{digits}g}")
 
 
 def _message(
@@ -312,7 +323,8 @@ def _message(
     binding: SpeedLimit,
 ) -> Notice:
     residual, undetected = residuals
-    values: dict[str, object] = {"factor": binding.speed_factor, "limit": binding.name}
+    factor = _cautious(binding.speed_factor, 3, np.floor)
+    values: dict[str, object] = {"factor": factor, "limit": binding.name}
     code = "faster" if binding.speed_factor >= 1 else "slower"
     if binding.speed_factor >= FASTEST:
         code = "fastest"

@@ -30,6 +30,7 @@ from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.quantities import MAP_SPACING
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
+ASSUMED = "assumed"
 
 # Degree of the polynomial through the points that gives the slopes without a nominal surface.
 _POLYNOMIAL_DEGREE = 6

@@ -25,12 +25,6 @@ from omsm_ros.report.tables import Table, part
 from omsm_ros.report.verdict import PageVerdict, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
-_FIGURES = {
-    "robust_peak_to_valley": "PV of 99.5 % of the part",
-    "peak_to_valley": "PV of the whole part, noise and other errors subtracted",
-    "rms": "rms",
-    "peak_to_valley_best_fit": "PV after best-fit alignment",
-}
 _SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
 _OTHER_UNITS = {"Ssk": "", "Sku": ""} | dict.fromkeys(_SLOPES, "rad")
 _SIGNED = ("Ssk",)
@@ -46,40 +40,49 @@ _POSE_UNITS = {
 
 
 def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> PageVerdict | None:
-    """Return deviation and conformity of the part; None without a nominal surface."""
-    deviation = part(form, "deviation")
-    if deviation:
-        words = [
-            f"{name}: {_expanded(deviation[key])}"
-            for key, name in _FIGURES.items()
-            if part(deviation, key, "value") is not None
-        ]
-        words += part(form, "removed", "notes") or ()
-    elif raw := part(summary, "deviation", "corrected"):
-        words = [
-            f"peak to valley {quantity(raw['peak_to_valley'], 'm')}",
-            f"rms {quantity(raw['rms_area_weighted'], 'm')} by area",
-            "uncertainty not evaluated: fit the part's pose, such as --fit auto",
-        ]
-    else:
+    """Return deviation and conformity of the part; None without a nominal surface.
+
+    The figures are those of the summary, which its verdict holds for; of a form that has no
+    summary, its own.
+    """
+    figures = part(summary, "figures") or _form_figures(form)
+    if not figures:
         return None
-    held = part(form, "conformity") or part(summary, "form", "conformity")
+    words = [
+        f"{name} {_expanded(figures[key])}"
+        for key, name in (("peak_to_valley", "PV"), ("rms", "rms"))
+    ]
+    words.append(f"removed: {', '.join(figures['removed'])}")
+    words += part(form, "removed", "notes") or ()
+    held = part(summary, "conformity") or part(form, "conformity")
     if not held:
         words.append("no tolerance given (--tolerance): conformity not assessed")
-        return PageVerdict("unknown", "Deviation from nominal", tuple(words))
+        return PageVerdict("unknown", "Form deviation", tuple(words))
     level, word = _CONFORMITY[held["verdict"]]
-    if level == "good" and part(summary, "light", "level") != "green":
-        # The uncertainty of sources that were not evaluated is not included.
-        level, word = "care", f"By the evaluated sources, {word[0].lower()}{word[1:]}"
+    if level == "good" and part(summary, "verdict", "code") != "verified":
+        level, word = "care", f"Not verified: {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
-    return PageVerdict(
-        level, f"{word} of {tolerance} on the peak to valley of 99.5 %", tuple(words)
-    )
+    return PageVerdict(level, f"{word} of {tolerance} on the peak to valley", tuple(words))
+
+
+def _form_figures(form: Mapping[str, Any]) -> dict[str, Any]:
+    """Return PV of 99.5 % of the part and rms of a registered form; none without them."""
+    names = {"peak_to_valley": "robust_peak_to_valley", "rms": "rms"}
+    found = {key: part(form, "deviation", name) for key, name in names.items()}
+    if not all(one and one["value"] is not None for one in found.values()):
+        return {}
+    return {
+        **{
+            key: {"value": one["value"], "standard_uncertainty": one["uncertainty"]}
+            for key, one in found.items()
+        },
+        "removed": part(form, "removed", "fitted") or (),
+    }
 
 
 def _expanded(figure: Mapping[str, Any]) -> str:
     """Return a figure with its expanded uncertainty, k = 2."""
-    text = expanded(figure["value"], figure.get("uncertainty"), "m")
+    text = expanded(figure["value"], figure["standard_uncertainty"], "m")
     bound = text.removeprefix("at most ")
     return text if bound == text else f"< {bound}, not resolved"
 
@@ -322,17 +325,15 @@ def render(report: Report) -> str:
 def _trust_section(report: Report) -> PageVerdict:
     if report.form and not report.summary:
         return verdict_on_points(report.form)
-    return verdict_on_measurement(report.summary, report.calibration)
+    return verdict_on_measurement(report.summary)
 
 
 def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     """Return the main results that are known."""
     found = []
-    form = part(summary, "deviation", "corrected")
-    if form:
-        value = quantity(form["rms_area_weighted"], "m")
-        detail = f"peak to valley {quantity(form['peak_to_valley'], 'm')}"
-        found.append(Headline("Deviation from nominal, rms by area", value, detail))
+    if figures := part(summary, "figures"):
+        detail = f"rms {_expanded(figures['rms'])}"
+        found.append(Headline("Form deviation, PV", _expanded(figures["peak_to_valley"]), detail))
     before = part(summary, "dynamic_error_before")
     if before:
         found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))

@@ -10,14 +10,15 @@ from certified import certified_by
 
 from omsm_ros.core.calibration.calibration import Calibration, with_latency
 from omsm_ros.core.calibration.latency import declared_latency
-from omsm_ros.core.correction.budget import ScanBudget, scan_budget
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.machine_sources import (
     NAMES,
     NOTHING_STATED,
     MachineSources,
+    ScanBudget,
     StatedSource,
     declared_sources,
+    scan_budget,
 )
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.systematic import (

@@ -134,7 +134,7 @@ def test_message_tells_error_residual_and_advice() -> None:
     message = predicted(late_probe(2e-6), sine(1.0)).message
     assert "1.88 µm peak to valley" in message
     assert "after correction 12.6 nm (k = 2, largest on the path), within the budget" in message
-    assert "maximum speed: 3.98 × this motion, limited by dynamics" in message
+    assert "maximum speed: 3.97 × this motion, limited by dynamics" in message
 
 
 @pytest.mark.parametrize("budget", [0.0, -1e-9, np.nan, np.inf])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.budget import excess_noise_reasons
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.machine_sources import excess_noise
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
@@ -95,8 +95,7 @@ def test_the_points_of_a_noisier_scan_state_what_they_scatter_by(
     settled = slice(8000, None)
     found = float(np.std(points.height[settled]))
     assert np.median(points.uncertainty[settled]) == pytest.approx(found, rel=0.05)
-    (reason,) = excess_noise_reasons(corrector.budget)
-    assert "probe_noise" in str(reason.remedy)
+    assert "state probe_noise" in str(excess_noise(corrector.budget))
 
 
 def test_of_a_scan_as_stated_there_is_nothing_to_say(true_calibration: Calibration) -> None:
@@ -104,4 +103,4 @@ def test_of_a_scan_as_stated_there_is_nothing_to_say(true_calibration: Calibrati
     gain = true_calibration.static_gain
     assert np.median(points.uncertainty) == pytest.approx(NOISE / gain, rel=1e-9)
     assert corrector.budget["scan_scatter"] == 0
-    assert not [*excess_noise_reasons(corrector.budget)]
+    assert excess_noise(corrector.budget) is None

@@ -11,7 +11,7 @@ DAY_NS = 86_400 * 10**9
 def measurement(i, rms, state="done", name=None):
     summary = {
         "samples": {"distance": {"received": 1000, "corrected": 990, "counted": {"settling": 10}}},
-        "deviation": {"corrected": {"rms_area_weighted": rms, "peak_to_valley": 5 * rms}},
+        "figures": {"rms": {"value": rms}, "peak_to_valley": {"value": 5 * rms}},
         "uncertainty": {"median": 10e-9},
     }
     said = "" if state == "done" else "no axes"
@@ -32,8 +32,8 @@ def drifting():
 
 def test_outliers_and_drift_are_named_with_their_size(drifting):
     reported = remarks(drifting, judge(drifting))
-    assert any(t.startswith("11.mcap is an outlier: deviation from nominal") for t in reported)
-    (drift,) = [t for t in reported if "rms by area drifts" in t]
+    assert any(t.startswith("11.mcap is an outlier: form deviation, rms") for t in reported)
+    (drift,) = [t for t in reported if "deviation, rms drifts" in t]
     assert "pm per day" in drift or "nm per day" in drift
     assert not any("ncertainty" in t for t in reported)
 
@@ -45,7 +45,7 @@ def test_correlation_with_temperature_is_reported_with_its_size():
     reported = [measurement(i, 20e-9 + 2e-9 * (t - 20)) for i, t in enumerate(warm)]
     for one, t in zip(reported, warm, strict=True):
         one.summary["conditions"] = {"temperature": {"mean": t}, "calibration_age": 86400.0}
-    (said,) = [t for t in remarks(reported, judge(reported)) if "rms by area depends" in t]
+    (said,) = [t for t in remarks(reported, judge(reported)) if "deviation, rms depends" in t]
     assert "temperature, 2.00 nm to 2.00 nm per kelvin" in said
     assert not any("Age" in t for t in remarks(reported, judge(reported)))
 
