@@ -23,7 +23,7 @@ def error(x, y):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cut")
-    n = 30_000
+    n = 15_000
     r, angle = np.linspace(RADIUS, 0, n), np.linspace(0, 200 * np.pi, n)
     x, y = r * np.cos(angle), r * np.sin(angle)
     noise = np.random.default_rng(1).normal(0, 1e-8, n)
