@@ -122,7 +122,7 @@ def _plain_qos(described: Any) -> list[Qos]:
     text = described if isinstance(described, str) else ""
     if len(text) > _LONGEST_QOS or has_aliases(text.encode("utf-8", "replace")):
         raise ReaderError("a topic states its quality of service in no way that rosbag2 does")
-    return parse_qos(described)
+    return list(parse_qos(described))
 
 
 def check_index(path: Path, reader: Reader) -> None:
@@ -152,7 +152,7 @@ def _held_together(chunks: Sequence[Any]) -> int:
     """Return the most bytes of chunks whose times overlap, which a reader holds at once."""
     edges = [(c.message_start_time, 0, c.uncompressed_size) for c in chunks]
     edges += [(c.message_end_time, 1, -c.uncompressed_size) for c in chunks]
-    return max(accumulate(size for _, _, size in sorted(edges)))
+    return int(max(accumulate(size for _, _, size in sorted(edges))))
 
 
 def check_checksums(path: Path) -> None:
@@ -219,7 +219,7 @@ def _hash_of(definition: MessageDefinition, name: str) -> str:
         store.register(get_types_from_msg(definition.data, name))
     else:
         store.register(get_types_from_idl(definition.data))
-    return store.hash_rihs01(name)
+    return str(store.hash_rihs01(name))
 
 
 def unpacked_message(data: bytes) -> bytes:
@@ -229,7 +229,7 @@ def unpacked_message(data: bytes) -> bytes:
 
 def unpacked_chunk(data: bytes, compression: str, size: int, checksum: int) -> bytes:
     """Return the records of a chunk; ReaderError if size or checksum do not match."""
-    return storage_mcap.decompress(data, compression, size, checksum)
+    return bytes(storage_mcap.decompress(data, compression, size, checksum))
 
 
 def _zstd(data: bytes, size: int, exactly: bool = True) -> bytes:

@@ -23,7 +23,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from omsm_ros.errors import BagError
 from omsm_ros.io.bag_checks import MAX_CHUNK_BYTES, check_unpacked, unpacked_chunk, unpacked_message
-from omsm_ros.io.bag_writer import finish, new_bag_file, new_writer
+from omsm_ros.io.bag_writer import GrowingFile, finish, new_bag_file, new_writer
 from omsm_ros.io.bags import check_message
 from omsm_ros.io.files import exception_text, open_regular
 from omsm_ros.io.message_mapping import typestore
@@ -79,7 +79,7 @@ def repair(path: Path) -> Repair:
     return made
 
 
-def _copy(parts: list[Path], file: IO[bytes], made: Repair) -> None:
+def _copy(parts: list[Path], file: GrowingFile, made: Repair) -> None:
     try:
         writer = new_writer(file)
         for part in parts:

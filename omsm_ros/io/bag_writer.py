@@ -39,7 +39,7 @@ def _end_without_index() -> bytes:
     builder = RecordBuilder()
     DataEnd(data_section_crc=0).write(builder)
     Footer(summary_start=0, summary_offset_start=0, summary_crc=0).write(builder)
-    return builder.end() + MCAP0_MAGIC
+    return bytes(builder.end() + MCAP0_MAGIC)
 
 
 END = _end_without_index()
@@ -91,7 +91,7 @@ class GrowingFile:
             raise
         self._written += len(piece)
 
-    def _put(self, data: bytes) -> None:
+    def _put(self, data: bytes | bytearray) -> None:
         rest, place = memoryview(data), self._written
         while rest:
             count = os.pwrite(self._descriptor, rest, place)

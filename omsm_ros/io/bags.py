@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Connection
 
-from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, DistanceBlock, FloatArray
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import BagError, CalibrationError, DataError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.bag_checks import (
@@ -176,7 +176,7 @@ _BYTES = bytes | memoryview
 # The year 2000: earlier stamps count from the start of a computer or of the twin.
 _CLOCK_SET_NS = 946_684_800 * 10**9
 
-Item: TypeAlias = "tuple[str, AxisBlock | DistanceBlock | AccelerationBlock | Any]"
+Item: TypeAlias = "tuple[str, Any]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +312,7 @@ class BagReader:
         """Return the levels that the vibration monitor reported, in their order."""
         if not self.count([VIBRATION_TOPIC]):
             return []
-        return [stated_messages for _, stated_messages in self.records(VIBRATION_TOPIC)]
+        return [levels for _, levels in self.records(VIBRATION_TOPIC)]
 
     def temperatures(self) -> FloatArray:
         """Return the readings of the temperature (n,) [°C], in their order; NaN = invalid."""
@@ -383,7 +383,8 @@ class BagReader:
                             f"bag {str(self.path)!r}: a message is {shown(raw)}, not bytes: "
                             f"{DAMAGED}"
                         )
-                    yield connection, stamp, unpacked_message(raw) if self._compressed else raw
+                    unpacked: Any = unpacked_message(bytes(raw)) if self._compressed else raw
+                    yield connection, stamp, unpacked
         if promised and start_ns is None and stop_ns is None:
             more_or_less = "fewer" if promised > 0 else "more"
             raise BagError(

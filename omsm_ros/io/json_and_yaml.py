@@ -118,7 +118,7 @@ class _PlainLoader(yaml.SafeLoader):
     _depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        event = self.peek_event()
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
             self._refuse(event, "aliases and anchors are not accepted; write the value out")
         if getattr(event, "tag", None) not in (None, "!"):
@@ -141,7 +141,8 @@ class _PlainLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def _refuse(self, where: yaml.Event | yaml.Node, why: str) -> NoReturn:
-        raise yaml.constructor.ConstructorError(None, None, why, where.start_mark)
+        mark: Any = where.start_mark
+        raise yaml.constructor.ConstructorError(None, None, why, mark)
 
     def construct_bounded_int(self, node: yaml.ScalarNode) -> int:
         return self._number(node, bounded_integer)
@@ -302,7 +303,7 @@ def _said_of_schemas(found: jsonschema.ValidationError) -> str:
     wanted = found.validator_value
     match found.validator:
         case "additionalProperties":
-            known = sorted(found.schema["properties"])  # type: ignore[index, call-overload]
+            known = sorted(found.schema["properties"])  # type: ignore[index]
             unknown = next(name for name in found.instance if name not in known)  # type: ignore[union-attr]
             return f"{shown(unknown)} is unknown, expected one of {known}"
         case "required":

@@ -37,10 +37,10 @@ _SET = "calibration_set"
 
 _AXES = ("x", "y", "z", "b", "c")
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
+_PLACES: Mapping[str, Any] = POINT_DTYPE.fields or {}
 # Name, offset [bytes], type and count of each field of a point.
 _POINT_LAYOUT = [
-    (name, (POINT_DTYPE.fields or {})[name][1], _POINT_FIELD_TYPES[kind], 1)
-    for name, kind in CLOUD_FIELDS
+    (name, _PLACES[name][1], _POINT_FIELD_TYPES[kind], 1) for name, kind in CLOUD_FIELDS
 ]
 
 
@@ -93,7 +93,7 @@ def _block_fields(message: Any) -> dict[str, Any]:
 
 def axis_block(message: Any) -> AxisBlock:
     """Return the record of an ``omsm_msgs/AxisBlock``; DataError if its channels do not fit."""
-    channels = {name: np.asarray(getattr(message, name), np.float64) for name in _AXES}
+    channels: Any = {name: np.asarray(getattr(message, name), np.float64) for name in _AXES}
     return AxisBlock(**_block_fields(message), **channels)
 
 
@@ -109,7 +109,7 @@ def distance_block(message: Any) -> DistanceBlock:
 
 def acceleration_block(message: Any) -> AccelerationBlock:
     """Return the record of an ``omsm_msgs/AccelerationBlock``; DataError if channels do not fit."""
-    channels = {name: np.asarray(getattr(message, name), np.float64) for name in "xyz"}
+    channels: Any = {name: np.asarray(getattr(message, name), np.float64) for name in "xyz"}
     return AccelerationBlock(**_block_fields(message), **channels)
 
 

@@ -237,12 +237,12 @@ class CalibratorNode(ManagedNode):
         origin = _origin(recording.recorded_ns)
         return _identified(motion, settings=settings, origin=origin, **options)
 
-    def _live_motion(self, *streams: list[Any]) -> MotionRecord:
+    def _live_motion(self, *streams: Any) -> MotionRecord:
         faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
         if faster == 1.0:  # the stamps of a time lapse depend on the computer that plays it
             for name, blocks in zip(_STREAMS, streams, strict=True):
                 check_period(name, blocks)
-        return assemble(*streams, trigger=self._trigger)
+        return assemble(*streams, trigger=self._trigger)  # type: ignore[misc]
 
     @property
     def _time_lapse(self) -> object:

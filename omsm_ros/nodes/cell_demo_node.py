@@ -211,7 +211,7 @@ class DemoStage:
             tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
             refresh_in_thread(partial(tick, bar)),
         ):
-            yield lambda done: bar.update(done - bar.n)
+            yield lambda done: bar.update(done - bar.n)  # type: ignore[misc]
             bar.update((total or bar.n) - bar.n)
 
 

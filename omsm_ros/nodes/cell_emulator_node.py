@@ -93,7 +93,7 @@ class CellEmulatorNode(ManagedNode):
         self._link = values["link"] or str(runtime_folder(self.get_namespace()) / "cell")
         if not self._link.startswith("tcp://"):
             undo.enter_context(exclusive_lock(Path(self._link)))
-        line = undo.enter_context(line_for(self._link))
+        line: Any = undo.enter_context(line_for(self._link))
         self._player = player_for(
             values["device"],
             line,
@@ -126,7 +126,8 @@ class CellEmulatorNode(ManagedNode):
         link = link or f"{self._link}_beside"
         if not link.startswith("tcp://"):
             undo.enter_context(exclusive_lock(Path(link)))
-        return undo.enter_context(line_for(link))
+        line: InstrumentLink = undo.enter_context(line_for(link))  # type: ignore[assignment]
+        return line
 
     def activate(self, undo: ExitStack) -> None:
         """Accept requests for motions."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlock
 from rclpy.clock import Clock, ClockType
@@ -52,7 +53,7 @@ class RecorderNode(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("recorder", PARAMETERS)
-        self._bag: BagWriter | None = None
+        self._bag: Any = None  # the writer of the bag, while active
 
     def hardware_id(self) -> str:
         """Return the bag's path."""

@@ -56,7 +56,7 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
     Exits with one line on stderr if it cannot start or continue: 2 for bad input, 70 for an
     internal error.
     """
-    node = None
+    node: ManagedNode | None = None
     try:
         with exit_on_signal_while_loading(ENDING):
             _init()
@@ -66,6 +66,7 @@ def run(make_node: Callable[[], ManagedNode]) -> None:
         freeze_garbage_collector()
     except Exception as err:
         _give_up(node, err)
+    assert node is not None  # else it gave up
     try:
         _spin(node, ending)
     finally:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     )
 
 
-def _beginning(stream: io.BufferedReader, what: str) -> tuple[list[str], str]:
+def _beginning(stream: IO[bytes], what: str) -> tuple[list[str], str]:
     """Return the lines before the first line of numbers, and that line."""
     header: list[str] = []
     # Text also ends lines at CR, as old Macs write; detached, it leaves the stream open.
@@ -300,6 +300,7 @@ def load_dabam(path: Path) -> DabamProfile:
             f"{what}: its header says FILE_FORMAT {form!r}, FILE_HEADER_LINES {skip!r}, factors "
             f"{factors!r}; expected 1 to 4, a count, and numbers above zero"
         )
+    assert isinstance(skip, int)
     with open_regular(path, FileError, "profile") as stream:
         lines = stream.read(_MAX_DATA_BYTES).decode("utf-8", "replace").splitlines()[skip:]
     table = rows_in(lines, what, "check FILE_HEADER_LINES", above=skip, usecols=(0, 1))

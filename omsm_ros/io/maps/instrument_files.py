@@ -209,7 +209,8 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
             warnings.simplefilter("ignore")  # of missing values, which are checked below
             with topography.open_topography(str(path)) as reader:
                 found = reader.topography()
-            height = np.ma.filled(np.ma.asarray(found.heights(), np.float64), np.nan)
+            heights = np.asanyarray(found.heights(), np.float64)
+            height = np.ma.filled(heights, np.nan)
     except Exception as err:  # its readers raise many kinds
         raise FileError(
             f"{what} is of no known format, convert it to xyz: {exception_text(err)}"

@@ -134,7 +134,7 @@ def _records(
     held = stream.seek(0, io.SEEK_END) - begin
     stream.seek(begin)
     # The last line of a text may have no end.
-    least = 2 * len(dtype) * count - 1 if ascii_text else dtype.itemsize * count
+    least = 2 * len(dtype.names or ()) * count - 1 if ascii_text else dtype.itemsize * count
     if held < least:
         raise FileError(
             f"{what} says that it has {count} points and holds {held} bytes of them; it was cut "
@@ -143,13 +143,15 @@ def _records(
     if not ascii_text:
         # Mapped, since the columns are read one by one.
         return np.memmap(stream, dtype, mode="r", offset=begin, shape=(count,))
+    names = list(dtype.names or ())
     lines = (line.decode("latin-1") for line in stream)
     columns = rows_in(lines, f"{what}, below its header", "write a line a point", max_rows=count).T
-    if columns.shape != (len(dtype), count):
+    if columns.shape != (len(names), count):
         raise FileError(
-            f"{what} says {count} points of {len(dtype)} numbers; it was cut short, write it again"
+            f"{what} says {count} points of {len(names)} numbers; it was cut short, write it again"
         )
-    return np.rec.fromarrays(columns, names=list(dtype.names or ()))
+    found: NDArray[np.void] = np.rec.fromarrays([*columns], names=names)  # type: ignore[call-overload]
+    return found
 
 
 def _points(

@@ -208,7 +208,7 @@ def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
     units = UNITS[channel]
     if channel == "trigger":
         return 1.0
-    unit = given.get("unit")
+    unit = given.get("unit", "")
     if unit == COUNT:
         if COUNT not in given:
             raise DataError(
@@ -222,6 +222,6 @@ def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
             )
         return value * sign
     if unit not in units:
-        said = "has no unit" if unit is None else f"has the unit {shown(unit)}"
+        said = "has no unit" if not unit else f"has the unit {shown(unit)}"
         raise DataError(f"{channel} {said}; write one of {[*units, COUNT]}")
     return units[unit] * sign

@@ -402,7 +402,7 @@ def _rows(
     marks = -1 if cells is None or mark is None else cells - 1
     for number, line in enumerate(lines, seen[0] + 1):
         seen[0], seen[1] = number, line
-        if marks > 0 and line.count(mark) == marks:  # as nearly all are
+        if mark and marks > 0 and line.count(mark) == marks:  # as nearly all are
             yield line
         elif line and not line.isspace():
             if cells is not None:
@@ -449,7 +449,7 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
                 f"{shown(table.names)}; {hint}"
             )
     pieces = list(table.pieces(names, ()))
-    columns = [np.concatenate([piece[name] for piece in pieces] or [[]]) for name in names]
+    columns = [np.concatenate([piece[name] for piece in pieces] or [np.empty(0)]) for name in names]
     if len(columns[0]) < 2:
         raise FileError(f"{table} has {len(columns[0])} lines of numbers; record more")
     for name, column in zip(names, columns, strict=True):

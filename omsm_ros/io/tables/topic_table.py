@@ -181,7 +181,7 @@ def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
         here = f"{way}{field}"
         if isinstance(value, np.ndarray):
             named = isinstance(labels, list) and len(labels) == len(value)
-            marks = labels if named else range(len(value))
+            marks: Any = labels if named else range(len(value))
             yield from (f"{here}[{mark}]" for mark in list(marks)[:_MOST_ELEMENTS])
         elif getattr(value, "__msgtype__", "") == _STAMP:
             yield here
