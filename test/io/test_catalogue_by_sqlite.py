@@ -68,7 +68,7 @@ def test_a_measurement_is_a_row_of_its_summary(tmp_path, address):
         "bag": "scan.mcap", "calibration": "c" * 64, "settings": {"machine": "a"},
         "versions": {"omsm_ros": "1.2"}, "uncertainty": {"median": 1.5e-8},
         "samples": {"distance": {"received": 2**40, "corrected": 7}},
-        "deviation": {"corrected": {"rms_area_weighted": 1 / 3, "peak_to_valley": 2e-9}},
+        "figures": {"rms": {"value": 1 / 3}, "peak_to_valley": {"value": 2e-9}},
         "dynamic_error_before": {"rms": 4e-7},
     }  # fmt: skip
     folder = folder_with(tmp_path / "r", **summary)
