@@ -184,12 +184,125 @@ def _line(
     return offset, slope, float(uncertainty)
 
 
+# Span of arrivals that decides whether triggers were missed: it lasts for the first [s] and holds
+# the second number of arrivals, or lasts for the third; and the longest wait for a decision.
+_DECISION_S, _ARRIVALS, _LONG_DECISION_S, _LONGEST_S = 0.2, 8, 0.6, 0.8
+_LEAST_ARRIVALS = 3
+# Spans whose earliest arrivals are the reference; how many it needs, and how many show a drift.
+_SPANS, _LEAST_SPANS, _DRIFT_SPANS = 15, 4, 8
+# The last sample of a portion may be nearly a period old, so only a delay of this is one [period].
+_LATE_PERIODS = 0.75
+# Limit of lateness over the range of the earliest arrivals, of many and of few spans [1].
+_RANGES, _RANGES_OF_FEW = 2.0, 3.0
+
+
+class MissedTriggerDetector:
+    """Detects triggers that a device without a clock missed, by the arrivals of its samples.
+
+    No sample arrives before it was taken, so the earliest arrivals of each span are even although
+    others are late by chance. After a missed trigger all arrivals are late by a period. An arrival
+    that is not late confirms all samples up to it; until then they wait.
+
+    seen_from: least number of missed triggers that exceeds the scatter of the arrivals
+    """
+
+    def __init__(self, period: float) -> None:
+        """period: of the trigger [s]."""
+        self._period = period
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all arrivals, as after a pause of the trigger."""
+        # Begin of each span, its earliest lateness [s], arrivals.
+        self._earliest: deque[tuple[float, float, int]] = deque(maxlen=_SPANS)
+        self._off: list[tuple[float, float]] = []  # arrival and excess of those that are off [s]
+        self._dropped = False
+        self._since = self._expected = self._drift = 0.0
+        self._limit, self.seen_from = _LATE_PERIODS * self._period, 1
+
+    def missed(self, due: float, arrival: float) -> int | None:
+        """Return the triggers missed before this arrival; 0 confirms it; None: it has to wait.
+
+        due: count, with the triggers missed so far, times period [s];  arrival: monotonic [s]
+        A negative number is of triggers that were counted in excess.
+        """
+        late = arrival - due
+        excess = late - self._expected - self._drift * (arrival - self._since)
+        early = bool(self._off) and self._off[0][1] < 0
+        if len(self._earliest) < _LEAST_SPANS or (abs(excess) <= self._limit and not early):
+            self._accept(arrival, late)
+            return 0
+        if excess < -self._limit and not early:
+            self._off.clear()  # earlier than expected: none was missed
+        if excess < -self._limit or (excess > self._limit and not early):
+            self._off.append((arrival, excess))
+        return self._decide(arrival)
+
+    def end(self) -> int:
+        """Return the triggers missed before the samples that wait, when no more will come."""
+        missed = self._decide(self._off[-1][0] + _LONGEST_S) if self._off else 0
+        self._off.clear()
+        return missed or 0
+
+    def _decide(self, now: float) -> int | None:
+        waited, few = now - self._off[0][0], len(self._off) < _LEAST_ARRIVALS
+        if not _is_whole(waited, len(self._off)) or (few and waited < _LONGEST_S):
+            return None
+        if few:
+            self._off.clear()
+            return 0
+        recent = [excess for _, excess in self._off][-max(_ARRIVALS, len(self._off) // 2) :]
+        half = (len(recent) + 1) // 2
+        if abs(min(recent[:half]) - min(recent[half:])) > self._limit:
+            if waited < _LONGEST_S:
+                return None
+            if len(self._off) > _ARRIVALS // 2 and not self._dropped:
+                self._off, self._dropped = self._off[-half:], True  # the first ones were by chance
+                return None
+            self.restart()  # what grows is another rate
+            return 0
+        self._off.clear()
+        self._dropped = False
+        return round(min(recent) / self._period)
+
+    def _accept(self, arrival: float, late: float) -> None:
+        self._off.clear()
+        self._dropped = False
+        if self._earliest:
+            begin, least, count = self._earliest[-1]
+            if not _is_whole(arrival - begin, count):
+                self._earliest[-1] = (begin, min(least, late), count + 1)
+                return
+        if len(self._earliest) >= _LEAST_SPANS:
+            self._set_reference()
+        self._earliest.append((arrival, late, 1))
+
+    def _set_reference(self) -> None:
+        """Lay a line below the earliest arrivals; their scatter is the limit of detection."""
+        begin, late, _ = np.array(self._earliest).T
+        since = begin - begin[-1]
+        many = len(begin) >= _DRIFT_SPANS
+        self._drift = float(np.polyfit(since, late, 1)[0]) if many else 0.0
+        rest = late - self._drift * since
+        self._since, self._expected = float(begin[-1]), float(rest[-_LEAST_SPANS:].min())
+        scatter = (_RANGES if many else _RANGES_OF_FEW) * float(np.ptp(rest))
+        self._limit = max(_LATE_PERIODS * self._period, scatter)
+        self.seen_from = int(np.ceil(self._limit / self._period))
+
+
+def _is_whole(lasted: float, arrivals: int) -> bool:
+    """Return whether a span that ``lasted`` [s] decides."""
+    return lasted >= (_DECISION_S if arrivals >= _ARRIVALS else _LONG_DECISION_S)
+
+
 # Crystals differ by less; beyond it the stated period is wrong.
 PERIOD_TOLERANCE = 100 * PPM
 # A free-running device that deviates by more is set to another rate.
 RATE_TOLERANCE = 1000 * PPM
-# The same for a device without time stamps, by the arrivals of its samples.
-ARRIVAL_TOLERANCE = 5000 * PPM
+# The same for a trigger from outside, and for a device without time stamps, by its arrivals.
+TRIGGER_TOLERANCE = ARRIVAL_TOLERANCE = 5000 * PPM
+# The period of a trigger is wrong if it is so in each of these parts of a block: no pause is.
+_PARTS = 4
 
 
 class BlockPair(NamedTuple):
@@ -250,6 +363,7 @@ class BlockCutter:
     """Cuts runs into blocks of ``block_size`` samples; a gap or restart ends a block early.
 
     delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
+    missed: triggers without a sample of the device, by the arrivals of the others
     period_deviation: relative, from nominal: of the last full block's device time, or of the
         arrivals of a device without time stamps [1]
     period_warnings: full blocks beyond PERIOD_TOLERANCE
@@ -262,27 +376,78 @@ class BlockCutter:
         self._pending: Samples = np.empty(0, SAMPLE)
         self._first = self._stamp = 0
         self._turns = [Turns(axis.wrap) for axis in channels.axes or ()]
+        # Without a clock of the device, only arrivals show a trigger that it missed.
+        watched = not (channels.timed or settings.free_running)
+        self._detector = MissedTriggerDetector(settings.sample_period) if watched else None
+        self._waiting: list[CountedRun] = []
+        self.missed = self._ahead = 0
         self.delivered = self.withheld = self.blocks = self.period_warnings = 0
         self.period_deviation = 0.0
+        self._evenly_wrong = False
 
     @property
     def pending(self) -> int:
-        """Return the number of samples that wait for their block to fill."""
-        return len(self._pending)
+        """Return the number of samples that wait for their block, or for later arrivals."""
+        return len(self._pending) + sum(len(run.samples) for run in self._waiting)
+
+    @property
+    def least_missed(self) -> int:
+        """Return the least number of missed triggers that is detected; 0 = not by arrivals."""
+        return self._detector.seen_from if self._detector else 0
 
     @property
     def wrong_rate(self) -> bool:
-        """Return whether the device runs freely at another rate than stated."""
-        limit = RATE_TOLERANCE if self._channels.timed else ARRIVAL_TOLERANCE
-        return self._settings.free_running and abs(self.period_deviation) > limit
+        """Return whether the device, or its trigger, has another rate than stated."""
+        if not self._channels.timed:
+            return abs(self.period_deviation) > ARRIVAL_TOLERANCE
+        if self._settings.free_running:
+            return abs(self.period_deviation) > RATE_TOLERANCE
+        return self._evenly_wrong
 
     def add(
-        self, runs: Sequence[CountedRun], arrival_ns: int, *, after_silence: bool = False
+        self,
+        runs: Sequence[CountedRun],
+        arrival_ns: int,
+        now: float = 0.0,
+        *,
+        after_silence: bool = False,
     ) -> Iterator[BlockPair]:
-        """Yield the blocks completed by ``runs``, which arrived together at ``arrival_ns``."""
+        """Yield the blocks completed by ``runs``, which arrived together.
+
+        arrival_ns: by the clock of the stamps;  now: the same, monotonic [s]
+        """
+        if self._detector is None or not runs:
+            yield from self._cut(runs, arrival_ns, after_silence)
+            return
+        if after_silence or any(run.restarted for run in runs):
+            yield from self._release(self._detector.end(), arrival_ns)
+            self._detector.restart()
+            yield from self._cut(runs, arrival_ns, after_silence)
+            return
+        self._waiting += runs
+        last = self._waiting[-1]
+        count = last.first_sample + len(last.samples) - 1 + self._ahead
+        missed = self._detector.missed(count * self._settings.sample_period, now)
+        if missed is not None:
+            yield from self._release(missed, arrival_ns)
+
+    def _release(self, missed: int, arrival_ns: int) -> Iterator[BlockPair]:
+        """Yield the blocks of the samples that waited, after ``missed`` triggers."""
+        waiting, self._waiting = self._waiting, []
+        if missed and waiting:
+            yield from self._flush()
+            self._first = waiting[0].first_sample
+            self._ahead += missed
+            self.missed += abs(missed)
+        if waiting:
+            yield from self._cut(waiting, arrival_ns, False)
+
+    def _cut(
+        self, runs: Sequence[CountedRun], arrival_ns: int, after_silence: bool
+    ) -> Iterator[BlockPair]:
         for i, run in enumerate(runs):
-            if run.restarted or run.first_sample != self._first + self.pending:
-                yield from self.flush()
+            if run.restarted or run.first_sample != self._first + len(self._pending):
+                yield from self._flush()
                 self._first = run.first_sample
             if i == 0 or run.restarted:
                 self._set_clock(runs[i:], arrival_ns, after_silence and i == 0)
@@ -300,22 +465,27 @@ class BlockCutter:
     def _append(self, run: CountedRun) -> Iterator[BlockPair]:
         samples = run.samples.copy()
         samples["time"] = self._times(run)
-        if not self.pending:
+        if not len(self._pending):
             self._stamp = self._clock.to_host(int(samples["time"][0]))
         self._pending = np.concatenate([self._pending, samples])
-        while self.pending >= self._settings.block_size:
+        while len(self._pending) >= self._settings.block_size:
             yield from self._take(self._settings.block_size)
 
-    def flush(self) -> Iterator[BlockPair]:
-        """Yield the partial block, if any."""
-        if self.pending:
-            yield from self._take(self.pending)
+    def flush(self, arrival_ns: int) -> Iterator[BlockPair]:
+        """Yield the partial block, if any, with the samples that waited for later arrivals."""
+        if self._detector is not None:
+            yield from self._release(self._detector.end(), arrival_ns)
+        yield from self._flush()
+
+    def _flush(self) -> Iterator[BlockPair]:
+        if len(self._pending):
+            yield from self._take(len(self._pending))
 
     def _times(self, run: CountedRun) -> IntArray:
         """Return the device time [ns] of each sample: its own, or its count times the period."""
         times: IntArray = run.samples["time"]
         if not self._channels.timed:
-            counts = run.first_sample + np.arange(len(run.samples))
+            counts = run.first_sample + self._ahead + np.arange(len(run.samples))
             period_ns = self._settings.sample_period * NANOSECONDS_PER_S
             times = np.rint(counts * period_ns).astype(np.int64)
         return times
@@ -324,7 +494,7 @@ class BlockCutter:
         samples, self._pending = self._pending[:count], self._pending[count:]
         first, self._first = self._first, self._first + count
         stamp = self._stamp
-        if self.pending:
+        if len(self._pending):
             self._stamp = self._clock.to_host(int(self._pending["time"][0]))
         self._check_period(samples)
         if self.wrong_rate:
@@ -345,6 +515,11 @@ class BlockCutter:
         elapsed = (int(samples["time"][-1]) - int(samples["time"][0])) * NANOSECOND_S
         self.period_deviation = elapsed / nominal - 1
         self.period_warnings += abs(self.period_deviation) > PERIOD_TOLERANCE
+        edges = np.unique(np.linspace(0, periods, _PARTS + 1).astype(int))
+        parts = np.diff(samples["time"][edges]) * NANOSECOND_S
+        off = parts / np.maximum(np.diff(edges) * self._settings.sample_period, NANOSECOND_S) - 1
+        least, most = float(off.min()), float(off.max())
+        self._evenly_wrong = least > TRIGGER_TOLERANCE or most < -TRIGGER_TOLERANCE
 
     def _blocks(self, samples: Samples, first: int, stamp: int) -> BlockPair:
         common = {

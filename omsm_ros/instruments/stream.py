@@ -33,6 +33,7 @@ class StreamStatistics:
     held: waiting for their successor;  spoilt: with a counter that jumped ahead and back
     duplicates: received twice
     withheld: kept back because the device runs at another rate than it was set to
+    missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
     lost, gaps: trigger counts that never arrived, and in how many places
     restarts: how often the device's counter or clock fell back
     period_deviation: of the last full block's device time from nominal, relative [1]
@@ -47,6 +48,8 @@ class StreamStatistics:
     spoilt: int = 0
     duplicates: int = 0
     withheld: int = 0
+    missed: int = 0
+    least_missed: int = 0
     lost: int = 0
     gaps: int = 0
     restarts: int = 0
@@ -167,6 +170,8 @@ class StreamDevice:
             spoilt=tracker.spoilt,
             duplicates=tracker.duplicates,
             withheld=cutter.withheld,
+            missed=cutter.missed,
+            least_missed=cutter.least_missed,
             lost=tracker.lost,
             gaps=tracker.gaps,
             restarts=tracker.restarts,
@@ -237,7 +242,8 @@ class StreamDevice:
             self._went_on = self._monotonic()
         waited = self._ahead() * self._settings.sample_period
         came_ns = arrival_ns - round(waited * NANOSECONDS_PER_S)
-        return list(self._cutter.add(runs, came_ns, after_silence=after_silence))
+        came = self._came_at - waited
+        return list(self._cutter.add(runs, came_ns, came, after_silence=after_silence))
 
     def _end(self, arrival_ns: int) -> list[BlockPair]:
         """Return all samples that waited for the next ones."""
@@ -245,5 +251,5 @@ class StreamDevice:
         if len(rest):
             silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at
             blocks = self._add(rest, self._came_ns or arrival_ns, silent)
-        blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns)
-        return [*blocks, *self._cutter.flush()]
+        blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns, self._came_at)
+        return [*blocks, *self._cutter.flush(arrival_ns)]

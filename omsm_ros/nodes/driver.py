@@ -43,7 +43,7 @@ from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
-_FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown")
+_FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown", "missed")
 # The pauses between two motions of a step test are shorter [s].
 _SILENCE_S = 2.0
 _SILENCE_SAMPLES = 5

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import Block, BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import Block, FloatArray, IntArray
 from omsm_ros.errors import DataError, Notice
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -156,7 +156,7 @@ def _jump(stamps: IntArray, period: float) -> tuple[int, float] | None:
 
 # A stamp that is this far ahead begins a motion after a pause. It is half of the time after which
 # a live node settles the pairs that wait [ns].
-_PAUSE_NS = 0.5e9
+PAUSE_NS = 0.5e9
 
 
 class StampLine:
@@ -220,13 +220,16 @@ class StampLine:
         counts, stamps = self._counts[place], self._stamps[place]
         return np.concatenate([[count], counts]), np.concatenate([[stamp], stamps])
 
-    def follows_gap(self, session: int, count: int, period_ns: float) -> bool:
-        """Return whether a block begins at ``count`` after a pause."""
+    def step_to(self, session: int, count: int, period_ns: float) -> float:
+        """Return how much later the next block is stamped than the current one shows [ns].
+
+        0 unless it begins at ``count``.
+        """
         if self._current is None or not len(self) or self._next() != (session, count):
-            return False
+            return 0.0
         begun, before, stamp = self._current
-        ahead = self._stamps[self._head] - stamp - (count - before) * period_ns
-        return begun == session and ahead >= _PAUSE_NS
+        step = self._stamps[self._head] - stamp - (count - before) * period_ns
+        return step if begun == session else 0.0
 
     def next_in(self, session: int, end: int) -> int:
         """Return the count at which the next block begins, at most ``end``."""
@@ -262,34 +265,33 @@ class StampLine:
 
 def upcoming_stamps(
     lines: Sequence[StampLine], sessions: tuple[int, int], end: int, period_ns: float
-) -> tuple[FloatArray, BoolArray] | None:
+) -> tuple[FloatArray, FloatArray] | None:
     """Return the rows of :class:`StampHistory` (n, 5) for the next blocks of two streams.
 
-    There is a row for each count below ``end`` at which a block begins. The second array (n,) is
-    True where a block begins after a pause. None where a stream has no stamp yet. The values are
+    There is a row for each count below ``end`` at which a block begins. The second array (n, 2) has
+    the steps of the stamps of each stream there [ns], see ``step_to``. None where a stream has no stamp yet. The values are
     those of :class:`StampLine` to the last bit.
     """
     one, other = (line.coming(s, end) for line, s in zip(lines, sessions, strict=True))
     if one is None or other is None:
         return None
     counts = np.union1d(one[0][1:], other[0][1:])
-    (first, stamp, leap), (other_first, other_stamp, other_leap) = (
+    (first, stamp, step), (other_first, other_stamp, other_step) = (
         _at(counts, *blocks, period_ns) for blocks in (one, other)
     )
     skew = stamp - other_stamp + (other_first - first) * period_ns
     time = stamp + (counts - first) * period_ns
     columns = [counts, skew, first == counts, other_first == counts, time]
-    return np.stack(columns, axis=1, dtype=np.float64), leap | other_leap
+    return np.stack(columns, axis=1, dtype=np.float64), np.stack([step, other_step], axis=1)
 
 
 def _at(
     counts: IntArray, firsts: IntArray, stamps: IntArray, period_ns: float
-) -> tuple[IntArray, IntArray, BoolArray]:
-    """Return count and stamp of the blocks that hold ``counts`` (n,), and which begin a motion."""
-    ahead = np.diff(stamps) - np.diff(firsts) * period_ns
-    leap = np.concatenate([[False], ahead >= _PAUSE_NS])
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return count and stamp of the blocks that hold ``counts`` (n,), and their steps there."""
+    steps = np.concatenate([[0.0], np.diff(stamps) - np.diff(firsts) * period_ns])
     block = np.searchsorted(firsts, counts, "right") - 1
-    return firsts[block], stamps[block], (firsts[block] == counts) & leap[block]
+    return firsts[block], stamps[block], np.where(firsts[block] == counts, steps[block], 0.0)
 
 
 # Stamps that advance faster or slower than the counts by more than this factor were made in time

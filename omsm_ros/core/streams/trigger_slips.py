@@ -12,6 +12,10 @@ wanders while it is estimated from arrivals. The error of that estimate is bound
 a mean of n arrivals moves by 1/n of their scatter with the next one and is wrong by 1/√n of it,
 which is √n times the movement.
 
+The delays of two devices may differ by half a period and more, and hide a slip in the skew. So a
+block of one stream that is stamped later than the one before by a whole number of periods is a
+slip, too, unless the other stream has the same step.
+
 A pair waits until stamps of both streams that agree have come after it. At the start it waits for
 the first verdict, and after a stamp that is off for the verdict on the stamps that follow. Blocks
 of one driver carry the same stamps to the nanosecond and never wait.
@@ -29,7 +33,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.streams.stamps import StampHistory, StampLine, upcoming_stamps
+from omsm_ros.core.streams.stamps import PAUSE_NS, StampHistory, StampLine, upcoming_stamps
 from omsm_ros.core.streams.statistics import median, spread_about_median
 from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
@@ -48,6 +52,13 @@ _LEAST_STAMPS = 8
 _SURE_STAMPS = 3
 # Time over which the scatter is also taken: the window of a driver's clock [s].
 _WANDER_S = 30.0
+# A step of stamps is a slip from the share of a period on; a longer one is a pause of the trigger.
+_STEP_PERIODS, _LONGEST_STEP_S = 0.7, 0.15
+# After so many verdicts it is looked anew whether this multiple of the steps that nearly all stamps
+# have (the share) is below it; otherwise steps show nothing.
+_STEP_VERDICTS, _USUAL_STEPS, _USUAL_SHARE = 5, 3.0, 0.95
+# A skew within this of that before the step shows that it was none [samples].
+_RETURNED = 0.25
 # Stamps kept for a median; single-sample blocks at 1 kHz make 800 in a span.
 _MOST_STAMPS = 1024
 # Standard deviations of single stamps that the median of several does not reach.
@@ -164,6 +175,9 @@ class TriggerSlipDetector:
         self._seen = StampHistory(_MOST_STAMPS)
         # Skew at each verdict of the last half minute without a slip [ns].
         self._wander: deque[float] = deque(maxlen=round(_WANDER_S / _STRIDE_S))
+        # Net step of both streams [samples], its count, the skew before it [ns]; least step [ns].
+        self._stepped, self._stepped_at, self._before_step = 0, first, 0.0
+        self._least_steps, self._begun_at = [math.inf, math.inf], [first, first]
 
     @property
     def same_stamps(self) -> bool:
@@ -198,7 +212,7 @@ class TriggerSlipDetector:
                 yield self._agreed_until(last, period_ns), False
                 continue
             pairs = zip(self._lines, sessions, strict=True)
-            if self._common or any(line.follows_gap(s, count, period_ns) for line, s in pairs):
+            if self._common or any(line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in pairs):
                 yield count, self.end()
             before = self._state.samples
             self._observe(count, period_ns)
@@ -220,13 +234,16 @@ class TriggerSlipDetector:
         """
         if self._starting or self._odd or self._state.samples or sum(map(len, self._lines)) < _MANY:
             return None
-        ahead = upcoming_stamps(self._lines, self.sessions, end, period_ns)
+        stride = self._stride(period_ns)
+        until = math.ceil((self._judged // _STEP_VERDICTS + 1) * _STEP_VERDICTS * stride)
+        ahead = upcoming_stamps(self._lines, self.sessions, min(end, until), period_ns)
         if ahead is None:
             return None
         self._period_ns = period_ns
-        rows, leaps = ahead
+        rows, steps = ahead
         size = abs(rows[:, 1])
-        apart = leaps | (size >= self._off_ns()) | (self._common & (size > _SAME_NS))
+        apart = (abs(steps) >= np.minimum(self._least_steps, PAUSE_NS)).any(axis=1)
+        apart |= (size >= self._off_ns()) | (self._common & (size > _SAME_NS))
         rows = rows[: int(np.argmax(apart)) if apart.any() else None]
         if not len(rows):
             return None
@@ -242,11 +259,13 @@ class TriggerSlipDetector:
             if len(begun):
                 line.skip(len(begun))
                 self._stamps[stream] += len(begun)
-                self._shown[stream] = int(rows[begun[-1], 0])
+                self._shown[stream] = self._begun_at[stream] = int(rows[begun[-1], 0])
         return int(rows[-1, 0])
 
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as their stamps show."""
+        if self._stepped:
+            return True
         since = self._start - 1 if self._starting else min(self._shown)
         few = self._starting and min(self._stamps) < _LEAST_STAMPS
         if (
@@ -278,12 +297,14 @@ class TriggerSlipDetector:
     def _observe(self, count: int, period_ns: float) -> None:
         """Take the skew at ``count``, where a block of either stream begins."""
         (axes, distance), (a, d) = self._lines, self.sessions
+        steps = axes.step_to(a, count, period_ns), distance.step_to(d, count, period_ns)
         begun = axes.advance(a, count), distance.advance(d, count)
         skew = axes.stamp_difference(distance, self.sessions, period_ns)
         if skew is None:
             self._common = False
             return
         self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
+        self._note_step(count, steps)
         self._note(count, skew, begun)
         stride = int(count // self._stride(period_ns))
         judged, self._judged = self._judged, stride
@@ -294,6 +315,8 @@ class TriggerSlipDetector:
                 self._judge(count)
             if not self._state.samples:
                 self._wander.append(skew)
+            if stride // _STEP_VERDICTS != judged // _STEP_VERDICTS:
+                self._set_least_steps()
         time = axes.stamp_of(a, count, period_ns) or 0.0
         self._seen.add(np.array([[count, skew, *begun, time]]))
         self._odd |= self._is_off(skew) and not early_days
@@ -304,10 +327,39 @@ class TriggerSlipDetector:
         self._common = abs(skew) <= _SAME_NS and (first or self._common)
         for stream in np.flatnonzero(begun):
             self._stamps[stream] += 1
+            self._begun_at[stream] = count
             if not self._is_off(skew):
                 self._shown[stream] = count
         if self._is_off(skew):
             self._odd_at = count
+
+    def _note_step(self, count: int, steps: tuple[float, float]) -> None:
+        """Keep a step of the stamps of axes or distance [ns] that is a whole number of periods."""
+        net = 0
+        for step, least, sign in zip(steps, self._least_steps, (1, -1), strict=True):
+            if least <= abs(step) < _LONGEST_STEP_S * NANOSECONDS_PER_S:
+                net += sign * round(step / self._period_ns)
+        if not net:
+            return
+        if self._state.samples and not self._stepped:
+            self._before_step = 0.0  # it ends the slip only if the skew is then zero
+        elif not self._stepped:
+            rows = self._seen.after(count - _SPAN_S * NANOSECONDS_PER_S / self._period_ns)
+            self._before_step = median(rows[:, 1]) if len(rows) else 0.0
+        self._stepped, self._stepped_at = self._stepped + net, count
+        self._odd, self._odd_at = True, count
+
+    def _set_least_steps(self) -> None:
+        """Take the least step of each stream that its scatter does not hide."""
+        rows = self._seen.rows
+        for stream in (0, 1):
+            begun = rows[rows[:, 2 + stream] > 0]
+            time = begun[:, 4] - stream * begun[:, 1]
+            steps = np.diff(time) - np.diff(begun[:, 0]) * self._period_ns
+            if len(steps) >= _LEAST_STAMPS:
+                usual = _USUAL_STEPS * float(np.quantile(abs(steps), _USUAL_SHARE))
+                least = _STEP_PERIODS * self._period_ns
+                self._least_steps[stream] = least if usual < least else math.inf
 
     def _off_ns(self) -> float:
         """Return the skew that is off [ns]."""
@@ -325,7 +377,11 @@ class TriggerSlipDetector:
         if not (self._odd or self._state.samples or self._starting):
             return
         rows = self._recent()
-        if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
+        if self._stepped and self._has_stepped(count, rows):
+            self._state = self.found = TriggerSlip(
+                self._stepped, 1, self._seen.rows[-1, 1] / NANOSECONDS_PER_S, self._trigger
+            )
+        elif rows is None or not self._seen.stamps_follow_counts(self._period_ns):
             self._state, self._odd = TriggerSlip(), True
             if rows is not None:
                 self._starting, self._judged_to = False, count  # stamps show nothing
@@ -335,6 +391,16 @@ class TriggerSlipDetector:
             self._starting, self._judged_to = False, int(rows[0, 0])
             self._odd = bool(np.any(abs(window) >= self._steady()))
             self.found = self._state if self._state.samples else self.found
+
+    def _has_stepped(self, count: int, rows: FloatArray | None) -> bool:
+        """Return whether the net step still holds, once both streams have shown theirs."""
+        if min(self._begun_at) < self._stepped_at:
+            return False
+        if rows is not None and rows[0, 0] > self._stepped_at:
+            moved = median(rows[:, 1]) - self._before_step
+            if abs(moved) < _RETURNED * self._period_ns:
+                self._stepped = 0
+        return self._stepped != 0
 
     def _recent(self) -> FloatArray | None:
         """Return the rows of :class:`StampHistory` to be judged; None if too few."""
