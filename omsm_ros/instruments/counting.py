@@ -122,7 +122,9 @@ class SequenceTracker:
         steps = np.diff(samples["counter"], prepend=self._raw) % self._counting.modulus
         good = steps == 1
         if self._counting.timed:
-            good &= np.diff(samples["time"], prepend=self._time) >= 0
+            # A time that falls back while the counter goes on is a spoilt time.
+            restarts = samples["counter"] == 0 if not self._counting.checked else True
+            good &= ~((np.diff(samples["time"], prepend=self._time) < 0) & restarts)
         return len(good) if good.all() else int(np.argmin(good))
 
     def _accept(self, samples: Samples, first: int, restarted: bool) -> CountedRun:
@@ -146,7 +148,7 @@ class SequenceTracker:
         if len(samples) < 2 or not self._counter_jumps(samples[0]):
             return False
         here, after = (self._step(int(counter)) for counter in samples["counter"][:2])
-        return after < here
+        return after <= here
 
     def _step(self, raw: int) -> int:
         return (raw - self._raw) % self._counting.modulus
@@ -159,6 +161,8 @@ class SequenceTracker:
             yield self._accept(alone, raw, False)
             return
         step, advance = self._step(raw), int(sample["time"]) - self._time
+        spoilt_time = advance < 0 and not (self._counting.checked or pause.broken or raw == 0)
+        advance = 0 if step == 1 and spoilt_time else advance
         in_order = step == 1 and advance >= 0
         if self._is_corrupted_counter(samples):
             self.spoilt += 1

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from enum import Enum
-from typing import Protocol
+from typing import Any, Protocol
 
 from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError, defect
 from omsm_ros.instruments.blocks import BlockPair
@@ -73,22 +73,22 @@ class DeviceReader:
         self._back_off = back_off
         self._when_connected = connected
         self._unproven = False
-        self._requests: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
+        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
             queue.SimpleQueue()
         )
 
-    def ask(self, request: Callable[[], None], patience: float) -> None:
-        """Let the reading thread do ``request`` to the device between two reads, and wait for it.
+    def ask(self, request: Callable[[], Any], patience: float) -> Any:
+        """Let the reading thread do ``request`` to the device between two reads; return its result.
 
         Raises what ``request`` raises; DeviceError if the device is not being read, or after
         ``patience`` [s].
         """
         if self.state is not State.READING:
             raise DeviceError(f"the device is not being read now: {self.trouble or 'it ended'}")
-        done: Future[None] = Future()
+        done: Future[Any] = Future()
         self._requests.put((request, done))
         try:
-            done.result(patience)
+            return done.result(patience)
         except TimeoutError as err:
             done.cancel()
             raise DeviceError(f"the device did not do it within {patience:g} s") from err
@@ -99,11 +99,11 @@ class DeviceReader:
             if not done.set_running_or_notify_cancel():
                 continue
             try:
-                request()
+                result = request()
             except Exception as err:  # raised where the request was made
                 done.set_exception(err)
             else:
-                done.set_result(None)
+                done.set_result(result)
 
     def run(self, stop: threading.Event) -> None:
         """Read until ``stop``."""

@@ -149,14 +149,33 @@ class StreamDevice:
     @property
     def trouble(self) -> str:
         """Return why the samples that come cannot be used; empty if they can."""
-        if self._cutter.wrong_rate:
-            period = self._settings.sample_period
-            found = 1 / (period * (1 + self._cutter.period_deviation))
+        if self._cutter.restarted_at_zero:
             return (
-                f"{self._transport.name} measures at {found:.6g} Hz, sample_period states "
-                f"{1 / period:.6g} Hz; its samples are withheld: set sample_period to the device's"
+                f"{self._transport.name}: the encoders count from zero after a restart of the "
+                "device, so positions are lost and samples are withheld: home the axes, then start "
+                "this driver again"
+            )
+        if self._cutter.wrong_rate:
+            return (
+                f"{self._transport.name} measures at {self._rates()}; its samples are withheld: "
+                "set sample_period to the device's"
             )
         return ""
+
+    @property
+    def caution(self) -> str:
+        """Return why the samples may be wrong, although they are handed over; empty if not."""
+        if self._cutter.arrives_otherwise:
+            return (
+                f"samples arrive at {self._rates()}: set sample_period to the trigger's, unless "
+                "a recording is played in time lapse"
+            )
+        return ""
+
+    def _rates(self) -> str:
+        period = self._settings.sample_period
+        found = 1 / (period * (1 + self._cutter.period_deviation))
+        return f"{found:.6g} Hz, sample_period states {1 / period:.6g} Hz"
 
     @property
     def statistics(self) -> StreamStatistics:

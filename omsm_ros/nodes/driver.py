@@ -43,7 +43,17 @@ from omsm_ros.nodes.running import run
 from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
-_FAULTS = ("bad", "lost", "losses", "malformed", "restarts", "spoilt", "period_w", "unknown", "missed")
+_FAULTS = (
+    "bad",
+    "lost",
+    "losses",
+    "malformed",
+    "restarts",
+    "spoilt",
+    "period_w",
+    "unknown",
+    "missed",
+)
 # The pauses between two motions of a step test are shorter [s].
 _SILENCE_S = 2.0
 _SILENCE_SAMPLES = 5
@@ -146,6 +156,8 @@ class DriverNode(ManagedNode):
         report = StateReport(f"reading at {self._flow.rate:.6g} Hz", values)
         if self._reader.trouble:
             report.add(ERROR, self._reader.trouble)
+        if caution := self._device.caution:
+            report.add(WARN, caution)
         self._add_faults(report, counts, now)
         self._add_silence(report, now)
         return report
@@ -199,8 +211,9 @@ class ConfocalDriverNode(DriverNode):
                 f"device {self.values['device']!r} takes no dark reference by command; take "
                 "it as the device's manual says"
             )
-        await self._worker.do(partial(self._reader.ask, take, _DARK_REFERENCE_S))
-        response.success, response.message = True, "dark reference taken; identify again"
+        light = await self._worker.do(partial(self._reader.ask, take, _DARK_REFERENCE_S))
+        stray = f", stray light {light}" if light else ""
+        response.success, response.message = True, f"dark reference taken{stray}; identify again"
 
 
 class AxisDriverNode(DriverNode):

@@ -40,7 +40,7 @@ def test_every_sample_arrives_once_with_its_counter(cell: Any, portion: int) -> 
 
 def test_seventy_kilohertz(cell: Any) -> None:
     run = cell(replace(SIX, sample_period=14.3e-6, block_size=700))
-    run.run(2.0)
+    run.run(2.2)
     run.end()
     run.check()
     assert run.delivered > 130_000

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.blocks import DeviceClock
+from omsm_ros.instruments.arrivals import DeviceClock
 
 MS = 1_000_000
 EPOCH = 1_700_000_000_000_000_000

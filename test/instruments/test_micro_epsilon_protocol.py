@@ -202,7 +202,13 @@ def test_the_scale_by_hand() -> None:
     distance, status = distance_of(raw, 300e-6)
     np.testing.assert_allclose(distance[:2], [0.0, 300e-6])
     assert np.isnan(distance[3:]).all()
-    assert status.tolist() == [0, 0, 0, *[Status.NO_TARGET] * 2, *[Status.OUT_OF_RANGE] * 2]
+    assert status.tolist() == [
+        0,
+        0,
+        Status.OUT_OF_RANGE,
+        *[Status.NO_TARGET] * 2,
+        *[Status.OUT_OF_RANGE] * 2,
+    ]
     assert values_of(np.array([0.0, 300e-6, np.nan]), 300e-6).tolist() == [98_232, 163_768, 262_076]
 
 

@@ -15,7 +15,7 @@ import pytest
 import two_counters
 
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.instruments.blocks import MissedTriggerDetector
+from omsm_ros.instruments.arrivals import MissedTriggerDetector
 from omsm_ros.instruments.six_channel.device import (
     CsvSettings,
     CsvStreamDevice,

@@ -269,8 +269,8 @@ def upcoming_stamps(
     """Return the rows of :class:`StampHistory` (n, 5) for the next blocks of two streams.
 
     There is a row for each count below ``end`` at which a block begins. The second array (n, 2) has
-    the steps of the stamps of each stream there [ns], see ``step_to``. None where a stream has no stamp yet. The values are
-    those of :class:`StampLine` to the last bit.
+    the steps of the stamps of each stream there [ns], see ``step_to``. None where a stream has no
+    stamp yet. The values are those of :class:`StampLine` to the last bit.
     """
     one, other = (line.coming(s, end) for line, s in zip(lines, sessions, strict=True))
     if one is None or other is None:

@@ -212,7 +212,9 @@ class TriggerSlipDetector:
                 yield self._agreed_until(last, period_ns), False
                 continue
             pairs = zip(self._lines, sessions, strict=True)
-            if self._common or any(line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in pairs):
+            if self._common or any(
+                line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in pairs
+            ):
                 yield count, self.end()
             before = self._state.samples
             self._observe(count, period_ns)

@@ -12,7 +12,8 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import AccelerationBlock, Block, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.blocks import BlockPair, DeviceClock
+from omsm_ros.instruments.arrivals import DeviceClock
+from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.parameters import NowNs, Values, block_settings
 from omsm_ros.instruments.transport import parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -290,6 +291,8 @@ class AnalogDevice:
     def trouble(self) -> str:
         """Return the empty text: the samples can always be used."""
         return ""
+
+    caution = trouble
 
     def counts(self) -> dict[str, float]:
         """Return the counts of samples: ``decoded = delivered + pending``; lost, gaps."""

@@ -6,6 +6,7 @@ forms are accepted.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +20,13 @@ from omsm_ros.errors import (
     DeviceTimeoutError,
     NoSamplesError,
 )
-from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockPair, BlockSettings, Channels, wrapping
+from omsm_ros.instruments.blocks import (
+    PERIOD_TOLERANCE,
+    BlockPair,
+    BlockSettings,
+    Channels,
+    wrapping,
+)
 from omsm_ros.instruments.chrocodile.protocol import (
     QUERY,
     Answer,
@@ -189,9 +196,15 @@ class Chrocodile(StreamDevice):
             )
         return blocks
 
-    def dark_reference(self) -> None:
-        """Take the dark reference, for about three seconds; no target may be in range."""
-        self._ask("DRK", patience=self._wanted.patience + 8.0)
+    def dark_reference(self) -> str:
+        """Take the dark reference, for about three seconds; no target may be in range.
+
+        Return the stray light as the device states it; empty if it does not. Raises DeviceError.
+        """
+        numbers = self._ask("DRK", patience=self._wanted.patience + 8.0).numbers
+        light = f"{numbers[-1]:g}" if numbers else ""
+        self._identity["stray_light"] = light or "not reported"
+        return light
 
     def _begin(self) -> None:
         """Make the device accept commands; raises DeviceError."""
@@ -204,16 +217,20 @@ class Chrocodile(StreamDevice):
         raise NotImplementedError
 
     def _prepare(self) -> None:
-        wanted = self._wanted
+        wanted, before = self._wanted, self._identity
         self._begin()
         self._identity = {"model": _version(self._try("VER").text)}
-        intact = self._ever_set_up and self._selected()
+        intact = self._ever_set_up and self._is_unchanged(before)
+        self._measure_distance()
         if wanted.head is not None:
             self._set("SEN", wanted.head)
         self._set("SODX", *self._selection)
         if wanted.averaging is not None:
             self._set("AVD", wanted.averaging)
         self._read("AVD")
+        for name in ("AVS", "AVDS"):  # averaging that another program left
+            self._try(name, 1)
+            self._read(name)
         self._set_rate()
         for name, value in (("LAI", wanted.lamp), ("THR", wanted.threshold)):
             if value is not None:
@@ -235,6 +252,31 @@ class Chrocodile(StreamDevice):
         except RefusedError:
             return Answer(b"", "")
 
+    def _is_unchanged(self, before: dict[str, str]) -> bool:
+        """Return whether the device was not restarted since the settings ``before`` were read.
+
+        A new client has ordered no signals, so an empty selection is no sign. Setting the trigger
+        again would reset the counter, and with it the pairing with another device.
+        """
+        signals = self._try("SODX", QUERY).numbers
+        if signals and not set(self._selection) <= set(signals):
+            return False
+        for name in ("SHZ", "AVD"):
+            found = self._try(name, QUERY).numbers
+            if found and name in before and f"{found[0]:g}" != before[name].split()[0]:
+                return False
+        return True
+
+    def _measure_distance(self) -> None:
+        """Choose the chromatic mode; DeviceError if the device stays in the interferometric one."""
+        self._try("MMD", 0)
+        self._read("MMD")
+        if self._identity.get("MMD", "0") != "0":
+            raise DeviceError(
+                f"{self._transport.name}: $MMD {self._identity['MMD']} measures thickness by "
+                "interference, and the device refuses $MMD 0; choose the chromatic mode on it"
+            )
+
     def _read(self, name: str) -> None:
         """Enter a setting of the device, if the model reports it."""
         if name not in self._identity and (found := self._try(name, QUERY).numbers):
@@ -245,7 +287,7 @@ class Chrocodile(StreamDevice):
         self._ask(name, *values)
         found = self._ask(name, QUERY).numbers
         self._identity[name] = " ".join(f"{number:g}" for number in found)
-        if found and not _agree(found, values, within=0.0 if name == "SODX" else 1e-3):
+        if not _agree(found, values, within=0.0 if name == "SODX" else 1e-3):
             raise DeviceError(
                 f"{self._transport.name}: ${name} was set to {values!r}, the device has {found!r}; "
                 "choose a value that it accepts"
@@ -253,17 +295,24 @@ class Chrocodile(StreamDevice):
 
     def _set_rate(self) -> None:
         """Set SHZ, the rate of exposures: each sample or trigger has as many as are averaged."""
-        averaging = _value(self._identity.get("AVD", "1"))
-        averaged = isinstance(averaging, float) and averaging > 1 and self._slowed_by_averaging
-        self._exposures = round(averaging) if averaged and isinstance(averaging, float) else 1
+        averaging = math.prod(self._averaged())
+        if not averaging:
+            raise DeviceError(
+                f"{self._transport.name}: with $AVD 0 it averages over the length of the trigger "
+                "pulse, so the time of a reading is unknown; set averaging to 1 or more"
+            )
+        self._exposures = averaging if self._slowed_by_averaging else 1
         rate = self._exposures / self._wanted.sample_period
         free = self._wanted.trigger == "free_run"
         self._ask("SHZ", rate if free else float(round(rate * _ABOVE_TRIGGER)))
         found = self._ask("SHZ", QUERY).numbers
         if not found:
-            return
+            raise DeviceError(
+                f"{self._transport.name} does not report its rate ($SHZ ?); check that it is a "
+                "CHRocodile and accepts commands"
+            )
         self._identity["SHZ"] = f"{found[0]:g}"
-        if free and abs(found[0] / rate - 1) > RATE_TOLERANCE / 2:
+        if free and abs(found[0] / rate - 1) > PERIOD_TOLERANCE:
             raise DeviceError(
                 f"{self._transport.name}: {rate:.6g} Hz was requested, the device measures at "
                 f"{found[0]:.6g} Hz; set sample_period to {self._exposures / found[0]:.9g} s"
@@ -273,6 +322,15 @@ class Chrocodile(StreamDevice):
                 f"{self._transport.name}: its {found[0]:.6g} Hz are below the trigger's "
                 f"{rate:.6g} Hz, so triggers would be lost; reduce exposure or averaging"
             )
+
+    def _averaged(self) -> tuple[int, ...]:
+        """Return the exposures in a spectrum, in a reading, and the readings in a sample."""
+        names = ("AVS", "AVD", "AVDS") if self._transport_is_serial() else ("AVS", "AVD")
+        values = (_value(self._identity.get(name, "1")) for name in names)
+        return tuple(round(value) if isinstance(value, float) else 1 for value in values)
+
+    def _transport_is_serial(self) -> bool:
+        return getattr(self._transport, "baud_rate", None) is not None
 
     def _read_scale(self) -> None:
         found = self._try("SCA", QUERY).numbers
@@ -309,7 +367,7 @@ class Chrocodile(StreamDevice):
 
     def _selected(self) -> bool:
         """Return whether the device still has the selection; a restart sets it back."""
-        found = self._ask("SODX", QUERY).numbers
+        found = self._try("SODX", QUERY).numbers
         return not found or set(self._selection) <= set(found)
 
     def _converted(self, batches: Sequence[Records]) -> Samples:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -15,6 +16,7 @@ from omsm_ros.instruments.chrocodile.device import (
     FORMATS,
     Chrocodile,
     ChrocodileSettings,
+    RefusedError,
     settings_from,
 )
 from omsm_ros.instruments.chrocodile.protocol import (
@@ -39,6 +41,8 @@ from omsm_ros.instruments.transport import Transport
 from omsm_ros.units import NANOSECONDS_PER_S
 
 _TIME_RANGE = 2**32
+# A refusal has no number of its own but words.
+_REFUSAL = re.compile(r"\b(error|unknown|invalid|illegal|refused|denied|fail\w*|not \w+)\b", re.I)
 # Start bit, eight data bits, stop bit.
 _BITS_PER_BYTE = 10
 
@@ -70,7 +74,7 @@ class ChrocodileDevice(Chrocodile):
     def _begin(self) -> None:
         self._stream.start()
         self._early.clear()
-        self._ask("STO")
+        self._try("STO")
         if self._unheard:
             # Another program may have changed the sync bytes, which follow this command at once.
             self._exchange(b"$SSQ" + self._wanted.sync + b"\r")
@@ -81,11 +85,11 @@ class ChrocodileDevice(Chrocodile):
         self._check_line(layout)
         binary = self._wanted.format == "binary"
         self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
-        self._ask("STA")
+        self._try("STA")
 
     def _layout(self) -> Layout:
         """Return the layout that the device describes, or that of the table if it does not."""
-        answer = self._ask("DTF")
+        answer = self._try("DTF")
         try:
             layout = Layout.described(answer.text, self._wanted.sync)
         except ProtocolError:
@@ -109,7 +113,13 @@ class ChrocodileDevice(Chrocodile):
 
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
         """Return the answer to a command, keeping telegrams; DeviceTimeoutError without one."""
-        return self._exchange(command(name, *arguments), patience)
+        answer = self._exchange(command(name, *arguments), patience)
+        if _REFUSAL.search(answer.text):
+            raise RefusedError(
+                f"{self._transport.name} refused ${name} {arguments!r}: {answer.text!r}; choose a "
+                "value that it accepts"
+            )
+        return answer
 
     def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
         self._stream.expect(wire)
@@ -150,7 +160,9 @@ class ChrocodileDevice(Chrocodile):
         """Return device time [ns] without wraps; those in a silence by the host's clock."""
         now = self._monotonic()
         previous = self._raw_time if self._raw_time is not None else int(raw[0])
-        steps = np.diff(raw, prepend=previous) % _TIME_RANGE
+        # Signed, so that a flipped bit costs its own sample only.
+        steps = (np.diff(raw, prepend=previous) + _TIME_RANGE // 2) % _TIME_RANGE
+        steps -= _TIME_RANGE // 2
         undetected = (now - self._time_at) * NANOSECONDS_PER_S - steps[0]
         steps[0] += max(0, round(undetected / _TIME_RANGE)) * _TIME_RANGE
         times: IntArray = self._device_ns + np.cumsum(steps)

@@ -55,7 +55,7 @@ class ChrocodilePacketDevice(Chrocodile):
         self._ticket, self._sample_bytes = 0, 1
         self._early: list[Data] = []
         self._commands: list[PacketCommand] = []
-        self._said = b""
+        self._said, self._answered = b"", False  # it has answered with a value of its own
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
@@ -66,7 +66,7 @@ class ChrocodilePacketDevice(Chrocodile):
         self._decoder.reset()
         self._early.clear()
         self._commands.clear()
-        self._said = b""
+        self._said, self._answered = b"", False
         self._await_configuration()
         self._try("STO")
 
@@ -100,8 +100,9 @@ class ChrocodilePacketDevice(Chrocodile):
             for value in answer.values
             if not isinstance(value, bytes)
         )
-        if query and answer.flags & QUERY and not answer.values:
+        if query and answer.flags & QUERY and not (answer.values or self._answered):
             raise self._unanswered(name, answer.name.encode())  # the command was echoed
+        self._answered |= bool(answer.values) and not values
         if answer.flags & ERROR:
             raise RefusedError(
                 f"{self._transport.name} refused {name} {arguments!r}: {text!r}; choose a value "

@@ -7,6 +7,7 @@ command port is given.
 
 from __future__ import annotations
 
+import itertools
 import re
 import time
 from collections.abc import Callable
@@ -16,9 +17,11 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import IntArray, Status
 from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
-from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels, wrapping
+from omsm_ros.instruments.blocks import PERIOD_TOLERANCE, BlockSettings, Channels, wrapping
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
 from omsm_ros.instruments.micro_epsilon.protocol import (
+    BEFORE_RANGE_NM,
+    BEHIND_RANGE_NM,
     FIRST_ERROR,
     HEADERS,
     INTENSITY_FULL,
@@ -53,6 +56,8 @@ _INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
 
 
+# So many distances in a portion are not all before the range by chance.
+_MANY_VALUES = 5
 COUNTER_RANGE = 2**32
 # The beginning of blocks whose header does not describe the frames.
 _UNDESCRIBED = b"DATA"
@@ -83,11 +88,13 @@ class BlockStreamDevice(StreamDevice):
         """kind: of :class:`BlockDecoder`;  period: of a free-running controller [s], else 0
         patience: for an answer [s];  commands: the controller's port 23; None = keep its settings
         """
-        counting = Counting(COUNTER_RANGE, timed=False, period=period)
+        counting = Counting(COUNTER_RANGE, timed=False, checked=False, period=period)
         super().__init__(transport, settings, channels, counting, now_ns, monotonic)
         self._decoder = BlockDecoder(kind, self._frame)
         self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
         self._unread, self._undescribed = 0, False
+        self._next: int | None = None  # counter of the next block
+        self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
         self._commands, self._answers_within = commands, patience
         self._identity: dict[str, str] = {}
 
@@ -102,6 +109,7 @@ class BlockStreamDevice(StreamDevice):
 
     def _prepare(self) -> None:
         self._decoder.reset()
+        self._doubtful, self._next = [], None
         self._unread, self._undescribed = 0, False
         if self._commands is None:
             return
@@ -110,7 +118,7 @@ class BlockStreamDevice(StreamDevice):
             self._identity = self._set_up(port)
 
     def _decode(self, data: bytes) -> Samples:
-        samples = self._converted(self._decoder.feed(data))
+        samples = self._converted(self._numbered(self._decoder.feed(data)))
         self._unread = 0 if len(samples) else self._unread + len(data)
         self._undescribed = not len(samples) and (self._undescribed or _UNDESCRIBED in data)
         return samples
@@ -121,7 +129,27 @@ class BlockStreamDevice(StreamDevice):
         return max(waiting, 0) / self._frame_bytes
 
     def _rest(self) -> Samples:
-        return self._converted(self._decoder.settle())
+        last = self._numbered(self._decoder.settle())
+        waited, self._doubtful = self._doubtful, []
+        return self._converted([*last, *waited])
+
+    def _numbered(self, blocks: list[MeasurementBlock]) -> list[MeasurementBlock]:
+        """Return the blocks, with the counter of a spoilt header as the next block shows it.
+
+        The last block waits for the next one if its counter is not the one expected.
+        """
+        waiting, found = self._doubtful + blocks, []
+        self._doubtful = []
+        for block, after in itertools.zip_longest(waiting, waiting[1:]):
+            if self._next is not None and block.counter != self._next:
+                if after is None:
+                    self._doubtful = [block]
+                    break
+                if after.counter == (self._next + len(block.frames)) % COUNTER_RANGE:
+                    block = block._replace(counter=self._next)
+            self._next = (block.counter + len(block.frames)) % COUNTER_RANGE
+            found.append(block)
+        return found
 
     def _converted(self, blocks: list[MeasurementBlock]) -> Samples:
         parts = []
@@ -243,6 +271,7 @@ class ConfocalDtDevice(StreamDevice):
         self._unread = 0 if len(values) else self._unread + len(data)
         columns = dict(zip(self._wanted.values, values.T, strict=True))
         samples = np.zeros(len(values), SAMPLE)
+        self._check_order(columns["distance"])
         raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
         samples["distance"] = self._wanted.probe.distance(raw)
         samples["intensity"] = np.nan
@@ -255,6 +284,16 @@ class ConfocalDtDevice(StreamDevice):
             samples["counter"] = self._counted + np.cumsum(1 + spoilt) - 1
             self._counted = int(samples["counter"][-1]) + 1
         return samples
+
+    def _check_order(self, distance: IntArray) -> None:
+        """Raise NoSamplesError if the values of the distance look like intensities."""
+        if len(distance) >= _MANY_VALUES and np.all(distance <= INTENSITY_FULL):
+            self._decoder.reset()
+            raise NoSamplesError(
+                f"{self._transport.name}: the values taken for distance are at most "
+                f"{int(distance.max())}, far before the range, as an intensity is; check the order "
+                "of `signals`"
+            )
 
     def _listen_in(self, silent: float) -> None:
         if "counter" not in self._wanted.values:
@@ -326,7 +365,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
                 f"{self._transport.name} did not report its measuring rate ({said[-64:]!r}); check "
                 "that command_port is this controller's, or set it to 0"
             )
-        if abs(answered[-1] / wanted - 1) > RATE_TOLERANCE:
+        if abs(answered[-1] / wanted - 1) > PERIOD_TOLERANCE:
             raise DeviceError(
                 f"{self._transport.name}: {wanted:.4g} kHz was requested, the controller measures "
                 f"at {answered[-1]:g} kHz; set sample_period to {1e-3 / answered[-1]:.9g} s"
@@ -343,8 +382,9 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         metres = np.where(nothing, np.nan, raw * NANOMETRE_M)
         samples["distance"] = self._wanted.probe.distance(metres)
         beyond = np.abs(metres) > self._wanted.probe.full_scale
+        beyond |= (raw >= BEFORE_RANGE_NM) & (raw <= BEHIND_RANGE_NM)
         samples["status"] = np.select(
-            [nothing, beyond], [Status.NO_TARGET, Status.OUT_OF_RANGE], Status.OK
+            [beyond, nothing], [Status.OUT_OF_RANGE, Status.NO_TARGET], Status.OK
         )
         samples["intensity"] = np.nan
         if light is not None:

@@ -61,6 +61,8 @@ INTENSITY_MASK, INTENSITY_FULL = 0x7FF, 1024
 _NO_INTENSITY = 0xC000F800
 # Distances from this value on are error codes.
 FIRST_ERROR = 0x7FFFFF00
+# Of them: a peak before, and one behind the measuring range.
+BEFORE_RANGE_NM, BEHIND_RANGE_NM = 0x7FFFFF05, 0x7FFFFF06
 _SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
 
 
@@ -291,6 +293,7 @@ def distance_of(values: IntArray, measuring_range: float) -> tuple[FloatArray, N
     """
     distance = (values - ZERO) * (measuring_range / SPAN)
     status = np.full(values.shape, Status.OK, np.uint8)
+    status[np.abs(distance) > measuring_range] = Status.OUT_OF_RANGE
     status[values > LAST_VALUE] = Status.NO_TARGET
     status[(values == BEFORE_RANGE) | (values == BEHIND_RANGE)] = Status.OUT_OF_RANGE
     return np.where(values > LAST_VALUE, np.nan, distance), status

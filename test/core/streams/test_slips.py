@@ -12,7 +12,7 @@ from omsm_ros.core.streams.blocks import AxisBlock, StreamAccount
 from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.trigger_slips import CommonTrigger, TriggerSlipDetector
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.blocks import DeviceClock
+from omsm_ros.instruments.arrivals import DeviceClock
 
 PERIOD = 1e-3
 EPOCH = 1_700_000_000 * 10**9
