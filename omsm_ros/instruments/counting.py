@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TypeAlias, TypeVar
 
 import numpy as np
@@ -24,6 +25,18 @@ SAMPLE = np.dtype(
 )
 Samples: TypeAlias = NDArray[np.void]
 """Structured array of shape (n,), dtype ``SAMPLE``: the common form of all devices' samples."""
+
+
+class WireCounts(SimpleNamespace):
+    """Counts of a decoder: ``bytes_received = in samples + bytes_discarded + bytes_pending``."""
+
+    def __init__(self, received: int, kept: int, pending: int, **counts: int) -> None:
+        """kept: bytes of what was decoded;  counts: of what it was, by name."""
+        discarded = received - kept - pending
+        super().__init__(
+            bytes_received=received, bytes_discarded=discarded, bytes_pending=pending, **counts
+        )
+
 
 # Arrivals are uneven, so a gap and the time that passed may differ by this much [s].
 _SLACK_S = 0.5

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any
 
 from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError, defect
 from omsm_ros.instruments.blocks import BlockPair
@@ -16,23 +16,6 @@ from omsm_ros.instruments.blocks import BlockPair
 _READ_S = 0.05
 # The pause before connecting again doubles from the first to the second [s].
 BACK_OFF_S = (0.25, 5.0)
-
-
-class Readable(Protocol):
-    """A device that a reader can read."""
-
-    @property
-    def trouble(self) -> str:
-        """Return why its samples cannot be used; empty if they can."""
-
-    def open(self) -> None:
-        """Connect and set up; raises DeviceError."""
-
-    def poll(self, timeout: float) -> list[BlockPair]:
-        """Return blocks that came within ``timeout`` [s]; raises DeviceError."""
-
-    def close(self) -> list[BlockPair]:
-        """Disconnect and return the partial block."""
 
 
 class State(Enum):
@@ -54,14 +37,15 @@ class DeviceReader:
 
     def __init__(
         self,
-        device: Readable,
+        device: Any,
         deliver: Callable[[Sequence[BlockPair]], None],
         note: Callable[[str], None] = lambda _: None,
         complain: Callable[[str], None] = lambda _: None,
         back_off: tuple[float, float] = BACK_OFF_S,
         connected: Callable[[], None] = lambda: None,
     ) -> None:
-        """complain, note: called once for each new trouble, and once when it is over
+        """device: as ``StreamDevice``
+        complain, note: called once for each new trouble, and once when it is over
         connected: called when the device was set up, before its samples are delivered
         """
         self.state = State.CONNECTING

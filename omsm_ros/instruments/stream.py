@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
@@ -88,11 +88,11 @@ class StreamDevice:
         self._monotonic = monotonic
         self._tracker = SequenceTracker(counting)
         self._cutter = BlockCutter(settings, channels)
-        self._decoded = 0
+        self.decoded = 0
         self._heard = self._opened = monotonic()
         self._came_ns, self._came_at = 0, self._heard  # of the last bytes
         self._down = False
-        self._renewals = 0
+        self.renewals = 0
         self._went_on = self._heard  # when a counter last advanced
 
     def open(self) -> None:
@@ -127,7 +127,7 @@ class StreamDevice:
         if 0 < self._settings.renew < silent:
             # A device that waits for its trigger accepts it; one that is gone refuses it.
             self.open()
-            self._renewals += 1
+            self.renewals += 1
         return blocks
 
     def close(self) -> list[BlockPair]:
@@ -180,25 +180,12 @@ class StreamDevice:
     @property
     def statistics(self) -> StreamStatistics:
         """Return the counts of all samples."""
-        tracker, cutter = self._tracker, self._cutter
-        return StreamStatistics(
-            decoded=self._decoded,
-            delivered=cutter.delivered,
-            pending=cutter.pending,
-            held=tracker.held,
-            spoilt=tracker.spoilt,
-            duplicates=tracker.duplicates,
-            withheld=cutter.withheld,
-            missed=cutter.missed,
-            least_missed=cutter.least_missed,
-            lost=tracker.lost,
-            gaps=tracker.gaps,
-            restarts=tracker.restarts,
-            blocks=cutter.blocks,
-            period_deviation=cutter.period_deviation,
-            period_warnings=cutter.period_warnings,
-            renewals=self._renewals,
-        )
+        owners = (self, self._tracker, self._cutter)
+        found = {
+            each.name: next(getattr(o, each.name) for o in owners if hasattr(o, each.name))
+            for each in fields(StreamStatistics)
+        }
+        return StreamStatistics(**found)
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
@@ -253,7 +240,7 @@ class StreamDevice:
             )
 
     def _add(self, samples: Samples, arrival_ns: int, silent: float) -> list[BlockPair]:
-        self._decoded += len(samples)
+        self.decoded += len(samples)
         after_silence = self._down or silent > self._settings.pause
         self._down = False
         runs = list(self._tracker.split(samples, silent, broken=after_silence))

@@ -277,10 +277,4 @@ def _origin(recorded_ns: int | None) -> Origin:
     return Origin(recorded_ns=recorded_ns, software=f"omsm_ros {__version__}")
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros calibrator``."""
-    run(CalibratorNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, CalibratorNode)

@@ -164,10 +164,4 @@ class CellEmulatorNode(ManagedNode):
         return StateReport(words, {"samples_played": self._player.played})
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros cell_emulator``."""
-    run(CellEmulatorNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, CellEmulatorNode)

@@ -490,10 +490,4 @@ def _prediction(*motion: Any) -> Prediction:
     return predict_from(*motion)
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros corrector``."""
-    run(CorrectorNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, CorrectorNode)

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -474,10 +475,4 @@ class PlayerNode(ManagedNode):
         return report
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros replay``."""
-    run(PlayerNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, PlayerNode)

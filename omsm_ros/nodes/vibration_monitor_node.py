@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 from omsm_msgs.msg import AccelerationBlock
@@ -177,10 +178,4 @@ def _edges(text: str) -> tuple[float, ...]:
         ) from err
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros vibration_monitor``."""
-    run(VibrationMonitorNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, VibrationMonitorNode)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,10 +139,4 @@ def load_token(path: str) -> str:
     return text
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros viewer``."""
-    run(ViewerNode)
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run, ViewerNode)

@@ -65,7 +65,7 @@ def run(
 
 def assert_consistent(blocks: list[BlockPair], device: GenericStreamDevice) -> None:
     found = device.statistics
-    assert found.decoded == device.wire.frames
+    assert found.decoded == device._decoder.statistics.frames
     kept_back = found.pending + found.duplicates + found.withheld
     assert found.decoded == found.delivered + kept_back
     assert found.delivered == sum(len(axes) for axes, _ in blocks)

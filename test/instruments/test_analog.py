@@ -10,14 +10,14 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.analog.device import (
     AnalogAccelerometer,
     AnalogReference,
-    AnalogSettings,
+    BlockSettings,
     NidaqInput,
     SyntheticInput,
     analog_input,
 )
 
 PERIOD_NS = 500_000
-SETTINGS = AnalogSettings(sample_period=5e-4, block_size=50)
+SETTINGS = BlockSettings(sample_period=5e-4, block_size=50)
 
 
 class Source:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 
 import numpy as np
 import pytest
@@ -102,7 +103,9 @@ def test_a_broken_frame_is_a_gap_of_one() -> None:
     blocks, device = run(bytes(wire))
     assert spans(blocks) == [(0, 4), (5, 5)]
     found = device.statistics
-    assert found.lost == device.wire.bad_crc + device.wire.bad_cobs == 1
+    assert (
+        found.lost == device._decoder.statistics.bad_crc + device._decoder.statistics.bad_cobs == 1
+    )
 
 
 def test_duplicates_are_left_out_and_counted() -> None:
@@ -199,7 +202,7 @@ class Moments:
 
 def polled(script: Script, renew: float, seconds: float) -> GenericStreamDevice:
     clock = Moments()
-    device = GenericStreamDevice(script, StreamSettings(renew=renew), monotonic=clock)
+    device = GenericStreamDevice(script, StreamSettings(renew=renew), time.time_ns, clock)
     device.open()
     for _ in range(round(seconds / 0.5)):
         clock.now += 0.5

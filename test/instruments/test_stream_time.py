@@ -111,7 +111,7 @@ def test_a_lost_connection_costs_nothing_that_had_arrived() -> None:
     assert spans(blocks) == [(0, 5), (7, 5)]
     assert_consistent(blocks, device)
     found = device.statistics
-    assert (found.lost, found.gaps, device.wire.bad_length) == (2, 1, 1)
+    assert (found.lost, found.gaps, device._decoder.statistics.bad_length) == (2, 1, 1)
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def driver(monkeypatch):
         now=now, counts=counts,
         values={"device": "six_channel", "port": "tcp://a:1", "sample_period": 1e-3,
                 "machine_frame": "mill", "probe_frame": "needle"},
-        _device=SimpleNamespace(counts=lambda: dict(counts), identity={"version": "2.1"},
+        _device=SimpleNamespace(counts=lambda: dict(counts), identity={"version": "2.1"}, caution="",
                                 settings={"rate_hz": 1000.0}),
         _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
         _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},

@@ -62,7 +62,7 @@ def test_the_file_of_disturbances_is_played(cell):
 def test_a_file_of_disturbances_that_cannot_be_is_one_line(tmp_path):
     file = tmp_path / "disturbances.yaml"
     file.write_text("probe: {latency: 1e-3}\n")
-    command = [sys.executable, "-m", "omsm_ros.nodes.cell_emulator_node", "--ros-args"]
+    command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_emulator", "--ros-args"]
     ended = subprocess.run(
         [*command, "-p", f"disturbances:={file}"], capture_output=True, text=True, timeout=60
     )

@@ -174,7 +174,7 @@ def test_a_wrong_parameter_is_one_line_and_exit_2(node, parameter, named):
 
 def test_interrupts_do_not_mask_a_node_that_failed_to_start():
     """They come until the last moment, as from a launch that ends what it started."""
-    command = [sys.executable, "-m", "omsm_ros.nodes.corrector_node", "--ros-args"]
+    command = [sys.executable, "-m", "omsm_ros.nodes.start", "corrector", "--ros-args"]
     with subprocess.Popen([*command, "-p", "polarity:=7"], stderr=subprocess.PIPE) as node:
         assert b"polarity" in node.stderr.readline()
         while node.poll() is None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, TypeAlias
 from urllib.parse import parse_qs
 
 import numpy as np
@@ -13,7 +13,7 @@ import numpy as np
 from omsm_ros.core.streams.blocks import AccelerationBlock, Block, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.arrivals import DeviceClock
-from omsm_ros.instruments.blocks import BlockPair
+from omsm_ros.instruments.blocks import BlockPair, BlockSettings
 from omsm_ros.instruments.parameters import NowNs, Values, block_settings
 from omsm_ros.instruments.transport import parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -22,30 +22,6 @@ from omsm_ros.units import NANOSECONDS_PER_S
 _BUFFER_S = 10.0
 # NI-DAQmx: samples were overwritten before they were read.
 _OVERWRITTEN = (-200279, -200278)
-
-
-class AnalogInput(Protocol):
-    """Several channels that are sampled together at a constant rate.
-
-    name: in messages
-    """
-
-    @property
-    def name(self) -> str:
-        """Return the name in messages."""
-        ...
-
-    def open(self, rate: float) -> None:
-        """Begin to sample at ``rate`` [Hz]; raises DeviceError."""
-
-    def read(self, timeout: float) -> FloatArray:
-        """Return the samples since the last call, (n, channels) [V], waiting up to ``timeout`` [s].
-
-        Raises DeviceError if samples were lost or the converter is gone.
-        """
-
-    def close(self) -> None:
-        """Stop; does nothing when not open."""
 
 
 class NidaqInput:
@@ -192,7 +168,10 @@ class SyntheticInput:
         self._taken = -1
 
 
-def analog_input(address: str, channels: int) -> AnalogInput:
+Converter: TypeAlias = NidaqInput | SyntheticInput
+
+
+def analog_input(address: str, channels: int) -> Converter:
     """Return the input that ``address`` names (``daq://``, ``synthetic://``), not yet open.
 
     Raises ConfigurationError.
@@ -218,14 +197,6 @@ STANDARD_GRAVITY = 9.80665
 """[m/s²], exact by definition."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnalogSettings:
-    """sample_period: [s];  block_size: samples in a block."""
-
-    sample_period: float
-    block_size: int
-
-
 class AnalogDevice:
     """Reads a free-running converter and cuts its samples into blocks.
 
@@ -234,10 +205,14 @@ class AnalogDevice:
     ``_block``.
     """
 
+    # A converter does not know its sensor, and its samples can always be used.
+    identity: Mapping[str, str] = MappingProxyType({})
+    trouble = caution = ""
+
     def __init__(
         self,
-        source: AnalogInput,
-        settings: AnalogSettings,
+        source: Converter,
+        settings: BlockSettings,
         now_ns: Callable[[], int] = time.time_ns,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -282,18 +257,6 @@ class AnalogDevice:
         self._source.close()
         return blocks
 
-    @property
-    def identity(self) -> dict[str, str]:
-        """Return nothing: a converter does not know its sensor."""
-        return {}
-
-    @property
-    def trouble(self) -> str:
-        """Return the empty text: the samples can always be used."""
-        return ""
-
-    caution = trouble
-
     def counts(self) -> dict[str, float]:
         """Return the counts of samples: ``decoded = delivered + pending``; lost, gaps."""
         return {
@@ -328,7 +291,11 @@ class AnalogAccelerometer(AnalogDevice):
     """Reads three axes; an IEPE sensor has no response at 0 Hz, and no offset is removed."""
 
     def __init__(
-        self, source: AnalogInput, settings: AnalogSettings, sensitivity: float, **clocks: Any
+        self,
+        source: Converter,
+        settings: BlockSettings,
+        sensitivity: float,
+        **clocks: Any,
     ) -> None:
         """sensitivity: [V/(m/s²)]; the paper's PCB 356A17 has 0.5 V/g."""
         super().__init__(source, settings, **clocks)
@@ -344,8 +311,8 @@ class AnalogReference(AnalogDevice):
 
     def __init__(
         self,
-        source: AnalogInput,
-        settings: AnalogSettings,
+        source: Converter,
+        settings: BlockSettings,
         *,
         sensitivity: float,
         full_scale: float,
@@ -370,7 +337,7 @@ class AnalogReference(AnalogDevice):
 
 def make_accelerometer(values: Values, now_ns: NowNs) -> AnalogAccelerometer:
     """Return the accelerometer that ``values`` describe."""
-    settings = AnalogSettings(**block_settings(values))
+    settings = BlockSettings(**block_settings(values))
     sensitivity = values["sensitivity"] / STANDARD_GRAVITY
     return AnalogAccelerometer(
         analog_input(values["port"], 3), settings, sensitivity, now_ns=now_ns
@@ -381,7 +348,7 @@ def make_reference(values: Values, now_ns: NowNs) -> AnalogReference:
     """Return the displacement sensor that ``values`` describe."""
     return AnalogReference(
         analog_input(values["port"], 1),
-        AnalogSettings(**block_settings(values)),
+        BlockSettings(**block_settings(values)),
         sensitivity=values["sensitivity"],
         full_scale=values["probe.full_scale"],
         polarity=values["probe.polarity"],

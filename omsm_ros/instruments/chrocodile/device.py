@@ -7,8 +7,7 @@ forms are accepted.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -134,11 +133,7 @@ class Chrocodile(StreamDevice):
     always_timed = False
 
     def __init__(
-        self,
-        transport: Transport,
-        settings: ChrocodileSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, settings: ChrocodileSettings | None = None, *clocks: Any
     ) -> None:
         settings = settings or ChrocodileSettings()
         free = settings.trigger == "free_run"
@@ -150,8 +145,7 @@ class Chrocodile(StreamDevice):
             replace(settings, free_running=free),
             Channels(axes=wrapping(settings.axes, ENCODER_RANGE), timed=timed),
             Counting(_COUNTER_RANGE, timed=timed, checked=False, period=period),
-            now_ns,
-            monotonic,
+            *clocks,
         )
         self.triggers_lost = self.triggers_delayed = 0
         self._wanted = settings

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -53,13 +51,9 @@ class ChrocodileDevice(Chrocodile):
     usual = (SAMPLE_COUNTER, START_TIME, FLAGS, DISTANCE, INTENSITY)
 
     def __init__(
-        self,
-        transport: Transport,
-        settings: ChrocodileSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, settings: ChrocodileSettings | None = None, *clocks: Any
     ) -> None:
-        super().__init__(transport, settings, now_ns, monotonic)
+        super().__init__(transport, settings, *clocks)
         self._stream = DollarStream()
         self._early: list[Records] = []
         self._raw_time: int | None = None
@@ -69,7 +63,7 @@ class ChrocodileDevice(Chrocodile):
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
         decoder = self._stream.decoder
-        return super().counts() | (asdict(decoder.statistics) if decoder is not None else {})
+        return super().counts() | (vars(decoder.statistics) if decoder is not None else {})
 
     def _begin(self) -> None:
         self._stream.start()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -44,13 +43,9 @@ class ChrocodilePacketDevice(Chrocodile):
     always_timed = True
 
     def __init__(
-        self,
-        transport: Transport,
-        settings: ChrocodileSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, settings: ChrocodileSettings | None = None, *clocks: Any
     ) -> None:
-        super().__init__(transport, settings, now_ns, monotonic)
+        super().__init__(transport, settings, *clocks)
         self._decoder = PacketDecoder()
         self._ticket, self._sample_bytes = 0, 1
         self._early: list[Data] = []
@@ -59,7 +54,7 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self._decoder.statistics)
+        return super().counts() | vars(self._decoder.statistics)
 
     def _begin(self) -> None:
         """Wait until the device has reported its whole configuration."""
@@ -145,7 +140,7 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def _ahead(self) -> float:
         """Return the samples of the next packet that have arrived."""
-        waiting = self._decoder.statistics.bytes_pending - HEADER.size - DATA_BODY.size
+        waiting = int(self._decoder.statistics.bytes_pending) - HEADER.size - DATA_BODY.size
         return max(waiting, 0) / self._sample_bytes
 
     def _rest(self) -> Samples:

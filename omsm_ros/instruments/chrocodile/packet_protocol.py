@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.errors import ConfigurationError, ProtocolError
 from omsm_ros.instruments.chrocodile.telegram import FLOAT, S16, S32, U16, U32, Records
+from omsm_ros.instruments.counting import WireCounts
 from omsm_ros.units import NANOSECONDS_PER_S
 
 MAGIC = 0xAA55AA55
@@ -185,22 +186,6 @@ def decode_format(body: bytes) -> DataFormat:
     return DataFormat(counter, rate, signals, stream)
 
 
-@dataclass(frozen=True, slots=True)
-class PacketStatistics:
-    """Counts of bytes: ``received = in packets + discarded + pending``.
-
-    packets: decoded;  malformed: packets whose content is not valid
-    unformatted: samples without their data format
-    """
-
-    bytes_received: int
-    bytes_discarded: int
-    bytes_pending: int
-    packets: int
-    malformed: int
-    unformatted: int
-
-
 class PacketDecoder:
     """Decodes bytes in any portions to messages; it never raises, memory is a packet and a portion.
 
@@ -250,16 +235,11 @@ class PacketDecoder:
         return found
 
     @property
-    def statistics(self) -> PacketStatistics:
-        """Return the counts of bytes."""
-        return PacketStatistics(
-            bytes_received=self._received,
-            bytes_discarded=self._received - self._understood - len(self._buffer),
-            bytes_pending=len(self._buffer),
-            packets=self._packets,
-            malformed=self._malformed,
-            unformatted=self._unformatted,
-        )
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, packets, malformed ones, and samples without their format."""
+        counts = {"malformed": self._malformed, "unformatted": self._unformatted}
+        pending, packets = len(self._buffer), self._packets
+        return WireCounts(self._received, self._understood, pending, packets=packets, **counts)
 
     def _length(self, place: int, *, last: bool = False) -> int | None:
         """Return the length of the packet at ``place``; 0 = no packet; None = wait for more.

@@ -15,7 +15,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +29,7 @@ from omsm_ros.instruments.chrocodile.telegram import (
     Layout,
     Records,
 )
+from omsm_ros.instruments.counting import WireCounts
 
 # Two telegrams between damaged bytes belong together if at most this many samples are missing.
 _NEAR = 16
@@ -37,20 +37,6 @@ _NEAR = 16
 _DEEP = 8
 # Matches a number in one way only; with more ways a long run of digits takes hours.
 _NUMBER_BYTES = rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?"
-
-
-@dataclass(frozen=True, slots=True)
-class TelegramStatistics:
-    """Counts of bytes: ``received = in telegrams + discarded + pending``.
-
-    telegrams: decoded;  losses_of_sync: how often synchronisation was lost
-    """
-
-    bytes_received: int
-    bytes_discarded: int
-    bytes_pending: int
-    telegrams: int
-    losses_of_sync: int
 
 
 class BinaryDecoder:
@@ -100,16 +86,11 @@ class BinaryDecoder:
         return found
 
     @property
-    def statistics(self) -> TelegramStatistics:
-        """Return the counts of bytes."""
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, telegrams, and losses of synchronisation."""
         decoded, waits = self._telegrams * self._layout.length, len(self._buffer + self._doubtful)
-        return TelegramStatistics(
-            bytes_received=self._received,
-            bytes_discarded=self._received - decoded - waits,
-            bytes_pending=waits,
-            telegrams=self._telegrams,
-            losses_of_sync=self._losses,
-        )
+        counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
+        return WireCounts(self._received, decoded, waits, **counts)
 
     def _cleared(self) -> bytes:
         """Return the telegram before a jump, since the next one follows it."""
@@ -299,14 +280,10 @@ class LineDecoder:
         return np.empty(0, self._dtype)
 
     @property
-    def statistics(self) -> TelegramStatistics:
-        return TelegramStatistics(
-            bytes_received=self._received,
-            bytes_discarded=self._received - self._kept - len(self._tail),
-            bytes_pending=len(self._tail),
-            telegrams=self._telegrams,
-            losses_of_sync=self._losses,
-        )
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, telegrams, and damaged lines."""
+        counts = {"telegrams": self._telegrams, "losses_of_sync": self._losses}
+        return WireCounts(self._received, self._kept, len(self._tail), **counts)
 
     def _well_formed(self, line: bytes) -> bool:
         return len(line) < MAX_TELEGRAM_BYTES and self._line.fullmatch(line) is not None

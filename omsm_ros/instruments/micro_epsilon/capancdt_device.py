@@ -7,9 +7,8 @@ and silent, so the driver connects again after a silence.
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -59,8 +58,7 @@ class CapaNcdtDevice(BlockStreamDevice):
         self,
         transport: Transport,
         settings: CapaNcdtSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        *clocks: Any,
         commands: Transport | None = None,
     ) -> None:
         """commands: the controller's port 23; None = keep its settings."""
@@ -74,8 +72,7 @@ class CapaNcdtDevice(BlockStreamDevice):
             period=settings.sample_period if free else 0.0,
             patience=settings.patience,
             commands=commands,
-            now_ns=now_ns,
-            monotonic=monotonic,
+            clocks=clocks,
         )
         self._wanted = settings
 

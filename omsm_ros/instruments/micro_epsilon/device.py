@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import itertools
 import re
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -82,14 +81,13 @@ class BlockStreamDevice(StreamDevice):
         period: float,
         patience: float,
         commands: Transport | None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        clocks: tuple[Any, ...] = (),
     ) -> None:
         """kind: of :class:`BlockDecoder`;  period: of a free-running controller [s], else 0
         patience: for an answer [s];  commands: the controller's port 23; None = keep its settings
         """
         counting = Counting(COUNTER_RANGE, timed=False, checked=False, period=period)
-        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+        super().__init__(transport, settings, channels, counting, *clocks)
         self._decoder = BlockDecoder(kind, self._frame)
         self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
         self._unread, self._undescribed = 0, False
@@ -100,7 +98,7 @@ class BlockStreamDevice(StreamDevice):
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self._decoder.statistics)
+        return super().counts() | vars(self._decoder.statistics)
 
     @property
     def identity(self) -> dict[str, str]:
@@ -125,7 +123,7 @@ class BlockStreamDevice(StreamDevice):
 
     def _ahead(self) -> float:
         """Return the frames of the next block that have arrived, since a block waits for it."""
-        waiting = self._decoder.statistics.bytes_pending - self._head_bytes
+        waiting = int(self._decoder.statistics.bytes_pending) - self._head_bytes
         return max(waiting, 0) / self._frame_bytes
 
     def _rest(self) -> Samples:
@@ -237,18 +235,14 @@ class ConfocalDtDevice(StreamDevice):
     described_by = "`signals` (the values of a frame)"
 
     def __init__(
-        self,
-        transport: Transport,
-        settings: ConfocalDtSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, settings: ConfocalDtSettings | None = None, *clocks: Any
     ) -> None:
         settings = settings or ConfocalDtSettings()
         counted = "counter" in settings.values
         modulus = 2**VALUE_BITS if counted else 2**62
         counting = Counting(modulus, timed=False, checked=not counted, period=settings.period)
         base = replace(settings, free_running=settings.period > 0)
-        super().__init__(transport, base, Channels(timed=False), counting, now_ns, monotonic)
+        super().__init__(transport, base, Channels(timed=False), counting, *clocks)
         self._wanted = settings
         self._decoder = SerialDecoder(len(settings.values))
         self._believed = PlausibleValueFilter(len(settings.values))
@@ -257,7 +251,7 @@ class ConfocalDtDevice(StreamDevice):
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
         waited = {"unconfirmed": self._believed.unconfirmed}
-        return super().counts() | asdict(self._decoder.statistics) | waited
+        return super().counts() | vars(self._decoder.statistics) | waited
 
     def _prepare(self) -> None:
         self._decoder.reset()
@@ -311,8 +305,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         self,
         transport: Transport,
         settings: ConfocalDtSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        *clocks: Any,
         commands: Transport | None = None,
     ) -> None:
         """commands: the controller's port 23; None = keep its settings."""
@@ -325,8 +318,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             period=settings.period,
             patience=settings.patience,
             commands=commands,
-            now_ns=now_ns,
-            monotonic=monotonic,
+            clocks=clocks,
         )
         self._wanted = settings
         self._intensity_leads = False  # the order of the manual, until the data show another

@@ -15,7 +15,6 @@ from __future__ import annotations
 import itertools
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
 from omsm_ros.errors import ProtocolError
+from omsm_ros.instruments.counting import WireCounts
 
 # Manuals give both: "MEAS" as text, and as a 32-bit number sent low byte first.
 PREAMBLES = (b"MEAS", b"SAEM")
@@ -133,20 +133,6 @@ def encode_block(form: str, block: MeasurementBlock, preamble: bytes = PREAMBLES
     return head + block.frames.tobytes()
 
 
-@dataclass(frozen=True, slots=True)
-class BlockStatistics:
-    """Counts of bytes: ``received = in blocks + discarded + pending``.
-
-    packets: decoded;  malformed: headers that are not valid
-    """
-
-    bytes_received: int
-    bytes_discarded: int
-    bytes_pending: int
-    packets: int
-    malformed: int
-
-
 class BlockDecoder:
     """Decodes bytes in any portions to blocks; it never raises, memory is a block and a portion.
 
@@ -197,15 +183,10 @@ class BlockDecoder:
         return [found]
 
     @property
-    def statistics(self) -> BlockStatistics:
-        """Return the counts of bytes."""
-        return BlockStatistics(
-            bytes_received=self._received,
-            bytes_discarded=self._received - self._understood - len(self._buffer),
-            bytes_pending=len(self._buffer),
-            packets=self._packets,
-            malformed=self._malformed,
-        )
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, blocks, and headers that are not valid."""
+        counts = {"packets": self._packets, "malformed": self._malformed}
+        return WireCounts(self._received, self._understood, len(self._buffer), **counts)
 
     def _find(self, start: int) -> int:
         places = [self._buffer.find(preamble, start) for preamble in PREAMBLES]
@@ -306,20 +287,6 @@ def values_of(distance: FloatArray, measuring_range: float) -> IntArray:
     return np.where(np.isnan(distance), NO_PEAK, inside)
 
 
-@dataclass(frozen=True, slots=True)
-class SerialStatistics:
-    """Counts of bytes: ``received = in frames + discarded + pending``.
-
-    frames: decoded;  malformed: places with missing or additional bytes
-    """
-
-    bytes_received: int
-    bytes_discarded: int
-    bytes_pending: int
-    frames: int
-    malformed: int
-
-
 class SerialDecoder:
     """Decodes bytes in any portions to frames of ``width`` values; it never raises."""
 
@@ -365,16 +332,11 @@ class SerialDecoder:
         return parts[..., 0] | parts[..., 1] << 6 | parts[..., 2] << 12, spoilt
 
     @property
-    def statistics(self) -> SerialStatistics:
-        """Return the counts of bytes."""
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, frames, and places with missing or additional bytes."""
+        counts = {"frames": self._frames, "malformed": self._malformed}
         decoded = self._frames * self._size
-        return SerialStatistics(
-            bytes_received=self._received,
-            bytes_discarded=self._received - decoded - len(self._buffer),
-            bytes_pending=len(self._buffer),
-            frames=self._frames,
-            malformed=self._malformed,
-        )
+        return WireCounts(self._received, decoded, len(self._buffer), **counts)
 
     def _starts(self, raw: NDArray[np.uint8]) -> NDArray[np.intp]:
         """Return where complete frames begin; their marks prevent an overlap."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -22,7 +21,6 @@ from omsm_ros.instruments.six_channel.protocol import (
     COLUMNS,
     FRAME,
     CsvDecoder,
-    DecoderStatistics,
     FrameArray,
     FrameDecoder,
     ProbeScaling,
@@ -51,11 +49,7 @@ class GenericStreamDevice(StreamDevice):
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        settings: StreamSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, settings: StreamSettings | None = None, *clocks: Any
     ) -> None:
         settings = settings or StreamSettings()
         super().__init__(
@@ -63,22 +57,20 @@ class GenericStreamDevice(StreamDevice):
             settings,
             Channels(axes=settings.scaling.axes),
             Counting(_SEQUENCE_RANGE),
-            now_ns,
-            monotonic,
+            *clocks,
         )
         self.unknown_status = 0
         self._scaling = settings.scaling
         self._decoder = FrameDecoder()
         self._unread = 0
 
-    @property
-    def wire(self) -> DecoderStatistics:
-        """Return the counts of all bytes."""
-        return self._decoder.statistics
-
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self.wire) | {"unknown_status": self.unknown_status}
+        return (
+            super().counts()
+            | vars(self._decoder.statistics)
+            | {"unknown_status": self.unknown_status}
+        )
 
     def _prepare(self) -> None:
         self._decoder.reset()
@@ -129,11 +121,7 @@ class CsvStreamDevice(StreamDevice):
     described_by = "`columns` (the columns of a line)"
 
     def __init__(
-        self,
-        transport: Transport,
-        settings: CsvSettings | None = None,
-        now_ns: Callable[[], int] = time.time_ns,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, settings: CsvSettings | None = None, *clocks: Any
     ) -> None:
         settings = settings or CsvSettings()
         self._decoder = CsvDecoder(settings.columns)
@@ -144,11 +132,11 @@ class CsvStreamDevice(StreamDevice):
         axes = tuple(map(_in_parts, settings.scaling.axes)) if has_axes else None
         channels = Channels("distance" in settings.columns, axes, timed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
-        super().__init__(transport, settings, channels, counting, now_ns, monotonic)
+        super().__init__(transport, settings, channels, counting, *clocks)
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return super().counts() | asdict(self._decoder.statistics)
+        return super().counts() | vars(self._decoder.statistics)
 
     def _prepare(self) -> None:
         self._decoder.reset()

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, Status
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.instruments.counting import WireCounts
 from omsm_ros.instruments.scaling import AXES, AxisScaling, check_sign, whole_counts
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
@@ -60,22 +61,6 @@ def encode_frames(frames: FrameArray) -> bytes:
     return b"".join(part + TERMINATOR for part in parts)
 
 
-@dataclass(frozen=True, slots=True)
-class DecoderStatistics:
-    """Counts of bytes: ``received = ENCODED_SIZE · frames + discarded + pending``.
-
-    bad_length, bad_cobs, bad_crc: segments between terminators that are not a frame
-    """
-
-    bytes_received: int
-    bytes_discarded: int
-    bytes_pending: int
-    frames: int
-    bad_length: int
-    bad_cobs: int
-    bad_crc: int
-
-
 class FrameDecoder:
     """Decodes bytes in any portions to frames with valid length, COBS and CRC-32.
 
@@ -103,17 +88,11 @@ class FrameDecoder:
         self._tail = b""
 
     @property
-    def statistics(self) -> DecoderStatistics:
-        """Return all counts since the decoder was created."""
-        return DecoderStatistics(
-            bytes_received=self._bytes,
-            bytes_discarded=self._bytes - ENCODED_SIZE * self._frames - len(self._tail),
-            bytes_pending=len(self._tail),
-            frames=self._frames,
-            bad_length=self._bad["length"],
-            bad_cobs=self._bad["cobs"],
-            bad_crc=self._bad["crc"],
-        )
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, frames, and segments between terminators that are none."""
+        bad = {f"bad_{name}": count for name, count in self._bad.items()}
+        kept = ENCODED_SIZE * self._frames
+        return WireCounts(self._bytes, kept, len(self._tail), frames=self._frames, **bad)
 
     def _open(self, segment: bytes) -> bytes | None:
         if len(segment) != SEGMENT_SIZE:
@@ -243,16 +222,6 @@ def _text(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:.17g}"
 
 
-@dataclass(frozen=True, slots=True)
-class LineStatistics:
-    """Counts of bytes and lines.  lines: decoded;  malformed: lines that hold no sample."""
-
-    bytes_received: int
-    bytes_pending: int
-    lines: int
-    malformed: int
-
-
 class CsvDecoder:
     """Decodes bytes in any portions to rows; it never raises, memory is a line and a portion."""
 
@@ -279,9 +248,11 @@ class CsvDecoder:
         return np.array(rows, self._dtype)
 
     @property
-    def statistics(self) -> LineStatistics:
-        """Return the counts of bytes and lines."""
-        return LineStatistics(self._received, len(self._tail), self._lines, self._malformed)
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, of lines with a sample, and of malformed ones."""
+        kept = self._received - len(self._tail)
+        counts = {"lines": self._lines, "malformed": self._malformed}
+        return WireCounts(self._received, kept, len(self._tail), **counts)
 
     def _row(self, line: bytes) -> tuple[float, ...] | None:
         words = [word for word in _SEPARATOR.split(line) if word]
