@@ -66,7 +66,8 @@ class NodeProcesses:
         """Start ``node``, called ``label`` here, with arguments for ROS and parameters."""
         command = [sys.executable, "-m", "omsm_ros.nodes.start", node, "--ros-args", *arguments]
         for name, value in parameters.items():
-            command += ["-p", f"{name}:={_parameter_text(value)}"]
+            # ROS parses it as YAML, which includes JSON; a float keeps its point.
+            command += ["-p", f"{name}:={json.dumps(value)}"]
         with (self._folder / f"{label}.log").open("ab") as log:
             self._running[label] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
@@ -108,11 +109,6 @@ class NodeProcesses:
             process.send_signal(signal.SIGINT)
         for name in tuple(self._running):
             self._wait(name)
-
-
-def _parameter_text(value: object) -> str:
-    # ROS parses it as YAML, which includes JSON; a float keeps its point.
-    return json.dumps(value)
 
 
 _DISCOVERY_S = 0.3
