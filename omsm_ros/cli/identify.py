@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -28,22 +29,21 @@ from omsm_ros.cli.command import (
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import Origin
 from omsm_ros.core.calibration.typed_json import from_json
-from omsm_ros.core.estimation.sampled_model import BAND_LIMITED, SampledModel
+from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, HOLDS
+from omsm_ros.core.estimation.sampled_fit import SampledRecord
+from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.identification.sampled_identification import HOLDS
+from omsm_ros.core.identification.sampled_identification import identify_samples
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.files import atomic_file
 from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
 from omsm_ros.pipelines.identify import (
-    SampledRecord,
     intended_use_of,
     load_model,
-    model_of,
     record_of_motion,
     record_of_table,
-    run_of,
     save_model,
     text_of_run,
     write_certificate,
@@ -66,13 +66,18 @@ _MAX_DELAY = 3
 
 
 def _declare(add: Arguments) -> None:
-    add.bags("recording", help="bag of a motion on a fixed target, or a table RECORD.csv")
+    add.bags(
+        "recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help="bag of a motion on a fixed target, or tables RECORD.csv that one model describes",
+    )
     add("--out", "CAL.json", required=True)
     add("--order", ORDER, "number of poles; 0 = choose", default=0)
     add(
         "--input",
         str,
-        "of a bag, 'encoder' or 'reference'; of a table, the input column",
+        "of a bag, 'encoder' or 'reference'; of a table, the input columns, A or A,B,C",
         default=ENCODER,
     )
     add("--output", str, "of a table, the output column")
@@ -129,15 +134,18 @@ def _declare_use(add: Arguments) -> None:
 
 
 def _identify(args: argparse.Namespace) -> Facts:
-    of_table = args.recording.suffix.lower() == TABLE_SUFFIX
+    first = args.recordings[0]
+    of_table = first.suffix.lower() == TABLE_SUFFIX
     _check_arguments(args, of_table)
     if of_table:
-        refuse_cell(args.recording, args)
-        record = record_of_table(
-            args.recording, args.input, args.output, args.period, args.duration
-        )
-        return _model_facts(record, args)
-    bag, stated = cell_of(args.recording, args), args.settings or {}
+        refuse_cell(first, args)
+        inputs = args.input.split(",")
+        records = [
+            record_of_table(path, inputs, args.output, args.period, args.duration)
+            for path in args.recordings
+        ]
+        return _model_facts(records, args.period, args)
+    bag, stated = cell_of(first, args), args.settings or {}
     with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
         motion = recording.motion(
             duration=args.duration,
@@ -147,7 +155,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         )
         settings = recording.settings(stated) if args.hold == BAND_LIMITED else stated
     if args.hold != BAND_LIMITED:
-        return _model_facts(record_of_motion(motion), args)
+        return _model_facts([record_of_motion(motion)], motion.sample_period, args)
     identified = identify(
         motion,
         order=args.order,
@@ -170,12 +178,12 @@ def _identify(args: argparse.Namespace) -> Facts:
         *record_in_catalogue(
             args.catalogue,
             lambda: keep_calibration(
-                args.catalogue, calibration, path, args.recording, recording.recorded_ns
+                args.catalogue, calibration, path, first, recording.recorded_ns
             ),
         ),
     ]
     if args.report is not None:
-        page = write_certificate(args.report, identified, source=args.recording.name)
+        page = write_certificate(args.report, identified, source=first.name)
         facts["report"] = str(page)
     return facts
 
@@ -191,10 +199,15 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
         _check_for_bags(args)
     elif args.output is not None or args.period is not None:
         raise ConfigurationError(
-            f"--output and --period are for a table; {str(args.recording)!r} is not a "
+            f"--output and --period are for a table; {str(args.recordings[0])!r} is not a "
             f"{TABLE_SUFFIX} file, and a bag states both: leave them out"
         )
 
+    if not of_table and len(args.recordings) > 1:
+        raise ConfigurationError(
+            f"{len(args.recordings)} bags are given, expected one; several recordings of one model "
+            f"are tables ({TABLE_SUFFIX}) with the same columns"
+        )
     if args.max_delay is not None and args.hold == BAND_LIMITED:
         raise ConfigurationError(
             "--max-delay is for a held input; give --hold zero-order or first-order, or leave it "
@@ -225,25 +238,26 @@ def _check_for_bags(args: argparse.Namespace) -> None:
         )
 
 
-def _model_facts(record: SampledRecord, args: argparse.Namespace) -> Facts:
+def _model_facts(
+    records: Sequence[SampledRecord], period: float, args: argparse.Namespace
+) -> Facts:
     longest = _MAX_DELAY if args.max_delay is None else args.max_delay
-    model = model_of(record, hold=args.hold, order=args.order, max_delay=longest)
+    model = identify_samples(records, period, hold=args.hold, order=args.order, max_delay=longest)
     path = output_path_for(args.out, str(model.certificate["verdict"]))
     save_model(path, model)
     facts = {
         **model.certificate,
         "hold": model.hold,
-        "valid_from": model.valid_from,
-        "valid_up_to": model.valid_up_to,
+        "valid": [list(range) for range in model.valid],
         "model": str(path),
     }
     if args.report is not None:
-        facts["report"] = _drawn(args.report, model, record, args.recording)
+        facts["report"] = _drawn(args.report, model, records[0], args.recordings[0])
     return facts
 
 
 def _drawn(out: Path, model: SampledModel, record: SampledRecord, source: Path) -> str:
-    run = run_of(model, record)
+    run = free_run(model, record.inputs, record.output, record.used)
     return str(write_model_page(out, model, record, run, source=source.name))
 
 
@@ -285,9 +299,9 @@ def _show(facts: Facts) -> None:
             ("hold", facts["hold"]),
             ("fit", f"{percent(facts['explained'], 4)} of the fitted samples"),
             ("validation", f"{percent(facts['predicted'], 4)} of held-out samples, simulated"),
-            (
-                "valid from",
-                " to ".join(quantity(facts[f"valid_{end}"], "Hz") for end in ("from", "up_to")),
+            *(
+                ("valid from", " to ".join(quantity(end, "Hz") for end in ends))
+                for ends in facts["valid"]
             ),
         ]
     else:
@@ -309,7 +323,7 @@ def _show(facts: Facts) -> None:
 def _declare_validate(add: Arguments) -> None:
     add("model", "MODEL.json")
     add("record", "RECORD.csv", "another record of the same sample period")
-    add("--input", str, "input column", required=True)
+    add("--input", str, "input columns, A or A,B,C", required=True)
     add("--output", str, "output column", required=True)
     add("--out", "RUN.csv", "write the simulated output")
     add("--report", "DIR", "write a report")
@@ -317,18 +331,19 @@ def _declare_validate(add: Arguments) -> None:
 
 def _validate(args: argparse.Namespace) -> Facts:
     model = load_model(args.model)
-    record = record_of_table(args.record, args.input, args.output, model.sample_period)
-    run = run_of(model, record)
+    inputs = args.input.split(",")
+    record = record_of_table(args.record, inputs, args.output, model.sample_period)
+    run = free_run(model, record.inputs, record.output, record.used)
     facts: Facts = {
         "model_verdict": str(model.certificate.get("verdict", "")),
         "explained": run.explained,
         "residual_rms": run.rms,
-        "samples": len(record.input),
+        "samples": len(record),
     }
     with ExitStack() as both:  # if one output cannot be written, neither is kept
         if args.out is not None:
             stream = both.enter_context(atomic_file(args.out, "w"))
-            stream.write(text_of_run(record, run))
+            stream.write(text_of_run(record, run, model.sample_period))
             facts["run"] = str(args.out)
         if args.report is not None:
             facts["report"] = _drawn(args.report, model, record, args.record)

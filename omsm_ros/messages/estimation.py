@@ -77,15 +77,16 @@ TEMPLATES: dict[str, str] = {
         "continuous one with its covariance; identify it again"
     ),
     "estimation.long_delay": (
-        "delay is {delay!r} s, expected at most {most} samples of {period!r} s; identify it again"
+        "delay {delay!r} s, expected 0 to {most} samples of {period!r} s, whole ones of a held "
+        "input; identify it again"
     ),
     "estimation.unstable": (
-        "numerator {numerator!r}, denominator {denominator!r} in s is no stable response, or is "
-        "zero; identify it again"
+        "sections {sections!r} are no stable response that can be computed; identify it again"
     ),
-    "estimation.unstable_discrete": (
-        "denominator {denominator!r} in z⁻¹ is no stable one that begins with 1; identify it again"
+    "estimation.model_sizes": (
+        "the parts of the model are not those of one model of {inputs} inputs; identify it again"
     ),
+    "estimation.input_count": "{given} inputs are given, the model has {expected}",
     "estimation.covariance_size": (
         "covariance has {count} numbers, expected {expected}; identify it again"
     ),
@@ -118,6 +119,10 @@ TEMPLATES: dict[str, str] = {
     "estimation.unknown_response": (
         "the response is known nowhere to {gain:%/1} of gain and {phase:rad/2}; record longer, or "
         "excite more"
+    ),
+    "estimation.worse_than_impulse_response": (
+        "a free run over the hidden last part accounts for {model:%/4} at the frequencies of the "
+        "inputs, an impulse response without a model for {comparator:%/4}: ask for another order"
     ),
     "estimation.residual_follows_input": (
         "the residual follows the input ({p:chance}): more poles, a longer delay, or something "

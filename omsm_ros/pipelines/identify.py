@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -10,11 +11,11 @@ import numpy as np
 
 from omsm_ros import __version__
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
-from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel, free_run
+from omsm_ros.core.estimation.parallel_sections import HOLDS
+from omsm_ros.core.estimation.sampled_fit import SampledRecord
+from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, FreeRun, SampledModel
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
-from omsm_ros.core.identification.sampled_identification import HOLDS, identify_samples
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import CalibrationError, DataError, FileError
 from omsm_ros.io import json_and_yaml
@@ -52,28 +53,18 @@ _PERIOD_TOLERANCE = 5e-3
 _GAP_PERIODS = 2.5
 
 
-@dataclass(frozen=True, eq=False)
-class SampledRecord:
-    """Samples (n,) of two quantities, ``period`` [s] apart; ``used`` where the output counts."""
-
-    input: FloatArray
-    output: FloatArray
-    used: BoolArray
-    period: float
-
-
 def record_of_table(
-    path: Path, input: str, output: str, period: float, duration: float = 0.0
+    path: Path, inputs: Sequence[str], output: str, period: float, duration: float = 0.0
 ) -> SampledRecord:
-    """Read two columns of a CSV file, one row a ``period`` [s]; ``duration`` [s], 0 = all.
+    """Read columns of a CSV file, one row a ``period`` [s]; ``duration`` [s], 0 = all.
 
-    Raises DataError if a time column contradicts the period.
+    Readings of the output may be missing. Raises DataError if a time column contradicts the period.
     """
     _check_time(path, period)
-    columns = load_columns(path, (input, output))
+    columns = load_columns(path, (*inputs, output), may_miss=(output,))
     lines = round(duration / period) or len(columns[0])
-    u, y = (column[:lines] for column in columns)
-    return SampledRecord(u, y, np.ones(len(y), np.bool_), period)
+    *drives, read = (column[:lines] for column in columns)
+    return SampledRecord(np.column_stack(drives), read, np.isfinite(read))
 
 
 def _check_time(path: Path, period: float) -> None:
@@ -107,35 +98,17 @@ def _check_time(path: Path, period: float) -> None:
 
 def record_of_motion(motion: MotionRecord) -> SampledRecord:
     """Return the position of Z [m] as input and the probe's distance [m] as output."""
-    return SampledRecord(motion.z, motion.distance, motion.ok, motion.sample_period)
+    return SampledRecord(motion.z[:, np.newaxis], motion.distance, motion.ok)
 
 
-def model_of(
-    record: SampledRecord, *, hold: str, order: int = 0, max_delay: int = 3
-) -> SampledModel:
-    """Identify a model from input to output; options of ``identify_samples``."""
-    return identify_samples(
-        record.input,
-        record.output,
-        record.period,
-        hold=hold,
-        order=order,
-        max_delay=max_delay,
-        used=record.used,
-    )
-
-
-def run_of(model: SampledModel, record: SampledRecord) -> FreeRun:
-    """Simulate ``model`` with the input of ``record``, and compare with its output."""
-    return free_run(model, record.input, record.output, record.used)
-
-
-def text_of_run(record: SampledRecord, run: FreeRun) -> str:
-    """Return time, input, output and the model's output as CSV."""
-    time = record.period * np.arange(len(record.input))
-    rows = np.column_stack([time, record.input, record.output, run.output])
+def text_of_run(record: SampledRecord, run: FreeRun, period: float) -> str:
+    """Return time, inputs, output and the model's output as CSV."""
+    rows = np.column_stack([period * np.arange(len(record)), record.inputs, record.output])
+    rows = np.column_stack([rows, run.output])
+    names = [f"input_{i}" for i in range(1, record.inputs.shape[1] + 1)]
+    head = ["time_s", *(names if len(names) > 1 else ["input"]), "output", "model"]
     lines = [",".join(f"{value:.12g}" for value in row) for row in rows.tolist()]
-    return "\n".join(["time_s,input,output,model", *lines]) + "\n"
+    return "\n".join([",".join(head), *lines]) + "\n"
 
 
 PAGE, MODEL_PAGE = "certificate.html", "model.html"
@@ -182,7 +155,7 @@ def write_model_page(
         date=_today(),
         source=source,
         version=__version__,
-        figures=model_figures_of(model, record.input, record.output, run),
+        figures=model_figures_of(model, record.inputs, record.output, run),
     )
     with result_folder(out, (MODEL_PAGE,)) as folder:
         save_bytes(folder / MODEL_PAGE, render_model(page).encode("utf-8", "replace"))
@@ -193,48 +166,63 @@ def _today() -> str:
     return date_text(datetime.now(timezone.utc))
 
 
-_MAX_BYTES = 4_000_000
-
-# 20 poles.
-_COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 21}
-_COVARIANCE = {"type": "array", "items": NUMBER, "maxItems": 42**2}
-_DISCRETE = {
-    "numerator": _COEFFICIENTS,
-    "denominator": _COEFFICIENTS,
-    "delay_samples": {"type": "integer"},
-    "covariance": _COVARIANCE,
-}
-_CONTINUOUS = {
-    "numerator": _COEFFICIENTS,
-    "denominator": _COEFFICIENTS,
-    "delay": NUMBER,
-    "covariance": {**_COVARIANCE, "type": ["array", "null"]},
-}
+_MAX_BYTES = 8_000_000
+# 40 poles of eight inputs.
+_MOST_SECTIONS, _MOST_INPUTS, _MOST_COVARIANCE = 40, 8, 450**2
+_NUMBERS = {"type": "array", "items": NUMBER, "maxItems": _MOST_INPUTS}
+_PAIR = {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2}
+_PAIRS = {"type": "array", "items": _PAIR, "maxItems": _MOST_SECTIONS}
 _PROPERTIES = {
     "schema": {"const": SCHEMA},
     "hold": {"enum": list(HOLDS)},
     "sample_period": NUMBER,
-    "discrete": {**form(_DISCRETE, tuple(_DISCRETE)), "type": ["object", "null"]},
-    "continuous": {**form(_CONTINUOUS, tuple(_CONTINUOUS)), "type": ["object", "null"]},
-    "working_point": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2},
-    "valid_from": NUMBER,
-    "valid_up_to": NUMBER,
+    "denominators": _PAIRS,
+    "numerators": {"type": "array", "items": _PAIRS, "minItems": 1, "maxItems": _MOST_INPUTS},
+    "direct": _NUMBERS,
+    "delays": _NUMBERS,
+    "covariance": {"type": ["array", "null"], "items": NUMBER, "maxItems": _MOST_COVARIANCE},
+    "continuous": {"type": ["object", "null"]},
+    "working_point": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 9},
+    "valid": {"type": "array", "items": _PAIR, "minItems": 1, "maxItems": _MOST_INPUTS},
     "certificate": {"type": "object"},
 }
 _FORM = form(_PROPERTIES, tuple(_PROPERTIES))
 
+# Version 1: polynomials of at most 20 poles, of one input.
+_COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 21}
+_COVARIANCE_1 = {"type": ["array", "null"], "items": NUMBER, "maxItems": 42**2}
+_POLYNOMIALS = {"numerator": _COEFFICIENTS, "denominator": _COEFFICIENTS}
+_DISCRETE = {**_POLYNOMIALS, "delay_samples": {"type": "integer"}, "covariance": _COVARIANCE_1}
+_CONTINUOUS = {**_POLYNOMIALS, "delay": NUMBER, "covariance": _COVARIANCE_1}
+_PROPERTIES_1 = {
+    "schema": {"const": SCHEMA_1},
+    "hold": {"enum": list(HOLDS)},
+    "sample_period": NUMBER,
+    "discrete": {**form(_DISCRETE, tuple(_DISCRETE)), "type": ["object", "null"]},
+    "continuous": {**form(_CONTINUOUS, tuple(_CONTINUOUS)), "type": ["object", "null"]},
+    "working_point": _PAIR,
+    "valid_from": NUMBER,
+    "valid_up_to": NUMBER,
+    "certificate": {"type": "object"},
+}
+_FORM_1 = form(_PROPERTIES_1, tuple(_PROPERTIES_1))
+
 
 def save_model(path: Path | str, model: SampledModel) -> None:
-    """Write ``MODEL.json`` (schema "omsm-model/1")."""
+    """Write ``MODEL.json`` (schema "omsm-model/2")."""
     save_json(path, model.content())
 
 
 def load_model(path: Path | str) -> SampledModel:
-    """Read ``MODEL.json``; CalibrationError if it is malformed or cannot be computed with."""
+    """Read ``MODEL.json`` of either version.
+
+    Raises CalibrationError if it is malformed or cannot be computed with.
+    """
     what = f"model {str(path)!r}"
     text = read_text(path, _MAX_BYTES, CalibrationError, "model")
     content = json_and_yaml.object_of(text, CalibrationError, what)
-    check_form(content, _FORM, CalibrationError, what)
+    first = content.get("schema") == SCHEMA_1
+    check_form(content, _FORM_1 if first else _FORM, CalibrationError, what)
     try:
         return SampledModel.from_content(content)
     except CalibrationError as err:

@@ -1,14 +1,12 @@
-"""Choose the order of a sampled model by cross-validation.
+"""Choose delays and order of parallel sections by their free runs over hidden parts of the records.
 
-Models of each order are fitted to the first part of the record and simulated over the rest. The
-best few are then compared on several held-out parts, once as they are and once with a whitened
-residual, which is efficient only for a model of all the dynamics. The
-simplest of equally good models is taken, because superfluous poles would follow a drift.
+Models of rising order are fitted to the first part of each record and simulated over the rest. The
+best few are then compared on several hidden parts. The simplest of equally good models is taken,
+because superfluous poles would follow a drift. An impulse response without a model is fitted to the
+same first part: a model whose free run over the rest is worse does not describe the records.
 
-To fit every order to every held-out part of a long record takes minutes. A few thousand samples
-determine the order as well, except for dynamics slower than they last or too weak for them. So the
-order is chosen on the most exciting part; the lowest orders, and two poles more, are fitted to the
-whole record too.
+A few thousand samples determine the order as well as all, except for dynamics slower than they
+last; so the orders of a long record are explored on its most exciting part.
 """
 
 from __future__ import annotations
@@ -19,60 +17,71 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.covariance import autoregression
-from omsm_ros.core.estimation.model_order import MAX_POLES
-from omsm_ros.core.estimation.model_structure import Structure
-from omsm_ros.core.estimation.output_error import Fit, fit
+from omsm_ros.core.estimation.impulse_response import convolved, impulse_response
+from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
-    RATE_SAMPLES,
-    DiscreteStarts,
-    ScaledDiscreteStructure,
-    ZeroOrderHoldProblem,
+    RATE,
+    SampledRecord,
+    SectionsFit,
+    SectionsProblem,
     grown_starts,
-    with_fast_pole,
 )
+from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
+from omsm_ros.linear_algebra import least_squares
 
-# Parts of the used samples: all but the first are held out in turn, and the last ones together.
+# Most poles. Orders that are tried: every one while it is low, then steps.
+MAX_ORDER = 40
+_ORDERS = (*range(7), *range(8, 21, 2), *range(24, MAX_ORDER + 1, 4))
+# Parts of each record: all but the first are hidden in turn, and the last ones together.
 _PARTS = 6
 # Share of the used samples to which every order is fitted first.
 _FIRST_PART = 0.75
-# Orders compared on every held-out part: the best over the last part, and the lowest orders within
+# Orders compared on every hidden part: the best over the last part, and the lowest orders within
 # this factor of the least error. One part alone is uncertain by about this factor.
 _FINALISTS = 3
 _EQUIVALENT = 2.0
 # Orders in a row without a better prediction that end the search.
-_FRUITLESS = 5
+_FRUITLESS = 4
 # Standard errors by which a model must predict better than another. With disturbances, a pole too
 # few costs more than one too many (docs/design/identification-ablation.md).
 _IMPROVES_BY = 0.5
-# Order of the model by which the delay is chosen.
+# Factor on the error of the chosen model within which another predicts about as well.
+_ALIKE = 1.1
+# Order by which delays are chosen, and delays [samples] at which those that are free start.
 _DELAY_ORDER = 3
+_FREE_DELAYS = (0.0, 1.0, 4.0, 15.0)
 # Samples per parameter: with fewer, an order is not tried.
 _LEAST_SAMPLES_EACH = 3
-# Sixty columns and their spectra then take a third of a gigabyte.
-_MOST_SAMPLES = 200_000
-# Iterations without a held-out part, from the minimum over all parts: more would gain less than the
-# uncertainty of one part, and beyond order ten would take most of the time.
-_HELD_OUT_EVALUATIONS = 5
+# Sixty columns of a record then take half a gigabyte.
+_MOST_SAMPLES = 1_000_000
+# Used samples on which orders are explored, and parts of a record whose excitation is compared.
+EXPLORED_ON = 20_000
+_MOST_PARTS = 16
+# Iterations of an explored fit, of one without a hidden part, and of the final one.
+_EXPLORING, _HIDDEN, _FINAL = 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
+# The comparator's record: half its sampling rate over the frequency below which this share of the
+# power of the inputs lies.
+_ABOVE_CONTENT, _CONTENT = 1.6, 0.999
+# Blocks whose scatter gives the uncertainty of a comparison; how many of these count as worse, and
+# the least difference, in shares of the variance.
+_BLOCKS, _CLEARLY, _NOTICEABLE = 12, 2.0, 0.005
 
 
 @dataclass(frozen=True, eq=False)
 class SampledCandidate:
-    """A fit to all used samples, and how it predicts.
+    """A fit, and its mean square errors of free runs over each hidden part (folds,)."""
 
-    order: poles;  whitened: fitted with its residual made white
-    held_out: mean square error of free runs over each held-out part (folds,), empty if not compared
-    """
+    fit: SectionsFit
+    hidden: FloatArray
 
-    problem: ZeroOrderHoldProblem
-    fit: Fit
-    order: int
-    whitened: bool
-    held_out: FloatArray
+    @property
+    def order(self) -> int:
+        """Return the number of poles."""
+        return self.fit.order
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,99 +89,128 @@ class SampledChoice:
     """The chosen model, and the free choice.
 
     chosen: of the order asked for, or the free choice;  free: the free choice
-    delay: whole samples;  by_order: mean square error [unit²] over the last part, of each order
+    alternatives: larger models that predict about as well, in sample periods
+    orders: explored;  by_order: share of the variance over the last part that each explains
+    comparator: share that an impulse response explains there at the frequencies of the inputs, and
+        ``compared`` that of the model of the chosen order; None where the records are too short
+    worse: the model is worse by more than the uncertainty of the comparison
     """
 
     chosen: SampledCandidate
     free: SampledCandidate
-    delay: int
+    alternatives: Sequence[ParallelSections]
+    orders: Sequence[int]
     by_order: FloatArray
-
-
-def parameters(order: int) -> int:
-    """Return the number of parameters: denominator, numerator, initial state and offset."""
-    return 3 * order + 3
+    comparator: float | None
+    compared: float | None
+    worse: bool
 
 
 def choose_sampled(
-    input: FloatArray,
-    output: FloatArray,
-    used: BoolArray,
-    period: float,
-    *,
-    order: int = 0,
-    max_delay: int = 0,
+    records: Sequence[SampledRecord], hold: str, *, order: int = 0, max_delay: int = 0
 ) -> SampledChoice:
-    """Fit sampled models of ``input`` to ``output`` (n,) where ``used`` (n,), and choose.
+    """Fit parallel sections to ``records``, about their means, and choose.
 
-    order: number of poles, 0 to choose;  max_delay: whole samples to try
+    order: number of poles, 0 to choose;  max_delay: whole samples to try, of a held input
 
     Raises IdentificationError for too few samples or frequencies of the input, for an order beyond
-    MAX_POLES, or where a value is not finite.
+    MAX_ORDER, or where a value is not finite.
     """
-    most = check_record(input, output, used, order)
-    centred = np.where(used, output - np.mean(output[used]), 0.0)
-    delay = _best_delay(input, centred, used, period, max_delay)
-    problem = delayed(input, centred, used, period, delay)
-    part = parts(problem.used)
-    early = replace(problem, used=problem.used & (part < _FIRST_PART * _PARTS))
-    late = problem.used & ~early.used
-    fits, by_order = _explored(early, late, most, order)
-    finalists = _finalists(by_order, order)
-    tried = [
-        SampledCandidate(problem, refit(problem, fits[n], white), n, white, np.empty(0))
-        for n in finalists
-        for white in ((False, True) if n else (False,))
-    ]
-    judged = [replace(c, held_out=held_out_errors(c, part)) for c in tried]
-    starts = DiscreteStarts(problem.input, problem.output, problem.used, most)
-    free = _finished(simplest_undominated(judged), starts)
-    chosen = free
-    if order and order != free.order:
-        chosen = _finished(simplest_undominated([c for c in judged if c.order == order]), starts)
-    return SampledChoice(chosen, free, delay, by_order)
+    most = check_records(records, order)
+    none = np.zeros(records[0].inputs.shape[1], np.int64)
+    whole = SectionsProblem([_exciting_part(record) for record in records], hold, none)
+    if hold != BAND_LIMITED and max_delay:
+        whole, _ = _with_delays(whole, max_delay)
+    explored, every, most = _explored(whole, order, most)
+    whole = replace(whole, records=records)
+    explored, lag = _with_delays(explored, 0)
+    early = replace(explored, records=[_early(record) for record in explored.records])
+    fits, by_order = _explore(early, explored, most, order, lag)
+    orders = [fitted.order for fitted in fits]
+    judged = []
+    for fitted in (fits[orders.index(n)] for n in _finalists(orders, by_order, order)):
+        refitted = explored.fit(fitted.order, [fitted.nonlinear], _EXPLORING)
+        judged.append(SampledCandidate(refitted, hidden_errors(refitted)))
+    free = simplest_undominated(judged)
+    chosen = free if not order else next(c for c in judged if c.order == order)
+    comparison = _against_impulse_response(explored, fits[orders.index(chosen.order)])
+    finished = _finished(whole, chosen, every)
+    other = finished if chosen is free else _finished(whole, free, every)
+    larger = [c.fit.model(float(every)) for c in _alternatives(judged, chosen)]
+    return SampledChoice(finished, other, larger, orders, by_order, *comparison)
 
 
-def check_record(input: FloatArray, output: FloatArray, used: BoolArray, order: int) -> int:
-    """Return the highest order that a record determines; raise as :func:`choose_sampled` does."""
-    most = _highest_order(int(np.sum(used)), order)
-    if np.ptp(input) == 0:
-        raise IdentificationError("estimation.constant_input")
-    if not (np.all(np.isfinite(input)) and np.all(np.isfinite(output[used]))):
-        raise IdentificationError("estimation.not_finite")
-    return _most_excited(input, most, order)
+def _alternatives(
+    judged: Sequence[SampledCandidate], chosen: SampledCandidate
+) -> list[SampledCandidate]:
+    most = _ALIKE * float(np.mean(chosen.hidden))
+    return [c for c in judged if c.order > chosen.order and float(np.mean(c.hidden)) <= most]
 
 
-def _finished(candidate: SampledCandidate, starts: DiscreteStarts) -> SampledCandidate:
-    """Return the candidate at the best minimum from starts of all used samples."""
-    if candidate.order == 0 or candidate.whitened:
-        return candidate
-    every = [candidate.fit.nonlinear, *proposed_starts(candidate.problem, candidate.order, starts)]
-    return replace(candidate, fit=fit(candidate.problem, candidate.fit.structure, every))
+def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsProblem, int, int]:
+    """Return the problem in which orders are explored, its sampling period, and its highest order.
+
+    Where the inputs are slow, the records are decimated. Samples of slow inputs are band-limited.
+    """
+    every = min(_decimation(record.inputs) for record in whole.records)
+    while every > 1:
+        records = [
+            SampledRecord(
+                _decimated(record.inputs, every),
+                _decimated(_filled(record), every),
+                record.used[::every],
+            )
+            for record in whole.records
+        ]
+        try:
+            most = min(most, check_records(records, order))
+        except IdentificationError:
+            every //= 2
+            continue
+        return SectionsProblem(records, BAND_LIMITED, 0 * whole.delays), every, most
+    try:
+        return whole, 1, min(most, check_records(whole.records, order))
+    except IdentificationError:
+        # No part excites as much as the whole record.
+        return whole, 1, most
 
 
-def proposed_starts(
-    problem: ZeroOrderHoldProblem, order: int, starts: DiscreteStarts
-) -> list[FloatArray]:
-    """Return ψ of what ``starts`` propose for ``order``, as far as they are any."""
-    scaled = ScaledDiscreteStructure(Structure(order, order, False), problem.rate)
-    every = [scaled.of_discrete(poles) for poles in starts.poles(order)]
-    return [p for p in every if len(p) == order and np.all(np.isfinite(p))]
+def _filled(record: SampledRecord) -> FloatArray:
+    index = np.arange(len(record))
+    return np.asarray(np.interp(index, index[record.used], record.output[record.used]))
 
 
-def _highest_order(samples: int, order: int) -> int:
-    if not 0 <= order <= MAX_POLES:
-        raise IdentificationError("estimation.order", order=order, most=MAX_POLES)
+def check_records(records: Sequence[SampledRecord], order: int) -> int:
+    """Return the highest order that records determine; raise as :func:`choose_sampled` does."""
+    samples = int(sum(np.sum(record.used) for record in records))
+    if not 0 <= order <= MAX_ORDER:
+        raise IdentificationError("estimation.order", order=order, most=MAX_ORDER)
     if samples > _MOST_SAMPLES:
         raise IdentificationError(
             "estimation.too_many_samples", samples=samples, most=_MOST_SAMPLES
         )
-    needed = _LEAST_SAMPLES_EACH * parameters(max(order, 1))
+    inputs, lowest = int(records[0].inputs.shape[1]), max(order, 1)
+    needed = _LEAST_SAMPLES_EACH * ((2 + inputs) * lowest + inputs + 2)
     if samples < needed:
         raise IdentificationError(
-            "estimation.too_few_samples", samples=samples, least=needed, order=max(order, 1)
+            "estimation.too_few_samples", samples=samples, least=needed, order=lowest
         )
-    return min(MAX_POLES, (samples // _LEAST_SAMPLES_EACH - 3) // 3)
+    most = min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - inputs - 2) // (2 + inputs))
+    for record in records:
+        known = np.all(np.isfinite(record.inputs)) and np.all(
+            np.isfinite(record.output[record.used])
+        )
+        if not known:
+            raise IdentificationError("estimation.not_finite")
+    excited = min(
+        max(excited_parameters(r.inputs[:, i], min(2 * most + 1, len(r))) for r in records)
+        for i in range(inputs)
+    )
+    if excited < 2 * lowest + 1:
+        raise IdentificationError(
+            "estimation.few_frequencies", excited=excited, needed=2 * lowest + 1, order=lowest
+        )
+    return min(most, (excited - 1) // 2)
 
 
 def excited_parameters(input: FloatArray, most: int) -> int:
@@ -181,257 +219,244 @@ def excited_parameters(input: FloatArray, most: int) -> int:
     That is its order of persistent excitation with a constant (Ljung 1999, ch. 13): the rank of
     all its windows of ``most`` samples. Each sine gives two, noise gives all.
     """
+    if np.ptp(input) == 0:
+        raise IdentificationError("estimation.constant_input")
     windows = np.lib.stride_tricks.sliding_window_view(input, most)
     varied = windows - np.mean(windows, axis=0)
     power = np.linalg.eigvalsh(varied.T @ varied)
     return int(np.sum(power > _UNEXCITED * power[-1]))
 
 
-def _most_excited(input: FloatArray, most: int, order: int) -> int:
-    """Return the highest order, at most ``most``, whose parameters the input determines."""
-    excited = excited_parameters(input, min(2 * most + 1, len(input)))
-    needed = 2 * max(order, 1) + 1
-    if excited < needed:
-        raise IdentificationError(
-            "estimation.few_frequencies", excited=excited, needed=needed, order=max(order, 1)
-        )
-    return min(most, (excited - 1) // 2)
+def _exciting_part(record: SampledRecord) -> SampledRecord:
+    """Return the part with EXPLORED_ON used samples in which the inputs vary most."""
+    places = np.flatnonzero(record.used)
+    count = len(places) // EXPLORED_ON
+    if count < 2:
+        return record
+    tried = np.unique(np.linspace(0, count - 1, min(count, _MOST_PARTS)).astype(int))
+    every = [
+        slice(int(places[i * EXPLORED_ON]), int(places[(i + 1) * EXPLORED_ON - 1]) + 1)
+        for i in tried
+    ]
+    return record.part(
+        max(every, key=lambda part: float(np.var(record.inputs[part], axis=0).sum()))
+    )
 
 
-def parts(used: BoolArray) -> FloatArray:
+def _parts(used: BoolArray) -> FloatArray:
     """Return the place of each used sample in parts, 0 to _PARTS, fractional; -1 elsewhere."""
     place = np.cumsum(used) - 1.0
     return np.asarray(np.where(used, place * _PARTS / max(float(np.sum(used)), 1.0), -1.0))
 
 
-def delayed(
-    input: FloatArray, output: FloatArray, used: BoolArray, period: float, delay: int
-) -> ZeroOrderHoldProblem:
-    """Return the problem with ``input`` (n,) delayed by ``delay`` samples."""
-    late = np.roll(input, delay)
-    return ZeroOrderHoldProblem(
-        input=late - np.mean(late),
-        output=output,
-        used=used & (np.arange(len(used)) >= delay),
-        period=period,
-        background=np.ones((len(output), 1)),
-        rate=RATE_SAMPLES / period,
-    )
+def _early(record: SampledRecord) -> SampledRecord:
+    return replace(record, used=record.used & (_parts(record.used) < _FIRST_PART * _PARTS))
 
 
-def _best_delay(
-    input: FloatArray, output: FloatArray, used: BoolArray, period: float, most: int
-) -> int:
-    """Return the delay [samples] at which a small model fits best."""
-    if most == 0:
-        return 0
-    same = used & (np.arange(len(used)) >= most)
-    sums = []
-    for delay in range(most + 1):
-        problem = delayed(input, output, same, period, delay)
-        starts = DiscreteStarts(problem.input, problem.output, problem.used, _DELAY_ORDER)
-        fits: list[Fit] = []
-        for _ in range(_DELAY_ORDER + 1):
-            fits.append(next_order(problem, fits, starts))
-        sums.append(fits[-1].sum_of_squares)
-    return int(np.argmin(sums))
+def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, SectionsFit]:
+    """Return the problem with the delays of its inputs, and a small fit with them."""
+    start = problem.spread_poles(_DELAY_ORDER)
+
+    def fitted(tried: SectionsProblem, late: FloatArray) -> SectionsFit:
+        poles = tried.relocated(start, late)
+        return tried.fit(_DELAY_ORDER, [tried.nonlinear_of(poles, late)], _EXPLORING)
+
+    delays = np.zeros(problem.inputs)
+    best = fitted(problem, delays)
+    for input in range(problem.inputs):
+        tried = range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]
+        for delay in tried:
+            late = delays.copy()
+            late[input] = delay
+            other = problem
+            if problem.hold != BAND_LIMITED:
+                other = replace(problem, delays=late.astype(np.int64))
+            found = fitted(other, late)
+            # Compared over the same samples: a longer delay leaves fewer.
+            if found.sum_of_squares / len(found.residual) < _mean_square(best):
+                best = found
+        delays = best.problem.late(best.nonlinear, best.order)
+    return best.problem, best
 
 
-def _explored(
-    early: ZeroOrderHoldProblem, late: BoolArray, most: int, at_least: int
-) -> tuple[list[Fit], FloatArray]:
-    """Return fits of rising order and their errors over ``late``, until they stop to improve.
+def _mean_square(fitted: SectionsFit) -> float:
+    return fitted.sum_of_squares / len(fitted.residual)
 
-    at_least: order to go to in any case
+
+def _explore(
+    early: SectionsProblem, whole: SectionsProblem, most: int, asked: int, lag: SectionsFit
+) -> tuple[list[SectionsFit], FloatArray]:
+    """Return fits of rising order to ``early``, and what they explain of the rest of ``whole``.
+
+    They end where orders stop to improve the prediction, at ``asked`` or beyond.
     """
-    fits: list[Fit] = []
-    errors: list[float] = []
-    starts = DiscreteStarts(early.input, early.output, early.used, most)
-    for order in range(most + 1):
-        fits.append(next_order(early, fits, starts))
-        errors.append(_missed(early, fits[-1], late))
-        if order - int(np.argmin(errors)) >= _FRUITLESS and order >= at_least:
+    fits: list[SectionsFit] = []
+    explained: list[float] = []
+    late = lag.problem.late(lag.nonlinear, lag.order)
+    for order in sorted({*_ORDERS, asked}):
+        if order > most:
             break
-    return fits, np.array(errors)
+        fits.append(_next_fit(early, fits, order, late))
+        explained.append(1 - float(np.mean(_relative(hidden_residual(fits[-1], whole)))))
+        past = len(explained) - 1 - int(np.argmax(explained))
+        if past >= _FRUITLESS and order >= asked:
+            break
+    return fits, np.nan_to_num(np.array(explained), nan=-np.inf)
 
 
-def next_order(
-    problem: ZeroOrderHoldProblem, smaller: Sequence[Fit], starts: DiscreteStarts
-) -> Fit:
-    """Return the best fit with as many poles as there are ``smaller`` fits."""
-    order = len(smaller)
-    structure = Structure(order, order, False)
+def _next_fit(
+    problem: SectionsProblem, smaller: Sequence[SectionsFit], order: int, late: FloatArray
+) -> SectionsFit:
+    """Return the best fit of ``order`` from vector fitting and from the ``smaller`` fits."""
     if order == 0:
-        return fit(problem, structure, [np.empty(0)])
-    larger = grown_starts([f.nonlinear for f in smaller], len(problem.output))
-    return fit(problem, structure, proposed_starts(problem, order, starts) + larger)
+        return problem.fit(0, [problem.nonlinear_of(np.empty(0, np.complex128), late)])
+    own = smaller[-1].problem.late(smaller[-1].nonlinear, smaller[-1].order)
+    starts = [problem.relocated(problem.spread_poles(order), late)]
+    starts += grown_starts(problem, smaller[-1], order)
+    poles = [problem.nonlinear_of(starts[0], late)]
+    poles += [problem.nonlinear_of(one, own) for one in starts[1:]]
+    return problem.fit(order, poles, _EXPLORING, race=3)
 
 
-def refit(problem: ZeroOrderHoldProblem, start: Fit, whitened: bool, *evaluations: int) -> Fit:
-    """Fit the structure of ``start`` to ``problem``, its residual made white if ``whitened``.
+def hidden_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatArray]:
+    """Return output less free run of each record of ``whole``, where it was hidden from the fit.
 
-    evaluations: of a fit, as of :func:`fit` if not given
+    The initial state and the offset of each record are those of its samples that were fitted. The
+    residual is relative to the deviation of the record, NaN elsewhere, (n,).
     """
-    found = fit(problem, start.structure, [start.nonlinear], *evaluations)
-    if not whitened:
-        return found
-    whitener, _ = autoregression(found.residual)
-    if len(whitener) == 1:
-        return found
-    apart = np.arange(len(problem.used)) >= len(whitener)
-    lost = np.convolve(~problem.used, np.ones(len(whitener)))[: len(problem.used)] > 0.5
-    white = replace(
-        problem,
-        input=signal.lfilter(whitener, 1.0, problem.input),
-        output=signal.lfilter(whitener, 1.0, problem.output),
-        used=problem.used & apart & ~lost,
-    )
-    return fit(white, start.structure, [found.nonlinear], *evaluations)
+    model, found = fitted.model(), []
+    for record, own in zip(whole.records, fitted.problem.records, strict=True):
+        middle = np.mean(record.inputs, axis=0)
+        missed = record.output - model.driven(record.inputs - middle)
+        columns = np.column_stack([np.ones(len(record)), *model.decays(len(record))])
+        with np.errstate(all="ignore"):
+            state = least_squares(columns[own.used], missed[own.used], 1e-12)
+            missed = missed - columns @ state
+        hidden = record.used & ~own.used
+        scale = float(np.std(record.output[record.used])) or 1.0
+        found.append(np.where(hidden, missed / scale, np.nan))
+    return found
 
 
-def _missed(problem: ZeroOrderHoldProblem, fitted: Fit, held_out: BoolArray) -> float:
-    """Return the mean square error of a free run over samples that are not used in ``problem``."""
-    missed = (problem.output - problem.free_run(fitted))[held_out]
-    value = float(np.mean(missed**2))
-    return value if np.isfinite(value) else np.inf
+def _relative(residuals: Sequence[FloatArray]) -> FloatArray:
+    """Return the squares of all counted residuals, (k,); infinite where one is not finite."""
+    every = np.concatenate([one[~np.isnan(one)] for one in residuals])
+    with np.errstate(over="ignore"):
+        return np.nan_to_num(every**2, nan=np.inf) if len(every) else np.full(1, np.inf)
 
 
-def _finalists(by_order: FloatArray, order: int) -> list[int]:
-    """Return the orders to compare: the best, the lowest of similar error, 0, 1 and ``order``."""
-    best = np.argsort(by_order, kind="stable")[:_FINALISTS]
-    about_as_good = np.flatnonzero(by_order <= _EQUIVALENT * np.min(by_order))[:_FINALISTS]
-    return sorted({0, 1, order, *best.tolist(), *about_as_good.tolist()})
+def _finalists(orders: Sequence[int], explained: FloatArray, asked: int) -> list[int]:
+    """Return the orders to compare: the best, the lowest of similar error, 0, 1 and ``asked``."""
+    missed = 1 - explained
+    best = np.argsort(missed, kind="stable")[:_FINALISTS]
+    alike = np.flatnonzero(missed <= _EQUIVALENT * np.min(missed))[:_FINALISTS]
+    return sorted({0, 1, asked, *(orders[i] for i in (*best, *alike))} & {*orders})
 
 
-def held_out_errors(
-    candidate: SampledCandidate, part: FloatArray, evaluations: int = _HELD_OUT_EVALUATIONS
-) -> FloatArray:
-    """Return the mean square error over each held-out part, the candidate fitted without it.
+def hidden_errors(fitted: SectionsFit, evaluations: int = _HIDDEN) -> FloatArray:
+    """Return the mean square error over each hidden part, refitted without it, (folds,).
 
-    part: of each sample, see :func:`parts`;  evaluations: of that fit
-
-    Some parts lie inside the record, others reach to its end. Parts inside alone would favour
+    Some parts lie inside the records, others reach to their end. Parts inside alone would favour
     models of a drift, because the data constrain the model on both sides.
     """
-    problem, number = candidate.problem, np.floor(part)
-    held_out = [number == i for i in range(1, _PARTS)]
-    held_out += [number >= i for i in range(_PARTS // 2, _PARTS - 1)]
+    problem = fitted.problem
+    numbers = [np.floor(_parts(record.used)) for record in problem.records]
+    folds = [[n == i for n in numbers] for i in range(1, _PARTS)]
+    folds += [[n >= i for n in numbers] for i in range(_PARTS // 2, _PARTS - 1)]
     errors = []
-    for samples in held_out:
-        rest = replace(problem, used=problem.used & ~samples)
-        found = refit(rest, candidate.fit, candidate.whitened, evaluations)
-        errors.append(_missed(rest, found, samples))
+    for fold in folds:
+        rest = [
+            replace(record, used=record.used & ~part)
+            for record, part in zip(problem.records, fold, strict=True)
+        ]
+        found = replace(problem, records=rest).fit(fitted.order, [fitted.nonlinear], evaluations)
+        errors.append(float(np.mean(_relative(hidden_residual(found, problem)))))
     return np.array(errors)
 
 
 def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate:
-    """Return the simplest candidate that no other dominates: not whitened, then fewest poles.
+    """Return the candidate of the fewest poles that no other dominates.
 
     A candidate dominates if its mean error is lower by more than half a standard error of their
     paired difference (after Breiman et al. 1984).
     """
-    errors = np.array([c.held_out for c in judged])
+    errors = np.array([c.hidden for c in judged])
     with np.errstate(invalid="ignore"):
         worse = errors[:, np.newaxis] - errors[np.newaxis]
         allowed = _IMPROVES_BY * np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
         unbeaten = np.all(np.mean(worse, axis=2) <= allowed, axis=1)
     best = int(np.argmin(np.mean(errors, axis=1)))
     every = {best, *np.flatnonzero(unbeaten).tolist()}
-    return judged[min(every, key=lambda i: (judged[i].whitened, judged[i].order))]
+    return judged[min(every, key=lambda i: judged[i].order)]
 
 
-# Used samples on which the order is chosen: eighty per parameter of the highest order.
-CHOSEN_ON = 5000
-# Parts whose excitation is compared.
-_MOST_PARTS = 16
-# Highest of the lowest orders, which are fitted to the whole record: for slow dynamics.
-_LOWEST = 2
-# Poles more than chosen on the part, fitted to the whole record: for weak dynamics.
-_POLES_MORE = 2
-# Iterations without a held-out part: in a long record it hardly changes the model.
-_HELD_OUT_EVALUATIONS_LONG_RECORD = 2
+def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -> SampledCandidate:
+    """Return a candidate that was explored at one in ``every`` samples, fitted to all of them."""
+    fitted = candidate.fit
+    late = fitted.problem.late(fitted.nonlinear, fitted.order) * every
+    roots = fitted.roots()
+    if every > 1:
+        turned = roots * RATE / every
+        held = whole.hold != BAND_LIMITED
+        roots = np.asarray((2 * np.tanh(turned / 2) if held else turned) / RATE)
+    starts = [whole.nonlinear_of(_paired(roots), late)]
+    found = whole.fit(candidate.order, starts, _FINAL)
+    if every == 1:
+        return replace(candidate, fit=found)
+    part = replace(whole, records=[_early(record) for record in whole.records])
+    rest = part.fit(candidate.order, [found.nonlinear], _HIDDEN)
+    return SampledCandidate(found, np.array([np.mean(_relative(hidden_residual(rest, whole)))]))
 
 
-def choose_sampled_long(
-    input: FloatArray,
-    output: FloatArray,
-    used: BoolArray,
-    period: float,
-    *,
-    order: int = 0,
-    max_delay: int = 0,
-) -> SampledChoice:
-    """Choose a model as :func:`choose_sampled` does, quickly for a long record too."""
-    check_record(input, output, used, order)
-    if int(np.sum(used)) <= CHOSEN_ON:
-        return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
-    part = most_exciting_part(input, used)
-    try:
-        choice = choose_sampled(
-            input[part], output[part], used[part], period, order=order, max_delay=max_delay
-        )
-    except IdentificationError:
-        # No part excites as much as the whole record.
-        return choose_sampled(input, output, used, period, order=order, max_delay=max_delay)
-    centred = np.where(used, output - np.mean(output[used]), 0.0)
-    return _on_full_record(delayed(input, centred, used, period, choice.delay), choice)
+def _paired(roots: ComplexArray) -> ComplexArray:
+    """Return ``roots`` without imaginary parts by rounding."""
+    return np.where(abs(roots.imag) < 1e-12 * abs(roots), roots.real + 0j, roots)
 
 
-def most_exciting_part(input: FloatArray, used: BoolArray) -> slice:
-    """Return the part with CHOSEN_ON samples ``used`` (n,) in which ``input`` (n,) excites most."""
-    places = np.flatnonzero(used)
-    count = len(places) // CHOSEN_ON
-    tried = np.unique(np.linspace(0, count - 1, min(count, _MOST_PARTS)).astype(int))
-    every = [
-        slice(int(places[i * CHOSEN_ON]), int(places[(i + 1) * CHOSEN_ON - 1]) + 1) for i in tried
-    ]
+def _against_impulse_response(
+    whole: SectionsProblem, fitted: SectionsFit
+) -> tuple[float | None, float | None, bool]:
+    """Return what an impulse response and ``fitted`` explain of hidden samples, as shares.
 
-    def information(part: slice) -> tuple[int, float]:
-        varied = input[part]
-        excited = excited_parameters(varied, 2 * MAX_POLES + 1) if np.ptp(varied) > 0 else 0
-        return excited, float(np.var(varied))
-
-    return max(every, key=information)
-
-
-def _on_full_record(problem: ZeroOrderHoldProblem, choice: SampledChoice) -> SampledChoice:
-    part = parts(problem.used)
-    starts = DiscreteStarts(problem.input, problem.output, problem.used, MAX_POLES)
-    lowest: list[Fit] = []
-    while len(lowest) <= _LOWEST:
-        lowest.append(next_order(problem, lowest, starts))
-    tried = [SampledCandidate(problem, f, f.structure.poles, False, np.empty(0)) for f in lowest]
-    free = _refit_on_full_record(problem, choice.free)
-    tried += [free, *_with_further_poles(problem, free, starts)]
-    judged = [
-        replace(c, held_out=held_out_errors(c, part, _HELD_OUT_EVALUATIONS_LONG_RECORD))
-        for c in tried
-    ]
-    best = simplest_undominated(judged)
-    if choice.chosen is choice.free:
-        return replace(choice, chosen=best, free=best)
-    asked = _refit_on_full_record(problem, choice.chosen)
-    asked = replace(asked, held_out=held_out_errors(asked, part, _HELD_OUT_EVALUATIONS_LONG_RECORD))
-    return replace(choice, chosen=asked, free=best)
-
-
-def _refit_on_full_record(
-    problem: ZeroOrderHoldProblem, found: SampledCandidate
-) -> SampledCandidate:
-    """Return the candidate ``found`` on a part, fitted to the whole ``problem``."""
-    return replace(found, problem=problem, fit=refit(problem, found.fit, found.whitened))
-
-
-def _with_further_poles(
-    problem: ZeroOrderHoldProblem, found: SampledCandidate, starts: DiscreteStarts
-) -> list[SampledCandidate]:
-    order = found.order + _POLES_MORE
-    if order > MAX_POLES:
-        return []
-    grown = found.fit.nonlinear
-    for _ in range(_POLES_MORE):
-        grown = with_fast_pole(grown)
-    larger = fit(
-        problem, Structure(order, order, False), [*proposed_starts(problem, order, starts), grown]
+    The third value is True if the model is worse by more than the uncertainty of the comparison.
+    """
+    record, own = whole.records[0], fitted.problem.records[0]
+    inputs = record.inputs - np.mean(record.inputs, axis=0)
+    inputs = np.column_stack(
+        [np.roll(u, d) for u, d in zip(inputs.T, fitted.problem.delays, strict=True)]
     )
-    return [replace(found, fit=larger, order=order, whitened=False)]
+    middle = np.mean(record.output[own.used])
+    output = _filled(record) - middle
+    residual = hidden_residual(fitted, whole)[0] * np.std(record.output[record.used])
+    hidden = ~np.isnan(residual)
+    missed, used = np.where(hidden, residual, 0.0), own.used
+    taps = impulse_response(inputs[: _end(used)], output[: _end(used)], used[: _end(used)])
+    if taps is None or np.sum(hidden) < _BLOCKS:
+        return None, None, False
+    free = output - convolved(taps, inputs)
+    free -= np.mean(free[used])
+    power = float(np.var(output[hidden])) or 1.0
+    blocks = np.array_split(np.flatnonzero(hidden), _BLOCKS)
+    means = np.array([[np.mean(e[b] ** 2) for b in blocks] for e in (free, missed)]) / power
+    apart = means[1] - means[0]
+    uncertain = float(np.std(apart, ddof=1)) / np.sqrt(_BLOCKS)
+    shares = 1 - np.mean(means, axis=1)
+    worse = float(np.mean(apart)) > max(_CLEARLY * uncertain, _NOTICEABLE)
+    return float(shares[0]), float(shares[1]), bool(worse)
+
+
+def _end(used: BoolArray) -> int:
+    return int(np.flatnonzero(used)[-1]) + 1
+
+
+def _decimation(inputs: FloatArray) -> int:
+    """Return how many samples of the record are one of a record with the content of ``inputs``."""
+    power = np.cumsum(np.sum(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1))
+    share = float(np.searchsorted(power, _CONTENT * power[-1])) / len(power)
+    return max(int(1 / max(share * _ABOVE_CONTENT, 1e-3)), 1)
+
+
+def _decimated(values: FloatArray, every: int) -> FloatArray:
+    if every == 1:
+        return values
+    return np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))

@@ -1,436 +1,500 @@
-"""Fit a rational H(z) to an input that is held between samples, such as a drive's command.
+"""Fit parallel sections to sampled records by the error of the simulated output.
 
-A linear system behind a zero-order or a first-order hold is exactly rational in z⁻¹, with the poles
-of the system. Its initial state adds a polynomial over the same denominator, exactly. So the fit of
-:mod:`output_error` is used with q = z⁻¹ for s. The denominator is a product of sections of
-``w = (2/T) (1 - q)/(1 + q)``, so that every parameter vector is stable.
+All records share the sections; each has its own initial state and offset. Those and the numerators
+enter linearly and are eliminated (variable projection, Golub and Pereyra 1973), the states of each
+record first. Model and data are compared in time, so missing samples of the output do not count.
 
-The G(s) of a sampled H(z): each pole p of H is exp(sT) of a pole of G, and its residue follows in
-closed form. With a zero-order hold ``x' = s x + u`` gives ``x[k+1] = p x[k] + h u[k]``,
-h = (p - 1)/s; with a first-order hold ``x[k+1] = p x[k] + h0 u[k] + h1 u[k+1]``,
-h1 = (h/T - 1)/s, h0 = h - h1.
-
-Starting points are poles by ARX, instrumental variables and a subspace method. ARX finds
-well-damped responses in little noise, instrumental variables find them in coloured noise, and a
-subspace method finds all modes of a high order at once.
+Starting points are poles by vector fitting of the spectra of input and output (Gustavsen and
+Semlyen 1999), with the transients of the record as further residues, and the poles of a smaller fit
+with pairs added at the lines at which its residual is largest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-from numpy.polynomial import polynomial
-from scipy import fft, signal
+from scipy import fft, linalg, ndimage
 
+from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
 from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
-from omsm_ros.core.estimation.output_error import Fit, Problem
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.linear_algebra import least_squares
+from omsm_ros.core.estimation.optimisation import Projection, descend
+from omsm_ros.core.estimation.parallel_sections import (
+    BAND_LIMITED,
+    ParallelSections,
+    closed_inputs,
+    decays_of,
+    recursion,
+    variable,
+)
+from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
-# w over the rate, per (1 - q)/(1 + q), and the rate in 1/T: the middle of the range of sampled
-# poles.
-_PER_BILINEAR = 4.0
-RATE_SAMPLES = 0.5
-# Least relative distance of a pole from the unit circle; at z = -1, w is infinite.
-_OFF_BORDER = 1e-6
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScaledDiscreteStructure(ScaledStructure):
-    """Sections in w of a denominator in q; numerators are polynomials in q."""
-
-    def lag(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Return L = 1 / denominator at q = ``s`` (k,), (k,)."""
-        denominator = np.ones_like(s)
-        for value, _ in self._factors(nonlinear, s):
-            denominator *= value
-        return np.asarray(1 / denominator)
-
-    def lag_slopes(self, nonlinear: FloatArray, s: ComplexArray) -> ComplexArray:
-        """Return d ln L / dψ (len ψ, k) at q = ``s`` (k,), see :meth:`lag`."""
-        first, second = [], []
-        for value, (linear, *square) in self._factors(nonlinear, s):
-            first.append(-linear / value)
-            second += [-term / value for term in square]
-        return np.array(first + second, np.complex128).reshape(-1, len(s))
-
-    def _factors(
-        self, nonlinear: FloatArray, s: ComplexArray
-    ) -> Iterator[tuple[ComplexArray, list[ComplexArray]]]:
-        """Yield each factor of the denominator at q = ``s``, and its terms beyond the first.
-
-        They are not computed from coefficients in q, which cancel near q = 1 for a slow pole.
-        """
-        up, down = 1 + s, _PER_BILINEAR * (1 - s)
-        for section in self.sections(nonlinear):
-            if len(section) == 3:
-                terms = [section[1] * down * up, section[2] * down * down]
-                yield up * up + terms[0] + terms[1], terms
-            else:
-                linear = section[1] * down
-                yield up + linear, [linear]
-
-    def polynomials(self, nonlinear: FloatArray) -> list[FloatArray]:
-        """Return the factors of the denominator, ascending in q."""
-        up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
-        found = []
-        for section in self.sections(nonlinear):
-            size = len(section) - 1
-            terms = (
-                value
-                * polynomial.polymul(polynomial.polypow(down, i), polynomial.polypow(up, size - i))
-                for i, value in enumerate(section)
-            )
-            found.append(np.asarray(sum(terms), np.float64))
-        return found
-
-    def of_discrete(self, poles: ComplexArray) -> FloatArray:
-        """Return ψ of ``poles`` in z (n,), conjugates included; unstable ones are reflected."""
-        inside = inside_unit_circle(poles) * (1 - _OFF_BORDER)
-        bilinear = np.asarray(_PER_BILINEAR * (inside - 1) / (inside + 1), np.complex128)
-        return self.nonlinear_of(bilinear, 0.0)
-
-
-def inside_unit_circle(poles: ComplexArray) -> ComplexArray:
-    """Return ``poles`` in z with those outside the unit circle reflected into it."""
-    outside = np.abs(poles) > 1
-    return np.where(outside, 1 / np.conj(np.where(outside, poles, 1.0)), poles)
-
-
-class ZeroOrderHoldProblem(Problem):
-    """A problem whose input is held between samples: ``s`` is q = z⁻¹, the rate is 0.5 / period."""
-
-    @cached_property
-    def closed_length(self) -> int:
-        """Samples of the record: a held input needs no bridge back to its start."""
-        return len(self.input)
-
-    def closed_spectrum(self, values: FloatArray) -> ComplexArray:
-        """Transform of ``values`` (n,) as they are, shape (k,)."""
-        return np.asarray(fft.rfft(values), np.complex128)
-
-    @cached_property
-    def _spectrum(self) -> ComplexArray:
-        return self.closed_spectrum(self.input)
-
-    @cached_property
-    def s(self) -> ComplexArray:
-        """q = exp(-jωT) of the transform, (k,)."""
-        angle = 2 * np.pi * fft.rfftfreq(self.closed_length)
-        return np.asarray(np.exp(-1j * angle), np.complex128)
-
-    def parametrised(self, structure: Structure) -> ScaledDiscreteStructure:
-        """Return how ``structure`` is parametrised over q."""
-        return ScaledDiscreteStructure(structure, self.rate)
-
-    def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
-        """Return the input and a pulse at the first sample, whose terms make any initial state.
-
-        n terms do so from the second sample on; one more does so for the first sample.
-        """
-        pulse = np.ones(len(self.s), np.complex128)
-        return [(self._spectrum, structure.zeros + 1), (pulse, structure.poles + 1)]
-
-    def _driven(self, structure: Structure, lag: ComplexArray) -> ComplexArray:
-        """Return columns without their mean, which is huge for an integrator; the offset has it."""
-        spectra = super()._driven(structure, lag)
-        spectra[:, 0] = 0.0
-        return spectra
-
-    def _moved(self, structure: Structure, lag: ComplexArray) -> FloatArray:
-        """Return the linear columns where they are compared, (terms, k).
-
-        Each is the one before, delayed by a sample; the period has no bridge, so the columns wrap.
-        """
-        rows = []
-        for spectrum, count in self.drives(structure):
-            base = lag * spectrum
-            base[0] = 0.0
-            first = fft.irfft(base, self.closed_length)
-            rows += [np.take(first, self._places - late, mode="wrap") for late in range(count)]
-        return np.array(rows)
-
-    def _answer(
-        self, structure: Structure, lag: ComplexArray, coefficients: FloatArray
-    ) -> ComplexArray:
-        """Return the spectrum of the linear columns times their ``coefficients`` (terms,), (k,)."""
-        total, place = np.zeros_like(lag), 0
-        for spectrum, count in self.drives(structure):
-            # The values of a polynomial in q are the transform of its coefficients.
-            part = coefficients[place : place + count]
-            total += fft.rfft(part, self.closed_length) * spectrum
-            place += count
-        total[0] = 0.0
-        return lag * total
-
-    def columns(self, fitted: Fit) -> FloatArray:
-        """Return d output / d(terms of the numerator, ψ, initial state, background), (k, …)."""
-        driven = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
-        terms = fitted.structure.zeros + 1
-        slopes = fitted.scaled.lag_slopes(fitted.nonlinear, self.s)
-        by_nonlinear = slopes * (fitted.driven @ driven)
-        every = np.concatenate([driven[:terms], by_nonlinear, driven[terms:]])
-        return np.column_stack([self._in_time(every).T, self._fixed])
-
-    def free_run(self, fitted: Fit) -> FloatArray:
-        """Return the output (n,) of ``fitted`` with initial state and offset fitted anew."""
-        spectra = self._driven(fitted.structure, fitted.scaled.lag(fitted.nonlinear, self.s))
-        terms = fitted.structure.zeros + 1
-        columns = fft.irfft(spectra, self.closed_length)[:, : len(self.input)].T
-        moved = columns[:, :terms] @ fitted.driven[:terms]
-        free = np.column_stack([columns[:, terms:], self.background])
-        state = least_squares(free[self.used], (self.output - moved)[self.used])
-        return np.asarray(moved + free @ state)
-
-    def residual(self, fitted: Fit) -> FloatArray:
-        """Return the output less a free run, where it is used, (k,)."""
-        return np.asarray((self.output - self.free_run(fitted))[self.used])
-
-
-def coefficients(fitted: Fit) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return numerator (n+1,) and denominator (n+1,) in q, its first 1, and their derivatives.
-
-    The derivatives (2n + 1, 2n + 1) are of numerator, denominator[1:] by the terms of the
-    numerator, ψ, as :meth:`ZeroOrderHoldProblem.columns` orders them.
-    """
-    scaled, order = fitted.scaled, fitted.structure.poles
-    assert isinstance(scaled, ScaledDiscreteStructure)
-    factors = scaled.polynomials(fitted.nonlinear)
-    whole = _product(factors)
-    terms = fitted.driven[: order + 1]
-    numerator, denominator = terms / whole[0], whole / whole[0]
-    jacobian = np.zeros((2 * order + 1, 2 * order + 1))
-    jacobian[: order + 1, : order + 1] = np.eye(order + 1) / whole[0]
-    for column, changed in enumerate(_changes(scaled, fitted.nonlinear, factors)):
-        jacobian[: order + 1, order + 1 + column] = -numerator * changed[0] / whole[0]
-        moved = (changed - denominator * changed[0]) / whole[0]
-        jacobian[order + 1 :, order + 1 + column] = moved[1:]
-    return numerator, denominator, jacobian
-
-
-def _product(factors: list[FloatArray]) -> FloatArray:
-    product: FloatArray = np.ones(1)
-    for factor in factors:
-        product = np.asarray(polynomial.polymul(product, factor), np.float64)
-    return product
-
-
-def _changes(
-    scaled: ScaledDiscreteStructure, nonlinear: FloatArray, factors: list[FloatArray]
-) -> list[FloatArray]:
-    """Return the derivatives of the product of ``factors`` by each of ψ, ascending in q."""
-    up, down = np.array([1.0, 1.0]), _PER_BILINEAR * np.array([1.0, -1.0])
-    first, second = [], []
-    for place, section in enumerate(scaled.sections(nonlinear)):
-        others = _product(factors[:place] + factors[place + 1 :])
-        if len(section) == 3:
-            linear = section[1] * polynomial.polymul(down, up)
-            square = section[2] * polynomial.polymul(down, down)
-            second.append(np.asarray(polynomial.polymul(square, others), np.float64))
-        else:
-            linear = section[1] * down
-        first.append(np.asarray(polynomial.polymul(linear, others), np.float64))
-    return first + second
-
-
-ZERO_ORDER, FIRST_ORDER = "zero-order", "first-order"
-# Residues of poles nearer to each other than this are lost in rounding.
-_APART = 1e-6
-# A pole nearer to z = 0 than this is a delay, one nearer to 1 an integrator.
-_LEAST = 1e-9
-
-
-def zero_order_hold_equivalent(
-    numerator: FloatArray, denominator: FloatArray, period: float, hold: str
-) -> TransferFunction | None:
-    """Return G(s) of which ``numerator``/``denominator``, ascending in z⁻¹, is the sampled form.
-
-    period: [s];  hold: "zero-order" or "first-order"
-
-    Return None where there is no such G: for a pole on the negative real axis, at 0 or at 1, or for
-    multiple poles.
-    """
-    n = len(denominator) - 1
-    b = np.pad(numerator, (0, max(n + 1 - len(numerator), 0)))
-    if len(b) > n + 1:
-        return None
-    poles = np.asarray(np.roots(denominator), np.complex128)
-    if n == 0:
-        return TransferFunction(b[:1] / denominator[0], np.ones(1))
-    if _without_equivalent(poles):
-        return None
-    direct, residues = _fractions(b, denominator, poles)
-    s = np.log(poles) / period
-    held = (poles - 1) / s
-    if hold == FIRST_ORDER:
-        now = (held / period - 1) / s
-        scaled = residues / (held - now + poles * now)
-        direct = direct - float(np.sum(scaled * now).real)
-    else:
-        scaled = residues / held
-    down = polynomial.polyfromroots(s)
-    up = direct * down
-    for i, residue in enumerate(scaled):
-        term = residue * polynomial.polyfromroots(np.delete(s, i))
-        up = polynomial.polyadd(up, term)
-    return TransferFunction.from_ascending(np.real(up), np.real(down))
-
-
-def _without_equivalent(poles: ComplexArray) -> bool:
-    near_negative = (poles.real <= _LEAST) & (np.abs(poles.imag) <= _LEAST)
-    distances = np.abs(poles[:, np.newaxis] - poles) + np.eye(len(poles))
-    return bool(
-        np.any(near_negative) or np.any(np.abs(poles - 1) < _LEAST) or np.min(distances) < _APART
-    )
-
-
-def _fractions(b: FloatArray, a: FloatArray, poles: ComplexArray) -> tuple[float, ComplexArray]:
-    """Return d and r of H(z) = d + Σ r_i / (z - p_i)."""
-    descending, monic = b / a[0], a / a[0]
-    direct = float(descending[0])
-    rest = descending - direct * monic
-    values = np.polyval(rest, poles)
-    slopes = np.array([np.prod(p - np.delete(poles, i)) for i, p in enumerate(poles)])
-    return direct, np.asarray(values / slopes, np.complex128)
-
-
-# Iterations after Steiglitz and McBride (1965): by then they have converged, or will not.
-_ITERATIONS = 8
-# Rows of past and of future beyond the highest order.
-_SPARE_ROWS = 5
-# Most columns: thirty times the rows at the highest order; more only cost time.
-_MAX_COLUMNS = 5000
-# Logarithm of the time constant of an added pole: too fast to matter, but with a gradient.
-_FAST = float(np.log(0.1))
+# Unit of w inside a fit, in 1/T: the middle of the range of sampled poles.
+RATE = 0.5
+# Directions of the linear columns weaker than this part of the strongest are rounding.
+_RANK_TOLERANCE = 1e-13
+# Least share of the largest power of the input at which a line is excited, and the lines averaged.
+_EXCITED, _AVERAGED = 1e-3, 9
+# Most lines of one record for vector fitting, evenly among the excited ones.
+_MOST_LINES = 4000
+# Iterations of vector fitting: by then it has converged, or will not.
+_RELOCATIONS = 10
+# Damping ratio of pairs at a start, and of those that are added for a line of the residual.
+_START_DAMPING, _ADDED_DAMPING = 0.05, 0.01
+# Least damping ratio that a start may have, and range of |pole| T / RATE in a start.
+_LEAST_DAMPING, _SLOWEST, _FASTEST = 1e-5, 1e-6, 1e4
+# Time constant [samples] of an added pole that is too fast to matter.
+_FAST = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class DiscreteStarts:
-    """Propose poles in z for a record ``input``, ``output`` (n,), compared where ``used`` (n,).
+class SampledRecord:
+    """Samples of inputs (n, m) and output (n,), evenly spaced; ``used`` where the output counts."""
 
-    order: the highest one needed
-    """
-
-    input: FloatArray
+    inputs: FloatArray
     output: FloatArray
     used: BoolArray
-    order: int
 
-    def poles(self, order: int) -> list[ComplexArray]:
-        """Return proposals of ``order`` poles each, conjugates included."""
-        found = [self.arx(order), *self._iterated(order)]
-        subspace = self._subspace(order)
-        return found if subspace is None else [*found, subspace]
+    def __len__(self) -> int:
+        return len(self.output)
+
+    def part(self, part: slice) -> SampledRecord:
+        """Return the samples of ``part``."""
+        return SampledRecord(self.inputs[part], self.output[part], self.used[part])
+
+
+@dataclass(frozen=True, eq=False)
+class _Spectra:
+    """One record in a fit: about its means, its inputs as spectra (m, k) at w (k,)."""
+
+    record: SampledRecord
+    hold: str
 
     @cached_property
-    def _filled(self) -> FloatArray:
-        index = np.arange(len(self.used))
-        return np.asarray(np.interp(index, index[self.used], self.output[self.used]))
+    def places(self) -> IntArray:
+        return np.flatnonzero(self.record.used)
 
-    def _rows(self, order: int) -> BoolArray:
-        """Return True where the sample and ``order`` before it are all used, shape (n - order,)."""
-        return np.asarray(np.all(sliding_window_view(self.used, order + 1), axis=1))
+    @cached_property
+    def output(self) -> FloatArray:
+        known = self.record.output[self.places]
+        return np.asarray(known - np.mean(known), np.float64)
 
-    def _regressors(
-        self, u: FloatArray, y: FloatArray, order: int
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return columns -y[k-1] … -y[k-n], u[k] … u[k-n], 1 and target y[k], if all are used."""
-        rows = self._rows(order)
-        past = sliding_window_view(y, order + 1)[rows][:, ::-1]
-        drive = sliding_window_view(u, order + 1)[rows][:, ::-1]
-        return np.column_stack([-past[:, 1:], drive, np.ones(len(drive))]), past[:, 0]
+    @cached_property
+    def length(self) -> int:
+        return int(fft.next_fast_len(self._closed.shape[1], real=True))
 
-    def arx(self, order: int) -> ComplexArray:
-        """Return the poles in z (``order``,) of the equation-error fit, ARX."""
-        columns, target = self._regressors(self.input, self._filled, order)
-        return _poles(least_squares(columns, target)[:order])
+    @cached_property
+    def _closed(self) -> FloatArray:
+        return closed_inputs(self.record.inputs - np.mean(self.record.inputs, axis=0), self.hold)
 
-    def _iterated(self, order: int) -> list[ComplexArray]:
-        """Return poles by instrumental variables, then by Steiglitz and McBride's iteration."""
-        columns, target = self._regressors(self.input, self._filled, order)
-        found = least_squares(columns, target)
-        try:
-            simulated = signal.lfilter(
-                found[order:-1], np.poly(inside_unit_circle(_poles(found[:order]))).real, self.input
-            )
-            instruments, _ = self._regressors(self.input, simulated, order)
-            by_instruments = np.asarray(
-                np.linalg.solve(instruments.T @ columns, instruments.T @ target), np.float64
-            )
-        except np.linalg.LinAlgError:
-            return []
-        poles = _poles(by_instruments[:order])
-        return [p for p in (poles, self._prefiltered(order, poles)) if len(p) == order]
+    @cached_property
+    def inputs(self) -> ComplexArray:
+        return np.asarray(fft.rfft(self._closed, self.length), np.complex128)
 
-    def _prefiltered(self, order: int, poles: ComplexArray) -> ComplexArray:
-        for _ in range(_ITERATIONS):
-            denominator = np.poly(inside_unit_circle(poles)).real
-            u, y = (
-                signal.lfilter([1.0], denominator, values) for values in (self.input, self._filled)
-            )
-            columns, target = self._regressors(u, y, order)
-            if not np.all(np.isfinite(columns)):
-                break
-            poles = _poles(least_squares(columns, target)[:order])
+    @cached_property
+    def angle(self) -> FloatArray:
+        return np.asarray(2 * np.pi * fft.rfftfreq(self.length), np.float64)
+
+    @cached_property
+    def w(self) -> ComplexArray:
+        return variable(self.hold, self.angle / (2 * np.pi)) / RATE
+
+    def in_time(self, spectra: ComplexArray) -> FloatArray:
+        """Return ``spectra`` (…, k) at the compared samples, (…, places)."""
+        return np.asarray(fft.irfft(spectra, self.length, axis=-1)[..., self.places])
+
+    def free(self, sections: FloatArray) -> FloatArray:
+        """Return an orthonormal basis (places, states + 1) of initial states and offset."""
+        samples = len(self.record)
+        rows = [np.ones(samples)]
+        for d1, d2 in sections:
+            rows += decays_of(recursion(d1 / RATE, d2 / RATE**2, self.hold, 1.0), samples)
+        columns = np.array(rows)[:, self.places].T
+        scale = np.linalg.norm(columns, axis=0)
+        return np.asarray(linalg.qr(columns / np.where(scale > 0, scale, 1.0), mode="economic")[0])
+
+    @cached_property
+    def excited(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+        """Angles at which the inputs have power, their spectra there and that of the output.
+
+        They are those of the record as it is, without a bridge, whose output is not known.
+        """
+        inputs = self.record.inputs - np.mean(self.record.inputs, axis=0)
+        spectra = np.asarray(fft.rfft(inputs.T), np.complex128)
+        power = ndimage.uniform_filter1d(np.sum(np.abs(spectra) ** 2, axis=0), _AVERAGED)
+        lines = np.flatnonzero(power[1:-1] > _EXCITED * np.max(power[1:-1])) + 1
+        lines = lines[np.linspace(0, len(lines) - 1, min(len(lines), _MOST_LINES)).astype(int)]
+        filled = np.interp(np.arange(len(self.record)), self.places, self.output)
+        angle = 2 * np.pi * lines / len(self.record)
+        return angle, spectra[:, lines], np.asarray(fft.rfft(filled)[lines], np.complex128)
+
+
+@dataclass(frozen=True, eq=False)
+class SectionsFit:
+    """Sections fitted to the records of ``problem``.
+
+    nonlinear: logarithms of d1 of each section, of d2 of each pair, then the delays [RATE/T]
+    linear: (m, 1 + k), direct term and numerators of each input;  residual: (all places,)
+    """
+
+    problem: SectionsProblem
+    order: int
+    nonlinear: FloatArray
+    linear: FloatArray
+    residual: FloatArray
+
+    @property
+    def sum_of_squares(self) -> float:
+        """Return the sum of the squared residual."""
+        return float(self.residual @ self.residual)
+
+    @property
+    def sections(self) -> FloatArray:
+        """Return d1, d2 of each section (k, 2), scaled."""
+        return sections_of(self.nonlinear, self.order)
+
+    def roots(self) -> ComplexArray:
+        """Return the poles in w, scaled, (n,)."""
+        return self.model().roots() / RATE
+
+    def model(self, period: float = 1.0, covariance: FloatArray | None = None) -> ParallelSections:
+        """Return the fit as a model in seconds."""
+        unit = RATE / period
+        pairs = self.sections[:, 1] > 0
+        ups = np.zeros((len(self.linear), len(pairs), 2))
+        ups[:, np.column_stack([np.full(len(pairs), True), pairs])] = self.linear[:, 1:]
+        return ParallelSections(
+            hold=self.problem.hold,
+            period=period,
+            denominators=self.sections / [unit, unit**2],
+            numerators=ups / [1.0, unit],
+            direct=self.linear[:, 0].copy(),
+            delays=self.problem.late(self.nonlinear, self.order) * period,
+            covariance=covariance,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SectionsProblem:
+    """Records to be fitted together.
+
+    delays: whole samples (m,) of a held input, 0 of a band-limited one, whose delays are free
+    """
+
+    records: Sequence[SampledRecord]
+    hold: str
+    delays: IntArray
+
+    @cached_property
+    def spectra(self) -> list[_Spectra]:
+        """The records as spectra, without the samples that answer to inputs before the record."""
+        first = int(np.max(self.delays)) + 1 if self.hold != BAND_LIMITED else 0
+        return [
+            _Spectra(replace(r, used=r.used & (np.arange(len(r)) >= first)), self.hold)
+            for r in self.records
+        ]
+
+    @property
+    def inputs(self) -> int:
+        """Return the number of inputs."""
+        return int(self.records[0].inputs.shape[1])
+
+    @property
+    def _free_delays(self) -> bool:
+        return self.hold == BAND_LIMITED
+
+    def late(self, nonlinear: FloatArray, order: int) -> FloatArray:
+        """Return the delay of each input [samples], (m,)."""
+        if self._free_delays:
+            return np.asarray(nonlinear[order:] / RATE)
+        return np.asarray(self.delays, np.float64)
+
+    def box(self, order: int) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds of the nonlinear parameters."""
+        ends = ScaledStructure(Structure(order, order, False), RATE).bounds()
+        count = self.inputs if self._free_delays else 0
+        longest = max(len(record) for record in self.records) / 4 * RATE
+        return (
+            np.concatenate([ends[0], np.zeros(count)]),
+            np.concatenate([ends[1], np.full(count, longest)]),
+        )
+
+    def _drives(self, one: _Spectra, nonlinear: FloatArray, order: int) -> ComplexArray:
+        """Return the delayed spectra of the inputs, (m, k)."""
+        late = self.late(nonlinear, order)[:, np.newaxis]
+        return one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
+
+    def project(self, nonlinear: FloatArray, order: int) -> Projection:
+        """Return the residual after the linear parameters are eliminated."""
+        sections = sections_of(nonlinear, order)
+        rows, targets, frees = [], [], []
+        for one in self.spectra:
+            basis = np.concatenate([np.ones((1, len(one.w))), basis_of(sections, one.w)])
+            drives = self._drives(one, nonlinear, order)
+            columns = one.in_time((drives[:, np.newaxis] * basis).reshape(-1, len(one.w)))
+            free = one.free(sections)
+            rows.append(columns - (columns @ free) @ free.T)
+            targets.append(one.output - free @ (free.T @ one.output))
+            frees.append(free)
+        every, target = np.concatenate(rows, axis=1), np.concatenate(targets)
+        scale = np.sqrt(np.einsum("cn,cn->c", every, every))
+        scale[scale == 0] = 1.0
+        every /= scale[:, np.newaxis]
+        inverse = _inverse(every @ every.T)
+        linear = inverse @ (every @ target)
+        # Refined once, because the inverse has the squared condition of the columns.
+        linear += inverse @ (every @ (target - linear @ every))
+        found = (linear / scale).reshape(self.inputs, -1)
+
+        def derivative() -> FloatArray:
+            slopes = self.slopes(nonlinear, order, found, frees)
+            return np.asarray(((slopes @ every.T) @ inverse @ every - slopes).T)
+
+        return Projection(nonlinear, target - linear @ every, np.ravel(found), derivative)
+
+    def slopes(
+        self, nonlinear: FloatArray, order: int, linear: FloatArray, frees: Sequence[FloatArray]
+    ) -> FloatArray:
+        """Return d output / d nonlinear, without what the initial states take up, (p, places)."""
+        sections, every = sections_of(nonlinear, order), []
+        for one, free in zip(self.spectra, frees, strict=True):
+            drives = self._drives(one, nonlinear, order)
+            terms = (linear[:, 1:].T @ drives) * basis_of(sections, one.w)
+            first, second, place = [], [], 0
+            for d1, d2 in sections:
+                size = 2 if d2 > 0 else 1
+                part = np.sum(terms[place : place + size], axis=0)
+                part = part * one.w / (1 + d1 * one.w + d2 * one.w**2)
+                first.append(-d1 * part)
+                second += [-d2 * part * one.w] if d2 > 0 else []
+                place += size
+            late = []
+            if self._free_delays:
+                basis = np.concatenate([np.ones((1, len(one.w))), basis_of(sections, one.w)])
+                late = list(-1j * one.angle / RATE * (linear @ basis) * drives)
+            rows = one.in_time(np.reshape([*first, *second, *late], (-1, len(one.w))))
+            every.append(rows - (rows @ free) @ free.T)
+        return np.concatenate(every, axis=1)
+
+    def fit(
+        self, order: int, starts: Sequence[FloatArray], evaluations: int = 40, race: int = 5
+    ) -> SectionsFit:
+        """Improve each of ``starts`` by ``race`` iterations; return the minimum of the best."""
+        box = self.box(order)
+
+        def project(nonlinear: FloatArray) -> Projection:
+            return self.project(nonlinear, order)
+
+        tried = [project(np.clip(start, *box)) for start in starts]
+        if len(tried) > 1:
+            tried = [descend(project, one, box, race) for one in tried]
+        best = min(tried, key=lambda one: float(one.residual @ one.residual))
+        best = descend(project, best, box, evaluations)
+        linear = best.linear.reshape(self.inputs, -1)
+        return SectionsFit(self, order, best.nonlinear, linear, best.residual)
+
+    def nonlinear_of(self, poles: ComplexArray, late: FloatArray) -> FloatArray:
+        """Return the nonlinear parameters: stable ``poles`` in w, scaled, delays [samples]."""
+        scaled = ScaledStructure(Structure(len(poles), len(poles), False), RATE)
+        tail = late * RATE if self._free_delays else np.empty(0)
+        return np.concatenate([scaled.nonlinear_of(poles, 0.0), tail])
+
+    def relocated(self, poles: ComplexArray, late: FloatArray) -> ComplexArray:
+        """Return the poles that vector fitting reaches from ``poles``, in w, scaled."""
+        data = []
+        for one in self.spectra:
+            angle, drives, output = one.excited
+            w = variable(self.hold, angle / (2 * np.pi)) / RATE
+            data.append((w, drives * np.exp(-1j * angle * late[:, np.newaxis]), output))
+        for _ in range(_RELOCATIONS):
+            poles = _stable(_relocate(poles, data))
         return poles
 
-    @cached_property
-    def _observability(self) -> tuple[FloatArray, FloatArray] | None:
-        """Singular vectors and values of the future output, past as instrument (PO-MOESP)."""
-        rows = self.order + _SPARE_ROWS
-        if len(self.used) < 4 * rows:
-            return None
-        places = np.flatnonzero(np.all(sliding_window_view(self.used, 2 * rows), axis=1))
-        if len(places) < 6 * rows:
-            return None
-        places = places[:: -(-len(places) // _MAX_COLUMNS)]
-        u, y = (sliding_window_view(v, 2 * rows)[places] for v in (self.input, self._filled))
-        stacked = np.concatenate([u[:, rows:], u[:, :rows], y[:, :rows], y[:, rows:]], axis=1)
-        lower = np.asarray(np.linalg.qr(stacked - np.mean(stacked, axis=0), mode="r")).T
-        left, values, _ = np.linalg.svd(lower[3 * rows :, rows : 3 * rows])
-        return left, values
+    def spread_poles(self, order: int) -> ComplexArray:
+        """Return lightly damped pairs over the excited lines, in w, scaled."""
+        ends = [
+            np.abs(variable(self.hold, one.excited[0][[0, -1]] / (2 * np.pi))) / RATE
+            for one in self.spectra
+        ]
+        low, high = min(e[0] for e in ends), min(max(e[1] for e in ends), 8 / RATE)
+        pairs = order // 2
+        even = np.linspace(low, high, pairs + 2)[1:-1]
+        rates = np.sqrt(even * np.geomspace(low, high, pairs + 2)[1:-1])
+        upper = rates * (1j - _START_DAMPING)
+        single = np.full(order % 2, -np.sqrt(low * high), np.complex128)
+        return np.concatenate([upper, np.conj(upper), single])
 
-    def _subspace(self, order: int) -> ComplexArray | None:
-        found = self._observability
-        if found is None:
-            return None
-        basis = found[0][:, :order] * np.sqrt(found[1][:order])
-        return np.asarray(np.linalg.eigvals(np.linalg.lstsq(basis[:-1], basis[1:], rcond=None)[0]))
+    def covariance(self, fitted: SectionsFit) -> FloatArray:
+        """Return the covariance (p, p) of the parameters of ``fitted.model()``, scaled by RATE.
+
+        It is the sandwich of the least squares in coloured noise, with the autocovariance of the
+        residual of each record.
+        """
+        order, size = fitted.order, fitted.linear.size
+        sections, start = fitted.sections, 0
+        gram = np.zeros((size + len(fitted.nonlinear), size + len(fitted.nonlinear)))
+        score = np.zeros_like(gram)
+        for one in self.spectra:
+            free = one.free(sections)
+            basis = np.concatenate([np.ones((1, len(one.w))), basis_of(sections, one.w)])
+            drives = self._drives(one, fitted.nonlinear, order)
+            rows = one.in_time((drives[:, np.newaxis] * basis).reshape(size, -1))
+            alone = replace(self, records=[one.record])
+            by_nonlinear = alone.slopes(fitted.nonlinear, order, fitted.linear, [free])
+            rows = np.concatenate([rows - (rows @ free) @ free.T, by_nonlinear])
+            residual = fitted.residual[start : start + len(one.places)]
+            start += len(one.places)
+            spare = len(residual) / max(len(residual) - len(rows) - free.shape[1], 1)
+            on_grid = np.zeros((len(rows), len(one.record)))
+            on_grid[:, one.places] = rows
+            length = fft.next_fast_len(len(one.record) + 64, real=True)
+            noise = noise_spectrum(residual * np.sqrt(spare), length)
+            gram += rows @ rows.T
+            score += weighted_gram(on_grid, length, noise)
+        return self._of_coefficients(fitted, _sandwich(gram, score))
+
+    def _of_coefficients(self, fitted: SectionsFit, covariance: FloatArray) -> FloatArray:
+        """Return a covariance of linear and nonlinear parameters as one of the coefficients."""
+        size, sections = fitted.linear.size, fitted.sections
+        count, inputs = len(sections), self.inputs
+        each = 1 + 2 * count
+        turn = np.zeros((inputs * (each + 1) + 2 * count, len(covariance)))
+        places = [0] + [
+            1 + 2 * i + j for i, (_, d2) in enumerate(sections) for j in range(1 + (d2 > 0))
+        ]
+        for input in range(inputs):
+            for column, place in enumerate(places):
+                turn[input * each + place, input * len(places) + column] = 1.0
+        for i, (d1, d2) in enumerate(sections):
+            turn[inputs * each + 2 * i, size + i] = d1
+            if d2 > 0:
+                turn[inputs * each + 2 * i + 1, size + count + i] = d2
+        if self._free_delays:
+            for input in range(inputs):
+                turn[-inputs + input, size + fitted.order + input] = 1.0
+        found = turn @ covariance @ turn.T
+        return np.asarray(0.5 * (found + found.T))
 
 
-def _poles(coefficients: FloatArray) -> ComplexArray:
-    """Return the poles in z of 1 + a1 q + … + an q^n."""
-    if not np.all(np.isfinite(coefficients)):
-        return np.empty(0, np.complex128)
-    return np.asarray(np.roots(np.concatenate([[1.0], coefficients])), np.complex128)
+def in_seconds(covariance: FloatArray, inputs: int, sections: int, period: float) -> FloatArray:
+    """Return a covariance of scaled coefficients as one of those of a model in seconds."""
+    unit = RATE / period
+    each = np.concatenate([[1.0], np.tile([1.0, 1 / unit], sections)])
+    down = np.tile([1 / unit, unit**-2], sections)
+    scale = np.concatenate([np.tile(each, inputs), down, np.full(inputs, 1 / unit)])
+    return covariance * np.outer(scale, scale)
 
 
-def grown_starts(smaller: Sequence[FloatArray], samples: int) -> list[FloatArray]:
-    """Return the starts for one pole more than the last of ``smaller``.
+def sections_of(nonlinear: FloatArray, order: int) -> FloatArray:
+    """Return d1, d2 (k, 2) of the nonlinear parameters; d2 is 0 for a single pole."""
+    pairs = order // 2
+    count = order - pairs
+    found = np.zeros((count, 2))
+    found[:, 0] = np.exp(nonlinear[:count])
+    found[:pairs, 1] = np.exp(nonlinear[count:order])
+    return found
 
-    One adds a pole too fast to matter, so that a larger model never fits worse. The other adds two
-    as slow as the record is long: from other starts a fit does not reach a pair of integrators.
+
+def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
+    """Return 1/S and w/S of each section S at ``w`` (k,), without w/S of single poles, (n, k)."""
+    rows = []
+    for d1, d2 in sections:
+        rows.append(1 / (1 + d1 * w + d2 * w * w))
+        rows += [w * rows[-1]] if d2 > 0 else []
+    return np.asarray(np.reshape(rows, (-1, len(w))), np.complex128)
+
+
+def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
+    """Return poles (order,) in w, scaled: those of ``smaller`` and further ones.
+
+    They are pairs at the lines of the largest residual, poles too fast to matter (so that a larger
+    model fits no worse), or poles as slow as the record.
     """
-    slow = np.log(samples / 2)
-    fast = [with_fast_pole(smaller[-1])]
-    return fast + [_with_pole(_with_pole(found, slow), slow) for found in smaller[-2:-1]]
+    more, own = order - smaller.order, smaller.roots()
+    fast = -1 / (_FAST * RATE) * 1.5 ** np.arange(more)
+    slowest = -1 / (0.5 * max(len(r) for r in problem.records) * RATE)
+    found = [np.concatenate([own, fast]), np.concatenate([own, slowest * 1.5 ** np.arange(more)])]
+    rates = _residual_lines(problem, smaller, more // 2)
+    if len(rates) == more // 2 > 0:
+        upper = rates * (1j - _ADDED_DAMPING)
+        found.append(np.concatenate([own, upper, np.conj(upper), fast[: more % 2]]))
+    return [np.asarray(poles, np.complex128) for poles in found]
 
 
-def with_fast_pole(nonlinear: FloatArray) -> FloatArray:
-    """Return ψ (n+1,) of ``nonlinear`` (n,) with a pole too fast to matter."""
-    return _with_pole(nonlinear, _FAST)
+def _residual_lines(problem: SectionsProblem, fitted: SectionsFit, count: int) -> FloatArray:
+    """Return w of the excited lines of the largest residual of the longest record, apart."""
+    index = int(np.argmax([len(one.places) for one in problem.spectra]))
+    start = sum(len(one.places) for one in problem.spectra[:index])
+    one, grid = problem.spectra[index], np.zeros(len(problem.records[index]))
+    grid[one.places] = fitted.residual[start : start + len(one.places)]
+    power = np.abs(fft.rfft(grid, one.length)) ** 2
+    power = ndimage.uniform_filter1d(power, 15)
+    shown = one.excited[0][[0, -1]]
+    power[(one.angle < shown[0]) | (one.angle > shown[1])], found = 0.0, []
+    for _ in range(count):
+        line = int(np.argmax(power))
+        if power[line] == 0:
+            break
+        found.append(abs(one.w[line]))
+        apart = max(40, line // 20)
+        power[max(line - apart, 0) : line + apart] = 0.0
+    return np.array(found)
 
 
-def _with_pole(nonlinear: FloatArray, log_time: float) -> FloatArray:
-    """Return ψ (n+1,) of the denominator of ``nonlinear`` (n,) times 1 + e^log_time w."""
-    pairs, odd = divmod(len(nonlinear), 2)
-    first, second = nonlinear[:pairs], nonlinear[pairs + odd :]
-    if not odd:
-        return np.concatenate([first, [log_time], second])
-    merged = np.logaddexp(nonlinear[pairs], log_time)
-    return np.concatenate([first, [merged], second, [nonlinear[pairs] + log_time]])
+def _inverse(gram: FloatArray) -> FloatArray:
+    values, directions = np.linalg.eigh(gram)
+    kept = values > _RANK_TOLERANCE * values[-1]
+    return np.asarray((directions[:, kept] / values[kept]) @ directions[:, kept].T)
+
+
+def _sandwich(gram: FloatArray, score: FloatArray) -> FloatArray:
+    """Return gram⁻¹ score gram⁻¹; a direction lost in rounding is as uncertain as the weakest."""
+    scale = np.sqrt(np.diag(gram))
+    scale[scale == 0] = 1.0
+    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
+    inverse = directions / np.maximum(values, _RANK_TOLERANCE * values[-1]) @ directions.T
+    bread = inverse / np.outer(scale, scale)
+    return np.asarray(bread @ score @ bread)
+
+
+def _relocate(
+    poles: ComplexArray, data: Sequence[tuple[ComplexArray, ComplexArray, ComplexArray]]
+) -> ComplexArray:
+    """Return the zeros of σ with σ Y ≈ Σ_j N_j U_j + transients, all over ``poles`` (n,)."""
+    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
+    rows, targets = [], []
+    for w, inputs, output in data:
+        pairs = [np.array([1 / (w - p), 1 / (w - np.conj(p))]) for p in upper]
+        basis = [b for one, other in pairs for b in (one + other, 1j * (one - other))]
+        fractions = np.reshape([*basis, *(1 / (w - p) for p in real)], (-1, len(w)))
+        direct = np.concatenate([fractions, np.ones((1, len(w)))])
+        shared = np.concatenate([*(direct * one for one in inputs), -fractions * output])
+        free = np.concatenate([direct, w[np.newaxis]])
+        orthogonal = np.linalg.qr(_stacked(free).T)[0]
+        columns, target = _stacked(shared).T, _stacked(output[np.newaxis])[0]
+        rows.append(columns - orthogonal @ (orthogonal.T @ columns))
+        targets.append(target - orthogonal @ (orthogonal.T @ target))
+    every = np.concatenate(rows)
+    scale = np.linalg.norm(every, axis=0)
+    scale[scale == 0] = 1.0
+    solved = np.linalg.lstsq(every / scale, np.concatenate(targets), rcond=1e-13)[0] / scale
+    blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in upper]
+    a = linalg.block_diag(*blocks, *([[p]] for p in real))
+    b = np.concatenate([np.tile([2.0, 0.0], len(upper)), np.ones(len(real))])
+    return np.asarray(np.linalg.eigvals(a - np.outer(b, solved[-len(poles) :])), np.complex128)
+
+
+def _stacked(values: ComplexArray) -> FloatArray:
+    return np.concatenate([values.real, values.imag], axis=1)
+
+
+def _stable(poles: ComplexArray) -> ComplexArray:
+    """Return ``poles`` reflected into the left half plane, within the range of a start."""
+    size = np.clip(np.abs(poles), _SLOWEST, _FASTEST)
+    poles = poles * size / np.maximum(np.abs(poles), np.finfo(float).tiny)
+    real = poles.imag == 0
+    decay = np.maximum(np.abs(poles.real), _LEAST_DAMPING * size)
+    return np.where(real, -size, -decay + 1j * poles.imag)

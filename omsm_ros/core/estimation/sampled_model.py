@@ -1,4 +1,4 @@
-"""Sampled model of any two quantities: coefficients with uncertainty, its file, and free runs."""
+"""Sampled model of an output from one or more inputs: its file, and free runs."""
 
 from __future__ import annotations
 
@@ -7,195 +7,177 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from omsm_ros.core.calibration.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
-from omsm_ros.core.calibration.plausibility import checked_roots
+from omsm_ros.core.estimation.parallel_sections import (
+    BAND_LIMITED,
+    ParallelSections,
+    from_polynomials,
+)
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES
-from omsm_ros.core.lti.discretisation import discretise
-from omsm_ros.core.lti.frequency_response import Band
-from omsm_ros.core.lti.recursion import Recursion
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
-from omsm_ros.errors import CalibrationError, IdentificationError, OmsmError
+from omsm_ros.errors import CalibrationError, IdentificationError
 from omsm_ros.linear_algebra import least_squares
-from omsm_ros.quantities import FREQUENCY, MAX_DELAY_SAMPLES, SAMPLE_PERIOD, SIGNAL
+from omsm_ros.quantities import FREQUENCY, SAMPLE_PERIOD, SIGNAL
 
-SCHEMA = "omsm-model/1"
-BAND_LIMITED = "band-limited"
-_ENDS = ("from", "up_to")
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Discrete:
-    """``H = (b0 + b1 z⁻¹ + …)/(1 + a1 z⁻¹ + …) · z^-delay``.
-
-    numerator: (m+1,);  denominator: (n+1,), its first is 1;  delay: whole samples
-    covariance: (m + 1 + n,) squared, order numerator, denominator[1:]
-    """
-
-    numerator: FloatArray
-    denominator: FloatArray
-    delay: int
-    covariance: FloatArray
-
-    def response(self, frequency: FloatArray, period: float) -> ComplexArray:
-        """Return H at ``frequency`` (k,) [Hz], for samples every ``period`` [s]."""
-        q = np.exp(-2j * np.pi * np.asarray(frequency) * period)
-        up, down = (np.polynomial.polynomial.polyval(q, c) for c in self._both)
-        return np.asarray(up / down * q**self.delay, np.complex128)
-
-    def band(self, frequency: FloatArray, period: float) -> Band:
-        """Return the standard uncertainty of relative gain and of phase at ``frequency`` [Hz]."""
-        q = np.exp(-2j * np.pi * np.asarray(frequency) * period)[:, np.newaxis]
-        up, down = (np.polynomial.polynomial.polyval(q, c) for c in self._both)
-        jacobian = np.concatenate(
-            [
-                q ** np.arange(len(self.numerator)) / up,
-                -(q ** np.arange(1, len(self.denominator))) / down,
-            ],
-            axis=1,
-        )
-        variance = [
-            np.einsum("kp,pq,kq->k", part, self.covariance, part)
-            for part in (jacobian.real, jacobian.imag)
-        ]
-        gain, phase = np.sqrt(np.maximum(variance, 0.0))
-        return Band(np.asarray(frequency, np.float64), gain, phase)
-
-    @property
-    def _both(self) -> tuple[FloatArray, FloatArray]:
-        return self.numerator, self.denominator
+SCHEMA, SCHEMA_1 = "omsm-model/2", "omsm-model/1"
+# Most poles whose polynomials are stated, too: beyond, their coefficients lose too many digits.
+_POLYNOMIAL_POLES = 12
+# Largest d1, d2 and numerators per power of the sample period: 1e9 samples.
+_SLOWEST_SAMPLES = 1e9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SampledModel:
-    """A model of samples of ``output`` from samples of ``input``, in the units of the record.
+    """A model of samples of an output from samples of its inputs, in the units of the record.
 
-    hold: of the input between samples: "band-limited", "zero-order" or "first-order"
-    working_point: input and its steady output; the model is of deviations from both
-    discrete: the model of a held input, None of a band-limited one
-    continuous: G(s) with its gain; of a held input the one equivalent to ``discrete``, or None
-    covariance: (p, p) of ``continuous``, order numerator, denominator[1:], delay; None of a held
-        input, whose covariance is in ``discrete``
-    valid_from, valid_up_to: [Hz] between which the 95 % band is within the limits; equal if it is
-        nowhere
+    sections: the responses, with covariance
+    working_point: means of the inputs and the steady output there; the model is of deviations
+    valid: [Hz] for each input, between which it is known within the limits; equal if nowhere
     certificate: JSON values
     """
 
-    hold: str
-    sample_period: float
-    discrete: Discrete | None
-    continuous: TransferFunction | None
-    covariance: FloatArray | None
-    valid_from: float
-    valid_up_to: float
-    working_point: tuple[float, float]
+    sections: ParallelSections
+    valid: Sequence[tuple[float, float]]
+    working_point: Sequence[float]
     certificate: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def hold(self) -> str:
+        """Return the behaviour of the inputs between samples."""
+        return self.sections.hold
+
+    @property
+    def sample_period(self) -> float:
+        """Return the sample period [s]."""
+        return self.sections.period
+
+    @property
+    def continuous(self) -> TransferFunction | None:
+        """Return G(s) of the first input as polynomials; None if there is none, or many poles."""
+        found = self.sections.equivalent()
+        if found is None or found.order > _POLYNOMIAL_POLES:
+            return None
+        return found.transfer_function()
 
     def content(self) -> dict[str, object]:
         """Return the model as JSON values."""
+        sections, continuous = self.sections, self.continuous
+        covariance = sections.covariance
         return {
             "schema": SCHEMA,
-            "hold": self.hold,
-            "sample_period": self.sample_period,
-            "discrete": None if self.discrete is None else _discrete_content(self.discrete),
-            "continuous": None if self.continuous is None else self._continuous_content(),
+            "hold": sections.hold,
+            "sample_period": sections.period,
+            "denominators": sections.denominators.tolist(),
+            "numerators": sections.numerators.tolist(),
+            "direct": sections.direct.tolist(),
+            "delays": sections.delays.tolist(),
+            "covariance": None if covariance is None else np.ravel(covariance).tolist(),
+            "continuous": None
+            if continuous is None
+            else {
+                "numerator": continuous.numerator.tolist(),
+                "denominator": continuous.denominator.tolist(),
+                "delay": continuous.delay,
+            },
             "working_point": list(self.working_point),
-            "valid_from": self.valid_from,
-            "valid_up_to": self.valid_up_to,
+            "valid": [list(range) for range in self.valid],
             "certificate": dict(self.certificate),
         }
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> SampledModel:
-        """Return the inverse of :meth:`content`, for values of the right types.
+        """Return the inverse of :meth:`content`, for values of the right types; reads version 1.
 
         Raises CalibrationError for an inconsistent model, or one that cannot be computed.
         """
         period = SAMPLE_PERIOD.checked(content["sample_period"], CalibrationError)
-        continuous, covariance = _continuous_of(content["continuous"], period)
-        discrete = None if content["discrete"] is None else _discrete_of(content["discrete"])
-        lacks = covariance if content["hold"] == BAND_LIMITED else discrete
-        if lacks is None:
-            raise CalibrationError("estimation.missing_part", hold=content["hold"])
-        if content["hold"] == BAND_LIMITED and continuous is not None:
-            _check_runs(continuous)
-        valid = [FREQUENCY.checked(content[f"valid_{end}"], CalibrationError) for end in _ENDS]
+        first = content["schema"] == SCHEMA_1
+        sections = _sections_of_1(content, period) if first else _sections_of(content, period)
+        every = [(content["valid_from"], content["valid_up_to"])] if first else content["valid"]
+        valid = [
+            (FREQUENCY.checked(a, CalibrationError), FREQUENCY.checked(b, CalibrationError))
+            for a, b in every
+        ]
         point = [SIGNAL.checked(value, CalibrationError) for value in content["working_point"]]
+        if len(valid) != sections.inputs or len(point) != sections.inputs + 1:
+            raise CalibrationError("estimation.model_sizes", inputs=sections.inputs)
         return cls(
-            hold=content["hold"],
-            sample_period=period,
-            discrete=discrete,
-            continuous=continuous,
-            covariance=covariance,
-            valid_from=valid[0],
-            valid_up_to=valid[1],
-            working_point=(point[0], point[1]),
+            sections=sections,
+            valid=valid,
+            working_point=point,
             certificate=content["certificate"],
         )
 
-    def _continuous_content(self) -> dict[str, object]:
-        assert self.continuous is not None
-        return {
-            "numerator": self.continuous.numerator.tolist(),
-            "denominator": self.continuous.denominator.tolist(),
-            "delay": self.continuous.delay,
-            "covariance": None if self.covariance is None else self.covariance.ravel().tolist(),
-        }
+
+def _sections_of(content: Mapping[str, Any], period: float) -> ParallelSections:
+    try:
+        down, up, direct, delays = (
+            SIGNAL.checked_all(np.asarray(content[name], np.float64), CalibrationError, name)
+            for name in ("denominators", "numerators", "direct", "delays")
+        )
+    except ValueError as err:
+        raise CalibrationError("estimation.model_sizes", inputs=len(content["direct"])) from err
+    inputs, count = len(direct), len(content["denominators"])
+    fits = up.size == 2 * inputs * count and down.size == 2 * count and len(delays) == inputs
+    if not (inputs and fits):
+        raise CalibrationError("estimation.model_sizes", inputs=inputs)
+    sections = ParallelSections(
+        hold=content["hold"],
+        period=period,
+        denominators=down.reshape(count, 2),
+        numerators=up.reshape(inputs, count, 2),
+        direct=direct,
+        delays=delays,
+    )
+    _check_runs(sections)
+    if content["covariance"] is None:
+        return sections
+    size = inputs * (2 + 2 * count) + 2 * count
+    return ParallelSections(
+        **{**vars(sections), "covariance": _square(content["covariance"], size)}
+    )
 
 
-def _continuous_of(
-    content: Mapping[str, Any] | None, period: float
-) -> tuple[TransferFunction | None, FloatArray | None]:
-    if content is None:
-        return None, None
-    if content["delay"] > LONGEST_DELAY_SAMPLES * period:
+def _check_runs(sections: ParallelSections) -> None:
+    """Raise CalibrationError for sections that are unstable, too slow or too late."""
+    slowest = _SLOWEST_SAMPLES * sections.period
+    slow = np.any(sections.denominators > [slowest, slowest**2])
+    if not sections.is_stable or slow:
+        raise CalibrationError("estimation.unstable", sections=sections.denominators.tolist())
+    samples = sections.delays / sections.period
+    whole = sections.hold == BAND_LIMITED or np.all(abs(samples - np.round(samples)) < 1e-6)
+    if np.any(samples < 0) or np.any(samples > LONGEST_DELAY_SAMPLES) or not whole:
         raise CalibrationError(
             "estimation.long_delay",
-            delay=content["delay"],
+            delay=sections.delays.tolist(),
             most=LONGEST_DELAY_SAMPLES,
-            period=period,
-        )
-    try:
-        dynamics = TransferFunction(
-            np.asarray(content["numerator"], np.float64),
-            np.asarray(content["denominator"], np.float64),
-            content["delay"],
-        )
-    except OmsmError as err:
-        raise CalibrationError(err.code, **err.values) from err
-    for kind in ("poles", "zeros"):
-        checked_roots(dynamics, kind)
-    if content["covariance"] is None:
-        return dynamics, None
-    size = len(dynamics.numerator) + len(dynamics.denominator)
-    return dynamics, _square(content["covariance"], size)
-
-
-def _check_runs(dynamics: TransferFunction) -> None:
-    """Raise CalibrationError for a response that is unstable or zero."""
-    if not dynamics.is_stable or not np.any(dynamics.numerator):
-        raise CalibrationError(
-            "estimation.unstable",
-            numerator=dynamics.numerator.tolist(),
-            denominator=dynamics.denominator.tolist(),
+            period=sections.period,
         )
 
 
-def _discrete_of(content: Mapping[str, Any]) -> Discrete:
-    numerator, denominator = (
-        SIGNAL.checked_all(np.asarray(content[name], np.float64), CalibrationError, name)
+def _sections_of_1(content: Mapping[str, Any], period: float) -> ParallelSections:
+    """Return the sections of a file of version 1, without covariance."""
+    smooth = content["hold"] == BAND_LIMITED
+    part = content["continuous" if smooth else "discrete"]
+    if part is None:
+        raise CalibrationError("estimation.missing_part", hold=content["hold"])
+    up, down = (
+        SIGNAL.checked_all(np.asarray(part[name], np.float64), CalibrationError, name)
         for name in ("numerator", "denominator")
     )
-    if denominator[0] != 1 or np.any(abs(np.roots(denominator)) >= 1):
-        raise CalibrationError("estimation.unstable_discrete", denominator=denominator.tolist())
-    return Discrete(
-        numerator=numerator,
-        denominator=denominator,
-        delay=MAX_DELAY_SAMPLES.checked(content["delay_samples"], CalibrationError),
-        covariance=_square(content["covariance"], len(numerator) + len(denominator) - 1),
-    )
+    delay = part["delay"] if smooth else part["delay_samples"] * period
+    with np.errstate(all="ignore"):
+        try:
+            sections = from_polynomials(content["hold"], period, up, down, float(delay))
+        except (np.linalg.LinAlgError, ValueError, ZeroDivisionError) as err:
+            raise CalibrationError("estimation.unstable", sections=down.tolist()) from err
+    values = (sections.denominators, sections.numerators, sections.direct)
+    if not all(np.all(np.isfinite(value)) for value in values):
+        raise CalibrationError("estimation.unstable", sections=down.tolist())
+    _check_runs(sections)
+    return sections
 
 
 def _square(values: Sequence[float], size: int) -> FloatArray:
@@ -207,15 +189,6 @@ def _square(values: Sequence[float], size: int) -> FloatArray:
     if np.any(np.diag(square) < 0) or not np.allclose(square, square.T, rtol=1e-6):
         raise CalibrationError("estimation.no_covariance")
     return square
-
-
-def _discrete_content(discrete: Discrete) -> dict[str, object]:
-    return {
-        "numerator": discrete.numerator.tolist(),
-        "denominator": discrete.denominator.tolist(),
-        "delay_samples": discrete.delay,
-        "covariance": discrete.covariance.ravel().tolist(),
-    }
 
 
 # The square of a smaller change underflows.
@@ -237,46 +210,72 @@ class FreeRun:
 
 
 def free_run(
-    model: SampledModel, input: FloatArray, output: FloatArray, used: BoolArray | None = None
+    model: SampledModel, inputs: FloatArray, output: FloatArray, used: BoolArray | None = None
 ) -> FreeRun:
-    """Simulate ``model`` for ``input`` (n,) and compare it with the measured ``output`` (n,).
+    """Simulate ``model`` for ``inputs`` (n, m), or (n,), and compare with the ``output`` (n,).
 
     used: True where the output counts, None where it is finite
 
     Only the initial state and a constant are fitted to the output. Samples are a ``sample_period``
     of the model apart.
 
-    Raises IdentificationError for a record that is too short or constant, or for gaps of the input.
+    Raises IdentificationError for a record that is too short or constant, for gaps of an input, or
+    another number of inputs.
     """
     counted = np.isfinite(output) if used is None else used & np.isfinite(output)
-    if np.sum(counted) < LEAST_SAMPLES or len(input) != len(output):
+    inputs = inputs[:, np.newaxis] if inputs.ndim == 1 else inputs
+    if np.sum(counted) < LEAST_SAMPLES or len(inputs) != len(output):
         raise IdentificationError(
             "estimation.short_columns",
-            input=len(input),
+            input=len(inputs),
             output=int(np.sum(counted)),
             least=LEAST_SAMPLES,
         )
-    check_input(input)
+    if inputs.shape[1] != model.sections.inputs:
+        raise IdentificationError(
+            "estimation.input_count", given=inputs.shape[1], expected=model.sections.inputs
+        )
+    check_inputs(inputs)
     check_varies(output[counted], "output")
-    driven, free = _responses(model, input - model.working_point[0])
-    columns = np.column_stack([*free, np.ones(len(input))])
-    unknown = least_squares(columns[counted], (output - driven)[counted])
-    run = driven + columns @ unknown
+    run = _run(model.sections, inputs - model.working_point[:-1], output, counted)
     residual = np.where(counted, output - run, np.nan)
     rms = float(np.sqrt(np.mean(residual[counted] ** 2)))
     variance = float(np.var(output[counted]))
-    return FreeRun(np.asarray(run), residual, 1 - rms**2 / variance, rms)
+    return FreeRun(run, residual, 1 - rms**2 / variance, rms)
 
 
-def check_input(input: FloatArray) -> None:
+def _run(
+    sections: ParallelSections, inputs: FloatArray, output: FloatArray, used: BoolArray
+) -> FloatArray:
+    driven = sections.driven(inputs)
+    columns = np.column_stack([*sections.decays(len(inputs)), np.ones(len(inputs))])
+    # A column that has decayed where nothing is counted has no size.
+    known = np.linalg.norm(columns[used], axis=0) > 0
+    state = least_squares(columns[used][:, known], (output - driven)[used], 1e-13)
+    return np.asarray(driven + columns[:, known] @ state)
+
+
+def stationary_output(
+    sections: ParallelSections, inputs: FloatArray, output: FloatArray, used: BoolArray
+) -> float:
+    """Return the steady output at the means of ``inputs`` (n, m)."""
+    centred = inputs - np.mean(inputs, axis=0)
+    driven = sections.driven(centred)
+    columns = np.column_stack([*sections.decays(len(inputs)), np.ones(len(inputs))])
+    known = np.linalg.norm(columns[used], axis=0) > 0
+    return float(least_squares(columns[used][:, known], (output - driven)[used], 1e-13)[-1])
+
+
+def check_inputs(inputs: FloatArray) -> None:
     """Raise IdentificationError for a constant input, or one with a missing value.
 
     After a missing value the output would be unknown.
     """
-    missing = int(np.count_nonzero(~np.isfinite(input)))
+    missing = int(np.count_nonzero(~np.isfinite(inputs)))
     if missing:
         raise IdentificationError("estimation.input_gaps", missing=missing)
-    check_varies(input, "input")
+    for column in inputs.T:
+        check_varies(column, "input")
 
 
 def check_varies(values: FloatArray, name: str) -> None:
@@ -285,38 +284,3 @@ def check_varies(values: FloatArray, name: str) -> None:
     change = float(np.ptp(values)) if len(values) else 0.0
     if change <= _LEAST_CHANGE:
         raise IdentificationError("estimation.constant_column", name=name, change=change)
-
-
-def stationary_output(
-    discrete: Discrete, input: FloatArray, output: FloatArray, used: BoolArray
-) -> float:
-    """Return the steady output of ``discrete`` at the mean of ``input`` (n,)."""
-    driven, free = _zero_order_hold_responses(discrete, input - np.mean(input))
-    columns = np.column_stack([*free, np.ones(len(input))])
-    return float(least_squares(columns[used], (output - driven)[used])[-1])
-
-
-def _responses(model: SampledModel, motion: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the response (n,) to ``motion``, and those (k, n) to each initial state."""
-    if model.discrete is not None:
-        return _zero_order_hold_responses(model.discrete, motion)
-    assert model.continuous is not None  # a band-limited model has no other response
-    recursion = Recursion(discretise(model.continuous, model.sample_period))
-    recursion.start(motion[:1])
-    poles = np.exp(model.continuous.poles() * model.sample_period)
-    return recursion.run(motion), _decays(np.real(np.poly(poles)), len(poles), len(motion))
-
-
-def _zero_order_hold_responses(
-    discrete: Discrete, motion: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    late = np.roll(motion, discrete.delay)
-    late[: discrete.delay] = 0.0
-    driven = signal.lfilter(discrete.numerator, discrete.denominator, late)
-    states = max(len(discrete.denominator) - 1 + discrete.delay, 1)
-    return np.asarray(driven), _decays(discrete.denominator, states, len(motion))
-
-
-def _decays(denominator: FloatArray, states: int, samples: int) -> FloatArray:
-    """Return the responses (states, n) to a pulse at each of the first samples."""
-    return np.asarray(signal.lfilter([1.0], denominator, np.eye(states, samples), axis=1))

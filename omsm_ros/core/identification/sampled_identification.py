@@ -1,7 +1,6 @@
-"""Identify a model between any two sampled quantities, in any units.
+"""Identify a model between any sampled quantities, in any units, from one or more records.
 
-The method is that of :mod:`omsm_ros.core.identification.identify`, without the checks of a probe on
-a machine (gain, stationary noise, steps). ``hold`` is the behaviour of the input between samples:
+``hold`` is the behaviour of the inputs between samples:
 
 | hold | the input | the model |
 |---|---|---|
@@ -9,91 +8,328 @@ a machine (gain, stationary noise, steps). ``hold`` is the behaviour of the inpu
 | zero-order | constant from sample to sample, as a command | H(z), and its equivalent G(s) |
 | first-order | linear from sample to sample | the same H(z), another G(s) |
 
-A band-limited record is identified as a motion is. The durations of that method (fading, bridging,
-settling) are those of a machine sampled every millisecond, so time is scaled to that period, and
-the result is scaled back.
+The response is valid where the inputs excite it and the data support it. They do where the band of
+the model is narrow, or where a response without a model agrees with it: within blocks of
+neighbouring lines, the residual is fitted by the inputs and the transient of the record (local
+polynomial method, Pintelon et al. 2010). Where that finds a difference, the model is not valid.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import signal
+from scipy import ndimage
 
 from omsm_ros.core.calibration.certificate import REJECTED
-from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
-from omsm_ros.core.estimation.model_order import held_out_rms
-from omsm_ros.core.estimation.output_error import Fit, Problem
-from omsm_ros.core.estimation.preparation import Prepared, faded_to_stationary, input_bandwidth
-from omsm_ros.core.estimation.sampled_choice import (
-    SampledCandidate,
-    SampledChoice,
-    choose_sampled_long,
-)
-from omsm_ros.core.estimation.sampled_fit import (
-    FIRST_ORDER,
-    ZERO_ORDER,
-    coefficients,
-    zero_order_hold_equivalent,
-)
+from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
+from omsm_ros.core.estimation.sampled_choice import SampledCandidate, SampledChoice, choose_sampled
+from omsm_ros.core.estimation.sampled_fit import SampledRecord, in_seconds
 from omsm_ros.core.estimation.sampled_model import (
-    BAND_LIMITED,
-    Discrete,
     SampledModel,
-    check_input,
+    check_inputs,
     check_varies,
     stationary_output,
 )
-from omsm_ros.core.estimation.steps import LEAST_SAMPLES, Steps, held_out, sample_noise
-from omsm_ros.core.identification.model_choice import model_from_start
+from omsm_ros.core.estimation.steps import LEAST_SAMPLES
 from omsm_ros.core.identification.residual_tests import independence, whiteness
-from omsm_ros.core.identification.response_uncertainty import (
-    inflate_to_free_choice,
-    response_uncertainty,
-)
-from omsm_ros.core.lti.frequency_response import (
-    COVERAGE_FACTOR,
-    Band,
-    ResponseLimits,
-    is_detectable,
-    response_band,
-    widening,
-)
-from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, ResponseLimits, widening
+from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, IdentificationError, Notice
 from omsm_ros.linear_algebra import one_blas_thread
 
 # Limits of the band, a tenth of gain and of a radian: for a process, not a measuring machine.
 SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
-# Least share of the variance of held-out parts that free runs predict.
+# Least share of the variance of hidden parts that free runs predict.
 _LEAST_PREDICTED = 0.5
 # Least p-value of a residual that is independent of the input.
 _LEAST_INDEPENDENCE_P = 1e-4
+# Frequencies over three decades: neighbours are 2 % apart.
+_FREQUENCIES = 400
+# Lines of a block: these, and so many for each input; most ratio of its frequencies.
+_LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
+# Power of a line over the largest nearby, and over the largest of all, below which it is left out.
+_NEARBY, _LEAST_POWER = 1e-3, 1e-8
+# Power of a line over the largest of its block from which it counts for the range of the block.
+_STRONG = 0.1
+# Standard uncertainties beyond which a difference is not chance, and the largest share of blocks
+# near a frequency that may differ.
+_SIGNIFICANT, _MAY_DIFFER = 3.0, 0.1
+# Half the width of what is near a frequency [octaves].
+_NEAR_OCTAVES = 1 / 6
 
 
-def widest_valid_range(
-    band: Band, limits: ResponseLimits, shown: BoolArray | None = None
-) -> tuple[float, float]:
-    """Return the widest range [Hz], in octaves, in which the 95 % band keeps within ``limits``.
+@one_blas_thread()
+def identify_samples(
+    records: Sequence[SampledRecord],
+    period: float,
+    *,
+    hold: str = "zero-order",
+    order: int = 0,
+    max_delay: int = 3,
+) -> SampledModel:
+    """Return the one model by which the outputs of ``records`` follow their inputs.
 
-    shown: True where the data would show a response beyond the limits, (k,) at the frequencies of
-        the band; None for everywhere
-    Both ends are the lowest frequency of the band if there is no such range.
+    period: from sample to sample [s];  hold: of the inputs between samples, one of HOLDS
+    order: number of poles, 0 to choose it
+    max_delay: of a held input, whole samples to try; of a band-limited one the delay is free
+
+    Raises IdentificationError for records that determine no model, ConfigurationError for another
+    hold.
     """
-    inside = (COVERAGE_FACTOR * band.gain <= limits.gain) & (
-        COVERAGE_FACTOR * band.phase <= limits.phase
+    if hold not in HOLDS:
+        raise ConfigurationError("estimation.unknown_hold", hold=hold, known=HOLDS)
+    records = [replace(r, used=r.used & np.isfinite(r.output)) for r in records]
+    for record in records:
+        samples = int(np.sum(record.used))
+        if samples < LEAST_SAMPLES:
+            raise IdentificationError(
+                "estimation.short_record", samples=samples, least=LEAST_SAMPLES
+            )
+        check_inputs(record.inputs)
+        check_varies(record.output[record.used], "output")
+    choice = choose_sampled(records, hold, order=order, max_delay=max_delay)
+    sections = _sections(choice.chosen, period)
+    sections, factor = _inflated_to_free_choice(sections, choice, period)
+    blocks = _blocks(choice.chosen, period)
+    frequency = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
+    others = np.array(
+        [other.response(frequency * period) for other in choice.alternatives], np.complex128
+    ).reshape(-1, sections.inputs, _FREQUENCIES)
+    valid = [
+        valid_range(sections, blocks, frequency, input, others[:, input])
+        for input in range(sections.inputs)
+    ]
+    entries = _entries(choice, sections, valid)
+    first = records[0]
+    steady = stationary_output(sections, first.inputs, first.output, first.used)
+    return SampledModel(
+        sections=sections,
+        valid=valid,
+        working_point=(*np.mean(first.inputs, axis=0).tolist(), steady),
+        certificate=sampled_certificate(
+            order=choice.chosen.order,
+            free_order=choice.free.order,
+            widened=factor,
+            valid=valid,
+            worse=choice.worse,
+            entries=entries,
+        ),
     )
-    inside = inside if shown is None else inside & shown
+
+
+def _sections(candidate: SampledCandidate, period: float) -> ParallelSections:
+    fitted = candidate.fit
+    covariance = fitted.problem.covariance(fitted)
+    count = len(fitted.sections)
+    return fitted.model(period, in_seconds(covariance, fitted.problem.inputs, count, period))
+
+
+def _inflated_to_free_choice(
+    sections: ParallelSections, choice: SampledChoice, period: float
+) -> tuple[ParallelSections, float]:
+    """Return ``sections`` with uncertainties that include the free choice, and their factor."""
+    if choice.chosen is choice.free:
+        return sections, 1.0
+    free, factor = _sections(choice.free, period), 1.0
+    lines = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
+    with np.errstate(divide="ignore", invalid="ignore"):
+        apart = np.log(free.response(lines) / sections.response(lines))
+    for input in range(sections.inputs):
+        own, other = sections.band(lines, input), free.band(lines, input)
+        low, high = _widest(lines, _narrow(own))
+        trusted = (lines >= low) & (lines <= high) & np.isfinite(apart[input])
+        cut = [Band(b.frequency[trusted], b.gain[trusted], b.phase[trusted]) for b in (own, other)]
+        with np.errstate(divide="ignore"):
+            factor = max(factor, widening(cut[0], cut[1], apart[input][trusted]))
+    return replace(sections, covariance=factor**2 * np.asarray(sections.covariance)), factor
+
+
+def _narrow(band: Band) -> BoolArray:
+    limits = SAMPLED_LIMITS
+    gain, phase = COVERAGE_FACTOR * band.gain, COVERAGE_FACTOR * band.phase
+    return np.asarray((gain <= limits.gain) & (phase <= limits.phase))
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Neighbouring lines, and the response of the residual to each input there.
+
+    frequency: lowest and highest at which they have power [Hz]
+    difference, uncertainty: of the response from the model, relative to that, (m,)
+    """
+
+    frequency: tuple[float, float]
+    difference: FloatArray
+    uncertainty: FloatArray
+
+
+def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
+    """Return the differences of the responses of all records from the model, without a model."""
+    fitted = candidate.fit
+    model, start, found = fitted.model(), 0, []
+    for one in fitted.problem.spectra:
+        record = one.record
+        grid = np.zeros(len(record))
+        grid[one.places] = fitted.residual[start : start + len(one.places)]
+        start += len(one.places)
+        centred = record.inputs - np.mean(record.inputs, axis=0)
+        spectra = np.asarray(np.fft.rfft(centred, axis=0).T, np.complex128)
+        frequency = np.asarray(np.fft.rfftfreq(len(record)), np.float64)
+        driven = np.asarray(spectra * model.response(frequency))
+        power = np.sum(np.abs(spectra) ** 2, axis=0)
+        power[0] = 0.0
+        nearby = ndimage.maximum_filter1d(power, _LINES)
+        lines = np.flatnonzero((power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max()))
+        residual = np.asarray(np.fft.rfft(grid), np.complex128)
+        for part in _neighbours(lines, _LINES + _LINES_PER_INPUT * len(spectra)):
+            found.append(
+                _compared(frequency[part] / period, driven[:, part], residual[part], power[part])
+            )
+    return sorted(found, key=lambda block: block.frequency)
+
+
+def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
+    """Return ``lines`` in blocks of ``size``; none spans more than a ratio of frequencies."""
+    blocks, place = [], 0
+    while place < len(lines):
+        end = min(place + size, len(lines))
+        far = np.searchsorted(lines, _BLOCK_RATIO * lines[place] + size / 2)
+        end = max(min(end, int(far)), place + 1)
+        if 2 * (end - place) > size:
+            blocks.append(lines[place:end])
+        place = end
+    return blocks
+
+
+def _compared(
+    frequency: FloatArray, driven: ComplexArray, residual: ComplexArray, power: FloatArray
+) -> _Block:
+    """Fit the residual of one block by the responses ``driven`` (m, k) and a transient."""
+    place = np.linspace(-1.0, 1.0, len(residual))
+    columns = np.concatenate([driven, [np.ones(len(place)), place]]).T
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    inverse = np.linalg.pinv(columns / scale)
+    solved = inverse @ residual
+    left = residual - columns / scale @ solved
+    variance = float(np.sum(np.abs(left) ** 2)) / max(len(residual) - columns.shape[1], 1)
+    spread = np.sqrt(variance * np.sum(np.abs(inverse) ** 2, axis=1)) / scale
+    inputs = len(driven)
+    strong = frequency[power > _STRONG * np.max(power)]
+    ends = float(strong[0]), float(strong[-1])
+    return _Block(ends, np.abs(solved / scale)[:inputs], spread[:inputs])
+
+
+def valid_range(
+    sections: ParallelSections,
+    blocks: Sequence[_Block],
+    frequency: FloatArray,
+    input: int,
+    others: ComplexArray,
+) -> tuple[float, float]:
+    """Return the widest range [Hz], in octaves, that the data support for one input.
+
+    others: responses (a, k) of models that predict about as well; where they differ, the model is
+        not known unless the data show it
+    Both ends are the lowest of ``frequency`` if there is no such range.
+    """
+    if not blocks:
+        return float(frequency[0]), float(frequency[0])
+    lowest, highest = np.array([block.frequency for block in blocks]).T
+    difference = np.array([block.difference[input] for block in blocks])
+    spread = np.array([block.uncertainty[input] for block in blocks])
+    limit = min(SAMPLED_LIMITS.gain, SAMPLED_LIMITS.phase)
+    lines, near_ratio = frequency[:, np.newaxis], 2**_NEAR_OCTAVES
+    near = (lines >= lowest / near_ratio) & (lines <= highest * near_ratio)
+    count = np.maximum(np.sum(near, axis=1), 1)
+    off = (difference > limit) & (difference > _SIGNIFICANT * spread)
+    differs = near @ off / count > _MAY_DIFFER
+    agrees = near @ (difference + COVERAGE_FACTOR * spread <= limit) / count >= 1 - _MAY_DIFFER
+    with np.errstate(divide="ignore"):
+        shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / limit) ** 2
+    excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
+    own = sections.response(frequency)[input]
+    alike = np.all(np.abs(others - own) <= limit * np.abs(own), axis=0)
+    inside = (_narrow(sections.band(frequency, input)) & alike) | agrees
+    return _widest(frequency, inside & excited & ~differs)
+
+
+def _widest(frequency: FloatArray, inside: BoolArray) -> tuple[float, float]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
     if not len(edges):
-        return float(band.frequency[0]), float(band.frequency[0])
+        return float(frequency[0]), float(frequency[0])
     starts, stops = edges[::2], edges[1::2] - 1
-    octaves = np.log2(band.frequency[stops] / band.frequency[starts])
-    widest = int(np.argmax(octaves))
-    return float(band.frequency[starts[widest]]), float(band.frequency[stops[widest]])
+    widest = int(np.argmax(frequency[stops] / frequency[starts]))
+    return float(frequency[starts[widest]]), float(frequency[stops[widest]])
+
+
+def _entries(
+    choice: SampledChoice, sections: ParallelSections, valid: Sequence[tuple[float, float]]
+) -> dict[str, object]:
+    chosen = choice.chosen
+    problem, residual = chosen.fit.problem, chosen.fit.residual
+    outputs = [one.output for one in problem.spectra]
+    variance = float(np.mean(np.concatenate(outputs) ** 2)) or 1.0
+    drive = np.concatenate(
+        [
+            np.gradient(np.sum(r.record.inputs / np.std(r.record.inputs, axis=0), axis=1))[r.places]
+            for r in problem.spectra
+        ]
+    )
+    return {
+        "delay_samples": (sections.delays / sections.period).tolist(),
+        "residual_rms": float(np.sqrt(np.mean(residual**2))),
+        "explained": 1 - float(np.mean(residual**2)) / variance,
+        "predicted": 1 - float(np.mean(chosen.hidden)),
+        "last_part_by_order": {
+            str(order): float(share) if np.isfinite(share) else None
+            for order, share in zip(choice.orders, choice.by_order, strict=True)
+        },
+        "impulse_response": {"explained": choice.comparator, "model": choice.compared},
+        "whiteness_p": whiteness(residual),
+        "independence_p": independence(residual, drive),
+        "poles": _poles(sections, valid),
+        "continuous_error": _continuous_error(sections, valid[0]),
+        "samples": {
+            "received": sum(len(r) for r in problem.records),
+            "compared": len(residual),
+        },
+    }
+
+
+def _poles(
+    sections: ParallelSections, valid: Sequence[tuple[float, float]]
+) -> list[dict[str, float]]:
+    """Return frequency [Hz] and damping of each pole that the data resolve, else a bound."""
+    low, high = min(v[0] for v in valid), max(v[1] for v in valid)
+    found: list[dict[str, float]] = []
+    for pole in sections.poles():
+        frequency = float(abs(pole)) / (2 * np.pi)
+        if pole.imag < 0:
+            continue
+        if not frequency <= high:
+            found.append({"faster_than_hz": high})
+        elif frequency < low:
+            found.append({"slower_than_hz": low})
+        else:
+            damping = float(-pole.real / abs(pole))
+            found.append({"frequency_hz": frequency, "damping": damping})
+    return sorted(found, key=lambda entry: next(iter(entry.values())))
+
+
+def _continuous_error(sections: ParallelSections, valid: tuple[float, float]) -> float | None:
+    """Return the largest relative error of G(s) as polynomials in its valid range."""
+    equivalent = sections.equivalent()
+    if equivalent is None or not valid[1] > valid[0]:
+        return None
+    lines = np.geomspace(*valid, _FREQUENCIES)
+    with np.errstate(all="ignore"):
+        ratio = equivalent.transfer_function().response(lines) / equivalent.response(lines)[0]
+    error = float(np.max(np.abs(ratio - 1)))
+    return error if np.isfinite(error) else None
 
 
 def sampled_certificate(
@@ -101,21 +337,31 @@ def sampled_certificate(
     order: int,
     free_order: int,
     widened: float,
-    valid: tuple[float, float],
-    limits: ResponseLimits,
+    valid: Sequence[tuple[float, float]],
+    worse: bool,
     entries: Mapping[str, object],
 ) -> dict[str, object]:
     """Return JSON values, ending with ``reasons``, ``warnings`` and ``verdict``.
 
     order, free_order: number of poles of the model, and of the free choice
     widened: factor on its uncertainties, for an order that was asked for
-    valid: range [Hz] within ``limits``
-    entries: with "predicted", the share of the variance of held-out parts that free runs explain
+    valid: range [Hz] within the limits, for each input
+    worse: an impulse response predicts hidden samples better
+    entries: with "predicted", the share of the variance of hidden parts that free runs explain
     """
-    predicted = entries["predicted"]
+    predicted, limits = entries["predicted"], SAMPLED_LIMITS
     assert isinstance(predicted, float)
-    reasons = _reasons(predicted, valid, limits)
-    accepted = Notice("estimation.accepted", low=valid[0], high=valid[1])
+    reasons = []
+    if not predicted >= _LEAST_PREDICTED:
+        reasons.append(
+            Notice("estimation.poor_prediction", predicted=predicted, least=_LEAST_PREDICTED)
+        )
+    if worse:
+        reasons.append(_worse(entries["impulse_response"]))
+    if not all(high > low for low, high in valid):
+        reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
+    low, high = max(v[0] for v in valid), min(v[1] for v in valid)
+    accepted = Notice("estimation.accepted", low=low, high=high)
     return {
         "order": order,
         "free_order": free_order,
@@ -126,20 +372,18 @@ def sampled_certificate(
             "predicted_least": _LEAST_PREDICTED,
         },
         "warnings": _warnings(entries.get("independence_p"), order, free_order, widened),
-        "reasons": reasons,
+        "reasons": [str(reason) for reason in reasons],
         "verdict": REJECTED if reasons else str(accepted),
     }
 
 
-def _reasons(predicted: float, valid: tuple[float, float], limits: ResponseLimits) -> list[str]:
-    reasons = []
-    if not predicted >= _LEAST_PREDICTED:
-        reasons.append(
-            Notice("estimation.poor_prediction", predicted=predicted, least=_LEAST_PREDICTED)
-        )
-    if not valid[1] > valid[0]:
-        reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
-    return [str(reason) for reason in reasons]
+def _worse(shares: object) -> Notice:
+    assert isinstance(shares, Mapping)
+    return Notice(
+        "estimation.worse_than_impulse_response",
+        model=shares["model"],
+        comparator=shares["explained"],
+    )
 
 
 def _warnings(independent: object, order: int, free_order: int, widened: float) -> list[str]:
@@ -151,264 +395,3 @@ def _warnings(independent: object, order: int, free_order: int, widened: float) 
             Notice("estimation.order_differs", order=order, free=free_order, factor=widened)
         )
     return [str(warning) for warning in warnings]
-
-
-# Sampling period of a machine, to which time is scaled.
-_NOMINAL_PERIOD_S = 1e-3
-
-
-def band_limited(
-    input: FloatArray,
-    output: FloatArray,
-    used: BoolArray,
-    period: float,
-    order: int,
-    limits: ResponseLimits,
-) -> SampledModel:
-    """Return the model of a record whose input is smooth between samples.
-
-    Arguments as of :func:`~omsm_ros.core.identification.sampled_identification.identify_samples`.
-    """
-    prepared, model = model_from_start(_prepared(input, output, used), order=order)
-    known = response_uncertainty(prepared, model, limits)
-    free = model.free or model
-    if model.free is not None:
-        known = inflate_to_free_choice(known, prepared, model, free, limits)
-    best, problem, slower = model.chosen.fit, prepared.problem, period / _NOMINAL_PERIOD_S
-    lines = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / problem.period
-    low, high = widest_valid_range(response_band(best.dynamics, known.covariance, lines), limits)
-    high = max(min(high, known.excited_up_to), low)
-    dynamics, covariance = _slower(best.dynamics, known.covariance, best.gain, slower)
-    valid = (low / slower, high / slower)
-    return SampledModel(
-        hold=BAND_LIMITED,
-        sample_period=period,
-        discrete=None,
-        continuous=dynamics,
-        covariance=covariance,
-        valid_from=valid[0],
-        valid_up_to=valid[1],
-        working_point=(float(np.mean(input)), float(np.mean(output[used]))),
-        certificate=sampled_certificate(
-            order=best.structure.poles,
-            free_order=free.chosen.fit.structure.poles,
-            widened=known.widened,
-            valid=valid,
-            limits=limits,
-            entries=_entries_of_band_limited(prepared, best, output[used]),
-        ),
-    )
-
-
-def _entries_of_band_limited(
-    prepared: Prepared, best: Fit, output: FloatArray
-) -> dict[str, object]:
-    problem, variance = prepared.problem, float(np.var(output)) or 1.0
-    validation_rms = held_out_rms(problem, best, held_out(prepared.steps, len(problem.input)))
-    return {
-        "residual_rms": best.rms,
-        "explained": 1 - best.rms**2 / variance,
-        "predicted": 1 - validation_rms**2 / variance,
-        "whiteness_p": whiteness(best.residual),
-        "independence_p": independence(best.residual, np.gradient(problem.input)[problem.used]),
-        "samples": {"received": len(problem.input), "compared": best.samples},
-    }
-
-
-def _prepared(input: FloatArray, output: FloatArray, used: BoolArray) -> Prepared:
-    if int(np.sum(used)) < 2 * LEAST_SAMPLES or not np.all(np.isfinite(input)):
-        raise IdentificationError(
-            "estimation.short_record", samples=int(np.sum(used)), least=2 * LEAST_SAMPLES
-        )
-    samples = len(input)
-    moving = np.ones(samples, np.bool_)
-    faded = faded_to_stationary(input, moving, _NOMINAL_PERIOD_S)
-    used = used & (faded == input)
-    problem = Problem(
-        input=faded - np.mean(input),
-        output=np.where(used, output, 0.0) - np.mean(output[used]),
-        used=used,
-        period=_NOMINAL_PERIOD_S,
-        background=np.column_stack([np.ones(samples), np.linspace(-1.0, 1.0, samples)]),
-        rate=2 * np.pi * input_bandwidth(input, _NOMINAL_PERIOD_S),
-    )
-    steps = Steps((), moving, sample_noise(input), float(np.ptp(input)))
-    return Prepared(problem, steps, 0)
-
-
-def _slower(
-    dynamics: TransferFunction, covariance: FloatArray, gain: float, factor: float
-) -> tuple[TransferFunction, FloatArray]:
-    """Return the dynamics with ``gain``, in a time that runs ``factor`` times slower."""
-    up = factor ** np.arange(len(dynamics.numerator), dtype=np.float64)
-    down = factor ** np.arange(len(dynamics.denominator), dtype=np.float64)
-    slower = replace(
-        dynamics,
-        numerator=gain * dynamics.numerator * up,
-        denominator=dynamics.denominator * down,
-        delay=dynamics.delay * factor,
-    )
-    scale = np.concatenate([gain * up, down[1:], [factor]])
-    return slower, covariance * np.outer(scale, scale)
-
-
-HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
-# Frequencies over three decades: neighbours are 2 % apart.
-_FREQUENCIES = 400
-
-
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """The model of one candidate, on a grid of frequencies."""
-
-    discrete: Discrete
-    frequency: FloatArray
-    band: Band
-
-    @classmethod
-    def of(cls, candidate: SampledCandidate, delay: int, period: float) -> _Known:
-        problem = candidate.problem
-        numerator, denominator, jacobian = coefficients(candidate.fit)
-        every = parameter_covariance(
-            problem, problem.columns(candidate.fit), problem.residual(candidate.fit)
-        )
-        size = len(jacobian)
-        covariance = jacobian @ every[:size, :size] @ jacobian.T
-        discrete = Discrete(
-            numerator=numerator,
-            denominator=denominator,
-            delay=delay,
-            covariance=np.asarray(0.5 * (covariance + covariance.T)),
-        )
-        frequency = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
-        return cls(discrete, frequency, discrete.band(frequency, period))
-
-
-@one_blas_thread()
-def identify_samples(
-    input: FloatArray,
-    output: FloatArray,
-    period: float,
-    *,
-    hold: str = ZERO_ORDER,
-    order: int = 0,
-    max_delay: int = 3,
-    used: BoolArray | None = None,
-) -> SampledModel:
-    """Return the model by which ``output`` (n,) follows ``input`` (n,), sampled evenly.
-
-    period: from sample to sample [s]
-    hold: behaviour of the input between samples, one of HOLDS
-    order: number of poles, 0 to choose it
-    max_delay: of a held input, whole samples to try; of a band-limited one the delay is free
-    used: True where the output counts, None where it is finite
-
-    Raises IdentificationError for a record that determines no model, ConfigurationError for another
-    hold.
-    """
-    if hold not in HOLDS:
-        raise ConfigurationError("estimation.unknown_hold", hold=hold, known=HOLDS)
-    used = np.isfinite(output) if used is None else used & np.isfinite(output)
-    check_input(input)
-    check_varies(output[used], "output")
-    if hold == BAND_LIMITED:
-        return band_limited(input, output, used, period, order, SAMPLED_LIMITS)
-    return _held_input(input, output, used, period, hold, order, max_delay)
-
-
-def _held_input(
-    input: FloatArray,
-    output: FloatArray,
-    used: BoolArray,
-    period: float,
-    hold: str,
-    order: int,
-    max_delay: int,
-) -> SampledModel:
-    """Return the model of a record whose input is held between samples."""
-    choice = choose_sampled_long(input, output, used, period, order=order, max_delay=max_delay)
-    known = _Known.of(choice.chosen, choice.delay, period)
-    known, factor = _inflate_to_free_choice(known, choice, period)
-    low, high = widest_valid_range(known.band, SAMPLED_LIMITS, _shown(known, choice.chosen))
-    return SampledModel(
-        hold=hold,
-        sample_period=period,
-        discrete=known.discrete,
-        continuous=_continuous(known.discrete, period, hold),
-        covariance=None,
-        valid_from=low,
-        valid_up_to=high,
-        working_point=(
-            float(np.mean(input)),
-            stationary_output(known.discrete, input, output, used),
-        ),
-        certificate=sampled_certificate(
-            order=choice.chosen.order,
-            free_order=choice.free.order,
-            widened=factor,
-            valid=(low, high),
-            limits=SAMPLED_LIMITS,
-            entries=_entries(choice, output[used]),
-        ),
-    )
-
-
-def _shown(known: _Known, candidate: SampledCandidate) -> BoolArray:
-    """Return True between the frequencies at which an error of the response would show, (k,)."""
-    problem, samples = candidate.problem, len(candidate.problem.used)
-    discrete, taper = known.discrete, signal.windows.hann(samples)
-    driven = signal.lfilter(discrete.numerator, discrete.denominator, problem.input)
-    answer = np.asarray(np.fft.rfft(taper * driven), np.complex128)
-    share = float(np.mean(problem.used))
-    noise = noise_spectrum(problem.residual(candidate.fit), samples) * float(taper @ taper) / share
-    lines = np.asarray(np.fft.rfftfreq(samples, problem.period), np.float64)
-    found = is_detectable(known.frequency, lines, answer, noise, SAMPLED_LIMITS)
-    return np.asarray(np.logical_or.accumulate(found) & np.logical_or.accumulate(found[::-1])[::-1])
-
-
-def _inflate_to_free_choice(
-    known: _Known, choice: SampledChoice, period: float
-) -> tuple[_Known, float]:
-    """Return ``known`` with uncertainties that include the free choice, and their factor."""
-    if choice.chosen.order == choice.free.order:
-        return known, 1.0
-    free = _Known.of(choice.free, choice.delay, period)
-    ratio = free.discrete.response(known.frequency, period) / known.discrete.response(
-        known.frequency, period
-    )
-    low, high = widest_valid_range(known.band, SAMPLED_LIMITS)
-    trusted = (known.frequency >= low) & (known.frequency <= high)
-    cut = [
-        Band(b.frequency[trusted], b.gain[trusted], b.phase[trusted])
-        for b in (known.band, free.band)
-    ]
-    with np.errstate(divide="ignore"):
-        factor = widening(cut[0], cut[1], np.log(ratio[trusted]))
-    wider = replace(known.discrete, covariance=factor**2 * known.discrete.covariance)
-    return replace(known, discrete=wider, band=wider.band(known.frequency, period)), factor
-
-
-def _continuous(discrete: Discrete, period: float, hold: str) -> TransferFunction | None:
-    found = zero_order_hold_equivalent(discrete.numerator, discrete.denominator, period, hold)
-    return None if found is None else replace(found, delay=discrete.delay * period)
-
-
-def _entries(choice: SampledChoice, output: FloatArray) -> dict[str, object]:
-    chosen, problem = choice.chosen, choice.chosen.problem
-    residual, variance = problem.residual(chosen.fit), float(np.var(output)) or 1.0
-    drive = np.gradient(problem.input)[problem.used]
-    return {
-        "delay_samples": choice.delay,
-        "whitened": chosen.whitened,
-        "residual_rms": float(np.sqrt(np.mean(residual**2))),
-        "explained": 1 - float(np.mean(residual**2)) / variance,
-        "predicted": 1 - float(np.mean(chosen.held_out)) / variance,
-        "last_part_by_order": [_finite(1 - float(e) / variance) for e in choice.by_order],
-        "whiteness_p": whiteness(residual),
-        "independence_p": independence(residual, drive),
-        "samples": {"received": len(problem.used), "compared": int(np.sum(problem.used))},
-    }
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None

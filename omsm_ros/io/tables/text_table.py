@@ -7,7 +7,7 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -429,8 +429,12 @@ _ROWS = (
 )
 
 
-def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
+def load_columns(
+    path: Path | str, names: tuple[str, ...], may_miss: Collection[str] = ()
+) -> list[FloatArray]:
     """Read the columns ``names`` of a CSV file, each (n,) in the units of the file.
+
+    may_miss: columns whose missing readings are NaN in the result
 
     Raises FileError for a file without these columns, or with invalid numbers.
     """
@@ -453,10 +457,11 @@ def load_columns(path: Path | str, names: tuple[str, ...]) -> list[FloatArray]:
     if len(columns[0]) < 2:
         raise FileError(f"{table} has {len(columns[0])} lines of numbers; record more")
     for name, column in zip(names, columns, strict=True):
-        if np.any(gone := np.isnan(column)):
+        gone = np.isnan(column)
+        if name not in may_miss and np.any(gone):
             raise FileError(
                 f"{table}: {name} has no reading in {int(np.sum(gone))} of {len(gone)} rows, "
                 f"first in row {int(np.argmax(gone)) + 1}; cut the record there"
             )
-        SIGNAL.checked_all(column, FileError, f"{table}: {name}")
+        SIGNAL.checked_all(column[~gone], FileError, f"{table}: {name}")
     return columns

@@ -24,11 +24,8 @@ from omsm_ros.core.identification.fitted_record import (
 )
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
-    Band,
     FrequencyResponse,
-    response_band,
 )
-from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import quantity
 from omsm_ros.report import style
@@ -202,7 +199,7 @@ _SPAN_MODEL_FIGURES: dict[str, Any] = {
 def response(model: SampledModel) -> Figure:
     """Draw gain and phase to half the sampling rate with their 95 % band; grey: not trusted."""
     frequency = np.geomspace(_LOWEST_SHARE, 1.0, _LINES) * 0.5 / model.sample_period
-    value, band = response_of(model, frequency)
+    value, band = model.sections.response(frequency)[0], model.sections.band(frequency)
     made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
     gain, spread = np.abs(value), np.exp(COVERAGE_FACTOR * np.minimum(band.gain, 5.0))
@@ -215,37 +212,27 @@ def response(model: SampledModel) -> Figure:
     off = COVERAGE_FACTOR * np.minimum(band.phase, np.pi) / DEGREE_RAD
     lower.fill_between(frequency, phase - off, phase + off, **_SPAN_MODEL_FIGURES)
     lower.plot(frequency, phase, color=style.AFTER, linewidth=1.6)
+    low, high = model.valid[0]
     for axes_ in (upper, lower):
         style.logarithmic(axes_.xaxis, every=(1.0, 2.0, 5.0))
         axes_.set_xlim(frequency[0], frequency[-1])
-        for low, high in ((frequency[0], model.valid_from), (model.valid_up_to, frequency[-1])):
-            if high > low:
-                axes_.axvspan(low, high, color=style.MISSING, zorder=0)
+        for start, end in ((frequency[0], low), (high, frequency[-1])):
+            if end > start:
+                axes_.axvspan(start, end, color=style.MISSING, zorder=0)
     style.legend_above(upper)
     style.label(upper, y="gain [output/input]", title="Response")
     style.label(lower, x="frequency [Hz]", y="phase [deg]")
     return made
 
 
-def response_of(model: SampledModel, frequency: FloatArray) -> tuple[ComplexArray, Band]:
-    """Return the response of the model at ``frequency`` (k,) [Hz], and its band."""
-    if model.discrete is not None:
-        period = model.sample_period
-        return model.discrete.response(frequency, period), model.discrete.band(frequency, period)
-    assert model.continuous is not None  # a band-limited model has both
-    assert model.covariance is not None
-    return (
-        model.continuous.response(frequency),
-        response_band(model.continuous, model.covariance, frequency),
-    )
-
-
-def record(model: SampledModel, input: FloatArray, output: FloatArray, run: FreeRun) -> Figure:
-    """Draw the input, the output with the free run, and their difference over time."""
+def record(model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun) -> Figure:
+    """Draw the inputs, the output with the free run, and their difference over time."""
     made, axes = style.figure(7.4, 6.2, rows=3, sharex=True)
     given, both, left = axes[:, 0]
-    time = model.sample_period * np.arange(len(input))
-    _draw(given, time, input, style.MUTED, "input")
+    inputs = inputs.reshape(len(inputs), -1)
+    time = model.sample_period * np.arange(len(inputs))
+    for column in inputs.T:
+        _draw(given, time, column, style.MUTED, "input")
     _draw(both, time, output, style.BEFORE, "measured")
     _draw(both, time, run.output, style.AFTER, "free run")
     _draw(left, time, run.residual, style.AFTER, "")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.calibration.certificate import REJECTED
+from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
@@ -46,12 +47,12 @@ class ModelPage(IssuedPage):
 
 
 def model_figures_of(
-    model: SampledModel, input: FloatArray, output: FloatArray, run: FreeRun
+    model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
 ) -> dict[str, bytes]:
     """Return PNG files for the page."""
     made = {
         BAND: drawn.response(model),
-        RECORD: drawn.record(model, input, output, run),
+        RECORD: drawn.record(model, inputs, output, run),
         CORRELATION: drawn.correlation(run),
     }
     return {name: style.png(figure) for name, figure in made.items()}
@@ -99,7 +100,7 @@ def _headlines(page: ModelPage) -> list[Headline]:
         ),
         Headline(
             "Valid",
-            f"{quantity(model.valid_from, 'Hz')} to {quantity(model.valid_up_to, 'Hz')}",
+            "; ".join(" to ".join(quantity(end, "Hz") for end in ends) for ends in model.valid),
             f"half the sampling rate is {quantity(0.5 / model.sample_period, 'Hz')}",
         ),
         Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.hold}"),
@@ -125,31 +126,31 @@ def _sections(page: ModelPage) -> list[Section]:
 
 
 def _coefficient_tables(model: SampledModel) -> list[Table]:
-    found = []
-    if model.discrete is not None:
-        discrete = model.discrete
-        names = [f"b{k}" for k in range(len(discrete.numerator))]
-        names += [f"a{k}" for k in range(1, len(discrete.denominator))]
-        values = np.concatenate([discrete.numerator, discrete.denominator[1:]])
-        title = f"H(z), ascending powers of z⁻¹, delay of {discrete.delay} samples"
-        found.append(_coefficients(title, names, values, discrete.covariance))
-    if model.continuous is not None:
-        dynamics = model.continuous
-        names = [f"n{k}" for k in range(len(dynamics.numerator))]
-        names += [f"d{k}" for k in range(1, len(dynamics.denominator))] + ["delay [s]"]
-        values = np.concatenate([dynamics.numerator, dynamics.denominator[1:], [dynamics.delay]])
-        found.append(_coefficients("G(s), ascending powers of s", names, values, model.covariance))
-    return found
+    sections, count = model.sections, len(model.sections.denominators)
+    every, size = [], 1 + 2 * count
+    spread = np.full(sections.inputs * (size + 1) + 2 * count, np.nan)
+    if sections.covariance is not None:
+        spread = np.sqrt(np.diag(sections.covariance))
+    variable = "s" if model.hold == BAND_LIMITED else "w = (2/T)(z - 1)/(z + 1)"
+    for i in range(sections.inputs):
+        names = ["direct", *(f"b{p} of section {k}" for k in range(1, count + 1) for p in (0, 1))]
+        values = np.concatenate([sections.direct[i : i + 1], np.ravel(sections.numerators[i])])
+        title = (
+            f"Input {i + 1}, delay {quantity(sections.delays[i], 's')}: numerators in {variable}"
+        )
+        every.append(_coefficients(title, names, values, spread[i * size : (i + 1) * size]))
+    names = [f"d{p} of section {k}" for k in range(1, count + 1) for p in (1, 2)]
+    at = sections.inputs * size
+    values = np.ravel(sections.denominators)
+    return [
+        *every,
+        _coefficients(f"Denominators in {variable}", names, values, spread[at : at + 2 * count]),
+    ]
 
 
-def _coefficients(
-    title: str, names: list[str], values: FloatArray, covariance: FloatArray | None
-) -> Table:
-    spread = [NOTHING] * len(names)
-    if covariance is not None:
-        spread = [plain(float(u), 2) for u in np.sqrt(np.diag(covariance))]
+def _coefficients(title: str, names: list[str], values: FloatArray, spread: FloatArray) -> Table:
     rows = [
-        (name, plain(float(value), _ALL_DIGITS), u)
+        (name, plain(float(value), _ALL_DIGITS), plain(float(u), 2) if np.isfinite(u) else NOTHING)
         for name, value, u in zip(names, values, spread, strict=True)
     ]
     return Table(title, ("value", "standard uncertainty"), rows)
@@ -161,8 +162,8 @@ def _identity(page: ModelPage) -> Table:
         ("schema", SCHEMA),
         ("record", page.source or NOTHING),
         ("sample period", quantity(model.sample_period, "s", 4)),
-        ("working point, input", plain(model.working_point[0], 6)),
-        ("working point, output", plain(model.working_point[1], 6)),
+        ("working point, inputs", ", ".join(plain(x, 6) for x in model.working_point[:-1])),
+        ("working point, output", plain(model.working_point[-1], 6)),
         ("omsm_ros", page.version or NOTHING),
     ]
     return Table("Identity", (), known_rows(rows, 1))

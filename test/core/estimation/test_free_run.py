@@ -6,13 +6,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.estimation.sampled_model import (
-    BAND_LIMITED,
-    Discrete,
-    SampledModel,
-    free_run,
-    stationary_output,
-)
+from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, from_polynomials
+from omsm_ros.core.estimation.sampled_model import SampledModel, free_run, stationary_output
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import IdentificationError
 
@@ -20,29 +15,22 @@ PERIOD = 0.01
 TRUTH = TransferFunction.from_ascending([2.0, 0.05], [1.0, 0.05, 0.02])
 TIME = PERIOD * np.arange(2000)
 NOISE = 1e-3
+B, A, _ = signal.cont2discrete((TRUTH.numerator[::-1], TRUTH.denominator[::-1]), PERIOD)
+B = np.ravel(B)
 
 
 def held(delay=0):
-    b, a, _ = signal.cont2discrete((TRUTH.numerator[::-1], TRUTH.denominator[::-1]), PERIOD)
-    discrete = Discrete(
-        numerator=np.ravel(b), denominator=a, delay=delay, covariance=1e-12 * np.eye(5)
+    return model(from_polynomials("zero-order", PERIOD, B, A, delay * PERIOD))
+
+
+def smooth(truth=TRUTH):
+    return model(
+        from_polynomials(BAND_LIMITED, PERIOD, truth.numerator, truth.denominator, truth.delay)
     )
-    return model(discrete=discrete)
 
 
-def smooth():
-    return model(hold=BAND_LIMITED, continuous=TRUTH, covariance=1e-12 * np.eye(6))
-
-
-def model(**parts):
-    nothing = dict.fromkeys(("discrete", "continuous", "covariance"))
-    return SampledModel(
-        **{"hold": "zero-order", **nothing, **parts},
-        sample_period=PERIOD,
-        valid_from=0.01,
-        valid_up_to=10.0,
-        working_point=(4.0, 30.0),
-    )
+def model(sections):
+    return SampledModel(sections=sections, valid=[(0.01, 10.0)], working_point=(4.0, 30.0))
 
 
 def moving(lead=5.0):
@@ -67,17 +55,23 @@ def test_a_record_that_begins_in_motion_is_followed_to_the_noise():
 def test_a_held_input_with_its_delay(delay):
     rng = np.random.default_rng(2)
     u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
-    _, a = np.ravel(held().discrete.numerator), held().discrete.denominator
     late = np.concatenate([np.zeros(delay), u - 4.0])[:2000]
-    y = 30.0 + signal.lfilter(held().discrete.numerator, a, late)
+    y = 30.0 + signal.lfilter(B, A, late)
     assert free_run(held(delay), u, y).rms < 1e-9
     assert free_run(held(delay + 1), u, y).rms > 0.02
 
 
+def test_the_cut_of_a_held_record_does_not_matter():
+    """Cut from a longer record: the first samples answer to inputs that the cut has not."""
+    rng = np.random.default_rng(3)
+    u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
+    y = 30.0 + signal.lfilter(B, A, np.concatenate([np.zeros(7), u - 4.0])[:2000])
+    assert free_run(held(7), u[503:], y[503:]).rms < 1e-9
+
+
 def test_a_wrong_model_does_not_account_for_the_record():
     u, y = moving()
-    slower = replace(smooth(), continuous=TransferFunction.from_ascending([2.0], [1.0, 0.3]))
-    run = free_run(slower, u, y)
+    run = free_run(smooth(TransferFunction.from_ascending([2.0], [1.0, 0.3])), u, y)
     assert run.explained < 0.9
     assert run.rms**2 == pytest.approx((1 - run.explained) * np.var(y))
 
@@ -94,34 +88,48 @@ def test_what_does_not_count_changes_nothing():
     assert free_run(smooth(), u, np.where(used, y, np.nan)).rms == pytest.approx(run.rms)
 
 
-def test_the_output_that_rests_where_the_input_has_its_mean():
+def test_the_steady_output_at_the_mean_of_the_input():
     u, y = moving()
-    found = stationary_output(held().discrete, u, y, np.ones(2000, bool))
+    every = np.ones(2000, bool)
+    found = stationary_output(held().sections, u[:, None], y, every)
     assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 4.0), abs=2e-2)
+    step = np.where(np.arange(2000) < 400, 3.0, 5.0)
+    y = 30.0 + signal.lfilter(B, A, step - 3.0)
+    found = stationary_output(held().sections, step[:, None], y, every)
+    assert found == pytest.approx(30.0 + 2.0 * (np.mean(step) - 3.0), abs=1e-6)
+
+
+def test_a_constant_on_either_column_is_taken_up():
+    rng = np.random.default_rng(4)
+    u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
+    y = 30.0 + signal.lfilter(B, A, u - 4.0) + rng.normal(0, 0.01, 2000)
+    plain = free_run(held(), u, y)
+    for run in (free_run(held(), u, y + 7.0), free_run(held(), u - 2.0, y)):
+        np.testing.assert_allclose(run.residual, plain.residual, atol=1e-9)
+    assert plain.rms == pytest.approx(0.01, rel=0.05)
+
+
+def test_two_inputs_are_run_together():
+    one = from_polynomials("zero-order", 1.0, np.array([0.0, 0.3]), np.array([1.0, -0.7]), 0.0)
+    both = replace(
+        one,
+        numerators=np.concatenate([one.numerators, 2 * one.numerators]),
+        direct=np.concatenate([one.direct, 2 * one.direct]),
+        delays=np.array([0.0, 2.0]),
+    )
+    u = np.random.default_rng(5).normal(size=(600, 2))
+    y = signal.lfilter([0.0, 0.3], [1.0, -0.7], u[:, 0])
+    y += signal.lfilter([0.0, 0.0, 0.0, 0.6], [1.0, -0.7], u[:, 1])
+    two = SampledModel(sections=both, valid=[(0.01, 0.4)] * 2, working_point=(0.0, 0.0, 0.0))
+    assert free_run(two, u, y).rms < 1e-10
+    with pytest.raises(IdentificationError, match="1 inputs are given, the model has 2"):
+        free_run(two, u[:, 0], y)
 
 
 @pytest.mark.parametrize("samples", [0, 49])
 def test_too_short_a_record_is_refused(samples):
     with pytest.raises(IdentificationError, match="at least 50"):
         free_run(held(), np.zeros(samples), np.zeros(samples))
-
-
-def test_what_moved_within_the_delay_before_the_record_is_a_state_too():
-    """Cut from a longer record: the first samples answer to inputs that the cut has not."""
-    rng = np.random.default_rng(3)
-    u = 4.0 + np.repeat(rng.choice([-1.0, 1.0], 400), 5)
-    discrete = held().discrete
-    late = np.concatenate([np.zeros(7), u - 4.0])[:2000]
-    y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, late)
-    assert free_run(held(7), u[503:], y[503:]).rms < 1e-9
-
-
-def test_the_resting_output_of_a_single_step():
-    u = np.where(np.arange(2000) < 400, 3.0, 5.0)
-    discrete = held().discrete
-    y = 30.0 + signal.lfilter(discrete.numerator, discrete.denominator, u - 3.0)
-    found = stationary_output(discrete, u, y, np.ones(2000, bool))
-    assert found == pytest.approx(30.0 + 2.0 * (np.mean(u) - 3.0), abs=1e-6)
 
 
 def test_the_least_record_is_enough():
@@ -132,6 +140,9 @@ def test_the_least_record_is_enough():
 @pytest.mark.parametrize("still", ["input", "output"])
 def test_of_a_record_that_stands_still_nothing_is_accounted_for(still):
     """A constant output is matched to the last digit by any model and the constant fitted to it."""
-    columns = {"input": np.sin(TIME), "output": np.sin(TIME), still: np.ones(len(TIME))}
+    columns = {"inputs": np.sin(TIME), "output": np.sin(TIME)}
+    columns["inputs" if still == "input" else "output"] = np.ones(len(TIME))
     with pytest.raises(IdentificationError, match=f"the {still} changes by 0 in all"):
         free_run(held(), **columns)
+    with pytest.raises(IdentificationError, match="2 values that are not finite"):
+        free_run(held(), np.where(np.arange(2000) < 2, np.nan, TIME), np.sin(TIME))

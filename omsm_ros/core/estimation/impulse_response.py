@@ -1,0 +1,92 @@
+"""Impulse response without a model: regularised least squares, as a comparator for models.
+
+The prior is the TC kernel, c · α^max(i, j), of Chen, Ohlsson and Ljung (2012): an impulse response
+that is smooth and decays. Its parameters maximise the marginal likelihood (Pillonetto et al. 2014).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import linalg, signal
+
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+
+# Most taps of all inputs together: the eigenvalues of their matrix take half a second.
+_MOST_TAPS = 800
+# Samples of the record per tap, and the fewest taps.
+_SAMPLES_PER_TAP, _LEAST_TAPS = 4, 10
+# Decays over the taps, and ratios of the variances of noise and response, that are tried.
+_DECAYS, _RATIOS = (3.0, 10.0, 40.0), 10.0 ** np.arange(-8.0, 2.0)
+
+
+def impulse_response(inputs: FloatArray, output: FloatArray, used: BoolArray) -> FloatArray | None:
+    """Return the impulse responses (m, L) of ``inputs`` (n, m), to ``output`` (n,) where ``used``.
+
+    None where the record is too short. Missing samples of the output are interpolated.
+    """
+    samples, count = inputs.shape
+    taps = min(_MOST_TAPS // count, int(np.sum(used)) // (_SAMPLES_PER_TAP * count))
+    if taps < _LEAST_TAPS:
+        return None
+    index = np.arange(samples)
+    target = np.interp(index, index[used], output[used])[taps - 1 :]
+    target = target - np.mean(target)
+    gram, moment = _normal_equations(inputs, target, taps)
+    power, least, best = float(target @ target), np.inf, np.zeros(len(moment))
+    for decay in _DECAYS:
+        root = linalg.block_diag(*[_root_of_kernel(taps, decay)] * count)
+        values, directions = np.linalg.eigh(root.T @ gram @ root)
+        along, values = directions.T @ (root.T @ moment), np.maximum(values, 0.0)
+        unit = float(values[-1])
+        for ratio in _RATIOS * unit:
+            unexplained = power - float(np.sum(along**2 / (values + ratio)))
+            score = len(target) * np.log(max(unexplained, np.finfo(float).tiny))
+            score += float(np.sum(np.log1p(values / ratio)))
+            if score < least:
+                least, best = score, root @ (directions @ (along / (values + ratio)))
+    return best.reshape(count, taps)
+
+
+def convolved(taps: FloatArray, inputs: FloatArray) -> FloatArray:
+    """Return the output (n,) of impulse responses (m, L) for ``inputs`` (n, m), 0 before."""
+    parts = [
+        signal.fftconvolve(drive, response)[: len(drive)]
+        for drive, response in zip(inputs.T, taps, strict=True)
+    ]
+    return np.asarray(np.sum(parts, axis=0), np.float64)
+
+
+def _root_of_kernel(taps: int, decay: float) -> FloatArray:
+    """Return a root R of the TC kernel, K = R Rᵀ: sums of steps that decay by e^-decay."""
+    kernel = np.exp(-decay * np.arange(taps + 1) / taps)
+    return np.asarray(np.triu(np.ones((taps, taps))) * np.sqrt(kernel[:-1] - kernel[1:]))
+
+
+def _normal_equations(
+    inputs: FloatArray, target: FloatArray, taps: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Gram matrix (mL, mL) of the delayed inputs, without means, and their moments."""
+    samples, count = len(target), inputs.shape[1]
+    gram = np.empty((count, taps, count, taps))
+    moment = np.empty((count, taps))
+    means = np.empty((count, taps))
+    for i, first in enumerate(inputs.T):
+        moment[i] = signal.correlate(first, target, "valid", "fft")[::-1]
+        means[i] = signal.correlate(first, np.ones(samples), "valid", "fft")[::-1] / samples
+        for j, second in enumerate(inputs.T):
+            gram[i, :, j] = _cross_gram(first, second, samples, taps)
+    centred = np.ravel(means)
+    found = gram.reshape(count * taps, -1) - samples * np.outer(centred, centred)
+    return found, np.ravel(moment)
+
+
+def _cross_gram(first: FloatArray, second: FloatArray, samples: int, taps: int) -> FloatArray:
+    """Return Σ_k first[k - i] second[k - j] (L, L), by its first row and column and a recursion."""
+    found = np.empty((taps, taps))
+    found[0] = signal.correlate(second, first[-samples:], "valid", "fft")[::-1]
+    found[:, 0] = signal.correlate(first, second[-samples:], "valid", "fft")[::-1]
+    before, last = taps - 2 - np.arange(taps - 1), len(first) - 1 - np.arange(taps - 1)
+    for i in range(1, taps):
+        found[i, 1:] = found[i - 1, :-1] + first[taps - 1 - i] * second[before]
+        found[i, 1:] -= first[len(first) - i] * second[last]
+    return found

@@ -1,0 +1,374 @@
+"""Responses of one output to several inputs, as a sum of sections of first and second order.
+
+``H_j = exp(-s τ_j) (direct_j + Σ_i (b0_ji + b1_ji w)/(1 + d1_i w + d2_i w²))``: the inputs j share
+the poles. For a band-limited input w = s. For an input that is held between samples
+``w = (2/T)(z - 1)/(z + 1)``, so H is rational in z, and a pole is stable in w where it is in z.
+A product of 40 poles has no accurate coefficients; a sum of sections has.
+
+The G(s) of a held H(z): each pole p of H is exp(sT) of a pole of G, and its residue follows in
+closed form. With a zero-order hold ``x' = s x + u`` gives ``x[k+1] = p x[k] + h u[k]``,
+h = (p - 1)/s; with a first-order hold ``x[k+1] = p x[k] + h0 u[k] + h1 u[k+1]``,
+h1 = (h/T - 1)/s, h0 = h - h1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.polynomial import polynomial
+from scipy import fft, signal
+
+from omsm_ros.core.estimation.output_error import close_period
+from omsm_ros.core.lti.frequency_response import Band
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    import control
+
+BAND_LIMITED, ZERO_ORDER, FIRST_ORDER = "band-limited", "zero-order", "first-order"
+HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
+# Sampling period for which the durations of ``close_period`` are made.
+_NOMINAL_PERIOD_S = 1e-3
+# The variable w at half the sampling rate of a held input, in rad/sample: infinite, here large.
+_INFINITE = 1e7
+# A pole nearer to z = 0 or to the negative axis has no equivalent in s.
+_NO_EQUIVALENT = 1e-6
+# Residues of poles nearer to each other than this are lost in rounding.
+_APART = 1e-9
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ParallelSections:
+    """The sections of all inputs.
+
+    hold: one of HOLDS;  period: [s]
+    denominators: (k, 2), d1 [s] > 0 and d2 [s²], 0 for a single pole
+    numerators: (m, k, 2), b0 and b1 [s];  direct: (m,);  delays: (m,) [s]
+    covariance: (p, p), order direct and numerators of each input, denominators, delays; or None
+    """
+
+    hold: str
+    period: float
+    denominators: FloatArray
+    numerators: FloatArray
+    direct: FloatArray
+    delays: FloatArray
+    covariance: FloatArray | None = None
+
+    @property
+    def order(self) -> int:
+        """Return the number of poles."""
+        return int(np.count_nonzero(self.denominators))
+
+    @property
+    def inputs(self) -> int:
+        """Return the number of inputs."""
+        return len(self.direct)
+
+    @property
+    def is_stable(self) -> bool:
+        """Return True if every section is stable, by the signs of its coefficients."""
+        return bool(np.all(self.denominators[:, 0] > 0) and np.all(self.denominators >= 0))
+
+    def variable(self, frequency: FloatArray) -> ComplexArray:
+        """Return w at ``frequency`` (f,) [Hz]."""
+        cycles = np.asarray(frequency, np.float64) * self.period
+        return np.asarray(variable(self.hold, cycles) / self.period)
+
+    def response(self, frequency: FloatArray) -> ComplexArray:
+        """Return H of each input at ``frequency`` (f,) [Hz], (m, f)."""
+        w, every = self.variable(frequency), []
+        basis = self._basis(w)
+        for direct, up, delay in zip(self.direct, self.numerators, self.delays, strict=True):
+            value = direct + np.sum((up[:, :1] + up[:, 1:] * w) * basis, axis=0)
+            every.append(value * np.exp(-2j * np.pi * np.asarray(frequency) * delay))
+        return np.asarray(every, np.complex128)
+
+    def _basis(self, w: ComplexArray) -> ComplexArray:
+        d1, d2 = self.denominators.T[:, :, np.newaxis]
+        return np.asarray(1 / (1 + d1 * w + d2 * w * w), np.complex128)
+
+    def band(self, frequency: FloatArray, input: int = 0) -> Band:
+        """Return the standard uncertainty of gain and phase of one input at ``frequency`` [Hz]."""
+        frequency = np.asarray(frequency, np.float64)
+        if self.covariance is None:
+            return Band(frequency, np.full(len(frequency), np.inf), np.full(len(frequency), np.inf))
+        w, omega = self.variable(frequency), 2 * np.pi * frequency
+        late, basis = np.exp(-1j * omega * self.delays[input]), self._basis(w)
+        up = self.numerators[input]
+        part = (up[:, :1] + up[:, 1:] * w) * basis
+        value = self.response(frequency)[input]
+        size = len(self.denominators)
+        jacobian = np.zeros((self.inputs, 1 + 2 * size, len(w)), np.complex128)
+        jacobian[input, 0] = late
+        jacobian[input, 1::2], jacobian[input, 2::2] = late * basis, late * basis * w
+        poles = np.stack([-late * part * basis * w, -late * part * basis * w * w], axis=1)
+        delays = np.zeros((self.inputs, len(w)), np.complex128)
+        delays[input] = -1j * omega * value
+        every = np.concatenate(
+            [jacobian.reshape(-1, len(w)), poles.reshape(-1, len(w)), delays]
+        ) / np.where(value == 0, np.finfo(float).tiny, value)
+        gain, phase = (
+            np.sqrt(np.maximum(np.einsum("pk,pq,qk->k", j, self.covariance, j), 0.0))
+            for j in (every.real, every.imag)
+        )
+        return Band(frequency, gain, phase)
+
+    def roots(self) -> ComplexArray:
+        """Return the poles in w [1/s], (n,), conjugates included."""
+        found = [_roots(d1, d2) for d1, d2 in self.denominators]
+        return np.asarray(np.concatenate([np.empty(0), *found]), np.complex128)
+
+    def poles(self) -> ComplexArray:
+        """Return the poles in s [rad/s], (n,); of a held input log z / T."""
+        if self.hold == BAND_LIMITED:
+            return self.roots()
+        return np.asarray(np.log(self._in_z()) / self.period, np.complex128)
+
+    def _in_z(self) -> ComplexArray:
+        half = 0.5 * self.period * self.roots()
+        return np.asarray((1 + half) / (1 - half), np.complex128)
+
+    def driven(self, inputs: FloatArray) -> FloatArray:
+        """Return the output (n,) for ``inputs`` (n, m), as if they repeated for ever.
+
+        The difference from another past is a sum of :meth:`decays`.
+        """
+        closed = closed_inputs(inputs, self.hold)
+        frequency = fft.rfftfreq(closed.shape[1], self.period)
+        spectrum = np.sum(self.response(frequency) * fft.rfft(closed), axis=0)
+        return np.asarray(fft.irfft(spectrum, closed.shape[1])[: len(inputs)])
+
+    def decays(self, samples: int) -> FloatArray:
+        """Return the responses (states, samples) to any past and to the first samples."""
+        late = int(np.ceil(np.max(self.delays, initial=0.0) / self.period - 1e-6))
+        pulses = np.eye(min(late + (self.hold != BAND_LIMITED), samples), samples)
+        rows = [row for down in self._recursions() for row in decays_of(down, samples, late=late)]
+        return np.asarray(np.concatenate([np.reshape(rows, (-1, samples)), pulses]))
+
+    def _recursions(self) -> list[FloatArray]:
+        return [recursion(d1, d2, self.hold, self.period) for d1, d2 in self.denominators]
+
+    def equivalent(self) -> ParallelSections | None:
+        """Return G(s) of which this is the sampled form; None where there is no such G.
+
+        A pole at z ≤ 0 has none, nor have two poles of one section that agree.
+        """
+        if self.hold == BAND_LIMITED:
+            return self
+        direct, sections, ups = self.direct.copy(), [], []
+        for (d1, d2), up in zip(self.denominators, np.moveaxis(self.numerators, 1, 0), strict=True):
+            w = _roots(d1, d2)
+            z = (1 + 0.5 * self.period * w) / (1 - 0.5 * self.period * w)
+            apart = np.abs(z[0] - z[-1]) > _APART or len(z) == 1
+            off = np.abs(z.imag) > _NO_EQUIVALENT
+            if not apart or np.any(~off & (z.real <= _NO_EQUIVALENT)) or np.any(abs(z - 1) < 1e-12):
+                return None
+            there, poles, residues = self._residues(w, z, up, d1, d2)
+            direct = direct + there
+            sections.append(_polynomial_of(poles))
+            ups.append([_numerator_of(poles, each) for each in residues])
+        return replace(
+            self,
+            hold=BAND_LIMITED,
+            direct=direct,
+            denominators=np.reshape(sections, (-1, 2)),
+            numerators=np.moveaxis(np.reshape(ups, (-1, self.inputs, 2)), 0, 1),
+            covariance=None,
+        )
+
+    def _residues(
+        self, w: ComplexArray, z: ComplexArray, up: FloatArray, d1: float, d2: float
+    ) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+        """Return what a section adds to the direct terms (m,), its poles (1 or 2,) and residues."""
+        slope = d1 + 2 * d2 * w
+        factor = (up[:, :1] + up[:, 1:] * w) / slope / (2 / self.period - w)
+        direct, residues = np.sum(factor, axis=1).real, factor * (1 + z)
+        s = np.asarray(np.log(z.astype(np.complex128)) / self.period, np.complex128)
+        held = (z - 1) / s
+        if self.hold == ZERO_ORDER:
+            return np.asarray(direct), s, np.asarray(residues / held, np.complex128)
+        now = (held / self.period - 1) / s
+        scaled = np.asarray(residues / (held - now + z * now), np.complex128)
+        return np.asarray(direct - np.sum(scaled * now, axis=1).real), s, scaled
+
+    def transfer_function(self, input: int = 0) -> TransferFunction:
+        """Return one response of a band-limited model as a ratio of two polynomials in s.
+
+        Its coefficients lose digits with every pole: see ``continuous_error`` in the certificate.
+        """
+        factors = [np.trim_zeros(np.array([1.0, *d]), "b") for d in self.denominators]
+        down = _product(factors)
+        up = self.direct[input] * down
+        for place, section in enumerate(self.numerators[input]):
+            others = _product(factors[:place] + factors[place + 1 :])
+            up = polynomial.polyadd(up, polynomial.polymul(np.trim_zeros(section, "b"), others))
+        up = np.trim_zeros(up, "b")
+        return TransferFunction(up if len(up) else np.zeros(1), down, float(self.delays[input]))
+
+    def to_control(self, delay_order: int = 3) -> control.StateSpace:
+        """Return the model for python-control: sampled for a held input, else continuous.
+
+        A delay of a continuous one becomes a Padé approximant of ``delay_order``. Raises
+        ConfigurationError for a delay_order that is not positive.
+        """
+        import control  # imported here, because it takes a second to load
+
+        if delay_order < 1:
+            raise ConfigurationError("lti.delay_order", order=delay_order)
+        step = 0 if self.hold == BAND_LIMITED else self.period
+        columns = [self._column(input, step) for input in range(self.inputs)]
+        late = [self._delay(delay, step, delay_order) for delay in self.delays]
+        joined = control.append(*(c * d for c, d in zip(columns, late, strict=True)))
+        nothing = np.zeros((0, 0))
+        total = np.ones((1, self.inputs))
+        return (
+            control.ss(nothing, np.zeros((0, self.inputs)), np.zeros((1, 0)), total, step) * joined
+        )
+
+    def _column(self, input: int, step: float) -> control.StateSpace:
+        """Return the state space of one input, without its delay: blocks of one or two states."""
+        import control
+
+        size, place = self.order, 0
+        a, b, c = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((1, size))
+        for (d1, d2), (b0, b1) in zip(self.denominators, self.numerators[input], strict=True):
+            states = 2 if d2 > 0 else 1
+            part = slice(place, place + states)
+            # The second state is the rate of the first over that of the pair, so both are alike.
+            rate = d2**-0.5 if d2 > 0 else 1 / d1
+            a[part, part] = [[0.0, rate], [-rate, -d1 * rate**2]] if d2 > 0 else [[-rate]]
+            b[part.stop - 1, 0] = rate
+            c[0, part] = [b0, b1 * rate][:states]
+            place = part.stop
+        d = np.full((1, 1), self.direct[input])
+        if not step:
+            return control.ss(a, b, c, d)
+        # The bilinear transform is exact, because w is one.
+        return control.ss(*signal.cont2discrete((a, b, c, d), step, "bilinear")[:4], step)
+
+    @staticmethod
+    def _delay(delay: float, step: float, order: int) -> control.StateSpace:
+        import control
+
+        samples = round(delay / step) if step else 0
+        if not step and delay:
+            # Made for a second and scaled: the polynomials of a short delay have no digits.
+            unit = control.ss(control.tf(*control.pade(1.0, order)))
+            return control.ss(unit.A / delay, unit.B / delay, unit.C, unit.D)
+        first, last = np.eye(samples, 1), np.eye(1, samples, k=max(samples - 1, 0))
+        return control.ss(np.eye(samples, k=-1), first, last, [[float(samples == 0)]], step)
+
+
+def variable(hold: str, frequency: FloatArray) -> ComplexArray:
+    """Return w [rad/sample] at ``frequency`` (f,) in cycles a sample."""
+    if hold == BAND_LIMITED:
+        return np.asarray(2j * np.pi * frequency, np.complex128)
+    with np.errstate(over="ignore"):
+        return np.asarray(2j * np.clip(np.tan(np.pi * frequency), None, _INFINITE), np.complex128)
+
+
+def closed_inputs(inputs: FloatArray, hold: str) -> FloatArray:
+    """Return ``inputs`` (n, m) as rows of a period, (m, N); smooth ones with a bridge."""
+    if hold != BAND_LIMITED:
+        return np.ascontiguousarray(inputs.T)
+    return np.array([close_period(column, _NOMINAL_PERIOD_S) for column in inputs.T])
+
+
+def recursion(d1: float, d2: float, hold: str, period: float) -> FloatArray:
+    """Return the denominator in z⁻¹ (2 or 3,) of the section 1 + d1 w + d2 w², its first 1."""
+    if hold == BAND_LIMITED and d2 > 0:
+        mean, apart = np.exp(-0.5 * d1 / d2 * period), d1 * d1 - 4 * d2
+        turn = 0.5 * np.sqrt(abs(apart)) / d2 * period
+        if apart < 0:
+            return np.array([1.0, -2 * mean * np.cos(turn), mean**2])
+        ends = np.exp((-0.5 * d1 / d2) * period + np.array([turn, -turn]))
+        return np.array([1.0, -float(np.sum(ends)), mean**2])
+    if hold == BAND_LIMITED:
+        return np.array([1.0, -np.exp(-period / d1)])
+    first, second = 2 * d1 / period, 4 * d2 / period**2
+    if d2 > 0:
+        found = np.array([1 + first + second, 2 * (1 - second), 1 - first + second])
+    else:
+        found = np.array([1 + first, 1 - first])
+    return np.asarray(found / found[0])
+
+
+def _roots(d1: float, d2: float) -> ComplexArray:
+    """Return the roots (1 or 2,) of 1 + d1 w + d2 w², the smaller one without cancellation."""
+    if d2 == 0:
+        return np.array([-1 / d1 + 0j])
+    apart = np.sqrt(complex(d1 * d1 - 4 * d2))
+    far = -0.5 * (d1 + apart) / d2
+    return np.array([far, 1 / (d2 * far)])
+
+
+def decays_of(down: FloatArray, samples: int, late: int = 0) -> list[FloatArray]:
+    """Return the free responses (samples,) of one recursion, from sample ``late`` on."""
+    pulse = np.zeros(samples)
+    pulse[min(late, samples - 1)] = 1.0
+    first = np.asarray(signal.lfilter([1.0], down, pulse))
+    return [first, np.concatenate([[0.0], first[:-1]])][: len(down) - 1]
+
+
+def _polynomial_of(poles: ComplexArray) -> list[float]:
+    if len(poles) == 1:
+        return [float((-1 / poles[0]).real), 0.0]
+    product = poles[0] * poles[1]
+    return [float((-(poles[0] + poles[1]) / product).real), float((1 / product).real)]
+
+
+def _numerator_of(poles: ComplexArray, residues: ComplexArray) -> list[float]:
+    """Return b0, b1 of Σ r/(s - p) over the denominator of :func:`_polynomial_of`."""
+    if len(poles) == 1:
+        return [float((-residues[0] / poles[0]).real), 0.0]
+    product = poles[0] * poles[1]
+    b0 = -(residues[0] * poles[1] + residues[1] * poles[0]) / product
+    return [float(b0.real), float((np.sum(residues) / product).real)]
+
+
+def _product(factors: list[FloatArray]) -> FloatArray:
+    found: FloatArray = np.ones(1)
+    for factor in factors:
+        found = np.asarray(polynomial.polymul(found, factor), np.float64)
+    return found
+
+
+def from_polynomials(
+    hold: str, period: float, numerator: FloatArray, denominator: FloatArray, delay: float
+) -> ParallelSections:
+    """Return the sections of one ratio of polynomials, ascending in s, or in z⁻¹ of a held input.
+
+    The poles must differ from each other and be stable; else the numbers have no meaning.
+    """
+    roots = np.roots(denominator[::-1] if hold == BAND_LIMITED else denominator)
+    if hold != BAND_LIMITED:
+        roots = np.asarray(2 / period * (roots - 1) / (roots + 1))
+    upper, real = roots[roots.imag > 0], list(roots[roots.imag == 0].real)
+    sections = [_polynomial_of(np.array([p, p.conjugate()])) for p in upper]
+    sections += [[-1 / p, 0.0] for p in real]
+    down = np.reshape(sections, (-1, 2))
+    lines = np.linspace(0.003, 0.47, 40 * (len(roots) + 1)) / period
+    if hold == BAND_LIMITED:
+        s = 2j * np.pi * lines
+        value = polynomial.polyval(s, numerator) / polynomial.polyval(s, denominator)
+    else:
+        q = np.exp(-2j * np.pi * lines * period)
+        value = polynomial.polyval(q, numerator) / polynomial.polyval(q, denominator)
+    w = variable(hold, lines * period) / period
+    basis = 1 / (1 + down[:, :1] * w + down[:, 1:] * w * w)
+    columns = [np.ones(len(w))]
+    for each, (_, d2) in zip(basis, down, strict=True):
+        columns += [each, each * w * (d2 > 0)]
+    matrix, scale = np.array(columns).T, np.abs(np.array(columns)).max(axis=1)
+    scale[scale == 0] = 1.0
+    both = np.concatenate([matrix.real, matrix.imag]) / scale
+    found = np.linalg.lstsq(both, np.concatenate([value.real, value.imag]), rcond=None)[0] / scale
+    return ParallelSections(
+        hold=hold, period=period, denominators=down, numerators=found[1:].reshape(1, -1, 2),
+        direct=found[:1], delays=np.array([delay]),
+    )  # fmt: skip
