@@ -42,14 +42,15 @@ def test_a_table_gives_a_model_that_runs_freely(capsys, table, tmp_path):
     assert facts["verdict"].startswith("accepted from")
     assert facts["predicted"] > 0.98
     model = json.loads(out.read_text())
-    assert model["schema"] == "omsm-model/1"
-    discrete = model["discrete"]
+    assert model["schema"] == "omsm-model/2"
+    # Each section in z, by the bilinear transform of its polynomials in w.
     u, y = np.loadtxt(table, delimiter=",", skiprows=1).T
-    late = np.concatenate([np.zeros(discrete["delay_samples"]), u])[:600]
-    free = signal.lfilter(discrete["numerator"], discrete["denominator"], late)
+    late = np.concatenate([np.zeros(round(model["delays"][0] / 0.1)), u])[:600]
+    free = model["direct"][0] * late
+    for up, down in zip(model["numerators"][0], model["denominators"], strict=True):
+        free = free + signal.lfilter(*signal.bilinear(up[::-1], [*down[::-1], 1.0], 10.0), late)
     assert np.std((free - y)[100:] - np.mean((free - y)[100:])) < 0.015
-    size = len(discrete["numerator"]) + len(discrete["denominator"]) - 1
-    assert len(discrete["covariance"]) == size**2
+    assert len(model["covariance"]) == (2 + 4 * len(model["denominators"])) ** 2
 
 
 def test_an_order_and_people(capsys, table, tmp_path):
@@ -97,8 +98,33 @@ def test_the_default_hold_of_a_table_is_band_limited(capsys, table, tmp_path):
     (path,) = tmp_path.iterdir()
     model = json.loads(path.read_text())
     assert model["hold"] == "band-limited"
-    assert model["discrete"] is None
-    assert model["continuous"]["covariance"]
+    assert model["covariance"]
+
+
+def test_two_inputs_of_two_records_give_one_model(capsys, tmp_path):
+    rng, paths = np.random.default_rng(5), [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for path in paths:
+        u = np.repeat(rng.normal(size=(150, 2)), 4, axis=0)
+        y = signal.lfilter(B, A, u[:, 0]) + signal.lfilter([0, 0.5], [1, -0.8], u[:, 1])
+        rows = [f"{a},{b},{c}" for (a, b), c in zip(u, y + rng.normal(0, 0.01, 600), strict=True)]
+        rows[300] = rows[300].rsplit(",", 1)[0] + ",nan"
+        path.write_text("\n".join(["x,c,probe", *rows]))
+    columns = ("--input", "x,c", "--output", "probe")
+    options = (*columns, "--period", 0.1, "--hold", "zero-order", "--out", tmp_path / "m.json")
+    status, said = run(capsys, *paths, *options, "--json")
+    assert status == 0, said.err
+    facts = json.loads(said.out)
+    assert facts["samples"] == {"received": 1200, "compared": 1196}
+    assert len(facts["valid"]) == 2
+    words = ("validate", tmp_path / "m.json", paths[1], *columns, "--json")
+    assert cli.main([str(w) for w in words]) == 0
+    assert json.loads(capsys.readouterr().out)["residual_rms"] == pytest.approx(0.01, rel=0.1)
+
+
+def test_several_bags_are_refused(capsys, tmp_path):
+    status, said = run(capsys, tmp_path / "a", tmp_path / "b", "--out", tmp_path / "m.json")
+    assert status == 2
+    assert "2 bags are given" in said.err
 
 
 def test_duration_cuts_the_table(capsys, table, tmp_path):
@@ -118,7 +144,7 @@ def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test,
     (path,) = tmp_path.glob("model*.json")
     model = json.loads(path.read_text())
     # The distance decreases when Z increases.
-    gain = sum(model["discrete"]["numerator"]) / sum(model["discrete"]["denominator"])
+    gain = model["direct"][0] + sum(b0 for b0, _ in model["numerators"][0])
     assert gain == pytest.approx(-1.0, abs=0.02)
 
 

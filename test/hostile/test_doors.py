@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from hypothesis import strategies as st
 
 from omsm_ros import cli
 from omsm_ros.core.calibration.calibration_set import calibration_set
-from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel
+from omsm_ros.core.estimation.parallel_sections import from_polynomials
+from omsm_ros.core.estimation.sampled_model import SampledModel
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.io.bag_writer import BagWriter
@@ -33,18 +35,13 @@ from omsm_ros.pipelines.identify import save_model
 from omsm_ros.twin.cell import blocks_of
 
 MODEL = SampledModel(
-    hold="zero-order",
-    sample_period=1e-3,
-    discrete=Discrete(
-        numerator=np.array([0.0, 0.3, 0.1]),
-        denominator=np.array([1.0, -1.2, 0.5]),
-        delay=1,
-        covariance=1e-6 * np.eye(5),
+    sections=replace(
+        from_polynomials(
+            "zero-order", 1e-3, np.array([0.0, 0.3, 0.1]), np.array([1.0, -1.2, 0.5]), 1e-3
+        ),
+        covariance=1e-6 * np.eye(6),
     ),
-    continuous=TransferFunction.from_ascending([1.3, 1e-4], [1.0, 2e-3, 1e-6]),
-    covariance=None,
-    valid_from=1.0,
-    valid_up_to=100.0,
+    valid=[(1.0, 100.0)],
     working_point=(0.0, 0.0),
     certificate={"verdict": "accepted"},
 )

@@ -1,52 +1,98 @@
 """A model comes back as it went, and nothing else is taken for one."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.estimation.parallel_sections import from_polynomials
+from omsm_ros.core.estimation.sampled_model import SampledModel
 from omsm_ros.errors import CalibrationError
 from omsm_ros.pipelines.identify import load_model, save_model
 
 LINES = np.array([0.1, 1.0, 4.0])
-DISCRETE = Discrete(
-    numerator=np.array([0.0, 0.3, 0.1]),
-    denominator=np.array([1.0, -1.2, 0.5]),
-    delay=2,
-    covariance=np.diag([1e-6, 2e-6, 3e-6, 4e-6, 5e-6]),
-)
-CONTINUOUS = TransferFunction.from_ascending([1.3, 0.02], [1.0, 0.16, 0.02], 0.05)
+B, A = np.array([0.0, 0.3, 0.1]), np.array([1.0, -1.2, 0.5])
+N, D = np.array([1.3, 0.02]), np.array([1.0, 0.16, 0.02])
 
 
 def held(**changes):
     parts = {
-        "hold": "zero-order",
-        "sample_period": 0.1,
-        "discrete": DISCRETE,
-        "continuous": CONTINUOUS,
-        "covariance": None,
-        "valid_from": 0.01,
-        "valid_up_to": 4.0,
-        "working_point": (4.0, 30.0),
+        "sections": replace(
+            from_polynomials("zero-order", 0.1, B, A, 0.2),
+            covariance=np.diag([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 0.0]),
+        ),
+        "valid": [(0.01, 4.0)],
+        "working_point": [4.0, 30.0],
         "certificate": {"verdict": "accepted from 0.01 Hz to 4 Hz", "order": 2},
     }
     return SampledModel(**(parts | changes))
 
 
-SMOOTH = held(hold="band-limited", discrete=None, covariance=1e-6 * np.eye(5))
+SMOOTH = held(sections=from_polynomials("band-limited", 0.1, N, D, 0.05))
+BOTH = held(
+    sections=replace(
+        held().sections,
+        numerators=np.ones((2, 1, 2)),
+        direct=np.ones(2),
+        delays=np.array([0.0, 0.3]),
+        covariance=None,
+    ),
+    valid=[(0.01, 4.0), (0.1, 2.0)],
+    working_point=[1.0, 2.0, 3.0],
+)
 
 
-@pytest.mark.parametrize("model", [held(), held(continuous=None), SMOOTH])
+@pytest.mark.parametrize("model", [held(), SMOOTH, BOTH])
 def test_what_was_saved_is_loaded(model, tmp_path):
     save_model(tmp_path / "m.json", model)
     loaded = load_model(tmp_path / "m.json")
     assert loaded.content() == model.content()
-    if model.discrete:
-        band = loaded.discrete.band(LINES, 0.1)
-        assert band.gain == pytest.approx(model.discrete.band(LINES, 0.1).gain)
+    if model.sections.covariance is not None:
+        band = loaded.sections.band(LINES)
+        assert band.gain == pytest.approx(model.sections.band(LINES).gain)
         assert np.all(band.gain > 0)
+
+
+def version_1(hold):
+    covariance = np.ravel(1e-6 * np.eye(5)).tolist()
+    discrete = {"numerator": B.tolist(), "denominator": A.tolist(), "delay_samples": 2}
+    continuous = {"numerator": N.tolist(), "denominator": D.tolist(), "delay": 0.05}
+    return {
+        "schema": "omsm-model/1",
+        "hold": hold,
+        "sample_period": 0.1,
+        "discrete": {**discrete, "covariance": covariance} if hold != "band-limited" else None,
+        "continuous": {**continuous, "covariance": covariance},
+        "working_point": [4.0, 30.0],
+        "valid_from": 0.01,
+        "valid_up_to": 4.0,
+        "certificate": {},
+    }
+
+
+@pytest.mark.parametrize("hold", ["zero-order", "band-limited"])
+def test_a_file_of_version_1_is_read(hold, tmp_path):
+    (tmp_path / "m.json").write_text(json.dumps(version_1(hold)))
+    model = load_model(tmp_path / "m.json")
+    s, q = 2j * np.pi * LINES, np.exp(-2j * np.pi * LINES * 0.1)
+    smooth = np.polyval(N[::-1], s) / np.polyval(D[::-1], s) * np.exp(-0.05 * s)
+    sampled = np.polyval(B[::-1], q) / np.polyval(A[::-1], q) * q**2
+    true = smooth if hold == "band-limited" else sampled
+    np.testing.assert_allclose(model.sections.response(LINES)[0], true, rtol=1e-9)
+    assert model.valid == [(0.01, 4.0)]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("denominator", [1.0, -2.5, 1.0]), ("denominator", [0.0, 0.0, 1.0]), ("numerator", [1e200])],
+)
+def test_a_file_of_version_1_that_cannot_run_is_refused(name, value, tmp_path):
+    content = version_1("zero-order")
+    content["discrete"][name] = value
+    (tmp_path / "m.json").write_text(json.dumps(content))
+    with pytest.raises(CalibrationError, match="m.json"):
+        load_model(tmp_path / "m.json")
 
 
 @pytest.mark.parametrize(
@@ -54,22 +100,20 @@ def test_what_was_saved_is_loaded(model, tmp_path):
     [
         (("schema",), "omsm-calibration/1", "schema"),
         (("hold",), "third-order", "hold"),
-        (("hold",), "band-limited", "band-limited one a continuous one with its covariance"),
-        (("discrete",), None, "held input needs a discrete model"),
-        (("discrete", "denominator"), [1.0, -2.5, 1.0], "no stable one"),
-        (("discrete", "denominator"), [2.0, -1.2, 0.5], "begins with 1"),
-        (("discrete", "denominator"), [1.0] * 22, "22 values"),
-        (("discrete", "delay_samples"), 51, "longest delay"),
-        (("discrete", "delay_samples"), -1, "longest delay"),
-        (("discrete", "covariance"), [1.0, 2.0], "covariance has 2 numbers, expected 25"),
-        (("discrete", "covariance"), [-1.0] * 25, "negative variance"),
-        (("discrete", "numerator"), [1e200], "numerator"),
-        (("continuous", "delay"), 1001.0, "at most 10000 samples"),
-        (("continuous", "delay"), -1.0, "delay"),
-        (("continuous", "denominator"), [2.0], "expected 1"),
-        (("continuous", "denominator"), [1.0, 1e300, 1e-300], "cannot be computed"),
+        (("denominators",), [[-0.1, 0.01]], "no stable response"),
+        (("denominators",), [[0.0, 0.01]], "no stable response"),
+        (("denominators",), [[1e300, 0.01]], "denominators"),
+        (("denominators",), [[0.1, 0.01, 0.1]], "denominators"),
+        (("numerators",), [[[1.0, 0.1], [1.0, 0.1]]], "are not those of one model"),
+        (("numerators",), [], "numerators"),
+        (("direct",), [1.0, 2.0], "are not those of one model"),
+        (("delays",), [1001.0], "0 to 10000 samples"),
+        (("delays",), [0.25], "whole ones of a held input"),
+        (("delays",), [-0.1], "0 to 10000 samples"),
+        (("covariance",), [1.0, 2.0], "covariance has 2 numbers, expected 36"),
+        (("covariance",), [-1.0] * 36, "negative variance"),
         (("sample_period",), 1e-15, "sample period"),
-        (("valid_up_to",), -1.0, "frequency"),
+        (("valid", 0, 1), -1.0, "frequency"),
         (("working_point",), [1.0], "working_point"),
         (("working_point",), [1e200, 0.0], "signal"),
         (("certificate",), [], "certificate"),
@@ -87,21 +131,3 @@ def test_what_is_no_model_is_refused_by_name(place, value, says, tmp_path):
     with pytest.raises(CalibrationError, match=says) as refusal:
         load_model(path)
     assert str(path) in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("denominator", [1.0, -1e-9, 0.02]),
-        ("denominator", [1.0, 0.0, 0.02]),
-        ("numerator", [0.0, 0.0]),
-    ],
-)
-def test_a_smooth_model_that_cannot_run_is_refused(name, value, tmp_path):
-    """Its output would grow without end, or it has none."""
-    content = SMOOTH.content()
-    content["continuous"][name] = value
-    path = tmp_path / "m.json"
-    path.write_text(json.dumps(content))
-    with pytest.raises(CalibrationError, match="no stable response, or is zero"):
-        load_model(path)

@@ -14,7 +14,8 @@ from certified import certified_by
 from page_tables import PageTables
 from parsed_page import Page
 
-from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel, free_run
+from omsm_ros.core.estimation.parallel_sections import from_polynomials
+from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.core.ripple.source_hypotheses import KINDS
 from omsm_ros.live_page.server import render as render_live
 from omsm_ros.pipelines.paper_experiments import Compared, ExperimentPage
@@ -42,12 +43,10 @@ ATTACKS = (
 )  # fmt: skip
 ATTACK = " ".join(ATTACKS)
 MODEL = SampledModel(
-    hold="zero-order", sample_period=0.1, covariance=None, valid_from=0.01, valid_up_to=4.0,
-    discrete=Discrete(
-        numerator=np.array([0.0, 0.4]), denominator=np.array([1.0, -0.6]), delay=1,
-        covariance=np.diag([1e-8, 4e-6, 1e-6]),
+    sections=from_polynomials(
+        "zero-order", 0.1, np.array([0.0, 0.4]), np.array([1.0, -0.6]), 0.1
     ),
-    continuous=None, working_point=(4.0, 30.0), certificate={"verdict": "accepted"},
+    valid=[(0.01, 4.0)], working_point=(4.0, 30.0), certificate={"verdict": "accepted"},
 )  # fmt: skip
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -42,8 +42,9 @@ _FIRST_PART = 0.75
 # this factor of the least error. One part alone is uncertain by about this factor.
 _FINALISTS = 3
 _EQUIVALENT = 2.0
-# Orders in a row without a better prediction that end the search.
-_FRUITLESS = 4
+# Orders in a row without a better prediction that end the search; better is an error below this
+# part of the least before.
+_FRUITLESS, _NO_GAIN = 4, 0.98
 # Standard errors by which a model must predict better than another. With disturbances, a pole too
 # few costs more than one too many (docs/design/identification-ablation.md).
 _IMPROVES_BY = 0.5
@@ -57,7 +58,7 @@ _LEAST_SAMPLES_EACH = 3
 # Sixty columns of a record then take half a gigabyte.
 _MOST_SAMPLES = 1_000_000
 # Used samples on which orders are explored, and parts of a record whose excitation is compared.
-EXPLORED_ON = 20_000
+EXPLORED_ON = 8000
 _MOST_PARTS = 16
 # Iterations of an explored fit, of one without a hidden part, and of the final one.
 _EXPLORING, _HIDDEN, _FINAL = 12, 4, 30
@@ -118,11 +119,11 @@ def choose_sampled(
     """
     most = check_records(records, order)
     none = np.zeros(records[0].inputs.shape[1], np.int64)
-    whole = SectionsProblem([_exciting_part(record) for record in records], hold, none)
+    whole = SectionsProblem(records, hold, none)
     if hold != BAND_LIMITED and max_delay:
-        whole, _ = _with_delays(whole, max_delay)
+        parts = replace(whole, records=[_exciting_part(record) for record in records])
+        whole = replace(_with_delays(parts, max_delay)[0], records=records)
     explored, every, most = _explored(whole, order, most)
-    whole = replace(whole, records=records)
     explored, lag = _with_delays(explored, 0)
     early = replace(explored, records=[_early(record) for record in explored.records])
     fits, by_order = _explore(early, explored, most, order, lag)
@@ -155,10 +156,12 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     every = min(_decimation(record.inputs) for record in whole.records)
     while every > 1:
         records = [
-            SampledRecord(
-                _decimated(record.inputs, every),
-                _decimated(_filled(record), every),
-                record.used[::every],
+            _exciting_part(
+                SampledRecord(
+                    _decimated(record.inputs, every),
+                    _decimated(_filled(record), every),
+                    record.used[::every],
+                )
             )
             for record in whole.records
         ]
@@ -168,8 +171,9 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
             every //= 2
             continue
         return SectionsProblem(records, BAND_LIMITED, 0 * whole.delays), every, most
+    parts = [_exciting_part(record) for record in whole.records]
     try:
-        return whole, 1, min(most, check_records(whole.records, order))
+        return replace(whole, records=parts), 1, min(most, check_records(parts, order))
     except IdentificationError:
         # No part excites as much as the whole record.
         return whole, 1, most
@@ -272,8 +276,9 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
             if problem.hold != BAND_LIMITED:
                 other = replace(problem, delays=late.astype(np.int64))
             found = fitted(other, late)
-            # Compared over the same samples: a longer delay leaves fewer.
-            if found.sum_of_squares / len(found.residual) < _mean_square(best):
+            # A delay counts as a parameter. Errors per sample, as a longer delay leaves fewer.
+            gain = np.log(_mean_square(best) / max(_mean_square(found), np.finfo(float).tiny))
+            if len(found.residual) * gain > np.log(len(found.residual)):
                 best = found
         delays = best.problem.late(best.nonlinear, best.order)
     return best.problem, best
@@ -292,14 +297,16 @@ def _explore(
     """
     fits: list[SectionsFit] = []
     explained: list[float] = []
+    best = 0
     late = lag.problem.late(lag.nonlinear, lag.order)
     for order in sorted({*_ORDERS, asked}):
         if order > most:
             break
         fits.append(_next_fit(early, fits, order, late))
         explained.append(1 - float(np.mean(_relative(hidden_residual(fits[-1], whole)))))
-        past = len(explained) - 1 - int(np.argmax(explained))
-        if past >= _FRUITLESS and order >= asked:
+        if explained[-1] > 1 - _NO_GAIN * (1 - explained[best]):
+            best = len(explained) - 1
+        if len(explained) - 1 - best >= _FRUITLESS and order >= asked:
             break
     return fits, np.nan_to_num(np.array(explained), nan=-np.inf)
 

@@ -52,6 +52,8 @@ _FREQUENCIES = 400
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
 # Power of a line over the largest nearby, and over the largest of all, below which it is left out.
 _NEARBY, _LEAST_POWER = 1e-3, 1e-8
+# Singular value of unit columns below which inputs are not distinguished.
+_COLLINEAR = 1e-3
 # Power of a line over the largest of its block from which it counts for the range of the block.
 _STRONG = 0.1
 # Standard uncertainties beyond which a difference is not chance, and the largest share of blocks
@@ -182,7 +184,9 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         power = np.sum(np.abs(spectra) ** 2, axis=0)
         power[0] = 0.0
         nearby = ndimage.maximum_filter1d(power, _LINES)
-        lines = np.flatnonzero((power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max()))
+        excited = (power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max())
+        # Lines near an excited one show the noise.
+        lines = np.flatnonzero(ndimage.binary_dilation(excited, iterations=_LINES // 2))
         residual = np.asarray(np.fft.rfft(grid), np.complex128)
         for part in _neighbours(lines, _LINES + _LINES_PER_INPUT * len(spectra)):
             found.append(
@@ -217,6 +221,8 @@ def _compared(
     left = residual - columns / scale @ solved
     variance = float(np.sum(np.abs(left) ** 2)) / max(len(residual) - columns.shape[1], 1)
     spread = np.sqrt(variance * np.sum(np.abs(inverse) ** 2, axis=1)) / scale
+    if np.linalg.matrix_rank(columns / scale, tol=_COLLINEAR) < columns.shape[1]:
+        spread[:] = np.inf
     inputs = len(driven)
     strong = frequency[power > _STRONG * np.max(power)]
     ends = float(strong[0]), float(strong[-1])

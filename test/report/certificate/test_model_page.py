@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.sampled_model import Discrete, SampledModel, free_run
-from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.report.certificate.figures import response, response_of
+from omsm_ros.core.estimation.parallel_sections import from_polynomials
+from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
+from omsm_ros.report.certificate.figures import response
 from omsm_ros.report.certificate.model_page import (
     ModelPage,
     model_figures_of,
@@ -16,18 +16,11 @@ from omsm_ros.report.certificate.model_page import (
 )
 
 HELD = SampledModel(
-    hold="zero-order",
-    sample_period=0.1,
-    discrete=Discrete(
-        numerator=np.array([0.0, 0.4]),
-        denominator=np.array([1.0, -0.6]),
-        delay=1,
-        covariance=np.diag([1e-8, 4e-6, 1e-6]),
+    sections=replace(
+        from_polynomials("zero-order", 0.1, np.array([0.0, 0.4]), np.array([1.0, -0.6]), 0.1),
+        covariance=np.diag([4e-6, 1e-6, 0.0, 1e-8, 0.0, 0.0]),
     ),
-    continuous=TransferFunction.from_ascending([1.0], [1.0, 0.2]),
-    covariance=None,
-    valid_from=0.01,
-    valid_up_to=4.0,
+    valid=[(0.01, 4.0)],
     working_point=(4.0, 30.0),
     certificate={
         "verdict": "accepted from 0.01 Hz to 4 Hz",
@@ -39,7 +32,7 @@ HELD = SampledModel(
         "samples": {"received": 400, "compared": 390},
     },
 )
-SMOOTH = replace(HELD, hold="band-limited", discrete=None, covariance=1e-6 * np.eye(3))
+SMOOTH = replace(HELD, sections=replace(HELD.sections, hold="band-limited"))
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +61,14 @@ def test_all_parts_are_there(model, record):
         assert text in page, text
     assert "<b>.csv" not in page
     assert page.count("<figure>") == 3
-    assert ("H(z)" in page) is (model is HELD)
+    assert ("(z - 1)/(z + 1)" in page) is (model is HELD)
 
 
 def test_a_coefficient_stands_next_to_its_uncertainty(record):
     page = render_model(page_of(HELD, record))
-    row = page[page.index(">b1<") :]
-    assert row.index("0.4000000000") < row.index("0.0020") < row.index(">a1<")
+    row = page[page.index(">direct<") :]
+    direct = float(HELD.sections.direct[0])
+    assert row.index(f"{direct:.10f}"[-9:]) < row.index("0.0020") < row.index(">d1 of section 1<")
 
 
 def test_the_verdict_is_the_models():
@@ -91,7 +85,7 @@ def test_the_curve_is_the_models_response_and_the_rest_of_the_axis_is_grey():
     gain, phase = made.get_axes()
     line = next(line for line in gain.get_lines() if len(line.get_xdata()) > 2)
     frequency = np.asarray(line.get_xdata())
-    value, _ = response_of(HELD, frequency)
+    value = HELD.sections.response(frequency)[0]
     assert line.get_ydata() == pytest.approx(np.abs(value))
     # A first-order lag of one sample behind a hold: at 1 Hz its phase is that of H(z) itself.
     q = np.exp(-2j * np.pi * 0.1)
