@@ -13,7 +13,7 @@ from omsm_ros import __version__
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
 from omsm_ros.core.estimation.parallel_sections import HOLDS
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
-from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, FreeRun, SampledModel
+from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.core.streams.motion_record import MotionRecord
@@ -181,31 +181,11 @@ _PROPERTIES = {
     "direct": _NUMBERS,
     "delays": _NUMBERS,
     "covariance": {"type": ["array", "null"], "items": NUMBER, "maxItems": _MOST_COVARIANCE},
-    "continuous": {"type": ["object", "null"]},
     "working_point": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 9},
     "valid": {"type": "array", "items": _PAIR, "minItems": 1, "maxItems": _MOST_INPUTS},
     "certificate": {"type": "object"},
 }
 _FORM = form(_PROPERTIES, tuple(_PROPERTIES))
-
-# Version 1: polynomials of at most 20 poles, of one input.
-_COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 21}
-_COVARIANCE_1 = {"type": ["array", "null"], "items": NUMBER, "maxItems": 42**2}
-_POLYNOMIALS = {"numerator": _COEFFICIENTS, "denominator": _COEFFICIENTS}
-_DISCRETE = {**_POLYNOMIALS, "delay_samples": {"type": "integer"}, "covariance": _COVARIANCE_1}
-_CONTINUOUS = {**_POLYNOMIALS, "delay": NUMBER, "covariance": _COVARIANCE_1}
-_PROPERTIES_1 = {
-    "schema": {"const": SCHEMA_1},
-    "hold": {"enum": list(HOLDS)},
-    "sample_period": NUMBER,
-    "discrete": {**form(_DISCRETE, tuple(_DISCRETE)), "type": ["object", "null"]},
-    "continuous": {**form(_CONTINUOUS, tuple(_CONTINUOUS)), "type": ["object", "null"]},
-    "working_point": _PAIR,
-    "valid_from": NUMBER,
-    "valid_up_to": NUMBER,
-    "certificate": {"type": "object"},
-}
-_FORM_1 = form(_PROPERTIES_1, tuple(_PROPERTIES_1))
 
 
 def save_model(path: Path | str, model: SampledModel) -> None:
@@ -214,15 +194,14 @@ def save_model(path: Path | str, model: SampledModel) -> None:
 
 
 def load_model(path: Path | str) -> SampledModel:
-    """Read ``MODEL.json`` of either version.
+    """Read ``MODEL.json``.
 
     Raises CalibrationError if it is malformed or cannot be computed with.
     """
     what = f"model {str(path)!r}"
     text = read_text(path, _MAX_BYTES, CalibrationError, "model")
     content = json_and_yaml.object_of(text, CalibrationError, what)
-    first = content.get("schema") == SCHEMA_1
-    check_form(content, _FORM_1 if first else _FORM, CalibrationError, what)
+    check_form(content, _FORM, CalibrationError, what)
     try:
         return SampledModel.from_content(content)
     except CalibrationError as err:

@@ -21,13 +21,12 @@ from hostile.doors import DOORS, Strategy, right_cases
 from hostile.judge import Answer, Case, ask, ask_process, judge
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from sections_of_polynomials import from_polynomials
 
 from omsm_ros import cli
 from omsm_ros.core.calibration.calibration_set import calibration_set
-from omsm_ros.core.estimation.parallel_sections import from_polynomials
 from omsm_ros.core.estimation.sampled_model import SampledModel
 from omsm_ros.core.kinematics.kinematics import Geometry
-from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.io.descriptions import save_geometry

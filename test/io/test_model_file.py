@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sections_of_polynomials import from_polynomials
 
-from omsm_ros.core.estimation.parallel_sections import from_polynomials
 from omsm_ros.core.estimation.sampled_model import SampledModel
 from omsm_ros.errors import CalibrationError
 from omsm_ros.pipelines.identify import load_model, save_model
@@ -52,47 +52,6 @@ def test_what_was_saved_is_loaded(model, tmp_path):
         band = loaded.sections.band(LINES)
         assert band.gain == pytest.approx(model.sections.band(LINES).gain)
         assert np.all(band.gain > 0)
-
-
-def version_1(hold):
-    covariance = np.ravel(1e-6 * np.eye(5)).tolist()
-    discrete = {"numerator": B.tolist(), "denominator": A.tolist(), "delay_samples": 2}
-    continuous = {"numerator": N.tolist(), "denominator": D.tolist(), "delay": 0.05}
-    return {
-        "schema": "omsm-model/1",
-        "hold": hold,
-        "sample_period": 0.1,
-        "discrete": {**discrete, "covariance": covariance} if hold != "band-limited" else None,
-        "continuous": {**continuous, "covariance": covariance},
-        "working_point": [4.0, 30.0],
-        "valid_from": 0.01,
-        "valid_up_to": 4.0,
-        "certificate": {},
-    }
-
-
-@pytest.mark.parametrize("hold", ["zero-order", "band-limited"])
-def test_a_file_of_version_1_is_read(hold, tmp_path):
-    (tmp_path / "m.json").write_text(json.dumps(version_1(hold)))
-    model = load_model(tmp_path / "m.json")
-    s, q = 2j * np.pi * LINES, np.exp(-2j * np.pi * LINES * 0.1)
-    smooth = np.polyval(N[::-1], s) / np.polyval(D[::-1], s) * np.exp(-0.05 * s)
-    sampled = np.polyval(B[::-1], q) / np.polyval(A[::-1], q) * q**2
-    true = smooth if hold == "band-limited" else sampled
-    np.testing.assert_allclose(model.sections.response(LINES)[0], true, rtol=1e-9)
-    assert model.valid == [(0.01, 4.0)]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("denominator", [1.0, -2.5, 1.0]), ("denominator", [0.0, 0.0, 1.0]), ("numerator", [1e200])],
-)
-def test_a_file_of_version_1_that_cannot_run_is_refused(name, value, tmp_path):
-    content = version_1("zero-order")
-    content["discrete"][name] = value
-    (tmp_path / "m.json").write_text(json.dumps(content))
-    with pytest.raises(CalibrationError, match="m.json"):
-        load_model(tmp_path / "m.json")
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ import pytest
 from certified import certified_by
 from page_tables import PageTables
 from parsed_page import Page
+from sections_of_polynomials import from_polynomials
 
-from omsm_ros.core.estimation.parallel_sections import from_polynomials
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.core.ripple.source_hypotheses import KINDS
 from omsm_ros.live_page.server import render as render_live

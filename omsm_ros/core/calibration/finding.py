@@ -41,11 +41,6 @@ class Finding:
         return text_of(self.code, {**self.limits, **self.values})
 
 
-def stored_text(severity: str, text: str) -> Finding:
-    """Return the finding of a sentence from a file of version 1."""
-    return Finding(TEXT, severity, {"text": text})
-
-
 def of_severity(findings: Iterable[Finding], severity: str) -> tuple[Finding, ...]:
     """Return those of ``findings`` that have ``severity``, in their order."""
     return tuple(finding for finding in findings if finding.severity == severity)

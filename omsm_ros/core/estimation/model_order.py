@@ -165,16 +165,6 @@ def cancels(dynamics: TransferFunction) -> bool:
     return bool(np.any(apart < _CANCELLING * np.abs(poles[:, np.newaxis])))
 
 
-def held_out_rms(problem: Problem, fitted: Fit, held: BoolArray) -> float:
-    """Return the rms residual [m] over ``held`` (n,), fitted without them; NaN for none."""
-    rest, unseen = problem.used & ~held, problem.used & held
-    if not (np.any(rest) and np.any(unseen)):
-        return float("nan")
-    without = fit(replace(problem, used=rest), fitted.structure, [fitted.nonlinear])
-    missed = problem.output[unseen] - problem.modelled(without)[unseen]
-    return float(np.sqrt(np.mean(missed**2)))
-
-
 # Guess of the slowest pole, in units of the bandwidth of the motion.
 _GUESSED_RATE = 3.0
 # Its angle from the positive real axis [rad]: a damping ratio of 0.42.

@@ -336,39 +336,3 @@ def _product(factors: list[FloatArray]) -> FloatArray:
     for factor in factors:
         found = np.asarray(polynomial.polymul(found, factor), np.float64)
     return found
-
-
-def from_polynomials(
-    hold: str, period: float, numerator: FloatArray, denominator: FloatArray, delay: float
-) -> ParallelSections:
-    """Return the sections of one ratio of polynomials, ascending in s, or in z⁻¹ of a held input.
-
-    The poles must differ from each other and be stable; else the numbers have no meaning.
-    """
-    roots = np.roots(denominator[::-1] if hold == BAND_LIMITED else denominator)
-    if hold != BAND_LIMITED:
-        roots = np.asarray(2 / period * (roots - 1) / (roots + 1))
-    upper, real = roots[roots.imag > 0], list(roots[roots.imag == 0].real)
-    sections = [_polynomial_of(np.array([p, p.conjugate()])) for p in upper]
-    sections += [[-1 / p, 0.0] for p in real]
-    down = np.reshape(sections, (-1, 2))
-    lines = np.linspace(0.003, 0.47, 40 * (len(roots) + 1)) / period
-    if hold == BAND_LIMITED:
-        s = 2j * np.pi * lines
-        value = polynomial.polyval(s, numerator) / polynomial.polyval(s, denominator)
-    else:
-        q = np.exp(-2j * np.pi * lines * period)
-        value = polynomial.polyval(q, numerator) / polynomial.polyval(q, denominator)
-    w = variable(hold, lines * period) / period
-    basis = 1 / (1 + down[:, :1] * w + down[:, 1:] * w * w)
-    columns = [np.ones(len(w))]
-    for each, (_, d2) in zip(basis, down, strict=True):
-        columns += [each, each * w * (d2 > 0)]
-    matrix, scale = np.array(columns).T, np.abs(np.array(columns)).max(axis=1)
-    scale[scale == 0] = 1.0
-    both = np.concatenate([matrix.real, matrix.imag]) / scale
-    found = np.linalg.lstsq(both, np.concatenate([value.real, value.imag]), rcond=None)[0] / scale
-    return ParallelSections(
-        hold=hold, period=period, denominators=down, numerators=found[1:].reshape(1, -1, 2),
-        direct=found[:1], delays=np.array([delay]),
-    )  # fmt: skip

@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.calibration.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
-from omsm_ros.core.estimation.parallel_sections import (
-    BAND_LIMITED,
-    ParallelSections,
-    from_polynomials,
-)
+from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
@@ -21,7 +17,7 @@ from omsm_ros.errors import CalibrationError, IdentificationError
 from omsm_ros.linear_algebra import least_squares
 from omsm_ros.quantities import FREQUENCY, SAMPLE_PERIOD, SIGNAL
 
-SCHEMA, SCHEMA_1 = "omsm-model/2", "omsm-model/1"
+SCHEMA = "omsm-model/2"
 # Most poles whose polynomials are stated, too: beyond, their coefficients lose too many digits.
 _POLYNOMIAL_POLES = 12
 # Largest d1, d2 and numerators per power of the sample period: 1e9 samples.
@@ -63,8 +59,7 @@ class SampledModel:
 
     def content(self) -> dict[str, object]:
         """Return the model as JSON values."""
-        sections, continuous = self.sections, self.continuous
-        covariance = sections.covariance
+        sections, covariance = self.sections, self.sections.covariance
         return {
             "schema": SCHEMA,
             "hold": sections.hold,
@@ -74,13 +69,6 @@ class SampledModel:
             "direct": sections.direct.tolist(),
             "delays": sections.delays.tolist(),
             "covariance": None if covariance is None else np.ravel(covariance).tolist(),
-            "continuous": None
-            if continuous is None
-            else {
-                "numerator": continuous.numerator.tolist(),
-                "denominator": continuous.denominator.tolist(),
-                "delay": continuous.delay,
-            },
             "working_point": list(self.working_point),
             "valid": [list(range) for range in self.valid],
             "certificate": dict(self.certificate),
@@ -88,17 +76,15 @@ class SampledModel:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> SampledModel:
-        """Return the inverse of :meth:`content`, for values of the right types; reads version 1.
+        """Return the inverse of :meth:`content`, for values of the right types.
 
         Raises CalibrationError for an inconsistent model, or one that cannot be computed.
         """
         period = SAMPLE_PERIOD.checked(content["sample_period"], CalibrationError)
-        first = content["schema"] == SCHEMA_1
-        sections = _sections_of_1(content, period) if first else _sections_of(content, period)
-        every = [(content["valid_from"], content["valid_up_to"])] if first else content["valid"]
+        sections = _sections_of(content, period)
         valid = [
             (FREQUENCY.checked(a, CalibrationError), FREQUENCY.checked(b, CalibrationError))
-            for a, b in every
+            for a, b in content["valid"]
         ]
         point = [SIGNAL.checked(value, CalibrationError) for value in content["working_point"]]
         if len(valid) != sections.inputs or len(point) != sections.inputs + 1:
@@ -155,29 +141,6 @@ def _check_runs(sections: ParallelSections) -> None:
             most=LONGEST_DELAY_SAMPLES,
             period=sections.period,
         )
-
-
-def _sections_of_1(content: Mapping[str, Any], period: float) -> ParallelSections:
-    """Return the sections of a file of version 1, without covariance."""
-    smooth = content["hold"] == BAND_LIMITED
-    part = content["continuous" if smooth else "discrete"]
-    if part is None:
-        raise CalibrationError("estimation.missing_part", hold=content["hold"])
-    up, down = (
-        SIGNAL.checked_all(np.asarray(part[name], np.float64), CalibrationError, name)
-        for name in ("numerator", "denominator")
-    )
-    delay = part["delay"] if smooth else part["delay_samples"] * period
-    with np.errstate(all="ignore"):
-        try:
-            sections = from_polynomials(content["hold"], period, up, down, float(delay))
-        except (np.linalg.LinAlgError, ValueError, ZeroDivisionError) as err:
-            raise CalibrationError("estimation.unstable", sections=down.tolist()) from err
-    values = (sections.denominators, sections.numerators, sections.direct)
-    if not all(np.all(np.isfinite(value)) for value in values):
-        raise CalibrationError("estimation.unstable", sections=down.tolist())
-    _check_runs(sections)
-    return sections
 
 
 def _square(values: Sequence[float], size: int) -> FloatArray:

@@ -131,14 +131,6 @@ def segments(steps: Steps, samples: int, least: int = 4) -> list[tuple[int, int]
     return list(pairwise(cuts))
 
 
-def held_out(steps: Steps, samples: int) -> BoolArray:
-    """Return True in the segment of every third edge, (n,): both directions are held out."""
-    mask = np.zeros(samples, np.bool_)
-    for start, stop in segments(steps, samples)[1::3]:
-        mask[start:stop] = True
-    return mask
-
-
 def backlash_columns(steps: Steps, samples: int) -> FloatArray:
     """Return the direction of the last move and 1 before the first move, as columns (n, 0 or 2).
 

@@ -107,12 +107,6 @@ class ResidualSpace:
     def _places(self) -> IntArray:
         return np.flatnonzero(self.problem.used)
 
-    def projected(self, columns: FloatArray) -> FloatArray:
-        """Return ``columns`` (n, c) projected orthogonally to the fit, where compared, (k, c)."""
-        rows = columns.T.copy()
-        self._free(rows)
-        return np.asarray(rows[:, self.problem.used].T)
-
     def _free(self, rows: FloatArray) -> None:
         """Project ``rows`` (c, n) orthogonally to the fit, with 0 where nothing is compared."""
         rows[:, ~self.problem.used] = 0.0

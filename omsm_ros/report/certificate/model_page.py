@@ -6,10 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from omsm_ros.core.calibration.certificate import REJECTED
-from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED
 from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
@@ -29,11 +26,9 @@ CAPTIONS = {
     ),
     CORRELATION: "From sample to sample: outside the shade the residual is not white.",
 }
-# Coefficients are far more correlated than uncertain: to be of use they need their digits.
-_ALL_DIGITS = 10
 _NOTE = (
-    "The model is of deviations from the working point. Uncertainties are standard, k = 1; those "
-    "of the coefficients are strongly correlated, and the file has their covariance."
+    "The model is of deviations from the working point. The file has its coefficients and their "
+    "covariance."
 )
 
 
@@ -119,41 +114,23 @@ def _sections(page: ModelPage) -> list[Section]:
     ]
     every = [
         Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
-        Section("Coefficients", (), tuple(_coefficient_tables(page.model))),
+        Section("Poles", (), (_poles(certificate),)),
         Section("Records", (), (_identity(page), _limits(certificate))),
     ]
     return present(every, page.figures)
 
 
-def _coefficient_tables(model: SampledModel) -> list[Table]:
-    sections, count = model.sections, len(model.sections.denominators)
-    every, size = [], 1 + 2 * count
-    spread = np.full(sections.inputs * (size + 1) + 2 * count, np.nan)
-    if sections.covariance is not None:
-        spread = np.sqrt(np.diag(sections.covariance))
-    variable = "s" if model.hold == BAND_LIMITED else "w = (2/T)(z - 1)/(z + 1)"
-    for i in range(sections.inputs):
-        names = ["direct", *(f"b{p} of section {k}" for k in range(1, count + 1) for p in (0, 1))]
-        values = np.concatenate([sections.direct[i : i + 1], np.ravel(sections.numerators[i])])
-        title = (
-            f"Input {i + 1}, delay {quantity(sections.delays[i], 's')}: numerators in {variable}"
-        )
-        every.append(_coefficients(title, names, values, spread[i * size : (i + 1) * size]))
-    names = [f"d{p} of section {k}" for k in range(1, count + 1) for p in (1, 2)]
-    at = sections.inputs * size
-    values = np.ravel(sections.denominators)
-    return [
-        *every,
-        _coefficients(f"Denominators in {variable}", names, values, spread[at : at + 2 * count]),
-    ]
-
-
-def _coefficients(title: str, names: list[str], values: FloatArray, spread: FloatArray) -> Table:
-    rows = [
-        (name, plain(float(value), _ALL_DIGITS), plain(float(u), 2) if np.isfinite(u) else NOTHING)
-        for name, value, u in zip(names, values, spread, strict=True)
-    ]
-    return Table(title, ("value", "standard uncertainty"), rows)
+def _poles(certificate: Mapping[str, Any]) -> Table:
+    """Return the poles that the data resolve, and bounds of the others."""
+    rows = []
+    for pole in certificate.get("poles", ()):
+        if "frequency_hz" in pole:
+            rows.append((quantity(pole["frequency_hz"], "Hz"), plain(pole["damping"], 3)))
+        else:
+            word = "faster" if "faster_than_hz" in pole else "slower"
+            bound = quantity(pole[f"{word}_than_hz"], "Hz")
+            rows.append((f"not resolved ({word} than {bound})", NOTHING))
+    return Table("", ("damping ratio",), rows)
 
 
 def _identity(page: ModelPage) -> Table:

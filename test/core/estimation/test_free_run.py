@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import signal
+from sections_of_polynomials import from_polynomials
 
-from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, from_polynomials
+from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run, stationary_output
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import IdentificationError

@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import signal
+from sections_of_polynomials import from_polynomials
 
 from omsm_ros.core.estimation import sampled_choice
-from omsm_ros.core.estimation.parallel_sections import HOLDS, from_polynomials
+from omsm_ros.core.estimation.parallel_sections import HOLDS
 from omsm_ros.core.estimation.sampled_choice import (
     EXPLORED_ON,
     SampledCandidate,

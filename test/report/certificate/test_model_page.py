@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sections_of_polynomials import from_polynomials
 
-from omsm_ros.core.estimation.parallel_sections import from_polynomials
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.report.certificate.figures import response
 from omsm_ros.report.certificate.model_page import (
