@@ -12,12 +12,10 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-import json
 import shutil
 import subprocess
 import tempfile
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -25,11 +23,12 @@ from pathlib import Path
 
 import numpy as np
 from scipy import io as scipy_io
-from scipy import linalg, signal
+from scipy import linalg
 
 from benchmarks.row import Row, at_least, shown
 from omsm_ros import cli
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.pipelines.identify import load_model
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "daisy"
 PERIODS_S = {"robotArm": 1.0, "hairdryer": 0.08, "ballbeam": 0.1}
@@ -82,14 +81,10 @@ def ours(command: FloatArray, seen: FloatArray, order: int, period: float) -> St
             cli.main(["identify", str(table), *(str(a) for a in arguments)])
         # A rejected model has another file name.
         (path,) = Path(folder).glob("model*.json")
-        model = json.loads(path.read_text())["discrete"]
-    late = [0.0] * model["delay_samples"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", signal.BadCoefficients)
-        a, b, c, d = signal.tf2ss(late + model["numerator"], model["denominator"] + late)
+        system = load_model(path).sections.to_control()
     # One more constant state for the operating point.
-    constant = linalg.block_diag(a, 1.0)
-    return constant, np.vstack([b, [[0.0]]]), np.hstack([c, [[1.0]]]), d
+    constant = linalg.block_diag(system.A, 1.0)
+    return constant, np.vstack([system.B, [[0.0]]]), np.hstack([system.C, [[1.0]]]), system.D
 
 
 def score(method: Method, record: Record, order: int) -> float:

@@ -156,7 +156,7 @@ TIME_CONSTANT = Quantity("time constant", "s", 1e-10, 1000.0, "identify again")
 FREQUENCY = Quantity("frequency", "Hz", 1e-6, 1e9, "give it in hertz")
 GAIN = Quantity("static gain", "", 1e-6, 1e6, "check the units of encoder and probe")
 MAX_DELAY_SAMPLES = Quantity("longest delay", "samples", 0, 50, "0 = none", whole=True)
-ORDER = Quantity("order", "", 0, 20, "0 = choose", whole=True)
+ORDER = Quantity("order", "", 0, 40, "0 = choose", whole=True)
 
 # Machine and surface.
 

@@ -138,13 +138,7 @@ def _identify(args: argparse.Namespace) -> Facts:
     of_table = first.suffix.lower() == TABLE_SUFFIX
     _check_arguments(args, of_table)
     if of_table:
-        refuse_cell(first, args)
-        inputs = args.input.split(",")
-        records = [
-            record_of_table(path, inputs, args.output, args.period, args.duration)
-            for path in args.recordings
-        ]
-        return _model_facts(records, args.period, args)
+        return _of_tables(args)
     bag, stated = cell_of(first, args), args.settings or {}
     with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
         motion = recording.motion(
@@ -186,6 +180,16 @@ def _identify(args: argparse.Namespace) -> Facts:
         page = write_certificate(args.report, identified, source=first.name)
         facts["report"] = str(page)
     return facts
+
+
+def _of_tables(args: argparse.Namespace) -> Facts:
+    refuse_cell(args.recordings[0], args)
+    inputs = args.input.split(",")
+    records = [
+        record_of_table(path, inputs, args.output, args.period, args.duration)
+        for path in args.recordings
+    ]
+    return _model_facts(records, args.period, args)
 
 
 def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:

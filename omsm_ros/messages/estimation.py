@@ -72,10 +72,6 @@ TEMPLATES: dict[str, str] = {
     ),
     "estimation.unknown_hold": "hold {hold!r}, expected one of {known}",
     # Stored models and free runs.
-    "estimation.missing_part": (
-        "model with hold {hold!r}: a held input needs a discrete model, a band-limited one a "
-        "continuous one with its covariance; identify it again"
-    ),
     "estimation.long_delay": (
         "delay {delay!r} s, expected 0 to {most} samples of {period!r} s, whole ones of a held "
         "input; identify it again"

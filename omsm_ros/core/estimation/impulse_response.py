@@ -47,15 +47,6 @@ def impulse_response(inputs: FloatArray, output: FloatArray, used: BoolArray) ->
     return best.reshape(count, taps)
 
 
-def convolved(taps: FloatArray, inputs: FloatArray) -> FloatArray:
-    """Return the output (n,) of impulse responses (m, L) for ``inputs`` (n, m), 0 before."""
-    parts = [
-        signal.fftconvolve(drive, response)[: len(drive)]
-        for drive, response in zip(inputs.T, taps, strict=True)
-    ]
-    return np.asarray(np.sum(parts, axis=0), np.float64)
-
-
 def _root_of_kernel(taps: int, decay: float) -> FloatArray:
     """Return a root R of the TC kernel, K = R Rᵀ: sums of steps that decay by e^-decay."""
     kernel = np.exp(-decay * np.arange(taps + 1) / taps)

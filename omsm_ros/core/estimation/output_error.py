@@ -142,10 +142,6 @@ class Problem:
         omega = 2 * np.pi * fft.rfftfreq(self.closed_length, self.period)
         return np.asarray(1j * omega[: len(self._spectrum)] / self.rate, np.complex128)
 
-    def parametrised(self, structure: Structure) -> ScaledStructure:
-        """Return how ``structure`` is parametrised over ``s``."""
-        return ScaledStructure(structure, self.rate)
-
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """Return the inputs: spectra (k,), each with its number of numerator terms."""
         motion = (self._spectrum, structure.zeros + 1)
@@ -368,7 +364,7 @@ def fit(
     evaluations: most iterations to that minimum
     budget: counts the evaluations, if given
     """
-    scaled = problem.parametrised(structure)
+    scaled = ScaledStructure(structure, problem.rate)
     box = scaled.bounds()
 
     def project(nonlinear: FloatArray) -> Projection:
@@ -389,7 +385,7 @@ def fit(
 
 def evaluated(problem: Problem, structure: Structure, nonlinear: FloatArray) -> Fit:
     """Return ``structure`` at the given ψ; only the linear parameters are fitted."""
-    scaled = problem.parametrised(structure)
+    scaled = ScaledStructure(structure, problem.rate)
     return _fit_at(problem, scaled, problem.project(scaled, nonlinear))
 
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.impulse_response import convolved, impulse_response
+from omsm_ros.core.estimation.impulse_response import impulse_response
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
     RATE,
@@ -265,7 +265,7 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
         poles = tried.relocated(start, late)
         return tried.fit(_DELAY_ORDER, [tried.nonlinear_of(poles, late)], _EXPLORING)
 
-    delays = np.zeros(problem.inputs)
+    delays, tiny = np.zeros(problem.inputs), np.finfo(float).tiny
     best = fitted(problem, delays)
     for input in range(problem.inputs):
         tried = range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]
@@ -277,15 +277,13 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
                 other = replace(problem, delays=late.astype(np.int64))
             found = fitted(other, late)
             # A delay counts as a parameter. Errors per sample, as a longer delay leaves fewer.
-            gain = np.log(_mean_square(best) / max(_mean_square(found), np.finfo(float).tiny))
-            if len(found.residual) * gain > np.log(len(found.residual)):
+            count, other = len(found.residual), len(best.residual)
+            gain = np.log(max(best.sum_of_squares, tiny) / other)
+            gain -= np.log(max(found.sum_of_squares, tiny) / count)
+            if count * gain > np.log(count):
                 best = found
         delays = best.problem.late(best.nonlinear, best.order)
     return best.problem, best
-
-
-def _mean_square(fitted: SectionsFit) -> float:
-    return fitted.sum_of_squares / len(fitted.residual)
 
 
 def _explore(
@@ -437,10 +435,13 @@ def _against_impulse_response(
     residual = hidden_residual(fitted, whole)[0] * np.std(record.output[record.used])
     hidden = ~np.isnan(residual)
     missed, used = np.where(hidden, residual, 0.0), own.used
-    taps = impulse_response(inputs[: _end(used)], output[: _end(used)], used[: _end(used)])
+    end = int(np.flatnonzero(used)[-1]) + 1
+    taps = impulse_response(inputs[:end], output[:end], used[:end])
     if taps is None or np.sum(hidden) < _BLOCKS:
         return None, None, False
-    free = output - convolved(taps, inputs)
+    free = output.copy()
+    for drive, response in zip(inputs.T, taps, strict=True):
+        free -= signal.fftconvolve(drive, response)[: len(drive)]
     free -= np.mean(free[used])
     power = float(np.var(output[hidden])) or 1.0
     blocks = np.array_split(np.flatnonzero(hidden), _BLOCKS)
@@ -450,10 +451,6 @@ def _against_impulse_response(
     shares = 1 - np.mean(means, axis=1)
     worse = float(np.mean(apart)) > max(_CLEARLY * uncertain, _NOTICEABLE)
     return float(shares[0]), float(shares[1]), bool(worse)
-
-
-def _end(used: BoolArray) -> int:
-    return int(np.flatnonzero(used)[-1]) + 1
 
 
 def _decimation(inputs: FloatArray) -> int:

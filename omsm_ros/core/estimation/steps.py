@@ -1,4 +1,4 @@
-"""Detect the steps in a motion, split it between them, and select parts to hold out.
+"""Detect the steps in a motion, and split it between them.
 
 No number, size, direction or rate of steps is assumed. A motion without plateaus (a chirp, a scan)
 has no edges; it can be used for identification too.

@@ -83,15 +83,7 @@ def identify_samples(
     """
     if hold not in HOLDS:
         raise ConfigurationError("estimation.unknown_hold", hold=hold, known=HOLDS)
-    records = [replace(r, used=r.used & np.isfinite(r.output)) for r in records]
-    for record in records:
-        samples = int(np.sum(record.used))
-        if samples < LEAST_SAMPLES:
-            raise IdentificationError(
-                "estimation.short_record", samples=samples, least=LEAST_SAMPLES
-            )
-        check_inputs(record.inputs)
-        check_varies(record.output[record.used], "output")
+    records = [_checked(record) for record in records]
     choice = choose_sampled(records, hold, order=order, max_delay=max_delay)
     sections = _sections(choice.chosen, period)
     sections, factor = _inflated_to_free_choice(sections, choice, period)
@@ -120,6 +112,17 @@ def identify_samples(
             entries=entries,
         ),
     )
+
+
+def _checked(record: SampledRecord) -> SampledRecord:
+    """Return the record with finite outputs used; raise IdentificationError for a useless one."""
+    used = record.used & np.isfinite(record.output)
+    samples = int(np.sum(used))
+    if samples < LEAST_SAMPLES:
+        raise IdentificationError("estimation.short_record", samples=samples, least=LEAST_SAMPLES)
+    check_inputs(record.inputs)
+    check_varies(record.output[used], "output")
+    return replace(record, used=used)
 
 
 def _sections(candidate: SampledCandidate, period: float) -> ParallelSections:
@@ -294,7 +297,7 @@ def _entries(
             str(order): float(share) if np.isfinite(share) else None
             for order, share in zip(choice.orders, choice.by_order, strict=True)
         },
-        "impulse_response": {"explained": choice.comparator, "model": choice.compared},
+        "impulse_response": {"comparator": choice.comparator, "model": choice.compared},
         "whiteness_p": whiteness(residual),
         "independence_p": independence(residual, drive),
         "poles": _poles(sections, valid),
@@ -363,7 +366,9 @@ def sampled_certificate(
             Notice("estimation.poor_prediction", predicted=predicted, least=_LEAST_PREDICTED)
         )
     if worse:
-        reasons.append(_worse(entries["impulse_response"]))
+        shares = entries["impulse_response"]
+        assert isinstance(shares, Mapping)
+        reasons.append(Notice("estimation.worse_than_impulse_response", **shares))
     if not all(high > low for low, high in valid):
         reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
     low, high = max(v[0] for v in valid), min(v[1] for v in valid)
@@ -381,15 +386,6 @@ def sampled_certificate(
         "reasons": [str(reason) for reason in reasons],
         "verdict": REJECTED if reasons else str(accepted),
     }
-
-
-def _worse(shares: object) -> Notice:
-    assert isinstance(shares, Mapping)
-    return Notice(
-        "estimation.worse_than_impulse_response",
-        model=shares["model"],
-        comparator=shares["explained"],
-    )
 
 
 def _warnings(independent: object, order: int, free_order: int, widened: float) -> list[str]:

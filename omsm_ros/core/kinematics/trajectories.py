@@ -187,25 +187,6 @@ class Chirp:
         return _z_only(0.5 * self.peak_to_peak * np.cos(2 * np.pi * turns))
 
 
-@dataclass(frozen=True, slots=True)
-class Multisine:
-    """Z swings at several ``frequencies`` [Hz] at once, each with ``amplitude`` [m].
-
-    Their phases keep the peak low (Schroeder 1970). It oscillates also before its start.
-    """
-
-    frequencies: tuple[float, ...] = (0.7, 1.3, 2.9, 5.1, 7.7, 11.3, 14.9)
-    amplitude: float = 3e-6
-    duration: float = 20.0
-
-    def positions(self, time: FloatArray) -> AxisPositions:
-        """Return the commanded axes at ``time`` [s]."""
-        count, z = len(self.frequencies), np.zeros_like(time)
-        for k, frequency in enumerate(self.frequencies):
-            z = z + np.cos(2 * np.pi * frequency * time - np.pi * k * k / count)
-        return _z_only(self.amplitude * z)
-
-
 # The golden ratio distributes any number of edges evenly over the sample period.
 _GOLDEN = 0.6180339887498949
 # Samples in an S-curve from which its content above the Nyquist frequency is negligible.

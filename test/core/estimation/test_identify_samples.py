@@ -213,7 +213,7 @@ class TestVerdict:
             "entries": {
                 "predicted": 0.9,
                 "independence_p": 0.5,
-                "impulse_response": {"explained": 0.99, "model": 0.9},
+                "impulse_response": {"comparator": 0.99, "model": 0.9},
             },
         }
         return sampled_certificate(**(given | changed))

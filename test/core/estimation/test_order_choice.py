@@ -1,7 +1,6 @@
 """Test which structures are tried and chosen, on steps through systems of known order."""
 
 import math
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -13,7 +12,6 @@ from omsm_ros.core.estimation.model_order import (
     cancels,
     choose,
     explore,
-    held_out_rms,
     identifiable,
     information,
     structures,
@@ -157,25 +155,6 @@ def test_the_chosen_one_contains_the_smallest_and_is_richer(truth):
     assert chosen.fit.structure.contains(smallest)
     assert chosen.fit.structure.size == max(smallest.size + 1, 3)
     assert distance(chosen.fit.dynamics, truth) < 0.01
-
-
-def test_held_out_edges_are_predicted_to_the_noise_by_the_right_structure_only():
-    problem = problem_of(PAIR)
-    held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
-    by_poles = {c.fit.structure.poles: c.fit for c in explored(PAIR)}
-    assert held_out_rms(problem, by_poles[2], held) == pytest.approx(NOISE, rel=0.1)
-    assert held_out_rms(problem, by_poles[0], held) > 10 * NOISE
-    assert math.isnan(held_out_rms(problem, by_poles[2], np.zeros(len(held), bool)))
-    assert math.isnan(held_out_rms(problem, by_poles[2], np.ones(len(held), bool)))
-
-
-def test_what_was_held_out_did_not_teach_the_model():
-    """Changed values in the held-out part change only the errors there."""
-    problem = problem_of(PAIR)
-    held = np.arange(len(problem.output)) > 0.6 * len(problem.output)
-    shifted = replace(problem, output=problem.output + np.where(held, 1e-6, 0.0))
-    found = best(explored(PAIR)).fit
-    assert held_out_rms(shifted, found, held) == pytest.approx(1e-6, rel=0.01)
 
 
 def test_a_zero_on_a_pole_is_no_richer():

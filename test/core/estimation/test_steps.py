@@ -9,7 +9,6 @@ from omsm_ros.core.estimation.steps import (
     backlash_columns,
     extended,
     find_steps,
-    held_out,
     sample_noise,
     segments,
 )
@@ -103,16 +102,6 @@ def test_segments_hold_one_edge_each_and_cover_the_record():
     assert parts[-1][1] == len(time)
     for (start, stop), edge in zip(parts, steps.edges, strict=True):
         assert start <= edge.start < edge.stop <= stop
-
-
-def test_held_out_edges_go_both_ways():
-    motion = StepTest()
-    time = np.arange(round(motion.duration / 1e-3)) * 1e-3
-    steps = find_steps(motion.positions(time).z, 1e-3)
-    held = held_out(steps, len(time))
-    heights = [e.height for e in steps.edges if held[(e.start + e.stop) // 2]]
-    assert min(heights) < 0 < max(heights)
-    assert 0.2 < np.mean(held) < 0.5
 
 
 def test_backlash_follows_the_direction_of_approach():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.finding import RESERVATION
-from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import consistency
@@ -134,7 +134,9 @@ def test_what_rang_before_the_record_is_no_part_of_the_answer_to_the_motion():
     diagnostics = survey_of(stepped(alike()))
     problem = replace(diagnostics.problem, fits_initial_condition=True)
     structure = Structure(2, 1, False)
-    start = problem.parametrised(structure).nonlinear_of(np.array([-20.0 + 0j, -30.0]), 0.0)
+    start = ScaledStructure(structure, problem.rate).nonlinear_of(
+        np.array([-20.0 + 0j, -30.0]), 0.0
+    )
     fitted = fit(problem, structure, [start])
     ringing = np.concatenate([fitted.driven[:2], 1e6 * np.ones(2)])
     huge = ResidualDiagnostics(problem, replace(fitted, driven=ringing), diagnostics.steps)
