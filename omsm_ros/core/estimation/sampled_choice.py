@@ -277,9 +277,10 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
                 other = replace(problem, delays=late.astype(np.int64))
             found = fitted(other, late)
             # A delay counts as a parameter. Errors per sample, as a longer delay leaves fewer.
-            count, other = len(found.residual), len(best.residual)
-            gain = np.log(max(best.sum_of_squares, tiny) / other)
-            gain -= np.log(max(found.sum_of_squares, tiny) / count)
+            count = len(found.residual)
+            gain = np.log(
+                max(np.mean(best.residual**2), tiny) / max(np.mean(found.residual**2), tiny)
+            )
             if count * gain > np.log(count):
                 best = found
         delays = best.problem.late(best.nonlinear, best.order)

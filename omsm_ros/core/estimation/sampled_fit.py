@@ -147,11 +147,6 @@ class SectionsFit:
     residual: FloatArray
 
     @property
-    def sum_of_squares(self) -> float:
-        """Return the sum of the squared residual."""
-        return float(self.residual @ self.residual)
-
-    @property
     def sections(self) -> FloatArray:
         """Return d1, d2 of each section (k, 2), scaled."""
         return sections_of(self.nonlinear, self.order)

@@ -38,10 +38,17 @@ def holed(step_test_of):
     return step_test_of.diagnostics(lost=[*range(300, 330), 900, 1500])
 
 
+def projected_by(space, columns):
+    """Return ``columns`` (n, c) projected orthogonally to the fit, where compared, (k, c)."""
+    rows = columns.T.copy()
+    space._free(rows)
+    return rows[:, space.problem.used].T
+
+
 class TestWhatIsFree:
     def test_it_is_at_right_angles_to_all_that_the_fit_may_change(self, holed):
         space = holed.space
-        projected = space.projected(columns_like(holed, 4))
+        projected = projected_by(space, columns_like(holed, 4))
         moved = holed.problem.sensitivity(holed.fitted)
         cosines = (projected / np.linalg.norm(projected, axis=0)).T @ (
             moved / np.linalg.norm(moved, axis=0)
@@ -55,7 +62,9 @@ class TestWhatIsFree:
         moved[clean.problem.used] = clean.problem.sensitivity(clean.fitted)[:, :1]
         moved *= np.linalg.norm(columns[:, 0]) / np.linalg.norm(moved)
         np.testing.assert_allclose(
-            clean.space.projected(columns + 5 * moved), clean.space.projected(columns), atol=1e-9
+            projected_by(clean.space, columns + 5 * moved),
+            projected_by(clean.space, columns),
+            atol=1e-9,
         )
 
 
@@ -69,7 +78,7 @@ class TestScore:
 
     def test_in_white_noise_its_covariance_is_that_of_least_squares(self, clean, step_test_of):
         columns = columns_like(clean, 3)
-        projected = clean.space.projected(columns)
+        projected = projected_by(clean.space, columns)
         expected = step_test_of.noise**2 * np.linalg.inv(projected.T @ projected)
         score = clean.space.score(columns)
         # The level of noise beside each line is known to a quarter, and taken large.
