@@ -3,12 +3,99 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
-from omsm_ros.pipelines.recording import Inspection, inspect_bag
+from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
+from omsm_ros.errors import Notice
+from omsm_ros.io import bags
+from omsm_ros.io.topics import AnyBag, relative
+from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.recording import Recording
 from omsm_ros.readable import quantity
+
+_NO_INDEX = (
+    "the file has no index: its recording was interrupted or the disk was full, so its end may be "
+    "missing; 'omsm inspect --repair' makes a copy with an index"
+)
+
+
+def inspect_bag(path: AnyBag, progress: Progress = no_progress) -> Facts:
+    """Return the topics of a bag, its faults as text, and its vibration levels.
+
+    topics: messages and samples of each; ``gaps`` of the trigger counter with the ``missing``
+    samples; ``restarts`` of the counter; ``invalid`` readings of the probe or axes
+    """
+    with Recording(path, progress) as recording:
+        bag = recording.bag
+        topics = bag.topics()
+        present = [t.role for t in topics if t.role in bags.BLOCK_TOPICS and t.messages]
+        watches = {topic: StreamWatch() for topic in present}
+        for topic, block in recording.stream(*present):
+            watches[topic].add(block)
+        if recording.holds(bags.ACCELERATION_TOPIC):
+            watches[bags.ACCELERATION_TOPIC] = StreamWatch()
+            for topic, block in bag.records(bags.ACCELERATION_TOPIC):
+                watches[topic].add(block)
+        faults = [] if bag.indexed else [_NO_INDEX]
+        faults += [
+            f"no {what}: nothing on {bag.name_of(topic)!r}, which identify and correct need"
+            for topic, what in ((bags.AXES_TOPIC, "axes"), (bags.DISTANCE_TOPIC, "distance"))
+            if topic not in watches
+        ]
+        vibration = _vibration(bag.vibration())
+    faults += map(str, _faults(watches))
+    rows = [_topic_facts(t, watches.get(t.role)) for t in topics]
+    return {"topics": rows, "faults": faults, "vibration": vibration}
+
+
+def _vibration(levels: Sequence[Mapping[str, Any]]) -> Facts | None:
+    """Return the largest levels of all spectra that the monitor reported; None without any.
+
+    rms: of each axis by band [m/s²];  height, height_total: effect on a height, rms [m], None
+    without a calibration;  alarms: number of spectra during which the alarm was raised
+    """
+    # The bands depend on the sampling rate; only spectra with those of the last one compare.
+    alike = [one for one in levels if one["bands"] == levels[-1]["bands"]]
+    if not alike:
+        return None
+    heights = [one for one in alike if one["height"] is not None]
+    return {
+        "spectra": len(levels),
+        "alarms": sum(one["alarm"] for one in levels),
+        "bands": alike[-1]["bands"],
+        "rms": {axis: _largest(one["rms"][axis] for one in alike) for axis in alike[-1]["rms"]},
+        "height": _largest(one["height"] for one in heights) if heights else None,
+        "height_total": max((one["height_total"] for one in heights), default=None),
+    }
+
+
+def _largest(levels: Iterable[Sequence[float]]) -> list[float]:
+    """Return the largest level of each band."""
+    return [float(max(band)) for band in zip(*levels, strict=True)]
+
+
+def _faults(watches: dict[str, StreamWatch]) -> Iterator[Notice]:
+    for topic, watch in watches.items():
+        yield from watch.faults(relative(topic))
+    axes, distance = watches.get(bags.AXES_TOPIC), watches.get(bags.DISTANCE_TOPIC)
+    if axes and distance and axes.samples and distance.samples:
+        period = min(axes.periods)
+        if period == min(distance.periods):
+            yield from skew_fault(counter_skew(axes, distance), period)
+
+
+def _topic_facts(topic: bags.TopicSummary, watch: StreamWatch | None) -> Facts:
+    found: Facts = {"topic": topic.topic, "type": topic.type, "messages": topic.messages}
+    names = ("samples", "sample_period", "duration", "gaps", "missing", "restarts", "invalid")
+    if watch is None or not watch.samples:
+        return found | dict.fromkeys(names, 0)
+    period = min(watch.periods)
+    values = (watch.samples, period, float(watch.samples * period), watch.places, watch.missing)
+    return found | dict(zip(names, (*values, watch.restarts, watch.invalid), strict=True))
 
 
 def _declare_inspect(add: Arguments) -> None:
@@ -25,8 +112,7 @@ def _inspect(args: argparse.Namespace) -> Facts:
     if args.repair:
         return _repaired(args.bag)
     with progress_bar("reading", args.json) as progress:
-        found: Inspection = inspect_bag(cell_of(args.bag, args), progress)
-    return {"bag": str(args.bag), **found.entry()}
+        return {"bag": str(args.bag), **inspect_bag(cell_of(args.bag, args), progress)}
 
 
 def _repaired(bag: Path) -> Facts:
@@ -57,10 +143,10 @@ def _show_inspect(facts: Facts) -> None:
         period = topic["sample_period"]
         say(row.format(rate=f"{1 / period:g}" if period else "-", **topic))
     faults = [("fault", text) for text in facts["faults"]] or [("faults", "none found")]
-    table([*_vibration(facts["vibration"]), *faults])
+    table([*_vibration_rows(facts["vibration"]), *faults])
 
 
-def _vibration(found: Facts | None) -> list[tuple[str, str]]:
+def _vibration_rows(found: Facts | None) -> list[tuple[str, str]]:
     """Return rows of the largest levels by band, as the vibration monitor reported them."""
     if found is None:
         return []

@@ -332,7 +332,7 @@ def test_what_nobody_knows_is_null(capsys, monkeypatch, folder):
     from omsm_ros.cli import recordings
 
     reported = {"topics": [{"a": float("nan"), "b": [float("inf")]}], "faults": []}
-    monkeypatch.setattr(recordings.Inspection, "entry", lambda _: reported)
+    monkeypatch.setattr(recordings, "inspect_bag", lambda *_: reported)
     status, out, _ = run(capsys, "inspect", folder / "scan.mcap", "--json")
     assert status == 0
     assert json.loads(out)["topics"] == [{"a": None, "b": [None]}]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.cli import main
+from omsm_ros.cli.recordings import inspect_bag
 from omsm_ros.core.ripple.accelerometer import MonitorOptions, RunningSpectrum
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.errors import BagError
@@ -14,7 +15,6 @@ from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.message_mapping import typestore, vibration_levels
 from omsm_ros.io.topics import VIBRATION_TOPIC
-from omsm_ros.pipelines.recording import inspect_bag
 
 SIZE, FREQUENCY = 50e-9, 680.0
 
@@ -47,7 +47,7 @@ def test_levels_go_through_a_bag_and_are_reported(tmp_path, capsys):
     path = record(tmp_path / "a.mcap", *states)
     with bags.BagReader(path) as bag:
         assert bag.vibration() == states
-    found = inspect_bag(path).vibration
+    found = inspect_bag(path)["vibration"]
     assert found["height_total"] == pytest.approx(SIZE / 2**0.5, rel=0.03)
     band = [low <= FREQUENCY < high for low, high in found["bands"]].index(True)
     assert found["height"][band] == pytest.approx(SIZE / 2**0.5, rel=0.03)
@@ -63,14 +63,14 @@ def test_levels_go_through_a_bag_and_are_reported(tmp_path, capsys):
 def test_an_effect_that_nobody_knows_is_said_to_be_none(tmp_path, capsys):
     quiet = replace(levels(), effect=None, total_effect=None)
     path = record(tmp_path / "a.mcap", reported(quiet))
-    assert inspect_bag(path).vibration["height"] is None
+    assert inspect_bag(path)["vibration"]["height"] is None
     main(["inspect", str(path)])
     assert "not evaluated: no calibration" in capsys.readouterr().out
 
 
 def test_a_bag_without_levels_has_none(tmp_path, capsys):
     path = record(tmp_path / "a.mcap")
-    assert inspect_bag(path).vibration is None
+    assert inspect_bag(path)["vibration"] is None
     assert main(["inspect", str(path)]) == 0
     assert "alarm in" not in capsys.readouterr().out
 

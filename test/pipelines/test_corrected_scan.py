@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from omsm_ros.cli.recordings import inspect_bag
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.streams.blocks import AxisBlock
@@ -17,7 +18,7 @@ from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines import correct
 from omsm_ros.pipelines.correct import Admission, CorrectedScan, correct_bag
 from omsm_ros.pipelines.measure import measure
-from omsm_ros.pipelines.recording import Recording, inspect_bag
+from omsm_ros.pipelines.recording import Recording
 
 TOPICS = (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
 
@@ -180,7 +181,7 @@ def test_a_probe_whose_counter_is_off_gives_no_points_and_is_reported(
     assert account["counted"]["slipped"] >= 2000 - samples - 21  # except for the settling samples
     said = summary["warnings"]
     assert any(f"slipped by {samples} samples" in s for s in said)
-    assert any(f"slipped by {samples} samples" in s for s in inspect_bag(path).faults)
+    assert any(f"slipped by {samples} samples" in s for s in inspect_bag(path)["faults"])
 
 
 def test_trigger_numbers_missing_from_both_streams_take_the_green_away(
@@ -193,8 +194,8 @@ def test_trigger_numbers_missing_from_both_streams_take_the_green_away(
             bag.write_distance(distance)
     said = reasons_of(path, true_calibration, tmp_path)
     assert [s for s in said if "200 trigger numbers are missing (800 to 999)" in s]
-    stream, _ = inspect_bag(path).streams
-    assert (stream.gaps, stream.missing) == (1, 200)
+    stream, _ = inspect_bag(path)["topics"]
+    assert (stream["gaps"], stream["missing"]) == (1, 200)
 
 
 def reasons_of(path, calibration, folder):
