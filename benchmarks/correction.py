@@ -9,6 +9,7 @@ import numpy as np
 from scipy import signal
 
 from benchmarks.row import Row, at_most, shown
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.adjustment.resolved_calibration import reversal
 from omsm_ros.core.adjustment.scan_reader import read_scan
 from omsm_ros.core.calibration.calibration import Calibration
@@ -26,7 +27,7 @@ from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.scenario import Scenario, step_test_of
+from omsm_ros.twin.scenario import Scenario
 from omsm_ros.units import MICROSECOND_S, NANOMETRE_M
 
 # The probe's noise and resolution, 10 nm each, at the scale of the surface.

@@ -12,13 +12,12 @@ from typing import Any, TypeVar
 
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import Drift, Harmonic, MachineErrors, SpindleError, Straightness
 from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.sensors import ClockErrors, EncoderErrors, Pitch, ReferenceSensor
 from omsm_ros.twin.structure import Creep, Friction, LogCreep, SoftMode, StructureErrors
-from omsm_ros.twin.vibration import VibrationLine
 
 Sizes = tuple[Disturbances, Disturbances, Disturbances]
 Record = TypeVar("Record")

@@ -14,7 +14,7 @@ from omsm_ros.core.correction.machine_sources import MachineSources, StatedSourc
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.model_errors.families import CREEP, MODE
 from omsm_ros.core.surface.nominal import PAPER_MIRROR_RADIUS_M
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import (
     Drift,
     Harmonic,
@@ -26,7 +26,6 @@ from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.sensors import ClockErrors, EncoderErrors, Pitch
 from omsm_ros.twin.structure import Creep, SoftMode, StructureErrors
-from omsm_ros.twin.vibration import VibrationLine
 from omsm_ros.units import PPM
 
 LATENCY_S, LATENCY_UNCERTAINTY_S = 50e-6, 2e-6

@@ -18,6 +18,7 @@ from benchmarks.against_truth import (
 )
 from benchmarks.cramer_rao import response_bounds
 from benchmarks.row import Row, at_least, at_most, shown
+from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.estimation.covariance import inter_sample_motion_covariance
 from omsm_ros.core.identification.identify import identify
@@ -28,7 +29,7 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
-from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant, respond
+from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 FREQUENCIES = np.array([1.0, 5.0, 15.0, 50.0])
 # Not the seeds on which the choice of structure was designed.

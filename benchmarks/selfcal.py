@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.row import Row, at_least, shown
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.adjustment.resolved_calibration import (
     after_step_test,
     from_scans_alone,
@@ -24,11 +25,10 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
-from omsm_ros.twin.disturbances import NOTHING, Disturbances
+from omsm_ros.twin.disturbances import NOTHING, Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import Drift, MachineErrors
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.scenario import Scenario, step_test_of
-from omsm_ros.twin.vibration import VibrationLine
+from omsm_ros.twin.scenario import Scenario
 from omsm_ros.units import NANOMETRE_M
 
 LAG_S = 0.34e-3

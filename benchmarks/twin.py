@@ -10,12 +10,13 @@ import numpy as np
 
 from benchmarks.disturbance_catalogue import CATALOGUE, together
 from benchmarks.row import Row, at_most
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
 from omsm_ros.twin.disturbances import Disturbances
-from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, scan_of
 from omsm_ros.twin.sensors import AccelerationSensor
 from omsm_ros.units import NANOMETRE_M
 

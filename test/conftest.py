@@ -9,11 +9,12 @@ import hypothesis
 import numpy as np
 import pytest
 
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
-from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, scan_of
 
 
 def pytest_configure():

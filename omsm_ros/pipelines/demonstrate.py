@@ -55,9 +55,8 @@ from omsm_ros.report.measurement.figures import levelled, overview_figure, surfa
 from omsm_ros.report.measurement.surface_map import CloudView
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth
-from omsm_ros.twin.disturbances import NOTHING, Disturbances
+from omsm_ros.twin.disturbances import NOTHING, Disturbances, TrueResponse
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
-from omsm_ros.twin.true_response import TrueResponse
 from omsm_ros.units import PPM
 
 # Range of TCP ports for emulated devices on this host.

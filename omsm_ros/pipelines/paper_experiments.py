@@ -34,13 +34,12 @@ from omsm_ros.report.spectrum import CAPTIONS, drawn
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.plant import PAPER_DYNAMICS
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, on_a_flat, planned_test_of, scan_of
 from omsm_ros.twin.sensors import AccelerationSensor
-from omsm_ros.twin.vibration import VibrationLine
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
 

@@ -1,5 +1,7 @@
 """A recorded bag: opened once, and each part of it read when a task needs it."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Any

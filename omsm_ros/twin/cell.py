@@ -25,7 +25,7 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part import mounted_surface
 from omsm_ros.twin.plant import Plant, TimeGrid, move
@@ -34,8 +34,6 @@ from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
 from omsm_ros.twin.structure import deform
 from omsm_ros.twin.trajectory import Trajectory
-from omsm_ros.twin.true_response import TrueResponse
-from omsm_ros.twin.vibration import Vibration
 from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
 
 __all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]

@@ -2,14 +2,86 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import ArrayLike
+
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.machine_errors import MachineErrors
-from omsm_ros.twin.probe import ProbeErrors
+from omsm_ros.twin.probe import Probe, ProbeErrors
+from omsm_ros.twin.record_checks import check_numbers
 from omsm_ros.twin.sensors import AccelerationSensor, ClockErrors, EncoderErrors, ReferenceSensor
 from omsm_ros.twin.structure import StructureErrors
-from omsm_ros.twin.vibration import VibrationLine
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VibrationLine:
+    """Line ``amplitude_m · sin(2π frequency_hz t + per_turn · c + phase_rad)``.
+
+    amplitude_m: half of peak to valley
+    frequency_hz: of a free line;  per_turn: waves a turn of a synchronous line
+    phase_rad: None takes a random phase
+    """
+
+    amplitude_m: float
+    frequency_hz: float = 0.0
+    per_turn: float = 0.0
+    phase_rad: float | None = None
+
+    def __post_init__(self) -> None:
+        check_numbers(self, not_negative=("frequency_hz",))
+        if not self.frequency_hz and not self.per_turn:
+            raise ConfigurationError(
+                "VibrationLine: frequency_hz and per_turn are both zero; give one of them"
+            )
+
+    def height(self, time: FloatArray, c: FloatArray, random_phase: float) -> FloatArray:
+        """Return the height [m] at ``time`` (n,) [s] and spindle angle ``c`` (n,) [rad]."""
+        phase = random_phase if self.phase_rad is None else self.phase_rad
+        turning = 2 * np.pi * self.frequency_hz * time + self.per_turn * c + phase
+        return np.asarray(self.amplitude_m * np.sin(turning), np.float64)
+
+    def turn(self, duration_s: float, spindle_rad: FloatArray) -> FloatArray:
+        """Return the change of its phase [rad] while the spindle turns by ``spindle_rad`` (n,)."""
+        return 2 * np.pi * self.frequency_hz * duration_s + self.per_turn * spindle_rad
+
+
+@dataclass(frozen=True)
+class Vibration:
+    """Several lines with their phases [rad]."""
+
+    lines: Sequence[VibrationLine]
+    phases: Sequence[float]
+
+    @classmethod
+    def of(cls, lines: Sequence[VibrationLine], random: np.random.Generator) -> Vibration:
+        """Return the lines with random phases for those without one."""
+        return cls(lines, random.uniform(0.0, 2 * np.pi, len(lines)).tolist())
+
+    def height(
+        self, middle: FloatArray, c: FloatArray, exposure_s: float, turned: FloatArray
+    ) -> FloatArray:
+        """Return the sum of all lines, averaged over exposures [m].
+
+        middle: of the exposures (n,) [s];  c: spindle angle then (n,) [rad]
+        turned: rotation of the spindle within an exposure (n,) [rad]
+        """
+        total = np.zeros_like(middle)
+        for line, phase in zip(self.lines, self.phases, strict=True):
+            dimmed = np.sinc(line.turn(exposure_s, turned) / (2 * np.pi))
+            total += dimmed * line.height(middle, c, phase)
+        return total
+
+    def acceleration(self, time: FloatArray, c: FloatArray, spindle: FloatArray) -> FloatArray:
+        """Return the second derivative of the height [m/s²] at speeds ``spindle`` (n,) [rad/s]."""
+        total = np.zeros_like(time)
+        for line, phase in zip(self.lines, self.phases, strict=True):
+            total -= line.turn(1.0, spindle) ** 2 * line.height(time, c, phase)
+        return total
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,3 +115,47 @@ class Disturbances:
 
 
 NOTHING = Disturbances()
+
+
+@dataclass(frozen=True, eq=False)
+class TrueResponse:
+    """Linear response from encoder to reading of the probe, at position 0 and time 0.
+
+    Stiffness along Z or X, periodic pitch and drift of a clock are not included.
+    """
+
+    plant_dynamics: TransferFunction
+    disturbances: Disturbances
+    probe: Probe
+
+    def response(self, frequency: ArrayLike) -> ComplexArray:
+        """Return G at ``frequency`` [Hz], of its shape, with a static gain of 1."""
+        f = np.asarray(frequency, np.float64)
+        return self.structural_response(f) * self.probe_response(f)
+
+    def structural_response(self, frequency: ArrayLike) -> ComplexArray:
+        """Return the mechanical part, which delays Z only, of the shape of ``frequency`` [Hz]."""
+        s = np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128)
+        moved = self.plant_dynamics.normalised().at(s) * self.disturbances.structure.response(s)
+        seen = self.disturbances.encoder.response(s) / self._encoder_gain
+        return np.asarray(moved / seen, np.complex128)
+
+    def probe_response(self, frequency: ArrayLike) -> ComplexArray:
+        """Return the part of the reading, a delay relative to all axes, at ``frequency`` [Hz]."""
+        f = np.asarray(frequency, np.float64)
+        turning = np.exp(-2j * np.pi * f * self.latency_s)
+        return np.asarray(turning * np.sinc(f * self.disturbances.probe.window_s), np.complex128)
+
+    @property
+    def static_gain(self) -> float:
+        """Static gain: reading over travel of the encoder [1]."""
+        return self.probe.scale * self.plant_dynamics.dc_gain / self._encoder_gain
+
+    @property
+    def _encoder_gain(self) -> float:
+        return float(self.disturbances.encoder.response(np.zeros(1, np.complex128))[0].real)
+
+    @property
+    def latency_s(self) -> float:
+        """Delay of the reading relative to the encoder of Z, at time 0."""
+        return self.disturbances.probe.lag_s + self.disturbances.clocks.lag_s

@@ -58,14 +58,6 @@ class Plant:
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
-    """True motion of slide and probe at the sampling instants [m], each (n,)."""
-
-    slide: FloatArray
-    probe: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Movement:
     """True motion of slide and probe as signals in time [m]."""
 
@@ -91,16 +83,6 @@ class TimeGrid:
     def step(self) -> float:
         """Step [s]."""
         return self.sample_period / self.substeps
-
-
-def respond(
-    plant: Plant, motion: Motion, samples: int, sample_period: float, substeps: int = 16
-) -> Response:
-    """Return the response of the plant to ``motion`` every ``sample_period`` [s]."""
-    lead = int(np.ceil(plant.lead_in() / sample_period))
-    moved = move(plant, motion, TimeGrid(lead, samples, sample_period, substeps, substeps))
-    at_samples = slice(lead - 1, lead - 1 + samples)
-    return Response(moved.slide.values[at_samples], moved.probe.values[at_samples])
 
 
 def move(plant: Plant, motion: Motion, grid: TimeGrid) -> Movement:

@@ -50,11 +50,6 @@ class Scenario:
         )
 
 
-def step_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """Return the step test of the paper on a fixed flat."""
-    return on_a_flat(scenario, StepTest(rise=scenario.step_rise), disturbances)
-
-
 def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
     """Return the step test of ``omsm plan steps`` with half its dwell, on a fixed flat."""
     step = StepTest().step

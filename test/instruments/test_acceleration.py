@@ -6,9 +6,8 @@ from omsm_ros.core.kinematics.trajectories import Circle
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.instruments.emulator_factory import AccelerationFeed
 from omsm_ros.twin.cell import Cell, record
-from omsm_ros.twin.disturbances import NOTHING, Disturbances
+from omsm_ros.twin.disturbances import NOTHING, Disturbances, VibrationLine
 from omsm_ros.twin.sensors import AccelerationSensor
-from omsm_ros.twin.vibration import VibrationLine
 
 
 def recording(disturbances):

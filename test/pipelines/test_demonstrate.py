@@ -9,6 +9,7 @@ import pytest
 from written_disturbances import write_disturbances
 
 from benchmarks.disturbance_catalogue import CATALOGUE
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.errors import FileError, OmsmError
 from omsm_ros.pipelines.demonstrate import (
     Demonstration,
@@ -18,7 +19,6 @@ from omsm_ros.pipelines.demonstrate import (
 )
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import step_test_of
 
 
 def test_without_a_file_nothing_is_wrong_with_the_machine(tmp_path):

@@ -14,11 +14,10 @@ from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines.record_twin import acceleration_blocks, write_recording
 from omsm_ros.twin.cell import Cell, Probe, record
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.sensors import AccelerationSensor
-from omsm_ros.twin.vibration import VibrationLine
 
 RADIUS, SECONDS = 21.6e-3, 10.0
 SPEEDS = {"F1": 0.14, "F2": 1.875, "F3": 15.0}

@@ -8,11 +8,12 @@ pytest.importorskip("omsm_msgs", reason="the interfaces are not built")
 
 from omsm_msgs.srv import Identify
 
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.pipelines.history import history
 from omsm_ros.twin.cell import blocks_of
-from omsm_ros.twin.scenario import Scenario, step_test_of
+from omsm_ros.twin.scenario import Scenario
 
 
 def _bag(path, rise):

@@ -5,10 +5,12 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 from scipy.spatial.transform import Rotation
 
+from benchmarks.twin_motions import respond
 from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.disturbances import Vibration, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple, PartPose
-from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, move, respond
+from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, move
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.sensors import (
@@ -28,7 +30,6 @@ from omsm_ros.twin.structure import (
     hardened,
 )
 from omsm_ros.twin.trajectory import Trajectory
-from omsm_ros.twin.vibration import Vibration, VibrationLine
 
 STEP = 1e-3
 EXACT = {"rtol": 1e-9, "atol": 1e-16, "method": "LSODA"}

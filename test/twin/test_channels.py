@@ -13,9 +13,8 @@ from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, record
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.sensors import AccelerationSensor, ReferenceSensor
-from omsm_ros.twin.vibration import VibrationLine
 
 SILENT = {"noise_m_per_s2": 0.0}
 

@@ -70,7 +70,7 @@ def test_structure_lags_in_z_only():
     expected = 0.34e-3 * SPEED_RAD_S * _by_angle(x, y)
     # The servo lags too, by 1.6 ms: the raw error belongs to where Z was.
     assert np.ptp(raw) == pytest.approx(np.ptp(expected), rel=0.01)
-    assert made.truth.response.latency_share == 0.0
+    assert made.truth.response.latency_s == 0.0
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from benchmarks.disturbance_catalogue import CATALOGUE, SIZES, together
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Spiral, StepTest
 from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.cell import Cell, Probe, record
-from omsm_ros.twin.disturbances import NOTHING, Disturbances
+from omsm_ros.twin.disturbances import NOTHING, Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import Drift, MachineErrors, PartPose
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, scan_of
 from omsm_ros.twin.structure import Creep, StructureErrors
-from omsm_ros.twin.vibration import VibrationLine
 from omsm_ros.units import NANOMETRE_M
 
 QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0)
@@ -143,8 +143,6 @@ def test_latency_shifts_time_and_place_by_itself_exactly(latency):
     assert np.max(abs(late.probe_motion - prompt.probe_motion)) < 1e-12
     assert np.max(abs(late.truth.x - prompt.truth.x)) < 1e-15
     assert late.truth.response.latency_s == latency
-    share = latency / (latency + Cell().plant.dynamics.low_frequency_delay)
-    assert late.truth.response.latency_share == pytest.approx(share)
 
 
 def test_the_reading_belongs_to_the_middle_of_the_exposure():

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from benchmarks.twin_motions import respond
 from omsm_ros.core.kinematics.trajectories import Spiral, StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.ripple.density import aliased_frequency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.twin.plant import PAPER_EQ_12, Plant, respond
+from omsm_ros.twin.plant import PAPER_EQ_12, Plant
 
 REFERENCE = [  # frequency [Hz], gain, phase [deg] of Eq. 12
     (0.5, 0.992126, -0.06115),

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from benchmarks.twin_motions import respond
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Chirp, Spiral, StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant, respond
+from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant
 from omsm_ros.units import NANOMETRE_M
 
 PERIOD = 1e-3

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.kinematics.trajectories import Chirp, plan_steps
-from omsm_ros.twin.scenario import Scenario, on_a_flat, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, on_a_flat, scan_of
 
 SMALL = {"start_radius": 1e-3, "feed_per_turn": 5e-4}
 

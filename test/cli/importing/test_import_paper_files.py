@@ -7,13 +7,14 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.twin_motions import step_test_of
 from omsm_ros import cli
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.io import calibration_file, results
 from omsm_ros.pipelines.record_twin import write_recording
 from omsm_ros.twin.cell import blocks_of
-from omsm_ros.twin.scenario import Scenario, scan_of, step_test_of
+from omsm_ros.twin.scenario import Scenario, scan_of
 
 MAP = """
 sample_period: 0.001

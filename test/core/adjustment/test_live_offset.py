@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 from two_counters import blocks, motion, watched
 
+from benchmarks.twin_motions import step_test_of
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
-from omsm_ros.twin.scenario import Scenario, step_test_of
+from omsm_ros.twin.scenario import Scenario
 
 
 @pytest.mark.parametrize("kind", ["chirp", "steps"])

@@ -28,11 +28,10 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
-from omsm_ros.twin.disturbances import Disturbances
+from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import Drift, MachineErrors, PartPose
 from omsm_ros.twin.plant import PAPER_DYNAMICS, Plant
 from omsm_ros.twin.probe import ProbeErrors
-from omsm_ros.twin.vibration import VibrationLine
 
 LAG_S = PAPER_DYNAMICS.low_frequency_delay
 TRUE_GAIN = Probe().scale

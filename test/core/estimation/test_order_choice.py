@@ -6,6 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from benchmarks.twin_motions import respond
 from omsm_ros.core.estimation.model_order import (
     Candidate,
     StartingPoints,
@@ -22,7 +23,7 @@ from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import IdentificationError
-from omsm_ros.twin.plant import Plant, respond
+from omsm_ros.twin.plant import Plant
 
 NOISE = 1e-8
 FIRST_ORDER = TransferFunction.from_ascending([1.0], [1.0, 3e-3])
