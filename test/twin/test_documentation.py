@@ -63,4 +63,4 @@ def test_the_example_runs():
     namespace = {}
     exec(compile(example, "docs/twin.md", "exec"), namespace)
     assert isinstance(namespace["scan"], Recording)
-    assert len(namespace["record"]) == 10_500
+    assert len(namespace["record"]) == 29_000
