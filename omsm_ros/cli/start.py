@@ -8,9 +8,9 @@ from dataclasses import asdict
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, say_lines
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.pipelines.record_twin import record_twin
+from omsm_ros.pipelines.record_twin import record_sources, record_twin
 from omsm_ros.quantities import FEED, RADIUS, SEED, SPEED
-from omsm_ros.twin.scenario import Scenario
+from omsm_ros.twin.scenario import PASSES, SPHERE, STAND_OFFS, STILL, TURNED, Scenario
 
 
 def _declare_twin(add: Arguments) -> None:
@@ -26,6 +26,14 @@ def _declare_twin(add: Arguments) -> None:
     add("--feed", FEED, "feed per turn [m]", default=usual.feed_per_turn)
     add("--disturbances", "FILE", "errors of the machine")
     add("--seed", SEED, "seed of noise and part", default=1)
+    add("--outward", None, "scan from the centre outward")
+    add(
+        "--recordings",
+        str,
+        "write the recordings that 'omsm sources' evaluates instead of step test and scan",
+        nargs="*",
+        choices=(SPHERE, STILL, TURNED, PASSES, STAND_OFFS),
+    )
     add("--part", SEED, "seed of the part alone, for several scans of one part")
 
 
@@ -36,11 +44,19 @@ def _twin(args: argparse.Namespace) -> Facts:
         feed_per_turn=args.feed,
         start_radius=args.radius,
         part_seed=args.part,
+        outward=args.outward,
     )
+    if args.recordings is not None:
+        kinds = args.recordings or (SPHERE, STILL, TURNED, PASSES, STAND_OFFS)
+        return {"recordings": record_sources(args.out, scenario, kinds, args.disturbances)}
     return asdict(record_twin(args.out, scenario, args.disturbances))
 
 
 def _show_twin(facts: Facts) -> None:
+    if "recordings" in facts:
+        for path, samples in facts["recordings"].items():
+            say(f"{path}: {samples} samples")
+        return
     say(f"{facts['steps']}: {facts['step_samples']} samples of a step test on a flat")
     say(f"{facts['scan']}: {facts['scan_samples']} samples of a scan of {facts['nominal']}")
 

@@ -72,6 +72,9 @@ TASKS: dict[str, dict[str, Word]] = {
             "correct",
             "estimate spindle centre and beam direction from a scan of a reference sphere",
         ),
+        "sources": Word(
+            "sources", "evaluate error sources of the machine from a recording made for it"
+        ),
         "correct": Word("correct", "correct a recorded scan: cloud, summary and report"),
         "adjust": Word(
             "adjust", "adjust two or more scans of one part together: form, sources, verdict"

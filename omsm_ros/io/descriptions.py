@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, fields, is_dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -109,7 +110,10 @@ _MOST_SOURCES = 200
 _TEXT = {"type": "string"}
 _OWN = {"source": _TEXT, "value": NUMBER, "unit": _TEXT, "how": _TEXT, "reason": _TEXT}
 _PARAMETERS = {key: NUMBER for kind in KINDS.values() for key in kind.parameters}
-_ITEM = form({**_OWN, "distribution": _TEXT, **_PARAMETERS}, tuple(_OWN))
+# How a source was evaluated; for people, and for the next evaluation of the same source.
+_EVALUATION = {"found": NUMBER, "uncertainty": NUMBER, "recording": _TEXT, "date": _TEXT,
+               "command": _TEXT}  # fmt: skip
+_ITEM = form({**_OWN, "distribution": _TEXT, **_PARAMETERS, **_EVALUATION}, tuple(_OWN))
 _FORM = form(
     {
         "schema": {"const": SCHEMA},
@@ -130,6 +134,28 @@ def load_sources(path: Path | str) -> MachineSources:
         return MachineSources(tuple(_stated(item) for item in content["sources"]))
     except ConfigurationError as err:
         raise FileError(f"{what}: {err}") from err
+
+
+def add_sources(path: Path, found: Sequence[Mapping[str, object]]) -> None:
+    """Add evaluated sources to ``SOURCES.yaml``, which is made if it does not exist.
+
+    Each replaces the entries of the same source and ``per_turn``; comments before the list remain.
+    """
+    head, kept = "", []
+    if path.exists():
+        load_sources(path)
+        text = read_text(path, MAX_BYTES, FileError, "sources")
+        head = "".join(takewhile(lambda line: line[0] in "#\n", text.splitlines(keepends=True)))
+        kept = json_and_yaml.mapping_of(text, FileError, f"sources {str(path)!r}")["sources"]
+    new = {(item["source"], item.get("per_turn")) for item in found}
+    kept = [item for item in kept if (item["source"], item.get("per_turn")) not in new]
+    lines = [
+        yaml.safe_dump(dict(item), default_flow_style=True, sort_keys=False, allow_unicode=True,
+                       width=10_000).strip()
+        for item in (*kept, *found)
+    ]  # fmt: skip
+    listed = "".join(f"  - {line}\n" for line in lines)
+    save_text(path, f"{head}schema: {SCHEMA}\nsources:\n{listed}")
 
 
 def _stated(item: Mapping[str, Any]) -> StatedSource:

@@ -77,4 +77,9 @@ TEMPLATES: dict[str, str] = {
         "({opt.polarity}), the static gain ({opt.static_gain}) or the latch of the encoder is not "
         "as stated; make a step test, and give it ({opt.calibration})"
     ),
+    "adjustment.recording_kind": "recording {kind!r}, expected one of {known:list}",
+    "adjustment.other_motion": (
+        "the axes do not move as in a recording of the kind {kind!r}; 'omsm sources --help' says "
+        "how each is made"
+    ),
 }

@@ -144,14 +144,15 @@ _CURVATURE_HZ = 10.0
 def priors_of(
     stated: MachineSources, abbe_arm: float = 0.0, calibration: Calibration | None = None
 ) -> tuple[Source, ...]:
-    """Return the declared sources as priors of the adjustment, but those of ``NOT_ADJUSTED``.
+    """Return the declared sources as priors of the adjustment, but zeros and ``NOT_ADJUSTED``.
 
     abbe_arm: over which pitch acts, unless it is stated with its own [m]
     calibration: its uncertainty of the lag adds to the declared change; None: it is exact
     """
     found: dict[str, Source] = {}
     for source in stated.stated:
-        if source.source in NOT_ADJUSTED:
+        # A zero is no figure of a machine: it evaluates and declares nothing.
+        if source.source in NOT_ADJUSTED or not source.standard_uncertainty:
             continue
         prior = _prior(source, abbe_arm)
         before = found.get(prior.name, replace(prior, uncertainty=0.0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +18,13 @@ from omsm_ros.io.files import save_text
 from omsm_ros.readable import count, quantity
 from omsm_ros.twin.cell import Recording, blocks_of
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
+from omsm_ros.twin.scenario import (
+    Scenario,
+    planned_test_of,
+    scan_of,
+    source_recording,
+    spiral_of,
+)
 from omsm_ros.units import NANOSECONDS_PER_S
 
 _BLOCK_SAMPLES = 1000
@@ -78,6 +84,21 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
     scan = _write(out / SCAN, scan_of(scenario, wrong))
     write_nominal(out / NOMINAL)
     return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+
+
+def record_sources(
+    out: Path, scenario: Scenario, kinds: Sequence[str], disturbance_file: Path | None = None
+) -> dict[str, int]:
+    """Write one bag for each of ``kinds`` into ``out``, for ``omsm sources``; return its samples.
+
+    Raises BagError if a bag of that name exists.
+    """
+    wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
+    bags_of = {kind: out / f"{kind}.mcap" for kind in kinds}
+    return {
+        str(path): _write(path, source_recording(kind, scenario, wrong))
+        for kind, path in bags_of.items()
+    }
 
 
 def _check(scenario: Scenario) -> None:

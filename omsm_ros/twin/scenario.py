@@ -10,15 +10,20 @@ from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
     SECOND_SHARE,
+    AxisPositions,
     Motion,
     Spiral,
     StepTest,
     plan_steps,
+    s_curve,
 )
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
+from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.part import FigureError, PartPose
+from omsm_ros.units import RPM_HZ, RPM_RAD_S
 
 
 @dataclass(frozen=True)
@@ -110,3 +115,89 @@ def verifying(scenario: Scenario) -> Scenario:
 def verifying_scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
     """Return the scan of :func:`verifying`."""
     return scan_of(verifying(scenario), disturbances)
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """The axes stand still for ``duration`` [s]."""
+
+    duration: float
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return zeros for each ``time``."""
+        return AxisPositions(*np.zeros((5, *np.shape(time))))
+
+
+@dataclass(frozen=True, slots=True)
+class Passes:
+    """X goes to ``radius`` [m] and back, ``passes`` times, each in ``period`` [s]."""
+
+    radius: float
+    passes: int
+    period: float
+
+    @property
+    def duration(self) -> float:
+        """Duration of all passes [s]."""
+        return self.passes * self.period
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]."""
+        none = np.zeros(np.shape(time))
+        x = self.radius * (1 - np.cos(2 * np.pi / self.period * np.maximum(time, 0.0))) / 2
+        return AxisPositions(x, none, none, none, none)
+
+
+@dataclass(frozen=True, slots=True)
+class StandOffs:
+    """A ring of ``radius`` [m] at ``spindle_speed`` [rpm]; Z goes up and down by ``reach`` [m].
+
+    The distance runs through its range once in ``turns``, in steps of a turn.
+    """
+
+    radius: float
+    spindle_speed: float
+    reach: float
+    turns: int
+
+    @property
+    def duration(self) -> float:
+        """Duration of all turns [s]."""
+        return self.turns / (abs(self.spindle_speed) * RPM_HZ)
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]."""
+        turned = np.maximum(time, 0.0) * abs(self.spindle_speed) * RPM_HZ
+        whole = np.floor(turned)
+        # The step takes the first tenth of each turn.
+        place = whole - 1 + s_curve(10 * (turned - whole))
+        z = self.reach * np.sin(2 * np.pi * np.maximum(place, 0.0) / self.turns)
+        none = np.zeros(np.shape(time))
+        return AxisPositions(
+            none + self.radius, none, z, none, self.spindle_speed * RPM_RAD_S * time
+        )
+
+
+# Of the reference sphere, and how far it is mounted from the axis: only so does centre_y show.
+SPHERE_RADIUS_M, SPHERE_OFFSET_M = 0.05, 1e-3
+SPHERE, STILL, TURNED, PASSES, STAND_OFFS = "sphere", "still", "turned", "passes", "stand_offs"
+
+
+def source_recording(
+    kind: str, scenario: Scenario, disturbances: Disturbances = NOTHING
+) -> Recording:
+    """Return the recording from which ``omsm sources`` evaluates the sources of ``kind``."""
+    cell = Cell(
+        seed=scenario.seed + 7, sample_period=scenario.sample_period, disturbances=disturbances
+    )
+    if kind == SPHERE:
+        ball = PosedSurface(Sphere(SPHERE_RADIUS_M), Pose(x=SPHERE_OFFSET_M))
+        return record(cell, Spiral(ball, 4e-3, 2e-4, scenario.spindle_speed), ball)
+    flat = Flat()
+    motion: Motion = {
+        STILL: Hold(60.0),
+        PASSES: Passes(1e-2, 10, 4.0),
+        TURNED: Spiral(flat, 1e-2, 4e-4, scenario.spindle_speed),
+        STAND_OFFS: StandOffs(1e-2, scenario.spindle_speed, 4e-5, 20),
+    }[kind]
+    return record(cell, motion, flat)
