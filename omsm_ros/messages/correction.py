@@ -2,48 +2,10 @@
 
 from __future__ import annotations
 
-# Name of each source.
-_SOURCES = {
-    "probe_noise": "noise of a reading",
-    "probe_resolution": "step of a reading",
-    "encoder_noise": "noise of the Z encoder",
-    "encoder_resolution": "step of the Z encoder",
-    "discretisation": "difference of the digital filter from G",
-    "vibration": "vibration of the probe against the turning part",
-    "scan_scatter": "scatter of this scan beyond the stated sources",
-    "dynamics": "noise of the step test",
-    "undetected_model_error": "model error that the step test cannot detect",
-    "static_gain": "static gain of the probe",
-    "probe_latency": "latency that X and C do not share",
-    "lag_change": "lag of Z since the step test",
-    "motion_error": "half the backlash of Z",
-    "tilt": "tilt of the part, each way",
-    "decentre": "shift of the part, each way",
-    "clocking": "turn of the part",
-    "expansion": "thermal strain of the part",
-    "centre_x": "zero of X at the spindle",
-    "centre_y": "zero of Y at the spindle",
-    "beam": "tilt of the beam, each way",
-    "squareness": "angle of X to the spindle's plane",
-    "parallelism": "angle of Z to the spindle, each way",
-    "straightness_x": "straightness of X towards the probe",
-    "straightness_z": "straightness of Z, lateral",
-    "pitch": "pitch of Z, over the Abbe arm",
-    "spindle_axial": "axial motion in step with the spindle",
-    "spindle_radial": "radial motion in step with the spindle",
-    "spindle_tilt": "tilt in step with the spindle",
-    "encoder_scale": "scale of the Z encoder",
-    "encoder_interpolation": "interpolation of the Z encoder",
-    "probe_linearity": "cubic error of the probe at the end of its range",
-    "probe_periodic": "periodic error of the probe",
-    "probe_slope": "error of the probe by the slope, each way",
-    "probe_slope_square": "error of the probe by the square of the slope",
-    "drift_rate": "steady drift",
-    "drift_walk": "drift as a random walk",
-    "drift": "drift with a correlation time",
-}
+from omsm_ros.messages.verdict import SOURCE_NAMES
+
 TEMPLATES: dict[str, str] = {
-    **{f"correction.source_{name}": text for name, text in _SOURCES.items()},
+    **{f"correction.source_{name}": text for name, text in SOURCE_NAMES.items()},
     "correction.noisier": (
         "heights of this scan scatter by {scatter:m}, the stated sources of single readings by "
         "{stated:m}; compare exposure, intensity and vibration with those of the step test, or "

@@ -53,6 +53,18 @@ TEMPLATES = {
 }
 
 SOURCE_NAMES = {
+    "probe_noise": "noise of a reading",
+    "probe_resolution": "step of a reading",
+    "encoder_noise": "noise of the Z encoder",
+    "encoder_resolution": "step of the Z encoder",
+    "discretisation": "difference of the digital filter from G",
+    "vibration": "vibration of the probe against the turning part",
+    "scan_scatter": "scatter of this scan beyond the stated sources",
+    "dynamics": "noise of the step test",
+    "undetected_model_error": "model error that the step test cannot detect",
+    "encoder_interpolation": "interpolation of the Z encoder",
+    "probe_periodic": "periodic error of the probe",
+    "probe_slope": "error of the probe by the slope, each way",
     "lag_change": "change of the structural lag since the step test",
     "probe_latency": "latency of the probe",
     "lag_asymmetry": "lag that differs between up and down",

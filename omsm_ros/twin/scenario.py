@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.part import FigureError, PartPose
-from omsm_ros.units import RPM_HZ, RPM_RAD_S
+from omsm_ros.units import RPM_HZ
 
 
 @dataclass(frozen=True)
@@ -118,64 +119,30 @@ def verifying_scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) 
 
 
 @dataclass(frozen=True, slots=True)
-class Hold:
-    """The axes stand still for ``duration`` [s]."""
+class Commanded:
+    """A motion of X, Z and C alone, for ``duration`` [s]: ``of`` gives x, z [m] and c [rad]."""
 
     duration: float
-
-    def positions(self, time: FloatArray) -> AxisPositions:
-        """Return zeros for each ``time``."""
-        return AxisPositions(*np.zeros((5, *np.shape(time))))
-
-
-@dataclass(frozen=True, slots=True)
-class Passes:
-    """X goes to ``radius`` [m] and back, ``passes`` times, each in ``period`` [s]."""
-
-    radius: float
-    passes: int
-    period: float
-
-    @property
-    def duration(self) -> float:
-        """Duration of all passes [s]."""
-        return self.passes * self.period
+    of: Callable[[FloatArray], tuple[FloatArray | float, FloatArray | float, FloatArray | float]]
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]."""
-        none = np.zeros(np.shape(time))
-        x = self.radius * (1 - np.cos(2 * np.pi / self.period * np.maximum(time, 0.0))) / 2
-        return AxisPositions(x, none, none, none, none)
+        x, z, c = (value + np.zeros(np.shape(time)) for value in self.of(np.maximum(time, 0.0)))
+        return AxisPositions(x, np.zeros_like(x), z, np.zeros_like(x), c)
 
 
-@dataclass(frozen=True, slots=True)
-class StandOffs:
-    """A ring of ``radius`` [m] at ``spindle_speed`` [rpm]; Z goes up and down by ``reach`` [m].
+def _ring_of_stand_offs(radius: float, speed: float, reach: float, turns: int) -> Commanded:
+    """Return a ring at ``speed`` [rpm], on which Z takes a step in the first tenth of each turn.
 
-    The distance runs through its range once in ``turns``, in steps of a turn.
+    The steps lead once through ± ``reach`` [m].
     """
 
-    radius: float
-    spindle_speed: float
-    reach: float
-    turns: int
+    def of(time: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        turned = time * speed * RPM_HZ
+        place = np.maximum(np.floor(turned) - 1 + s_curve(10 * (turned % 1.0)), 0.0)
+        return radius, reach * np.sin(2 * np.pi * place / turns), 2 * np.pi * turned
 
-    @property
-    def duration(self) -> float:
-        """Duration of all turns [s]."""
-        return self.turns / (abs(self.spindle_speed) * RPM_HZ)
-
-    def positions(self, time: FloatArray) -> AxisPositions:
-        """Return the commanded axes at ``time`` [s]."""
-        turned = np.maximum(time, 0.0) * abs(self.spindle_speed) * RPM_HZ
-        whole = np.floor(turned)
-        # The step takes the first tenth of each turn.
-        place = whole - 1 + s_curve(10 * (turned - whole))
-        z = self.reach * np.sin(2 * np.pi * np.maximum(place, 0.0) / self.turns)
-        none = np.zeros(np.shape(time))
-        return AxisPositions(
-            none + self.radius, none, z, none, self.spindle_speed * RPM_RAD_S * time
-        )
+    return Commanded(turns / (speed * RPM_HZ), of)
 
 
 # Of the reference sphere, and how far it is mounted from the axis: only so does centre_y show.
@@ -195,9 +162,9 @@ def source_recording(
         return record(cell, Spiral(ball, 4e-3, 2e-4, scenario.spindle_speed), ball)
     flat = Flat()
     motion: Motion = {
-        STILL: Hold(60.0),
-        PASSES: Passes(1e-2, 10, 4.0),
+        STILL: Commanded(60.0, lambda _: (0.0, 0.0, 0.0)),
+        PASSES: Commanded(40.0, lambda t: (5e-3 * (1 - np.cos(np.pi / 2 * t)), 0.0, 0.0)),
         TURNED: Spiral(flat, 1e-2, 4e-4, scenario.spindle_speed),
-        STAND_OFFS: StandOffs(1e-2, scenario.spindle_speed, 4e-5, 20),
+        STAND_OFFS: _ring_of_stand_offs(1e-2, scenario.spindle_speed, 4e-5, 20),
     }[kind]
     return record(cell, motion, flat)
