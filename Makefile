@@ -25,7 +25,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 setup: $(PACKAGE)
 
 demo: setup
-	$(RUN) omsm demo --out out/demo $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
+	$(RUN) $(if $(CONTROLLER),python config/$(CONTROLLER)/demo.py out/$(CONTROLLER),omsm demo --out out/demo) $(if $(DEVICE),--device $(DEVICE)) $(if $(VIEW),--view)
 
 # Three processes, a file each, in the order of test/conftest.py; JOBS=0 for one after the other.
 JOBS ?= 3

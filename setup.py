@@ -10,6 +10,7 @@ from setuptools import find_packages, setup
 ROOT = Path(__file__).resolve().parent  # --symlink-install runs a link to this file elsewhere
 PACKAGE = "omsm_ros"
 INTERFACES = f"{PACKAGE}.interfaces"
+LINUXCNC = f"{PACKAGE}.instruments.linuxcnc.machine"
 NODES = (
     "corrector",
     "calibrator",
@@ -52,10 +53,14 @@ setup(
     # built with --symlink-install, the code finds msg_defs/ itself:
     #     package = Path(omsm_ros.__file__).resolve().parent       (omsm_ros/)
     #     package / "interfaces" / "msg"  if it exists, else  package.parent / "msg_defs" / "msg"
-    packages=[*find_packages(include=[PACKAGE, f"{PACKAGE}.*"]), INTERFACES],
-    package_dir={INTERFACES: os.path.relpath(ROOT / "msg_defs")},
+    packages=[*find_packages(include=[PACKAGE, f"{PACKAGE}.*"]), INTERFACES, LINUXCNC],
+    package_dir={
+        INTERFACES: os.path.relpath(ROOT / "msg_defs"),
+        LINUXCNC: os.path.relpath(ROOT / "config" / "linuxcnc"),
+    },
     package_data={
         INTERFACES: ["msg/*.msg", "srv/*.srv"],
+        LINUXCNC: ["*"],
         PACKAGE: ["**/*.html", "**/*.css", "**/*.js", "**/*.json", "**/*.yaml", "**/*.xml"],
     },
     data_files=[

@@ -312,8 +312,8 @@ def plan(
         SECOND_SHARE,
         plan_steps,
     )
-    from omsm_ros.io.gcode_file import DIALECTS, scan_gcode, steps_gcode
-    from omsm_ros.pipelines.plan_scans import program_times, scan_path
+    from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
+    from omsm_ros.pipelines.plan_scans import scan_path, scan_program
 
     if nominal is None:
         step = steps.get("step", 9.8e-6)
@@ -325,9 +325,7 @@ def plan(
         return Plan(z=z, x=zero, c=zero, period=period, programs=programs)
     design = ScanDesign(rpm=rpm, start=radius, end=0.0, pitch=feed, rate=1 / period, **steps)
     x, z, c = scan_path(design, nominal, np.arange(0.0, design.duration, period, dtype=np.float64))
-    times = program_times(design)
-    at = scan_path(design, nominal, times)
-    programs = {d: scan_gcode(times, at[0], at[1], at[2], design, d) for d in DIALECTS}
+    programs = {d: scan_program(design, nominal, dialect=d)[1] for d in DIALECTS}
     return Plan(z=z, x=x, c=c, period=period, programs=programs)
 
 

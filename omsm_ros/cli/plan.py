@@ -32,31 +32,15 @@ def _declare_plan(add: Arguments) -> None:
     add("--out", "DIR", required=True)
     add("--dialect", str, "controller that reads the G-code", choices=DIALECTS, default="linuxcnc")
     steps = add.group("steps")
-    for name, kind, default, meaning in (
-        ("--sample-period", SAMPLE_PERIOD, 1e-3, "sample period of the probe [s]"),
-        ("--step", STEP, 9.8e-6, "height of a step [m]"),
-        (
-            "--second-step",
-            STEP,
-            None,
-            "height of every other step [m]; 3/9.8 of --step by default",
-        ),
-        (
-            "--count",
-            COUNT,
-            PLANNED_COUNT,
-            "number of steps up, and of steps down, from the middle",
-        ),
-        (
-            "--dwell",
-            DWELL,
-            PLANNED_DWELL_S,
-            "time from edge to edge [s]; four times the dwell halves the undetected creep",
-        ),
-        ("--rise", RISE, 20e-3, "rise time of an edge [s]"),
-        ("--half-range", STEP, 50e-6, "half the measuring range of the probe [m]"),
-    ):
-        steps(name, kind, meaning, default=default)
+    steps("--sample-period", SAMPLE_PERIOD, "sample period of the probe [s]", default=1e-3)
+    steps("--step", STEP, "height of a step [m]", default=9.8e-6)
+    steps("--second-step", STEP, "height of every other step [m]; 3/9.8 of --step by default")
+    steps("--count", COUNT, "number of steps up, and of steps down, from the middle",
+          default=PLANNED_COUNT)  # fmt: skip
+    steps("--dwell", DWELL, "time from edge to edge [s]; four times the dwell halves the "
+          "undetected creep", default=PLANNED_DWELL_S)  # fmt: skip
+    steps("--rise", RISE, "rise time of an edge [s]", default=20e-3)
+    steps("--half-range", STEP, "half the measuring range of the probe [m]", default=50e-6)
     _declare_scans(add.group("scans"))
 
 
@@ -115,6 +99,8 @@ def _declare_scans(add: Arguments) -> None:
         ("--radius", LENGTH, 12.7e-3, "radius of the part [m]"),
         ("--feed", LENGTH, 1e-4, "radial feed of a turn [m]"),
         ("--rpm", SPEED, 30.0, "spindle speed of the first scan [1/min]"),
+        ("--path-error", UNCERTAINTY, 1e-7, "bound on Z of the executed path [m]"),
+        ("--servo-period", SAMPLE_PERIOD, 1e-3, "cycle of the controller's planner [s]"),
     ):
         add(name, kind, meaning, default=default)
 
@@ -135,7 +121,9 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
         args.accuracy,
         load_limits(args.limits) if args.limits else MachineLimits(),
     )
-    return plan_facts(sets, args.accuracy, args.out, nominal, args.dialect)
+    return plan_facts(
+        sets, args.accuracy, args.out, nominal, args.dialect, args.path_error, args.servo_period
+    )
 
 
 def _scan_text(scan: Mapping[str, Any]) -> str:
@@ -143,6 +131,13 @@ def _scan_text(scan: Mapping[str, Any]) -> str:
     turned = f" turned by {np.degrees(scan['clocking']):.0f}°" if scan["clocking"] else ""
     beyond = " from beyond the centre" if scan["start"] * scan["end"] < 0 else ""
     return f"{abs(scan['rpm']):g} rpm {'outward' if outward else 'inward'}{beyond}{turned}"
+
+
+def _path_text(path: Mapping[str, float], bound: float) -> str:
+    kept = "" if path["error"] <= bound else f", MORE than {quantity(bound, 'm')}"
+    error, allowed = quantity(path["error"], "m"), np.degrees(path["c_acceleration"])
+    segment = f"{path['segment'] * 1e3:g} ms"
+    return f"Z within {error}{kept}; segments of {segment}; allow C {allowed:.0f} °/s²"
 
 
 def _show_scans(facts: Facts) -> None:
@@ -157,10 +152,15 @@ def _show_scans(facts: Facts) -> None:
                 f"{one['duration'] / 60:.1f} min: {scans}{verified}",
             )
         )
+    bound = facts["path_error"]
     reached = "reaches" if facts["reaches"] else "does not reach"
     table(
         [
             *rows,
+            *(
+                (f"scan_{k + 1}.nc", _path_text(path, bound))
+                for k, path in enumerate(facts["paths"])
+            ),
             ("chosen", f"{facts['set']}, which {reached} {quantity(facts['accuracy'], 'm', 2)}"),
             written(facts["files"]),
         ]

@@ -1,4 +1,4 @@
-"""The command inspect: streams and faults of a bag, and its repair."""
+"""Commands for recordings: record a device; inspect: streams and faults of a bag, its repair."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from typing import Any
 from omsm_ros.cli.arguments import Arguments, cell_of
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.errors import Notice
+from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.io import bags
+from omsm_ros.io.json_and_yaml import mapping_of
 from omsm_ros.io.topics import AnyBag, relative
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording
+from omsm_ros.quantities import DURATION, SILENCE
 from omsm_ros.readable import quantity
 
 _NO_INDEX = (
@@ -161,4 +163,40 @@ def _vibration_rows(found: Facts | None) -> list[tuple[str, str]]:
     return [("vibration", f"on a height at most {said}; {raised}"), *rows]
 
 
-COMMANDS = (CliCommand("inspect", _declare_inspect, _inspect, _show_inspect),)
+def _declare_record(add: Arguments) -> None:
+    add("--device", str, "model, as of the node confocal_driver", default="linuxcnc")
+    add("--port", str, "its address, such as tcp://127.0.0.1:7010", required=True)
+    add("--out", "BAG.mcap", required=True)
+    add("--seconds", DURATION, "duration in samples [s]; 0: until Ctrl+C", default=0.0)
+    add("--silence", SILENCE, "end when no sample came for so long [s]; 0: never", default=0.0)
+    add("--set", str, "parameters of the driver, such as sample_period=0.00025", nargs="+",
+        default=[], metavar="NAME=VALUE")  # fmt: skip
+
+
+def _record(args: argparse.Namespace) -> Facts:
+    # Imported on demand, because 'inspect' needs no devices.
+    from omsm_ros.pipelines.record_device import record_device
+
+    given: Facts = {"device": args.device, "port": args.port}
+    for text in args.set:
+        given |= mapping_of(text.replace("=", ": ", 1), ConfigurationError, f"--set {text}")
+    period = given.get("sample_period", 1e-3)
+
+    def ended(samples: int, silent: float) -> bool:
+        if samples and 0 < args.silence < silent:
+            return True
+        return bool(args.seconds and samples * period >= args.seconds)
+
+    with progress_bar("recording", args.json, " samples") as progress:
+        return record_device(given, args.out, ended, progress)
+
+
+def _show_record(facts: Facts) -> None:
+    counted = [(name.replace("_", " "), str(n)) for name, n in facts.items() if name != "bag"]
+    table([*counted, written([facts["bag"]])])
+
+
+COMMANDS = (
+    CliCommand("record", _declare_record, _record, _show_record),
+    CliCommand("inspect", _declare_inspect, _inspect, _show_inspect),
+)

@@ -26,6 +26,7 @@ TASKS: dict[str, dict[str, Word]] = {
         ),
     },
     "recordings": {
+        "record": Word("recordings", "record a device to a bag without ROS"),
         "inspect": Word("recordings", "list the streams and faults of a bag, or repair it"),
         "import": Word(
             "importing",

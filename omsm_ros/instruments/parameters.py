@@ -20,7 +20,7 @@ NowNs: TypeAlias = Callable[[], int]
 _SIGNS = (1, -1)
 _AS_IT_IS = "as the device has it"
 _PERIOD = "period of the trigger, or of a free-running device [s]"
-STREAMS = ("six_channel", "six_channel_text")
+STREAMS = ("six_channel", "six_channel_text", "linuxcnc")
 TRIGGERS = ("free_run", "each", "once", "window")
 FORMATS = ("binary", "ascii")
 LATCHES = ("start", "end", "mean")
@@ -89,14 +89,14 @@ _STREAM_PARAMETERS = (
     *(p for axis in AXES for p in _axis_parameters(axis, "rad" if axis in "bc" else "m")),
 )
 # The columns of ``six_channel.protocol``.
-_USUAL_COLUMNS = "sequence device_time distance status x y z b c"
+USUAL_COLUMNS = "sequence device_time distance status x y z b c"
 _COLUMNS = "columns of a line of text, in order; - = ignored"
 
 PARAMETERS = (
     DEVICE,
     *_STREAM_PARAMETERS,
     Parameter("trace", "", "file for a trace of the wire; empty = none"),
-    Parameter("columns", _USUAL_COLUMNS, _COLUMNS),
+    Parameter("columns", USUAL_COLUMNS, _COLUMNS),
     *probe_parameters(100e-6),
     Parameter(
         "probe.intensity_full_scale", 100.0, "reading that is intensity 1", quantities.INTENSITY
@@ -124,7 +124,7 @@ PARAMETERS = (
 AXIS_PARAMETERS = (
     replace(DEVICE, choices=STREAMS),
     *_STREAM_PARAMETERS,
-    Parameter("columns", _USUAL_COLUMNS, _COLUMNS),
+    Parameter("columns", USUAL_COLUMNS, _COLUMNS),
 )
 
 

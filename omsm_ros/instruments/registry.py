@@ -23,6 +23,7 @@ class Model(NamedTuple):
 PROBES = {
     "six_channel": Model("six_channel.device:make_binary", "six_channel.emulator:BINARY"),
     "six_channel_text": Model("six_channel.device:make_text", "six_channel.emulator:TEXT"),
+    "linuxcnc": Model("linuxcnc.device:make"),
     "chrocodile": Model("chrocodile.dollar_device:make", "chrocodile.emulator:DOLLAR"),
     "chrocodile_packet": Model("chrocodile.packet_device:make", "chrocodile.emulator:PACKET"),
     "confocaldt": Model("micro_epsilon.device:make_serial", "micro_epsilon.emulator:SERIAL"),

@@ -6,17 +6,17 @@ dry first.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from omsm_ros.core.kinematics.planner import PlannedPath
 from omsm_ros.core.kinematics.trajectories import StepPlan
-from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, MILLISECOND_S
 
-if TYPE_CHECKING:
-    from omsm_ros.core.adjustment import ScanDesign
+# Rest at the start of a path, in which the transient of the approach decays [s].
+_SETTLE_S = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +25,9 @@ class Dialect:
 
     comment, metric, dwell: patterns and words;  dwell_unit: value of one in the dwell word [s]
     dwell_decimals: 0 for a word without a decimal point;  frame, end: first and last lines
-    before_scan: path tolerance;  c_word: of the spindle;  c_relative: it takes increments, because
-    absolute angles are reduced to one turn;  decimals: of X and Z [mm]
+    before_scan: path tolerance;  measuring, measured: around what the probe measures
+    c_word: of the spindle;  c_relative: it takes increments, because absolute angles
+    are reduced to one turn;  decimals: of X and Z [mm]
     note: what the controller must be set to
     """
 
@@ -37,6 +38,8 @@ class Dialect:
     dwell_decimals: int = 6
     frame: tuple[str, ...] = ()
     before_scan: tuple[str, ...] = ()
+    measuring: tuple[str, ...] = ()
+    measured: tuple[str, ...] = ()
     c_word: str = "C{}"
     c_relative: bool = False
     decimals: int = 7
@@ -58,6 +61,10 @@ DIALECTS = {
         metric="G21",
         dwell="G4 P{}",
         before_scan=("G64 P0.0001",),
+        # A digital output; config/linuxcnc/cell.hal has no target for the probe while it is off.
+        measuring=("M64 P0",),
+        measured=("M65 P0",),
+        decimals=8,
         end=("M2",),
     ),
     "fanuc": Dialect(
@@ -83,10 +90,7 @@ DIALECTS = {
         note="SINUMERIK 840D; C is a rotary axis, not the spindle",
     ),
     "nanotech": Dialect(
-        comment="({})",
-        metric="G71",
-        dwell="G04 P{}",
-        note="dwell in seconds; C in position mode",
+        comment="({})", metric="G71", dwell="G04 P{}", note="dwell in seconds; C in position mode"
     ),
 }
 
@@ -103,7 +107,7 @@ def steps_gcode(plan: StepPlan, dialect: str = "linuxcnc") -> str:
         "step test for the identification of the measuring loop",
         f"{len(plan.starts)} edges, rise {plan.rise * 1e3:g} ms, set as S-curve time",
     ]
-    body = [words.metric, "G91"]
+    body = [words.metric, *words.measuring, "G91"]
     step = words.dwell_unit * 10.0**-words.dwell_decimals
     ends = [*plan.starts[1:], plan.duration]
     body.append(words.rest(plan.starts[0]))
@@ -117,40 +121,41 @@ def steps_gcode(plan: StepPlan, dialect: str = "linuxcnc") -> str:
             + words.remark(f"{height / MICROMETRE_M:+.3f} um")
         )
         body.append(words.rest(rest))
-    return _program(words, lines, [*body, "G90"])
+    return _program(words, lines, [*body, "G90", *words.measured])
 
 
-def scan_gcode(
-    t: FloatArray,
-    x: FloatArray,
-    z: FloatArray,
-    c: FloatArray,
-    design: ScanDesign,
-    dialect: str = "linuxcnc",
+def path_gcode(
+    path: PlannedPath, remarks: Sequence[str], dialect: str = "linuxcnc", measures: bool = True
 ) -> str:
-    """Return a scan as segments of inverse time, in millimetres and degrees.
+    """Return a path as segments of inverse time, in millimetres and degrees.
 
-    Each segment takes the same time, so C turns steadily whatever X and Z do.
+    Each segment takes the same time, whole cycles of the planner's servo, so C turns steadily
+    whatever X and Z do.
+
+    measures: whether the probe measures along the path
     """
     words = DIALECTS[dialect]
-    turned = np.round(np.degrees(c), 5)
-    per_minute = 60 / float(np.median(np.diff(t)))
+    turned = np.round(np.degrees(path.c), 6)
+    per_minute = 60 / path.segment
     lines = [
-        f"scan at {design.rpm:g} rpm, {len(t)} segments of {turned[1] - turned[0]:g} degrees",
-        f"part turned on the chuck by {np.degrees(design.clocking):g} degrees",
+        *remarks,
+        f"{len(path.time)} segments of {path.segment * 1e3:g} ms, whole cycles of {path.cycle:g} s",
+        f"within {path.error * 1e9:.3g} nm of the path if C reaches its speed in a cycle: set its",
+        f"largest acceleration to {np.degrees(path.c_acceleration):.0f} deg/s2",
     ]
 
     def at(axis: str, value: float) -> str:
         return f"{axis}{value / MILLIMETRE_M:.{words.decimals}f}"
 
-    moves = np.diff(turned) if words.c_relative else turned[1:]
+    x, z, c = path.x, path.z, np.diff(turned) if words.c_relative else turned[1:]
     body = [words.metric, "G90", *words.before_scan]
-    body += [f"G0 {at('X', x[0])}", f"G0 {at('Z', z[0])} C{turned[0]:.5f}", "G93"]
+    body += [f"G0 {at('X', x[0])}", f"G0 {at('Z', z[0])} C{turned[0]:.5f}"]
+    body += [*(words.measuring if measures else ()), words.rest(_SETTLE_S), "G93"]
     body += [
-        f"G1 {at('X', a)} {at('Z', b)} {words.c_word.format(f'{d:.5f}')} F{per_minute:.4f}"
-        for a, b, d in zip(x[1:], z[1:], moves, strict=True)
+        f"G1 {at('X', a)} {at('Z', b)} {words.c_word.format(f'{d:.6f}')} F{per_minute:.4f}"
+        for a, b, d in zip(x[1:], z[1:], c, strict=True)
     ]
-    return _program(words, lines, [*body, "G94"])
+    return _program(words, lines, [*body, "G94", *(words.measured if measures else ())])
 
 
 def _program(words: Dialect, remarks: list[str], body: list[str]) -> str:

@@ -53,6 +53,7 @@ _FAULTS = (
     "period_w",
     "unknown",
     "missed",
+    "overruns",
 )
 # The pauses between two motions of a step test are shorter [s].
 _SILENCE_S = 2.0

@@ -56,6 +56,7 @@ from omsm_ros.report.measurement.surface_map import CloudView
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth
 from omsm_ros.twin.disturbances import NOTHING, Disturbances, TrueResponse
+from omsm_ros.twin.part import FigureError
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
 from omsm_ros.units import PPM
 
@@ -304,16 +305,17 @@ def _adjusted(plan: Demonstration, calibration: Calibration) -> dict[str, Any]:
         bags_of_part,
         calibration,
         nominal=PAPER_MIRROR,
-        stated=_evaluated_sources(),
+        stated=twin_sources(),
         accuracy=TOLERANCE_M / 5,
     )
     facts = adjustment_facts(found, scans, calibration, TOLERANCE_M)
-    facts["truth"] = _form_truth(plan, found)
+    facts["truth"] = form_truth(plan.scenario.part, found)
     write_adjustment(plan.out, facts, found, scans, TITLE)
     return {name: facts[name] for name in ("verdict", "figures", "conformity", "truth")}
 
 
-def _evaluated_sources() -> MachineSources:
+def twin_sources() -> MachineSources:
+    """Return the sources that two scans do not show; the twin is built without them."""
     return MachineSources(
         tuple(
             StatedSource(
@@ -328,10 +330,10 @@ def _evaluated_sources() -> MachineSources:
     )
 
 
-def _form_truth(plan: Demonstration, found: Adjustment) -> dict[str, float]:
+def form_truth(part: FigureError, found: Adjustment) -> dict[str, float]:
     """Return the true PV and rms of the part, pose removed, and the error of the map (rms)."""
     form = found.form
-    error = plan.scenario.part.error(form.x, form.y)
+    error = part.error(form.x, form.y)
     columns = np.stack([np.ones_like(form.x), form.x, form.y], axis=1)
     weight = np.sqrt(form.area)[:, np.newaxis]
 

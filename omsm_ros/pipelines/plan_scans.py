@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,32 +14,30 @@ from omsm_ros.core.adjustment import PlannedSet, ScanDesign, plan_scans, usual_s
 from omsm_ros.core.correction.machine_sources import MachineSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
+from omsm_ros.core.kinematics.planner import PlannedPath, plan_path
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.files import save_text
-from omsm_ros.io.gcode_file import scan_gcode
+from omsm_ros.io.gcode_file import path_gcode
 from omsm_ros.pipelines.adjust import priors_of
-from omsm_ros.units import DEGREE_RAD, RPM_RAD_S
+from omsm_ros.units import RPM_RAD_S
 
-# Points of a program: a planner joins segments of 2° within 0.1 nm of this mirror's curvature.
-_SEGMENT_RAD = 2 * DEGREE_RAD
+# Largest distance of an executed path from the surface [m], and cycle of the planner's servo [s].
+PATH_ERROR_M, SERVO_PERIOD_S = 100e-9, 1e-3
 # Samples a second at which limits of a path are judged, and turns that stand for all.
 _JUDGED_HZ, _JUDGED_TURNS = 1000.0, 20.0
+_HEAD = "t_s,x_m,z_m,c_rad"
 
 
-def scan_path(design: ScanDesign, nominal: Surface, time: FloatArray) -> tuple[FloatArray, ...]:
+def scan_path(
+    design: ScanDesign, nominal: Surface, time: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return x [m], z [m] and c [rad] of ``design`` at ``time`` [s], Z on the nominal surface."""
     x = design.start + (design.end - design.start) * time / design.duration
     c = design.rpm * RPM_RAD_S * time
     place = x * np.exp(-1j * (c + design.clocking))
     return x, nominal.height(place.real, place.imag), c
-
-
-def program_times(design: ScanDesign) -> FloatArray:
-    """Return the times of the points of a program (n,) [s]."""
-    step = _SEGMENT_RAD / abs(design.rpm * RPM_RAD_S)
-    return np.arange(0.0, design.duration, step, dtype=np.float64)
 
 
 def within_limits(
@@ -99,21 +98,19 @@ def plan_facts(
     out: Path,
     nominal: Surface,
     dialect: str = "linuxcnc",
+    bound: float = PATH_ERROR_M,
+    cycle: float = SERVO_PERIOD_S,
 ) -> dict[str, Any]:
     """Write the programs of the best set into ``out``, and return what was planned.
 
     For each scan scan_N.csv (t_s, x_m, z_m, c_rad) and scan_N.nc (G-code).
+
+    bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
     """
     name, best = sets[0]
-    files = {}
-    for k, design in enumerate(best.designs):
-        steps = program_times(design)
-        x, z, c = scan_path(design, nominal, steps)
-        files[f"scan_{k + 1}.csv"] = _csv(steps, x, z, c)
-        files[f"scan_{k + 1}.nc"] = scan_gcode(steps, x, z, c, design, dialect)
-    for file, text in files.items():
-        save_text(out / file, text)
+    paths = write_scans(best.designs, nominal, out, bound, cycle, dialect)
     return {
+        "path_error": bound,
         "set": name,
         "reaches": best.reaches,
         "accuracy": accuracy,
@@ -127,10 +124,46 @@ def plan_facts(
             }
             for one, planned in sets
         ],
-        "files": list(files),
+        "paths": [
+            {field: getattr(path, field) for field in ("error", "rms", "segment", "c_acceleration")}
+            for path in paths
+        ],
+        "files": [f"scan_{k + 1}.{end}" for k in range(len(paths)) for end in ("csv", "nc")],
     }
 
 
-def _csv(t: FloatArray, x: FloatArray, z: FloatArray, c: FloatArray) -> str:
-    rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in zip(t, x, z, c, strict=True))
-    return "t_s,x_m,z_m,c_rad\n" + "\n".join(rows) + "\n"
+def write_scans(
+    designs: Sequence[ScanDesign],
+    nominal: Surface,
+    out: Path,
+    bound: float,
+    cycle: float,
+    dialect: str = "linuxcnc",
+) -> list[PlannedPath]:
+    """Write scan_N.csv and scan_N.nc of each design into ``out``; return their paths."""
+    paths = []
+    for k, design in enumerate(designs):
+        path, text = scan_program(design, nominal, bound, cycle, dialect)
+        save_text(out / f"scan_{k + 1}.csv", _csv(path))
+        save_text(out / f"scan_{k + 1}.nc", text)
+        paths.append(path)
+    return paths
+
+
+def scan_program(
+    design: ScanDesign,
+    nominal: Surface,
+    bound: float = PATH_ERROR_M,
+    cycle: float = SERVO_PERIOD_S,
+    dialect: str = "linuxcnc",
+) -> tuple[PlannedPath, str]:
+    """Return the path of ``design`` as a planner executes it, and its G-code."""
+    path = plan_path(partial(scan_path, design, nominal), design.duration, cycle, bound)
+    turned = f"part turned on the chuck by {np.degrees(design.clocking):g} degrees"
+    return path, path_gcode(path, [f"scan at {design.rpm:g} rpm", turned], dialect)
+
+
+def _csv(path: PlannedPath) -> str:
+    columns = zip(path.time, path.x, path.height, path.c, strict=True)
+    rows = (f"{a:.6f},{b:.10f},{d:.12f},{e:.8f}" for a, b, d, e in columns)
+    return _HEAD + "\n" + "\n".join(rows) + "\n"

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
 
-from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
@@ -16,7 +15,7 @@ from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.disturbance_file import load_disturbances
 from omsm_ros.io.files import save_text
 from omsm_ros.readable import count, quantity
-from omsm_ros.twin.cell import Recording, blocks_of
+from omsm_ros.twin.cell import Recording, blocks_of, pieces
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import (
     Scenario,
@@ -25,7 +24,6 @@ from omsm_ros.twin.scenario import (
     source_recording,
     spiral_of,
 )
-from omsm_ros.units import NANOSECONDS_PER_S
 
 _BLOCK_SAMPLES = 1000
 # Bounds memory to half a gigabyte with all disturbances.
@@ -42,23 +40,9 @@ def write_recording(path: Path, recording: Recording) -> Path:
             bag.write_axes(axes)
             bag.write_distance(distance)
         if recording.acceleration is not None:
-            for block in acceleration_blocks(recording.acceleration, _BLOCK_SAMPLES):
+            for block in pieces(recording.acceleration, _BLOCK_SAMPLES):
                 bag.write_acceleration(block)
     return path
-
-
-def acceleration_blocks(whole: AccelerationBlock, size: int) -> Iterator[AccelerationBlock]:
-    """Cut ``whole`` into blocks of ``size`` samples, as a driver publishes them."""
-    for start in range(0, len(whole), size):
-        part = slice(start, start + size)
-        yield AccelerationBlock(
-            stamp_ns=whole.stamp_ns + round(start * whole.sample_period * NANOSECONDS_PER_S),
-            first_sample=whole.first_sample + start,
-            sample_period=whole.sample_period,
-            x=whole.x[part],
-            y=whole.y[part],
-            z=whole.z[part],
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,9 @@ the noise of the encoder, and all ``Disturbances``. The file of each family stat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,6 +38,7 @@ from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
 
 __all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]
 
+_B = TypeVar("_B", AxisBlock, DistanceBlock, AccelerationBlock)
 Random = Mapping[str, np.random.Generator]
 
 # Sample periods simulated in addition, for the four points of a cubic.
@@ -410,28 +411,21 @@ def _further_channels(
     return channels
 
 
+def pieces(block: _B, size: int) -> Iterator[_B]:
+    """Cut a block into blocks of ``size`` samples, as a driver publishes them."""
+    arrays = [f.name for f in fields(block) if isinstance(getattr(block, f.name), np.ndarray)]
+    for start in range(0, len(block), size):
+        yield replace(
+            block,
+            stamp_ns=block.stamp_ns + round(start * block.sample_period * NANOSECONDS_PER_S),
+            first_sample=block.first_sample + start,
+            **{name: getattr(block, name)[start : start + size] for name in arrays},
+        )
+
+
 def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, DistanceBlock]]:
-    """Return the recording in blocks of ``size`` samples, as a driver publishes them."""
-    axes, distance = recording.axes, recording.distance
-    pairs = []
-    for start in range(0, len(axes), size):
-        part = slice(start, start + size)
-        stamp = axes.stamp_ns + round(start * axes.sample_period * NANOSECONDS_PER_S)
-        common = {
-            "stamp_ns": stamp,
-            "first_sample": axes.first_sample + start,
-            "sample_period": axes.sample_period,
-        }
-        axis_block = AxisBlock(
-            **common,  # type: ignore[arg-type]
-            **{name: getattr(axes, name)[part] for name in ("x", "y", "z", "b", "c")},
-        )
-        distance_block = DistanceBlock(
-            **common,  # type: ignore[arg-type]
-            **{name: getattr(distance, name)[part] for name in ("distance", "intensity", "status")},
-        )
-        pairs.append((axis_block, distance_block))
-    return pairs
+    """Return the recording in blocks of ``size`` samples."""
+    return list(zip(pieces(recording.axes, size), pieces(recording.distance, size), strict=True))
 
 
 @dataclass(frozen=True, slots=True)

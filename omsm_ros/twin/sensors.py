@@ -93,10 +93,7 @@ class AccelerationSensor:
             )
 
     def read(
-        self,
-        acceleration: FloatArray,
-        period: float,
-        random: np.random.Generator,
+        self, acceleration: FloatArray, period: float, random: np.random.Generator
     ) -> AccelerationBlock:
         """Return the readings for an ``acceleration`` (n,) of the probe, every ``period`` [s]."""
         z = self._high_passed(acceleration, period) * (1 + self.scale_ppm * PPM)

@@ -32,7 +32,7 @@ def test_what_halsampler_pipes_out() -> None:
     found = decoder.feed(b"0 12.345678 1 0.5 \n1 12.345679 0 0.6 \noverrun\n3 1 2 3\n")
     assert found["sequence"].tolist() == [0, 1, 3]
     assert found["x"].tolist() == [12.345678, 12.345679, 1.0]
-    assert decoder.statistics.malformed == 1
+    assert decoder.statistics.malformed == decoder.statistics.overruns == 1
 
 
 @pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])

@@ -1,15 +1,17 @@
 """G-code of each dialect, run through by a reader that knows that dialect only."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.adjustment import ScanDesign
+from omsm_ros.core.kinematics.planner import plan_path
 from omsm_ros.core.kinematics.trajectories import plan_steps
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.io.gcode_file import DIALECTS, scan_gcode, steps_gcode
+from omsm_ros.io.gcode_file import DIALECTS, path_gcode, steps_gcode
 from omsm_ros.pipelines.plan_scans import scan_path
 
 # How a block waits, as the manuals say: pattern and value of one in seconds.
@@ -47,7 +49,9 @@ def edges(text, dialect):
             yield now, height
             now += abs(height) / feed * 60
         else:
-            assert block in ("G21", "G71", "G91", "G90", "%", "O0001", "M2", "M30")
+            assert block in (
+                "G21", "G71", "G91", "G90", "%", "O0001", "M2", "M30", "M64 P0", "M65 P0",
+            )  # fmt: skip
     yield now, 0.0
 
 
@@ -68,20 +72,20 @@ def test_edges_are_where_the_plan_has_them(dialect):
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_a_scan_turns_steadily_to_its_end(dialect):
     design = ScanDesign(rpm=30.0, start=1e-3, end=0.0, pitch=5e-4)
-    time = np.arange(0.0, design.duration, 2 / 180)
-    x, z, c = scan_path(design, PAPER_MIRROR, time)
-    text = blocks(scan_gcode(time, x, z, c, design, dialect), dialect)
+    path = plan_path(partial(scan_path, design, PAPER_MIRROR), design.duration, 1e-3, 1e-7)
+    text = blocks(path_gcode(path, ["a scan"], dialect), dialect)
     word = {"fanuc": r"H(\S+)", "siemens": r"C=IC\((\S+)\)"}.get(dialect, r"C(\S+)")
     moves = [re.fullmatch(rf"G1 X(\S+) Z(\S+) {word} F(\S+)", b) for b in text if b[:3] == "G1 "]
     read = np.array([[float(v) for v in move.groups()] for move in moves])
     at = np.cumsum(read[:, 2]) if dialect in ("fanuc", "siemens") else read[:, 2]
-    np.testing.assert_allclose(read[:, 0], x[1:] * 1e3, atol=6e-7)
-    np.testing.assert_allclose(read[:, 1], z[1:] * 1e3, atol=6e-7)
-    np.testing.assert_allclose(at, np.degrees(c[1:]), atol=2e-5)
+    np.testing.assert_allclose(read[:, 0], path.x[1:] * 1e3, atol=6e-7)
+    np.testing.assert_allclose(read[:, 1], path.z[1:] * 1e3, atol=6e-7)
+    np.testing.assert_allclose(at, np.degrees(path.c[1:]), atol=2e-6)
     # Inverse time: a segment takes 1/F minutes; the spindle turns at its speed.
-    assert 60 / read[0, 3] * len(read) == pytest.approx(time[-1], rel=1e-6)
-    assert text[text.index("G93") - 2].startswith("G0 X")
-    assert "G94" in text
+    assert 60 / read[0, 3] * len(read) == pytest.approx(design.duration, rel=1e-6)
+    first = text.index("G93")
+    assert any(block.startswith("G0 X") for block in text[:first])
+    assert "G94" in text[first:]
 
 
 def test_the_command_writes_the_dialect(tmp_path):

@@ -12,8 +12,8 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.results import CloudFile
-from omsm_ros.pipelines.record_twin import acceleration_blocks, write_recording
-from omsm_ros.twin.cell import Cell, Probe, record
+from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.twin.cell import Cell, Probe, pieces, record
 from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple
 from omsm_ros.twin.probe import ProbeErrors
@@ -122,4 +122,4 @@ def test_acceleration_goes_through_a_bag_unchanged(tmp_path):
         blocks = [block for _, block in bag.records(bags.ACCELERATION_TOPIC)]
     np.testing.assert_array_equal(np.concatenate([b.z for b in blocks]), made.acceleration.z)
     assert [b.first_sample for b in blocks[:2]] == [0, 1000]
-    assert sum(map(len, acceleration_blocks(made.acceleration, 777))) == len(made.acceleration)
+    assert sum(map(len, pieces(made.acceleration, 777))) == len(made.acceleration)

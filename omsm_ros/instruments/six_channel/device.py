@@ -20,6 +20,7 @@ from omsm_ros.instruments.six_channel.protocol import (
     BODY_SIZE,
     COLUMNS,
     FRAME,
+    MOST_COUNTS,
     CsvDecoder,
     FrameArray,
     FrameDecoder,
@@ -99,7 +100,8 @@ def samples_of(frames: FrameArray, scaling: StreamScaling) -> Samples:
 
 
 # Text may carry decimals of a count: this many parts of a count are resolved.
-_PARTS = 1_000_000
+PARTS = 1_000_000
+_MOST_PARTS = MOST_COUNTS * PARTS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,12 +109,14 @@ class CsvSettings(BlockSettings):
     """Settings of the text stream.
 
     columns: of a line, in order;  scaling: counts ↔ SI;  modulus: of the sequence
+    parts: of a count that are resolved
     An axis without a column stays at its offset.
     """
 
     columns: tuple[str, ...] = COLUMNS
     scaling: StreamScaling = field(default_factory=StreamScaling)
     modulus: int = 2**32
+    parts: int = PARTS
 
 
 class CsvStreamDevice(StreamDevice):
@@ -124,12 +128,14 @@ class CsvStreamDevice(StreamDevice):
         self, transport: Transport, settings: CsvSettings | None = None, *clocks: Any
     ) -> None:
         settings = settings or CsvSettings()
-        self._decoder = CsvDecoder(settings.columns)
+        self._decoder = CsvDecoder(settings.columns, _MOST_PARTS // settings.parts)
         self._unread = 0
         self._columns, self._probe = settings.columns, settings.scaling.probe
+        self._parts = settings.parts
         timed = "device_time" in settings.columns
         has_axes = bool(set(AXES) & set(settings.columns))
-        axes = tuple(map(_in_parts, settings.scaling.axes)) if has_axes else None
+        in_parts = (_in_parts(axis, settings.parts) for axis in settings.scaling.axes)
+        axes = tuple(in_parts) if has_axes else None
         channels = Channels("distance" in settings.columns, axes, timed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
         super().__init__(transport, settings, channels, counting, *clocks)
@@ -162,16 +168,16 @@ class CsvStreamDevice(StreamDevice):
             samples["status"] = np.where(good & ~measured, Status.NO_TARGET, known)
         for index, name in enumerate(AXES):
             if name in self._columns:
-                samples["counts"][:, index] = np.rint(rows[name] * _PARTS).astype(np.int64)
+                samples["counts"][:, index] = np.rint(rows[name] * self._parts).astype(np.int64)
         return samples
 
     def _listen_in(self, silent: float) -> None:
         self._check_understood(silent, self._unread)
 
 
-def _in_parts(axis: AxisScaling) -> AxisScaling:
+def _in_parts(axis: AxisScaling, parts: int) -> AxisScaling:
     """Return the same axis, counted in parts of a count."""
-    return replace(axis, counts_per_unit=axis.counts_per_unit * _PARTS, wrap=axis.wrap * _PARTS)
+    return replace(axis, counts_per_unit=axis.counts_per_unit * parts, wrap=axis.wrap * parts)
 
 
 def _stream_settings(values: Values) -> dict[str, Any]:
@@ -194,12 +200,16 @@ def make_binary(values: Values, transport: Transport, now_ns: NowNs) -> GenericS
     return GenericStreamDevice(transport, settings, now_ns)
 
 
-def make_text(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice:
-    """Return the device that ``values`` describe."""
+def make_text(
+    values: Values, transport: Transport, now_ns: NowNs, parts: int = PARTS
+) -> CsvStreamDevice:
+    """Return the device that ``values`` describe, which resolves ``parts`` of a count."""
     columns = tuple(values["columns"].replace(",", " ").split())
     read = [axis for axis in AXES if axis in columns]
     scaling = StreamScaling(**axes_of(values, read), probe=_probe_scaling(values))
-    settings = CsvSettings(**_stream_settings(values), columns=columns, scaling=scaling)
+    settings = CsvSettings(
+        **_stream_settings(values), columns=columns, scaling=scaling, parts=parts
+    )
     return CsvStreamDevice(transport, settings, now_ns)
 
 

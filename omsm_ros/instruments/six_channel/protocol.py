@@ -179,6 +179,7 @@ class StreamScaling:
 
 COLUMNS = ("sequence", "device_time", "distance", "status", *AXES)
 SKIPPED = "-"
+OVERRUN = b"overrun"
 _WHOLE = ("sequence", "device_time", "status")
 # Bounds the memory of a line without end.
 MAX_LINE_BYTES = 1024
@@ -189,8 +190,8 @@ _SEPARATOR = re.compile(rb"[,;\s]+")
 
 # Numbers beyond these ranges are damage: counts that no counter reaches, times of centuries,
 # positions of hundreds of metres in tenths of a nanometre.
+MOST_COUNTS = 2**40
 _RANGES = {"sequence": (0, 2**52), "device_time": (-(2**62), 2**62)}
-_RANGES |= dict.fromkeys(AXES, (-(2**40), 2**40))
 _OTHER_RANGE = (-(2**62), 2**62)
 
 
@@ -225,13 +226,14 @@ def _text(value: float) -> str:
 class CsvDecoder:
     """Decodes bytes in any portions to rows; it never raises, memory is a line and a portion."""
 
-    def __init__(self, columns: Sequence[str] = COLUMNS) -> None:
+    def __init__(self, columns: Sequence[str] = COLUMNS, most_counts: int = MOST_COUNTS) -> None:
         """Raise ConfigurationError for columns that are not valid."""
         check_columns(columns)
+        self._ranges = _RANGES | dict.fromkeys(AXES, (-most_counts, most_counts))
         self._columns = tuple(columns)
         self._dtype = row_dtype(columns)
         self._tail = b""
-        self._received = self._lines = self._malformed = 0
+        self._received = self._lines = self._malformed = self._overruns = 0
 
     def reset(self) -> None:
         """Discard an incomplete line."""
@@ -249,15 +251,20 @@ class CsvDecoder:
 
     @property
     def statistics(self) -> WireCounts:
-        """Return the counts of bytes, of lines with a sample, and of malformed ones."""
+        """Return the counts of bytes, of lines with a sample, of malformed ones, and of overruns.
+
+        An overrun is a malformed line by which HAL's sampler reports that it had no room.
+        """
         kept = self._received - len(self._tail)
         counts = {"lines": self._lines, "malformed": self._malformed}
+        counts["overruns"] = self._overruns
         return WireCounts(self._received, kept, len(self._tail), **counts)
 
     def _row(self, line: bytes) -> tuple[float, ...] | None:
         words = [word for word in _SEPARATOR.split(line) if word]
         if not words:
             return None
+        self._overruns += words == [OVERRUN]
         row = self._values(words) if len(line) <= MAX_LINE_BYTES else None
         self._malformed += row is None
         return row
@@ -273,7 +280,7 @@ class CsvDecoder:
             if not (_INTEGER if whole else _NUMBER).fullmatch(word):
                 return None
             value = int(word) if whole else float(word)
-            least, most = _RANGES.get(name, _OTHER_RANGE)
+            least, most = self._ranges.get(name, _OTHER_RANGE)
             if not least <= value <= most:
                 return None
             row.append(value)

@@ -1,0 +1,33 @@
+#!/usr/bin/python3
+"""Send HAL's sampler over TCP, a line a servo cycle: python3 send.py PORT CFG (cfg of the sampler).
+
+What no client takes stays in the sampler's FIFO, so a client that comes back in time loses nothing.
+"""
+
+import socket
+import sys
+import time
+
+import hal
+
+component = hal.component(f"send-{sys.argv[1]}")
+component.ready()
+server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
+stream = None
+while True:
+    client, _ = server.accept()
+    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    stream = stream or hal.stream(component, hal.sampler_base, sys.argv[2])
+    overruns = stream.num_overruns
+    try:
+        while True:
+            lines = []
+            while stream.readable and len(lines) < 1000:
+                lines.append(" ".join(f"{float(value):.17g}" for value in stream.read()) + "\n")
+            if stream.num_overruns != overruns:
+                overruns = stream.num_overruns
+                lines.append("overrun\n")
+            client.sendall("".join(lines).encode())
+            time.sleep(0.01)
+    except OSError:
+        client.close()

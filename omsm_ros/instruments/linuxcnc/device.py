@@ -1,0 +1,31 @@
+"""Reads LinuxCNC: lines of HAL's sampler over TCP, one a servo cycle.
+
+The first column is the number of the servo cycle, counted in HAL itself, so that a lost cycle is a
+gap and a restart of LinuxCNC is a fall to one. ``overrun`` on a line of its own is counted; the
+samples that it reports are missing numbers, too.
+"""
+
+from __future__ import annotations
+
+from omsm_ros.instruments.parameters import USUAL_COLUMNS, NowNs, Values
+from omsm_ros.instruments.scaling import AXES
+from omsm_ros.instruments.six_channel.device import CsvStreamDevice, make_text
+from omsm_ros.instruments.transport import Transport
+from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M
+
+COLUMNS = "sequence x z c status distance"
+"""Columns of ``config/linuxcnc/cell.hal``."""
+# HAL's numbers have 53 bits: a picometre of a millimetre, and 17 prad of a degree, are resolved.
+_PARTS = 10**9
+# Units of LinuxCNC where the machine is metric.
+_COUNTS_PER_UNIT = {axis: 1 / (DEGREE_RAD if axis in "bc" else MILLIMETRE_M) for axis in AXES}
+
+
+def make(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice:
+    """Return the device that ``values`` describe; millimetres and degrees where they state none."""
+    given = dict(values)
+    if given["columns"] == USUAL_COLUMNS:
+        given["columns"] = COLUMNS
+    for axis, usual in _COUNTS_PER_UNIT.items():
+        given[f"{axis}.counts_per_unit"] = given[f"{axis}.counts_per_unit"] or usual
+    return make_text(given, transport, now_ns, _PARTS)

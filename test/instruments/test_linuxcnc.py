@@ -1,0 +1,51 @@
+"""Lines of HAL's sampler: resolution, restarts and overruns."""
+
+import numpy as np
+
+from omsm_ros.instruments.linuxcnc.device import make
+from omsm_ros.instruments.parameters import defaults
+
+from .scripted_stream import Script
+
+
+def read(portions, **given):
+    device = make(
+        defaults() | {"device": "linuxcnc", "port": "tcp://h:1"} | given,
+        Script(*portions),
+        lambda: 0,
+    )
+    device.open()
+    blocks = [pair for _ in portions for pair in device.poll(0.0)]
+    return [*blocks, *device.close()], device.counts()
+
+
+def line(cycle, x=0.0, z=0.0, c=0.0, away=0, probe=0.0):
+    return f"{cycle} {x:.17g} {z:.17g} {c:.17g} {away} {probe:.17g}\n".encode()
+
+
+def test_a_picometre_of_a_millimetre_arrives():
+    wire = b"".join(line(n, z=12.345678901234, c=359.123456789) for n in range(1, 4))
+    (pair,), _ = read([wire])
+    np.testing.assert_allclose(pair.axes.z, 12.345678901234e-3, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pair.axes.c, np.radians(359.123456789), rtol=0, atol=2e-11)
+
+
+def test_every_cycle_is_counted_and_a_restart_is_no_gap():
+    wire = [b"".join(map(line, range(1, 6))), line(8) + b"overrun\n" + line(9) + line(10)]
+    wire.append(b"".join(line(n, z=1.0) for n in range(1, 4)))
+    blocks, counts = read(wire)
+    assert (counts["lost"], counts["gaps"], counts["overruns"]) == (2, 1, 1)
+    assert counts["restarts"] == counts["malformed"] == 1
+    assert counts["decoded"] == counts["delivered"] == 11
+    assert [b.axes.first_sample for b in blocks][:2] == [1, 8]
+
+
+def test_the_probe_has_no_target_where_the_program_does_not_measure():
+    (pair,), _ = read([line(1, away=1) + line(2, probe=-123.25)])
+    assert pair.distance.ok.tolist() == [False, True]
+    assert pair.distance.distance[1] == -123.25e-9
+
+
+def test_stated_scales_are_kept():
+    (pair,), _ = read([line(1, x=1.0) + line(2, x=1.0)], **{"x.counts_per_unit": 1 / 0.0254})
+    np.testing.assert_allclose(pair.axes.x, 0.0254)

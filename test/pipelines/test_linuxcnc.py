@@ -1,0 +1,132 @@
+"""Programs on the real LinuxCNC of this machine, where it is installed."""
+
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.adjustment import ScanDesign
+from omsm_ros.core.kinematics.trajectories import AxisPositions, plan_steps
+from omsm_ros.core.streams.blocks import AxisBlock
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
+from omsm_ros.errors import DataError
+from omsm_ros.io.bag_writer import AXES_TOPIC
+from omsm_ros.io.bags import BagReader
+from omsm_ros.io.gcode_file import steps_gcode
+from omsm_ros.pipelines.plan_scans import scan_path, scan_program, write_scans
+from omsm_ros.pipelines.record_device import record_device
+from omsm_ros.twin.cell import Cell, record
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "config" / "linuxcnc"))
+import behind
+import demo
+import start
+
+REAL = pytest.mark.skipif(bool(start.missing()), reason=start.missing())
+pytestmark = pytest.mark.xdist_group("linuxcnc")
+
+
+def counters(bag):
+    with BagReader(bag) as reader:
+        blocks = [block for _, block in reader.records(AXES_TOPIC)]
+    return [range(b.first_sample, b.first_sample + len(b)) for b in blocks]
+
+
+@REAL
+def test_a_program_is_executed_as_planned_and_no_cycle_is_lost(tmp_path):
+    design = ScanDesign(rpm=60.0, start=2e-3, end=1e-3, pitch=2e-4)
+    (path,) = write_scans([design], PAPER_MIRROR, tmp_path, 1e-7, 1e-3)
+    counts = demo.run(tmp_path / "scan_1.nc", tmp_path / "command.mcap")
+    assert counts.get("lost", 0) == counts.get("overruns", 0) == 0
+    assert counts["samples"] == counts["decoded"] > 5000
+    judged = behind.judge(tmp_path / "scan_1.csv", tmp_path / "command.mcap", path.error)
+    assert judged["within"]
+    assert judged["rate"] == pytest.approx(2 * np.pi, rel=1e-3)
+    assert judged["rate_rms"] < 0.02 * 2 * np.pi
+    found = behind.behind(tmp_path / "command.mcap", None, Cell(), PAPER_MIRROR, 0.0)
+    # The reading is what the twin's truth says, within its noise and resolution.
+    truth = Cell().probe.scale * (found.surface_height - found.probe_motion)
+    ok = found.distance.ok
+    assert np.mean(ok) > 0.99
+    assert np.std((found.distance.distance - truth)[ok]) < 12e-9
+
+
+@REAL
+@pytest.mark.parametrize("victim", ["reader", "LinuxCNC"])
+def test_killed_in_mid_program_every_cycle_is_accounted_for(tmp_path, victim):
+    steps = plan_steps(sample_period=1e-3, count=1, dwell=2.0)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    given = {"device": "linuxcnc", "port": f"tcp://127.0.0.1:{port}"}
+    with start.running(steps_gcode(steps), port) as process:
+        command = ["omsm", "record", "--port", given["port"], "--out", str(tmp_path / "1.mcap")]
+        reader = subprocess.Popen([*command, "--silence", "2"])
+        time.sleep(7.0)
+        if victim == "reader":
+            reader.kill()
+            reader.wait()
+            more = record_device(given, tmp_path / "2.mcap", lambda n, _: n > 1000)
+        else:
+            subprocess.run(["pkill", "-9", "-g", str(process.pid)], check=False)
+            assert reader.wait(20.0) == 0
+    first = counters(tmp_path / "1.mcap")
+    seen = np.concatenate([np.array(r) for r in first])
+    assert len(seen) > 1000
+    assert np.all(np.diff(seen) == 1)
+    if victim == "reader":
+        then = np.concatenate([np.array(r) for r in counters(tmp_path / "2.mcap")])
+        # What the dead reader had taken is a gap of the count; the rest waited in HAL's FIFO.
+        assert 0 < then[0] - seen[-1] < 2000
+        assert np.all(np.diff(then) == 1)
+        assert more.get("lost", 0) == 0
+
+
+class Wave:
+    duration = 1.0
+
+    def positions(self, time):
+        zero = np.zeros_like(time)
+        z = 1e-5 * np.sin(2 * np.pi * 3 * np.clip(time, 0, 1))
+        return AxisPositions(zero, zero, z, zero, zero)
+
+
+def test_a_motion_in_servo_cycles_is_the_motion():
+    time_ = np.arange(1000) * 1e-3
+    zero = np.zeros(1000)
+    block = AxisBlock(
+        stamp_ns=0, first_sample=0, sample_period=1e-3,
+        x=zero, y=zero, z=Wave().positions(time_).z, b=zero, c=zero,
+    )  # fmt: skip
+    sampled = record(Cell(), behind.CommandedMotion(block), Flat())
+    direct = record(Cell(), Wave(), Flat())
+    inner = slice(50, -10)
+    np.testing.assert_allclose(
+        sampled.probe_motion[inner], direct.probe_motion[inner], rtol=0, atol=2e-11
+    )
+
+
+def test_without_linuxcnc_the_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(start.shutil, "which", lambda name: None)
+    assert start.INSTALL in start.missing()
+    with pytest.raises(SystemExit, match=r"apt-get install .* linuxcnc-uspace"):
+        demo.main(str(tmp_path / "none"))
+
+
+def test_a_recording_is_judged_against_its_plan():
+    design = ScanDesign(rpm=30.0, start=2e-3, end=1.8e-3, pitch=1e-4)
+    planned, _ = scan_program(design, PAPER_MIRROR)
+    path = (planned.time, planned.x, planned.height, planned.c)
+    t = np.arange(0, 4000) * 1e-3
+    x, z, c = scan_path(design, PAPER_MIRROR, t)
+    good = behind.judge_path(path, x, z + 3e-6, c, 1e-3)
+    assert good["error"] < 1e-10
+    assert good["mean"] == pytest.approx(3e-6)
+    assert good["rate"] == pytest.approx(np.pi, rel=1e-6)
+    bad = behind.judge_path(path, x, z + 2e-7 * np.sin(2 * t), c, 1e-3)
+    assert 1.5e-7 < bad["error"] < 3e-7
+    with pytest.raises(DataError):
+        behind.judge_path(path, x, z, np.zeros_like(c), 1e-3)
