@@ -251,8 +251,8 @@ def _declare_demo(add: Arguments) -> None:
     add(
         "--experiment",
         str,
-        "repeat an experiment of the paper on the twin: Fig. 9, 10, 11 or 8; needs no ROS",
-        choices=("chirp", "circles", "vibration", "mirror"),
+        "repeat an experiment of the paper on the twin, Fig. 6 to 11; needs no ROS",
+        choices=("mirror", "steps", "chirp", "circles", "vibration"),
     )
 
 
@@ -264,7 +264,7 @@ def _experiment(args: argparse.Namespace) -> int:
         print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)), flush=True)
         return DONE
     for row in facts["compared"]:
-        say(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}")
+        say(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}".rstrip())
     table([written(["report.html"], str(args.out))])
     return DONE
 

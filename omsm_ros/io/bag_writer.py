@@ -222,10 +222,10 @@ class BagWriter:
         message = message_mapping.axis_message(bag_messages(), block)
         self.write(AXES_TOPIC, block.stamp_ns, message)
 
-    def write_distance(self, block: DistanceBlock) -> None:
-        """Append a block of the probe at its own stamp."""
+    def write_distance(self, block: DistanceBlock, topic: str = DISTANCE_TOPIC) -> None:
+        """Append a block of the probe, or of another sensor's ``topic``, at its own stamp."""
         message = message_mapping.distance_message(bag_messages(), block)
-        self.write(DISTANCE_TOPIC, block.stamp_ns, message)
+        self.write(topic, block.stamp_ns, message)
 
     def write_acceleration(self, block: AccelerationBlock) -> None:
         """Append a block of the accelerometer at its own stamp."""

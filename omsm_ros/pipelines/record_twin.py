@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_HALF_LENGTH_M
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
@@ -34,11 +34,15 @@ STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
 def write_recording(path: Path, recording: Recording) -> Path:
     """Write ``recording`` to the bag ``path``; return the path."""
     topics = [bags.AXES_TOPIC, bags.DISTANCE_TOPIC]
+    topics += [bags.REFERENCE_TOPIC] if recording.reference is not None else []
     topics += [bags.ACCELERATION_TOPIC] if recording.acceleration is not None else []
     with BagWriter(path, topics) as bag:
         for axes, distance in blocks_of(recording, _BLOCK_SAMPLES):
             bag.write_axes(axes)
             bag.write_distance(distance)
+        if recording.reference is not None:
+            for reference in pieces(recording.reference, _BLOCK_SAMPLES):
+                bag.write_distance(reference, bags.REFERENCE_TOPIC)
         if recording.acceleration is not None:
             for block in pieces(recording.acceleration, _BLOCK_SAMPLES):
                 bag.write_acceleration(block)
@@ -86,10 +90,10 @@ def record_sources(
 
 
 def _check(scenario: Scenario) -> None:
-    if scenario.start_radius > PAPER_MIRROR_RADIUS_M:
+    if scenario.start_radius > PAPER_MIRROR_HALF_LENGTH_M:
         raise ConfigurationError(
             f"radius is {quantity(scenario.start_radius, 'm')}, expected at most that of the "
-            f"twin's mirror, {quantity(PAPER_MIRROR_RADIUS_M, 'm')}; give it in metres"
+            f"twin's mirror, {quantity(PAPER_MIRROR_HALF_LENGTH_M, 'm')}; give it in metres"
         )
     samples = spiral_of(scenario).duration / scenario.sample_period
     if samples > _MOST_SAMPLES:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.readable import NOTHING, count, measured, percent, plain, quantity
+from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 
 _OPEN = "not evaluated"
 
@@ -52,13 +52,16 @@ def error_table(summary: Mapping[str, object]) -> Table:
 
 
 def budget_table(summary: Mapping[str, object]) -> Table:
-    """Return the sources of uncertainty, the largest first, those not evaluated last."""
+    """Return the sources of uncertainty, the largest first, in one row those not evaluated."""
     rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
-    ordered = sorted(rows, key=lambda row: (row["status"] == _OPEN, -(row["height"] or 0.0)))
+    known = [row for row in rows if row["status"] != _OPEN]
+    ordered = [_budget_row(row) for row in sorted(known, key=lambda r: -(r["height"] or 0.0))]
+    if missing := [row["says"] or row["source"] for row in rows if row["status"] == _OPEN]:
+        ordered.append((_OPEN, NOTHING, NOTHING, NOTHING, "; ".join(missing)))
     return Table(
         "Uncertainty of the heights, k = 1, rms over the scan",
         ("of the source", "of the heights", "correlation", "basis"),
-        [_budget_row(row) for row in ordered],
+        ordered,
         prose="basis",
     )
 
@@ -80,25 +83,6 @@ def _sized(size: object, unit: str) -> str:
     if unit == "1":
         return plain(size) if size is not None else NOTHING
     return quantity(size, unit)
-
-
-def motion_table(summary: Mapping[str, object]) -> Table:
-    """Return the residual error of the motion, its maximum speed, and the filter's error."""
-    prediction: Mapping[str, Any] = part(summary, "prediction") or {}
-    outside = prediction.get("outside_band_fraction")
-    factor = prediction.get("speed_factor")
-    rows = [
-        ("residual of the uncertain dynamics, k = 1", quantity(prediction.get("residual"), "m")),
-        ("motion outside the valid band", percent(outside)),
-        ("maximum speed", NOTHING if factor is None else f"{plain(factor)} × this scan"),
-        ("limited by", str(prediction.get("binding") or NOTHING)),
-        ("limits not evaluated", ", ".join(prediction.get("not_evaluated") or ()) or NOTHING),
-        (
-            "discretisation, peak to valley",
-            quantity(part(summary, "discretisation", "peak_to_valley"), "m"),
-        ),
-    ]
-    return Table("Motion", (), [row for row in rows if row[1] != NOTHING])
 
 
 def sample_table(summary: Mapping[str, object]) -> Table:

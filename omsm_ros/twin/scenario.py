@@ -18,8 +18,14 @@ from omsm_ros.core.kinematics.trajectories import (
     plan_steps,
     s_curve,
 )
-from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, Flat, Sphere
+from omsm_ros.core.streams.blocks import FloatArray, Status
+from omsm_ros.core.surface.nominal import (
+    PAPER_MIRROR,
+    PAPER_MIRROR_HALF_LENGTH_M,
+    PAPER_MIRROR_RADIUS_M,
+    Flat,
+    Sphere,
+)
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
@@ -51,9 +57,8 @@ class Scenario:
     def part(self) -> FigureError:
         """Mirror with its figure error, which is the same for one ``part_seed``."""
         seed = self.seed if self.part_seed is None else self.part_seed
-        return FigureError(
-            PAPER_MIRROR, PAPER_MIRROR_RADIUS_M, seed=seed, tool_marks=self.tool_marks
-        )
+        radius = max(PAPER_MIRROR_RADIUS_M, self.start_radius)
+        return FigureError(PAPER_MIRROR, radius, seed=seed, tool_marks=self.tool_marks)
 
 
 def planned_test_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
@@ -83,12 +88,26 @@ def on_a_flat(
 
 
 def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """Return the spiral scan of the mirror with its figure error."""
+    """Return the spiral scan of the mirror with its figure error.
+
+    Beyond the circle of 25.4 mm the mirror is an ellipse; off it the probe sees no target.
+    """
     # The seed differs from that of the step test, so that their noise is independent.
     cell = Cell(
         seed=scenario.seed + 1, sample_period=scenario.sample_period, disturbances=disturbances
     )
-    return record(cell, spiral_of(scenario), scenario.part)
+    made = record(cell, spiral_of(scenario), scenario.part)
+    if scenario.start_radius <= PAPER_MIRROR_RADIUS_M:
+        return made
+    assert made.truth is not None
+    along = made.truth.x / PAPER_MIRROR_HALF_LENGTH_M
+    off = np.hypot(along, made.truth.y / PAPER_MIRROR_RADIUS_M) > 1.0
+    seen = replace(
+        made.distance,
+        distance=np.where(off, np.nan, made.distance.distance),
+        status=np.where(off, np.uint8(Status.NO_TARGET), made.distance.status),
+    )
+    return replace(made, distance=seen)
 
 
 def spiral_of(scenario: Scenario) -> Spiral:

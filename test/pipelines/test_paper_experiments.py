@@ -1,7 +1,6 @@
 """The paper's experiments reproduce Eq. 12 and Table 1, and the page compares them."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,15 +8,99 @@ import pytest
 from omsm_ros import cli
 from omsm_ros.core.calibration.verification import excited_bands
 from omsm_ros.errors import FileError
-from omsm_ros.pipelines import paper_experiments
-from omsm_ros.pipelines.paper_experiments import ExperimentPage, run_experiment
-from omsm_ros.twin.scenario import Scenario
+from omsm_ros.io import bags
+from omsm_ros.pipelines import paper_experiments, paper_mirror
+from omsm_ros.pipelines.paper_experiments import run_experiment
+from omsm_ros.pipelines.paper_mirror import explanations, on_the_mirror
+from omsm_ros.report.experiments import Done
+from omsm_ros.twin.scenario import Scenario, scan_of
 
 
 @pytest.fixture(autouse=True)
 def known(monkeypatch, true_calibration):
     """Replace the identification, which is slow and has its own tests."""
-    monkeypatch.setattr(paper_experiments, "_calibrated", lambda seed: true_calibration)
+    for module in (paper_experiments, paper_mirror):
+        monkeypatch.setattr(module, "calibrated", lambda seed: true_calibration)
+
+
+def figure(facts, name):
+    """Return ratio and text of our figure."""
+    row = next(r for r in facts["compared"] if r["name"] == name)
+    return float(row["ratio"]), row["ours"]
+
+
+def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path):
+    """Fig. 6: 2.288 µm by integration of a critically damped 200 Hz axis through Eq. 12."""
+    facts = run_experiment("steps", tmp_path / "s")
+    assert facts["peak"] == pytest.approx(2.288e-6, rel=0.02)
+    # The gain of 1.26/1.27 leaves 78.7 nm of each step of 10 µm, and 0.787 µm of 100 µm.
+    settled = np.array(facts["settled"])
+    assert abs(np.diff(settled)) == pytest.approx(np.full(20, 78.7e-9), abs=3e-9)
+    assert np.ptp(settled) == pytest.approx(787e-9, rel=0.01)
+    with bags.BagReader(tmp_path / "s/steps.mcap") as bag:
+        held = {topic.topic: topic.messages for topic in bag.topics()}
+    assert held[bags.REFERENCE_TOPIC] == held[bags.DISTANCE_TOPIC] > 0
+    assert held[bags.ACCELERATION_TOPIC] > 0
+
+
+def test_the_circle_of_6_mm_shows_the_printed_figures(tmp_path, monkeypatch):
+    monkeypatch.setattr(paper_experiments, "_CIRCLE_SECONDS", 8.0)
+    facts = run_experiment("circles", tmp_path / "c")
+    # An exposure of 1 ms averages marks of 15.9 µm and 11 nm that pass at 0.6 and 1.2 kHz.
+    passing = 2 * np.pi * 6e-3 * np.array([15.0, 30.0]) / 60 / 15.9e-6
+    expected = np.hypot(11e-9 * abs(np.sinc(passing * 1e-3)), 2e-9)
+    for name, rms in zip(("F3", "F4"), expected, strict=True):
+        ratio, _ = figure(facts, f"{name}: amplitude, rms")
+        assert ratio * paper_experiments.TABLE_1[name][3] == pytest.approx(rms, rel=0.1)
+    assert figure(facts, "F4: peak at a wavelength of")[0] == pytest.approx(1.016, abs=0.01)
+    assert figure(facts, "F2, 1.875 rpm: mean speed of Z")[0] == pytest.approx(
+        1.57 / 1.55, rel=0.01
+    )
+
+
+def test_the_mirror_is_an_ellipse_with_a_plane_rim():
+    """A cylinder along the parent's axis cuts the paraboloid in a plane, parallel to the tangent.
+
+    Seen along the normal the outline's middle is beside the vertex by the rise times sin 45°.
+    """
+    angle, rise = np.linspace(0, 2 * np.pi, 50), 12.7e-3**2 / (4 * 25.4e-3)
+    x = 12.7e-3 * 2**0.5 * np.cos(angle) + rise * 0.5**0.5
+    rim = [paper_mirror.PAPER_MIRROR.height(s * x, 12.7e-3 * np.sin(angle)) for s in (1, -1)]
+    assert min(np.ptp(height) for height in rim) < 1e-12
+    assert min(abs(np.mean(height) - rise * 0.5**0.5) for height in rim) < 1e-12
+    # 0.1 mm a turn at 30 rpm and 1 kHz, from 17.96 mm: points inside, and in 24.57 / 25.4 of it.
+    time = np.arange(0, 17.9605e-3 / 50e-6, 1e-3)
+    radius = 17.9605e-3 - 50e-6 * time
+    at = radius * np.cos(np.pi * time), radius * np.sin(np.pi * time)
+    assert time[-1] / 60 == pytest.approx(5.99, abs=0.01)
+    assert np.sum(on_the_mirror(*at)) == pytest.approx(299_800, abs=100)
+    assert np.sum(on_the_mirror(*at, 24.57 / 25.4)) == pytest.approx(290_011, abs=100)
+
+
+def test_off_the_mirror_nothing_is_read():
+    made = scan_of(Scenario(start_radius=17.96e-3, feed_per_turn=2e-3))
+    inside = on_the_mirror(made.truth.x, made.truth.y)
+    assert np.array_equal(np.isfinite(made.distance.distance), inside)
+    assert 0.6 < inside.mean() < 0.95
+
+
+def test_explanations_are_those_of_a_grid():
+    """Lag and gain on the surface itself: S - g S plus τ ω ∂S/∂θ, on a polar grid."""
+    found = {name: sizes for name, sizes, _ in explanations()}
+    radius, angle = np.meshgrid(np.linspace(1e-5, 12.7e-3, 200), np.linspace(0, 2 * np.pi, 721))
+    height = paper_mirror.PAPER_MIRROR.height(radius * np.cos(angle), -radius * np.sin(angle))
+    lag = 0.3397e-3 * np.pi * np.gradient(height, angle[1, 0], axis=0)
+    for name, gain in (
+        ("lag of Eq. 12 alone", 0.0),
+        ("lag, and the printed gain 0.9921", 1 / 127),
+        ("lag, and a gain 0.15 % below one", 0.0015),
+    ):
+        error = lag[1:-1] + gain * height[1:-1]
+        level = error - np.average(error, weights=radius[1:-1])
+        assert found[name][0] == pytest.approx(np.ptp(level), rel=0.02)
+        rms = np.sqrt(np.average(level**2, weights=radius[1:-1]))
+        assert found[name][1] == pytest.approx(rms, rel=0.03)
+    assert found["C latched 1.7 ms late"][0] == pytest.approx(6.1e-6, rel=0.03)
 
 
 def test_the_chirp_lags_as_equation_12_and_is_corrected(tmp_path, capsys):
@@ -37,7 +120,11 @@ def test_the_chirp_lags_as_equation_12_and_is_corrected(tmp_path, capsys):
 def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_experiments, "_CIRCLE_SECONDS", 6.0)
     facts = run_experiment("vibration", tmp_path / "v")
-    quiet, shaken = facts["spectrum"]["scans"]
+    quiet, shaken, still = facts["spectrum"]["scans"]
+    # Marks of 15.9 µm on the 6 mm circle pass at 592.7 Hz: 407.3 Hz at a rate of 1 kHz.
+    assert max(still["peaks"], key=lambda p: p["amplitude"])["frequency"] == pytest.approx(
+        407.3, abs=0.5
+    )
     assert [p["kind"] for p in quiet["peaks"]] == ["on the part"]
     aliased = next(p for p in shaken["peaks"] if p["kind"] == "aliased vibration")
     assert aliased["true_frequency"] == pytest.approx(680.0, abs=0.01)
@@ -46,19 +133,19 @@ def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
 
 
 def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
-    small = Scenario(start_radius=2e-3)
-    monkeypatch.setattr(paper_experiments, "Scenario", lambda seed=1: replace(small, seed=seed))
+    monkeypatch.setattr(paper_mirror, "SCAN", Scenario(start_radius=2e-3))
     facts = run_experiment("mirror", tmp_path / "m")
     found = facts["summary"]["deviation"]
     raw, after = (found[when]["rms_area_weighted"] for when in ("raw", "corrected"))
     assert after < 15e-9
     assert raw > after
     page = (tmp_path / "m/report.html").read_text()
-    assert "290 011 in 6 minutes" in page.replace("\u202f", " ")
+    assert "290 011" in page.replace("\u202f", " ")
+    assert len((tmp_path / "m/second_instrument.csv").read_text().splitlines()) == 23_514
     # The folder is a complete measurement that can be evaluated again.
     assert json.loads((tmp_path / "m/summary.json").read_text())["samples"]
-    # Fig. 8 shows maps before and after, and sections.
-    assert page.count("data:image/png") == 5
+    # Fig. 7, then maps before and after, and sections.
+    assert page.count("data:image/png") == 8
 
 
 def test_an_experiment_leaves_what_is_measured_alone(tmp_path, monkeypatch):
@@ -66,7 +153,7 @@ def test_an_experiment_leaves_what_is_measured_alone(tmp_path, monkeypatch):
 
     def quick(out, seed):
         (out / "chirp.mcap").write_text(f"of seed {seed}")
-        return paper_experiments._Done({}, ExperimentPage("", "", []))
+        return Done({}, [], "")
 
     monkeypatch.setitem(paper_experiments.EXPERIMENTS, "chirp", quick)
     for name, said in (("chirp.mcap", "is there and no result"), ("summary.json", "of another")):

@@ -210,8 +210,9 @@ def test_errors_and_lags_of_a_free_path_are_those_of_their_bands():
             assert angle.get_ydata()[k] == pytest.approx(np.degrees(mean))
     (true,) = points_of(lag, "true response")
     assert true.get_ydata() == pytest.approx(np.degrees([0.1, 0.2]))
-    top = max(c.get_paths()[0].vertices[:, 1].max() for c in over.collections)
-    assert top == pytest.approx(1e9 * max(columns[f"error_{s}"].max() for s in ("before", "after")))
+    for side in ("before", "after"):
+        (line,) = points_of(over, side)
+        assert line.get_ydata() == pytest.approx(1e9 * columns[f"error_{side}"])
 
 
 # Spectra.

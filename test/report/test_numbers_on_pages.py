@@ -11,8 +11,7 @@ from page_tables import PageTables, says, value_of
 
 from omsm_ros.core.ripple import source_hypotheses
 from omsm_ros.core.ripple.source_hypotheses import KINDS, PART
-from omsm_ros.pipelines.paper_experiments import Compared, ExperimentPage
-from omsm_ros.pipelines.paper_experiments import render as render_experiment
+from omsm_ros.report.experiments import compared, done
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.spectrum import SpectrumPage
 from omsm_ros.report.spectrum import render as render_spectrum
@@ -64,7 +63,7 @@ def test_errors_and_headlines_are_those_of_the_summary(pv, rms, area, before, le
 def test_the_budget_has_every_source_once_the_largest_first(sources):
     rows = [
         {
-            "source": f"s_{k}", "says": "x", "kind": "random" if k % 2 else "systematic",
+            "source": f"s_{k}", "says": f"x{k}", "kind": "random" if k % 2 else "systematic",
             "status": "not evaluated" if open_ else "stated", "reason": "why" if open_ else "",
             "standard_uncertainty": size, "height": height, "unit": "m",
         }
@@ -74,14 +73,19 @@ def test_the_budget_has_every_source_once_the_largest_first(sources):
         t for t in page_of({"budget": {"sources": rows}}).tables if t["title"].startswith("Uncert")
     )
     shown = {row[0]: row[1:] for row in found["rows"]}
-    assert len(shown) == len(sources)
-    for row in rows:
-        size, height, acts, known = shown[f"{row['source'].replace('_', ' ')} (x)"]
+    missing = [row["says"] for row in rows if row["reason"]]
+    known = [row for row in rows if not row["reason"]]
+    assert len(shown) == len(known) + bool(missing)
+    for row in known:
+        size, height, acts, basis = shown[f"{row['source'].replace('_', ' ')} ({row['says']})"]
         assert says(size, row["standard_uncertainty"])
         assert says(height, row["height"])
         assert acts == ("none" if row["kind"] == "random" else "all points")
-        assert known == ("not evaluated: why" if row["reason"] else "stated")
-    order = [(row[4].startswith("not"), -(value_of(row[2]) or 0.0)) for row in found["rows"]]
+        assert basis == "stated"
+    if missing:
+        assert shown["not evaluated"][-1] == "; ".join(missing)
+        assert found["rows"][-1][0] == "not evaluated"
+    order = [-(value_of(row[2]) or 0.0) for row in found["rows"][: len(known)]]
     assert order == sorted(order)
 
 
@@ -249,12 +253,15 @@ def test_the_verdict_counts_the_lines(peaks, level, word):
 
 
 def test_paper_figures_and_ours_stand_in_the_same_rows():
-    rows = [Compared("error", "7.85 nm", "7.91 nm", "as read"), Compared("lag", "340 µs", "339 µs")]
-    page = PageTables(render_experiment(ExperimentPage("Fig. 9", "as it is", rows)))
+    rows = [
+        compared("error", "7.85 nm", 7.85e-9, 7.91e-9, "m", "as read"),
+        compared("lag", "", None, 339e-6, "s"),
+    ]
+    page = PageTables(done("Fig. 9", "as it is", rows, {}, {}).page)
     (table,) = page.tables
-    assert table["columns"] == ["", "the paper", "the twin", "remark"]
+    assert table["columns"] == ["", "the paper", "the twin", "ratio", "remark"]
     assert table["rows"] == [
-        ["error", "7.85 nm", "7.91 nm", "as read"], ["lag", "340 µs", "339 µs", ""],
+        ["error", "7.85 nm", "7.910 nm", "1.01", "as read"], ["lag", "", "339.0 µs", "", ""],
     ]  # fmt: skip
 
 

@@ -18,13 +18,12 @@ from sections_of_polynomials import from_polynomials
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.core.ripple.source_hypotheses import KINDS
 from omsm_ros.live_page.server import render as render_live
-from omsm_ros.pipelines.paper_experiments import Compared, ExperimentPage
-from omsm_ros.pipelines.paper_experiments import render as render_experiment
 from omsm_ros.report.campaign import CampaignEntry
 from omsm_ros.report.campaign import render as render_campaign
 from omsm_ros.report.certificate.model_page import ModelPage, render_model
 from omsm_ros.report.certificate.page import CertificatePage
 from omsm_ros.report.certificate.page import render as render_certificate
+from omsm_ros.report.experiments import Compared, done
 from omsm_ros.report.measurement.page import CAPTIONS, Report
 from omsm_ros.report.measurement.page import render as render_report
 from omsm_ros.report.measurement.surface_map import Layer, embedded
@@ -109,8 +108,8 @@ def study(text, _):
 
 
 def experiment(text, _):
-    rows = [Compared(text, text, text, text)]
-    return render_experiment(ExperimentPage(text, text, rows, (Table(text, (), [(text, text)]),)))
+    rows = [Compared(text, text, text, text, text)]
+    return done(text, text, rows, {}, {}, (Table(text, (), [(text, text)]),)).page
 
 
 def campaign(text, calibration):

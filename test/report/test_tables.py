@@ -99,20 +99,8 @@ class TestBudgetAndMotion:
         ]
         rows = tables.budget_table({"budget": {"sources": sources}}).rows
         names = [row[0].split(" (")[0] for row in rows]
-        assert names == ["probe noise", "encoder noise", "tilt of it"]
+        assert names == ["probe noise", "encoder noise", "not evaluated"]
         assert rows[0][2] == "10.0 nm"
         assert rows[1][1] == "2.00 nm"
-        assert rows[2][1:3] == ("–", "–")
-        assert rows[2][4] == "not evaluated: because"
+        assert rows[2][1:4] == ("–", "–", "–")
         assert tables.budget_table({}).rows == []
-
-    def test_motion_says_how_much_faster(self):
-        summary = {
-            "prediction": {"residual": 2e-9, "outside_band_fraction": 0.0012, "speed_factor": 3.25},
-            "discretisation": {"peak_to_valley": 5e-14},
-        }
-        rows = dict(tables.motion_table(summary).rows)
-        assert rows["residual of the uncertain dynamics, k = 1"] == "2.00 nm"
-        assert rows["motion outside the valid band"] == "0.12 %"
-        assert rows["maximum speed"] == "3.25 × this scan"
-        assert tables.motion_table({}).rows == []

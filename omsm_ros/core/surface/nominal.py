@@ -439,6 +439,8 @@ PAPER_MIRROR = OffAxisParaboloid(parent_focal_length=25.4e-3, off_axis_distance=
 """The paper's mirror: 90° off-axis paraboloid of 50.8 mm effective focal length."""
 
 PAPER_MIRROR_RADIUS_M = 12.7e-3
+# A cylinder along the parent's axis, seen along the normal at 45°: an ellipse with a plane rim.
+PAPER_MIRROR_HALF_LENGTH_M = PAPER_MIRROR_RADIUS_M * 2**0.5
 
 SHAPES: dict[str, Callable[..., Surface]] = {
     "flat": Flat,

@@ -203,6 +203,8 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
         )
         for limit in limits
     ]
+    missing = part(summary, "prediction", "not_evaluated") or ()
+    rows += [(str(name), "not evaluated", NOTHING, NOTHING) for name in missing]
     return Table("Limits of the motion", ("on this scan", "allowed", "maximum speed"), rows)
 
 
@@ -380,7 +382,6 @@ def _records(report: Report) -> list[tables.Table]:
         tables.error_table(summary),
         tables.budget_table(summary),
         tables.Table("Reasons for the verdict", (), [(reason,) for reason in verdict.reasons]),
-        tables.motion_table(summary),
         limits_table(summary),
         tables.sample_table(summary),
     ]
