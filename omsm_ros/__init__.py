@@ -29,28 +29,10 @@ errors.write_texts_with(_sentence)
 
 # The public names, here alone; a test holds them.
 __all__ = [
-    "Adjusted",
-    "Calibration",
-    "Difference",
-    "Form",
-    "Plan",
-    "Points",
-    "Prediction",
-    "Recording",
-    "Spectrum",
-    "adjust",
-    "correct",
-    "difference",
-    "form",
-    "identify",
-    "load",
-    "plan",
-    "predict",
-    "read",
-    "simulate",
-    "spectrum",
-    "surface",
-]
+    "Adjusted", "Calibration", "Difference", "Form", "Plan", "Points", "Prediction", "Recording",
+    "Spectrum", "adjust", "correct", "difference", "form", "identify", "load", "plan", "predict",
+    "read", "simulate", "spectrum", "surface",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
-from omsm_ros.errors import ConfigurationError, DataError, FileError
+from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.interface_calibration import Calibration
 from omsm_ros.interface_results import (
     Adjusted,
@@ -429,18 +429,14 @@ def load(path: Path | str) -> Any:
 
 def _points_of(file: Path) -> Points:
     from omsm_ros.io.maps.read_map import read_points
-    from omsm_ros.io.results import CloudFile
 
-    try:
-        held = CloudFile(file).read()
-        columns = {name: held[name].astype(np.float64) for name in held.dtype.names or ()}
-    except FileError:
-        found = read_points(file)
-        unknown = np.full(len(found), np.nan)
-        columns = {"x": found.x, "y": found.y, "height": found.height,
-                   "uncertainty": unknown if found.uncertainty is None else found.uncertainty,
-                   "dynamic_error": np.zeros(len(found)),
-                   "sample": np.zeros(len(found)) if found.sample is None else found.sample,
-        }  # fmt: skip
-    names = ("x", "y", "height", "uncertainty", "dynamic_error")
-    return Points(**{n: columns[n] for n in names}, sample=columns["sample"].astype(np.int64))
+    found = read_points(file)
+    zero = np.zeros(len(found), np.int64)
+    return Points(
+        x=found.x,
+        y=found.y,
+        height=found.height,
+        uncertainty=zero * np.nan if found.uncertainty is None else found.uncertainty,
+        dynamic_error=zero.astype(np.float64),
+        sample=zero if found.sample is None else found.sample,
+    )

@@ -7,7 +7,6 @@ import os
 import select
 import socket
 import threading
-import time
 import tty
 from pathlib import Path
 
@@ -203,15 +202,6 @@ class Pty:
     def has_reader(self) -> bool:
         """Return whether a driver has the port open."""
         return not self._events(0.0) & select.POLLHUP
-
-    def wait_for_reader(self, timeout: float, stop: threading.Event | None = None) -> bool:
-        """Wait until a driver opens the port; return False after ``timeout`` [s] or ``stop``."""
-        stop = stop or threading.Event()
-        deadline = time.monotonic() + timeout
-        while not self.has_reader:
-            if time.monotonic() > deadline or stop.wait(_LOOK_S):
-                return False
-        return True
 
     def read(self) -> bytes:
         """Return what the driver sent; b"" if nothing."""

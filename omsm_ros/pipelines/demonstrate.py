@@ -18,8 +18,6 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS
 from omsm_ros.core.correction.systematic import EVALUATED
-from omsm_ros.core.lti.discretisation import discretise
-from omsm_ros.core.lti.recursion import Recursion, past_motion
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import OmsmError, printable
 from omsm_ros.instruments.emulator_factory import emulated
@@ -249,8 +247,6 @@ def _tcp_link() -> str:
     return f"tcp://127.0.0.1:{_FIRST_PORT + os.getpid() % _PORTS}"
 
 
-# The step test begins with a stationary segment of at least this length.
-_REST_SAMPLES = 100
 RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
 TITLE = "Paraboloid mirror measured on the emulated cell"
 _REGISTERING = measurement.RegistrationOptions(("piston", "tip", "tilt"))
@@ -276,19 +272,14 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     summary["files"] |= {"scan_report": SCAN_REPORT, "overview": OVERVIEW}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimated error by the true one
-    summary["response"] = response_errors(calibration, true_response(step_test))
+    true = true_response(step_test)
+    summary["response"] = response_errors(calibration, true)
     live = live_points(plan.bag)
     summary["live_equals_offline"] = same_points(live, cloud)
     summary["live_points"] = len(live)
-    index = cloud["sample"].astype(np.int64)
-    figures = surface_figures(
-        view,
-        PAPER_MIRROR,
-        true_height=recording.surface_height[index],
-        true_error_left=(recording.probe_motion - recording.axes.z)[index] + view.dynamic_error,
-    )
-    figures |= calibration_figures(calibration, step_test)
-    (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true_response(step_test)))
+    figures = surface_figures(view, PAPER_MIRROR)
+    figures["bode"] = style.png(response_figures.bode(calibration, true, plan.sample_period))
+    (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true))
     surface = publication.map_of(view, PAPER_MIRROR, plan.out)
     publication.publish(plan.out, TITLE, summary, calibration, figures, surface)
     (plan.out / REPORT).replace(plan.out / SCAN_REPORT)
@@ -398,21 +389,6 @@ def same_points(live: NDArray[np.void], stored: NDArray[np.void]) -> bool:
     return len(live) == len(stored) and all(
         live[name].tobytes() == stored[name].tobytes() for name, _ in CLOUD_FIELDS
     )
-
-
-def calibration_figures(calibration: Calibration, step: Recording) -> dict[str, bytes]:
-    """Draw a Bode plot with the true response, and the step test with the model's output."""
-    axes, period = step.axes, calibration.sample_period
-    recursion = Recursion(discretise(calibration.dynamics, period))
-    recursion.start(past_motion(axes.z[:_REST_SAMPLES]))
-    edges = response_figures.step_response(
-        np.arange(len(axes)) * period,
-        axes.z,
-        -step.distance.distance / calibration.static_gain,
-        recursion.run(axes.z),
-    )
-    bode = response_figures.bode(calibration, true_response(step), period)
-    return {"bode": style.png(bode), "step_response": style.png(edges)}
 
 
 def table_of(plan: Demonstration, summary: dict[str, Any]) -> str:

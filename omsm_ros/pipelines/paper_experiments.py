@@ -13,10 +13,7 @@ from omsm_ros.core.calibration.verification import PathCheck
 from omsm_ros.core.kinematics.trajectories import Chirp, Circle, StepTest
 from omsm_ros.core.ripple.source_hypotheses import ALIASED, PART
 from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray
-from omsm_ros.core.surface.nominal import (
-    PAPER_MIRROR,
-    Flat,
-)
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.io.files import EXPERIMENT, REPORT, save_json, save_text
 from omsm_ros.io.folders import EXPERIMENT_FILES, result_folder
 from omsm_ros.pipelines.paper_mirror import calibrated, mirror

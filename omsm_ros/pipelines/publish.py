@@ -48,10 +48,7 @@ from omsm_ros.report.response_figures import bode
 
 
 def figures_of(
-    view: CloudView | None,
-    calibration: Calibration,
-    nominal: Surface | None,
-    sample_period: float,
+    view: CloudView | None, calibration: Calibration, nominal: Surface | None, sample_period: float
 ) -> dict[str, bytes]:
     """Return the figures of a cloud as PNG files, by name."""
     figures = surface_figures(view, nominal) if view is not None else {}

@@ -157,10 +157,7 @@ def _frequency_axis(axes: Axes, frequency: FloatArray, identified: Calibration) 
 
 
 def step_response(
-    time: FloatArray,
-    encoder: FloatArray,
-    probe: FloatArray,
-    predicted: FloatArray | None = None,
+    time: FloatArray, encoder: FloatArray, probe: FloatArray, predicted: FloatArray | None = None
 ) -> Figure:
     """Draw the steepest edge of a step test, the probe's motion, and their difference.
 

@@ -79,8 +79,8 @@ STANDS_FOR = {
     "SURFACE.yaml": "mirror.yaml", "RECORD.csv": "record.csv", "MODEL.json": "model.json",
     "SOURCES.yaml": "machine.yaml", "R": "0.001", "W": "0.0003", "NAME": "twin",
     "FILE.png": "made.png", "FROM": "310", "TO": "330", "R,X,Y": "0.0009,0,0",
-    "OPTION": "--no-report", "mirror|steps|chirp|circles|vibration": "steps", "S.yaml": "mirror.yaml",
-    "M.yaml": "machine.yaml", "U": "20e-9",
+    "OPTION": "--no-report", "mirror|steps|chirp|circles|vibration": "steps",
+    "S.yaml": "mirror.yaml", "M.yaml": "machine.yaml", "U": "20e-9",
 }  # fmt: skip
 IN_COMMAND = {
     "identify": {"BAG": "steps.mcap"},

@@ -91,19 +91,11 @@ def test_a_program_that_sets_nothing_reads_raw_bytes_too(pty: Pty) -> None:
 
 def test_a_driver_is_seen_to_come_and_go(pty: Pty, driver: SerialTransport) -> None:
     assert not pty.has_reader
-    assert not pty.wait_for_reader(0.0)
     for _ in range(2):
         driver.open()
         assert pty.has_reader
-        assert pty.wait_for_reader(SOON)
         driver.close()
         assert not pty.has_reader
-
-
-def test_waiting_for_a_driver_can_be_stopped(pty: Pty) -> None:
-    stop = threading.Event()
-    stop.set()
-    assert not pty.wait_for_reader(1e6, stop)
 
 
 def test_bytes_without_a_reader_are_counted_as_lost(pty: Pty, driver: SerialTransport) -> None:

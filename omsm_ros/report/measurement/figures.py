@@ -112,24 +112,16 @@ def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
     bar.set_label(text, fontsize=style.TEXT_PT, color=style.INK)
 
 
-def profile(
-    raw: Profile, corrected: Profile, *, title: str, position: str, true: Profile | None = None
-) -> Figure:
+def profile(raw: Profile, corrected: Profile, *, title: str, position: str) -> Figure:
     """Draw one profile before and after the correction in µm, and below it that after in nm.
 
     position: name of the horizontal axis, drawn in mm
-    true: the true deviation along the same line, None if unknown
     """
     made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
     _draw_profile(upper, raw, MICROMETRE_M, color=style.BEFORE, label="uncorrected")
     _draw_profile(upper, corrected, MICROMETRE_M, color=style.AFTER, label="corrected")
     _draw_profile(lower, corrected, NANOMETRE_M, color=style.AFTER, label="corrected")
-    if true is not None:
-        _draw_profile(
-            lower, true, NANOMETRE_M, color=style.TRUTH, label="true", linestyle=(0, (4, 2))
-        )
-        style.legend_above(lower)
     style.legend_above(upper)
     style.label(upper, y="deviation [µm]", title=title)
     style.label(lower, x=f"{position} [mm]", y="deviation [nm]")
@@ -145,19 +137,14 @@ def _draw_profile(axes: Axes, drawn: Profile, scale: float, **look: Any) -> None
 
 
 def dynamic_error(
-    time: FloatArray,
-    before: FloatArray,
-    *,
-    after: FloatArray | None = None,
-    uncertainty: FloatArray | None = None,
+    time: FloatArray, before: FloatArray, *, uncertainty: FloatArray | None = None
 ) -> Figure:
-    """Draw the dynamic error over the scan, each (n,) [m]: before in µm, and after in nm.
+    """Draw the dynamic error over the scan in µm, and the uncertainty of a height below it in nm.
 
-    time: [s];  after: true error after the correction, known on the twin only
-    uncertainty: standard uncertainty of the height, drawn as ±2u
+    time: [s];  before: [m];  uncertainty: standard, drawn as ±2u [m]; each (n,)
     """
-    left = after is not None or uncertainty is not None
-    made, axes = style.figure(6.1, 3.7 if left else 2.2, rows=1 + left, sharex=True)
+    shown = uncertainty is not None
+    made, axes = style.figure(6.1, 3.7 if shown else 2.2, rows=1 + shown, sharex=True)
     upper, lower = axes[0, 0], axes[-1, 0]
     _draw_envelope(upper, time, before, MICROMETRE_M, style.BEFORE)
     style.label(upper, y="before [µm]", title="Dynamic error over the scan")
@@ -167,9 +154,6 @@ def dynamic_error(
         lower.fill_between(
             at, -bound, bound, color=style.AFTER, alpha=0.18, linewidth=0, label="±2u of a height"
         )
-    if after is not None:
-        _draw_envelope(lower, time, after, NANOMETRE_M, style.AFTER, "true error after")
-    if left:
         style.legend_above(lower)
         style.label(lower, y="after [nm]")
     style.label(lower, x="time [s]")
@@ -177,12 +161,10 @@ def dynamic_error(
 
 
 def _draw_envelope(
-    axes: Axes, time: FloatArray, value: FloatArray, scale: float, colour: str, text: str = ""
+    axes: Axes, time: FloatArray, value: FloatArray, scale: float, colour: str
 ) -> None:
     at, low, high = style.envelope(time, value)
-    axes.fill_between(
-        at, low / scale, high / scale, color=colour, linewidth=0.6, label=text or None
-    )
+    axes.fill_between(at, low / scale, high / scale, color=colour, linewidth=0.6)
     axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
     axes.margins(x=0.01)
 
@@ -225,23 +207,13 @@ _BAND_SHARE = 1 / 200
 _SEGMENTS = 200
 
 
-def surface_figures(
-    cloud: CloudView,
-    nominal: Surface | None,
-    *,
-    true_height: FloatArray | None = None,
-    true_error_left: FloatArray | None = None,
-) -> dict[str, bytes]:
-    """Return PNG files of a cloud; without a nominal surface a map of the height and of the error.
-
-    true_height, true_error_left: of each point [m], (n,), known on the twin only
-    """
-    made = {"dynamic_error": _error_trace(cloud, true_error_left)}
+def surface_figures(cloud: CloudView, nominal: Surface | None) -> dict[str, bytes]:
+    """Return PNG files of a cloud; without a nominal surface maps of height and error."""
+    trace = dynamic_error(cloud.time, cloud.dynamic_error, uncertainty=cloud.uncertainty)
+    made = {"dynamic_error": style.png(trace)}
     if nominal is None:
         return {**made, **_height_maps(cloud)}
     heights = {"raw": cloud.raw_height, "corrected": cloud.height}
-    if true_height is not None:
-        heights["true"] = true_height
     deviations = {name: levelled(cloud, h, nominal) for name, h in heights.items()}
     return {**made, **_maps(cloud, deviations), **_profiles(cloud, deviations)}
 
@@ -252,49 +224,32 @@ def levelled(cloud: CloudView, height: FloatArray, nominal: Surface) -> FloatArr
     return form.level(cloud.x, cloud.y, away, weights=cloud.area)
 
 
-def _error_trace(cloud: CloudView, left: FloatArray | None) -> bytes:
-    return style.png(
-        dynamic_error(cloud.time, cloud.dynamic_error, after=left, uncertainty=cloud.uncertainty)
-    )
-
-
 def _height_maps(cloud: CloudView) -> dict[str, bytes]:
     height = cloud.height - cloud.height.min()
-    limits = (0.0, float(height.max()) or 1.0)
+    look: dict[str, Any] = {"limits": (0.0, float(height.max()) or 1.0)}
+    above = "above the lowest point"
+    shown = {
+        "height_map": (height, "Height [µm]", {**look, "quantity": above}),
+        "error_map": (cloud.dynamic_error, "Dynamic error [µm]", {"quantity": "dynamic error"}),
+    }
     return {
-        "height_map": style.png(
-            deviation_map(
-                *(cloud.x, cloud.y, height),
-                unit="µm",
-                title="Height [µm]",
-                limits=limits,
-                quantity="above the lowest point",
-            )
-        ),
-        "error_map": style.png(
-            deviation_map(
-                *(cloud.x, cloud.y, cloud.dynamic_error),
-                unit="µm",
-                title="Dynamic error [µm]",
-                quantity="dynamic error",
-            )
-        ),
+        name: style.png(deviation_map(cloud.x, cloud.y, v, unit="µm", title=title, **more))
+        for name, (v, title, more) in shown.items()
     }
 
 
 def _maps(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, bytes]:
-    x, y, raw, corrected = cloud.x, cloud.y, deviations["raw"], deviations["corrected"]
-    limits = symmetric_limits(x, y, raw)
-    drawn = {
-        "raw_map": deviation_map(x, y, raw, unit="µm", title="Uncorrected [µm]", limits=limits),
-        "corrected_map_same_scale": deviation_map(
-            x, y, corrected, unit="µm", title="Corrected, same scale [µm]", limits=limits
-        ),
-        "corrected_map": deviation_map(
-            x, y, corrected, unit="nm", title="Corrected, enlarged [nm]"
-        ),
+    raw, corrected = deviations["raw"], deviations["corrected"]
+    limits = symmetric_limits(cloud.x, cloud.y, raw)
+    shown = {
+        "raw_map": (raw, "µm", "Uncorrected [µm]", limits),
+        "corrected_map_same_scale": (corrected, "µm", "Corrected, same scale [µm]", limits),
+        "corrected_map": (corrected, "nm", "Corrected, enlarged [nm]", None),
     }
-    return {name: style.png(figure) for name, figure in drawn.items()}
+    return {
+        name: style.png(deviation_map(cloud.x, cloud.y, v, unit=unit, title=title, limits=ends))
+        for name, (v, unit, title, ends) in shown.items()
+    }
 
 
 _LINES = {
@@ -337,8 +292,4 @@ def _feed(cloud: CloudView) -> float:
 
 
 def _profile(cuts: dict[str, form.Profile], title: str, position: str) -> bytes:
-    return style.png(
-        profile(
-            cuts["raw"], cuts["corrected"], title=title, position=position, true=cuts.get("true")
-        )
-    )
+    return style.png(profile(cuts["raw"], cuts["corrected"], title=title, position=position))

@@ -139,12 +139,7 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
 
 
 def _draw(
-    axes: Axes,
-    curve: Mapping[str, Any],
-    along: float,
-    unit: float,
-    *,
-    floor: float | None = None,
+    axes: Axes, curve: Mapping[str, Any], along: float, unit: float, *, floor: float | None = None
 ) -> None:
     """Draw a curve in units of ``along`` and ``unit`` with a band of ±2u.
 

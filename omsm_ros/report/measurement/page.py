@@ -92,9 +92,7 @@ def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
     missing = tuple(part(form, "removed", "not_evaluated") or ())
     if missing:
         return PageVerdict(
-            "unknown",
-            "Uncertainty budget incomplete",
-            (*(f"not evaluated: {m}" for m in missing),),
+            "unknown", "Uncertainty budget incomplete", (*(f"not evaluated: {m}" for m in missing),)
         )
     return PageVerdict(
         "care", "Valid with reservations", ("the measurement has no summary of its samples",)

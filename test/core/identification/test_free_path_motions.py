@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.free_path import Multisine
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.kinematics.trajectories import Chirp, Multisine
+from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble

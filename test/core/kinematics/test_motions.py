@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.free_path import Multisine
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.kinematics.trajectories import (
     Chirp,
     Circle,
-    Multisine,
     Spiral,
     StepPlan,
     StepTest,

@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.free_path import Multisine
 from omsm_ros.core.kinematics.trajectories import (
     Chirp,
     Circle,
-    Multisine,
     Spiral,
     StepTest,
     s_curve,
