@@ -22,27 +22,6 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant
 
-
-@dataclass(frozen=True, slots=True)
-class Multisine:
-    """Z swings at several ``frequencies`` [Hz] at once, each with ``amplitude`` [m].
-
-    Their phases keep the peak low (Schroeder 1970). It oscillates also before its start.
-    """
-
-    frequencies: tuple[float, ...] = (0.7, 1.3, 2.9, 5.1, 7.7, 11.3, 14.9)
-    amplitude: float = 3e-6
-    duration: float = 20.0
-
-    def positions(self, time: FloatArray) -> AxisPositions:
-        """Return the commanded axes at ``time`` [s]."""
-        count, z = len(self.frequencies), np.zeros_like(time)
-        for k, frequency in enumerate(self.frequencies):
-            z = z + np.cos(2 * np.pi * frequency * time - np.pi * k * k / count)
-        zero = np.zeros_like(z)
-        return AxisPositions(zero, zero, self.amplitude * z, zero, zero)
-
-
 _FIRST_SEED = 7000
 _OMEGA = 2 * np.pi * 60
 _LIGHT_MODE = Plant(TransferFunction.from_ascending([1.0], [1.0, 0.04 / _OMEGA, _OMEGA**-2]))

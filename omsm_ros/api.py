@@ -296,11 +296,13 @@ def plan(
     rpm: float = 30.0,
     radius: float = 12.7e-3,
     feed: float = 1e-4,
+    dialect: str = "linuxcnc",
     **steps: Any,
 ) -> Plan:
     """Plan a step test, or a scan of ``nominal`` from ``radius`` [m] to the centre.
 
     period: of the samples [s];  feed: per turn [m]
+    dialect: of the controller, ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``
     steps: ``step``, ``second_step``, ``half_range`` [m], ``count``, ``dwell``, ``rise`` [s]
 
     Raises ConfigurationError for a motion that the probe or the sampling cannot follow.
@@ -315,18 +317,20 @@ def plan(
     from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
     from omsm_ros.pipelines.plan_scans import scan_path, scan_program
 
+    if dialect not in DIALECTS:
+        raise ConfigurationError(f"dialect {dialect!r} is none of {', '.join(DIALECTS)}")
     if nominal is None:
         step = steps.get("step", 9.8e-6)
         usual = {"step": step, "second_step": SECOND_SHARE * step, "count": PLANNED_COUNT,
                  "dwell": PLANNED_DWELL_S}  # fmt: skip
         test = plan_steps(sample_period=period, **{**usual, **steps})
         z = test.z(np.arange(0.0, test.duration, period, dtype=np.float64))
-        zero, programs = np.zeros(len(z)), {name: steps_gcode(test, name) for name in DIALECTS}
-        return Plan(z=z, x=zero, c=zero, period=period, programs=programs)
+        zero = np.zeros(len(z))
+        return Plan(z=z, x=zero, c=zero, period=period, gcode=steps_gcode(test, dialect))
     design = ScanDesign(rpm=rpm, start=radius, end=0.0, pitch=feed, rate=1 / period, **steps)
     x, z, c = scan_path(design, nominal, np.arange(0.0, design.duration, period, dtype=np.float64))
-    programs = {d: scan_program(design, nominal, dialect=d)[1] for d in DIALECTS}
-    return Plan(z=z, x=x, c=c, period=period, programs=programs)
+    program = scan_program(design, nominal, dialect=dialect)[1]
+    return Plan(z=z, x=x, c=c, period=period, gcode=program)
 
 
 def predict(

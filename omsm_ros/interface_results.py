@@ -301,11 +301,11 @@ class Adjusted(Result):
         return str(self.facts["verdict"]["code"])
 
     def rows(self) -> Iterator[tuple[str, str]]:
-        from omsm_ros.report.adjustment import headline, next_steps
+        from omsm_ros.report.verdict import headline, next_steps
 
         yield "result", headline(self.facts)
         yield "verdict", self.facts["verdict"]["text"]
-        for text in next_steps(self.facts)[:8]:
+        for text in next_steps(self.facts["verdict"])[:8]:
             yield "", text
 
     def _figure(self) -> Figure:
@@ -388,14 +388,14 @@ class Plan(Result):
     """A planned step test or scan.
 
     z, x: positions [m];  c: angle of the spindle [rad], each (n,);  period: of the samples [s]
-    programs: text of the G-code by dialect
+    gcode: program for the controller
     """
 
     z: FloatArray
     x: FloatArray
     c: FloatArray
     period: float
-    programs: Mapping[str, str]
+    gcode: str
 
     @property
     def time(self) -> FloatArray:
@@ -410,12 +410,6 @@ class Plan(Result):
         if np.any(self.c):
             turn = (self.c[-1] - self.c[0]) / (2 * np.pi) / (len(self.z) - 1) / self.period
             yield "spindle", f"{60 * turn:.4g} rpm"
-
-    def gcode(self, dialect: str = "linuxcnc") -> str:
-        """Return the program for ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``."""
-        if dialect not in self.programs:
-            raise ConfigurationError(f"dialect {dialect!r} is none of {', '.join(self.programs)}")
-        return self.programs[dialect]
 
     def _figure(self) -> Figure:
         return _over_time(self.time, {"z": self.z})

@@ -188,10 +188,10 @@ def test_files_of_the_commands_are_read(results, tmp_path):
 
 def test_a_plan_is_the_motion_of_its_program(results):
     plan = results[7]
-    assert plan.gcode("linuxcnc").endswith("M2\n")
+    assert plan.gcode.endswith("M2\n")
     assert np.ptp(plan.c) == pytest.approx(2 * np.pi * 30 / 60 * plan.time[-1])
     with pytest.raises(ConfigurationError, match="none of linuxcnc"):
-        plan.gcode("heidenhain")
+        omsm.plan(dialect="heidenhain")
     # Its lag makes the error that is predicted: lag times the speed of Z, but for the settling.
     error = results[8].error
     expected = results[0].lag * np.gradient(plan.z, plan.period)[-len(error) :]
