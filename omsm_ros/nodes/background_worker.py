@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import queue
+import resource
 import threading
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
+from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from rclpy.node import Node
@@ -21,8 +24,50 @@ T = TypeVar("T")
 
 # Requests that may wait; a further one is refused at once.
 _MOST_WAITING = 8
+# Reading a bag from outside takes at most this time [s] and memory [bytes].
+_BAG_S, _BAG_BYTES = 300.0, 8 << 30
 # Idle time after which free memory is returned to the system [s].
 _IDLE_S = 1.0
+
+
+def in_child(work: Callable[[], T], seconds: float = _BAG_S, most_bytes: int = _BAG_BYTES) -> T:
+    """Return what ``work`` returns in a process of its own, or raise what it raises.
+
+    A bag from outside may be made to take memory or time without end. ``work`` and its result are
+    pickled. Raises OmsmError if it takes longer, or more memory.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    child = context.Process(target=_child, args=(sender, work, most_bytes), daemon=True)
+    child.start()
+    sender.close()
+    try:
+        if not receiver.poll(seconds):
+            raise OmsmError(f"the bag was not read in {seconds:g} s; try omsm inspect")
+        failed, result = receiver.recv()
+    except EOFError as err:
+        raise OmsmError(
+            f"the process that read the bag ended; it may have needed more than "
+            f"{most_bytes / 2**30:.3g} GB: check the bag with omsm inspect"
+        ) from err
+    finally:
+        child.kill()
+        child.join()
+        receiver.close()
+    if failed:
+        raise result
+    return result  # type: ignore[no-any-return]
+
+
+def _child(sender: Connection, work: Callable[[], Any], most_bytes: int) -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
+    try:
+        answer = (False, work())
+    except MemoryError:
+        return  # the parent sees that this process ended
+    except OmsmError as err:
+        answer = (True, OmsmError(str(err)))
+    sender.send(answer)
 
 
 class BackgroundWorker:

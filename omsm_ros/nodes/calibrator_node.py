@@ -18,12 +18,13 @@ from omsm_ros.core.calibration.certificate import REJECTED, Origin
 from omsm_ros.core.streams.monitoring import RecentIncrease
 from omsm_ros.core.streams.motion_record import BlockBuffer, MotionRecord, assemble
 from omsm_ros.core.streams.stamps import check_period
+from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.errors import BagError, ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder
 from omsm_ros.io.files import resolved_within
 from omsm_ros.io.folders import exclusive_lock
-from omsm_ros.nodes.background_worker import BackgroundWorker
+from omsm_ros.nodes.background_worker import BackgroundWorker, in_child
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, StateReport
@@ -215,27 +216,15 @@ class CalibratorNode(ManagedNode):
         order = quantities.ORDER.checked(request.order)
         options = {"order": order, "input": request.input or "encoder"}
         if bag:
-            return partial(self._identify_bag, bag, duration, self._settings, options)
+            lapse = self._time_lapse
+            work = partial(_identify_bag, bag, duration, self._settings, lapse, self._trigger)
+            return partial(in_child, partial(work, options))
         streams = [self._buffers[topic].recent(duration) for topic in _STREAMS]
         options |= {
             "settings": settings_with(self._settings, [self._probe]),
             "origin": _origin(int(self.get_clock().now().nanoseconds)),
         }
         return lambda: _identified(self._live_motion(*streams), **options)
-
-    def _identify_bag(
-        self, bag: Path, duration: float, stated: dict[str, object], options: dict[str, Any]
-    ) -> Identification:
-        # Loaded on demand, because reading bags takes long to import.
-        from omsm_ros.pipelines.recording import Recording
-
-        with Recording(bag) as recording:
-            motion = recording.motion(
-                duration=duration, time_lapse=self._time_lapse, trigger=self._trigger
-            )
-            settings = recording.settings(stated)
-        origin = _origin(recording.recorded_ns)
-        return _identified(motion, settings=settings, origin=origin, **options)
 
     def _live_motion(self, *streams: Any) -> MotionRecord:
         faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
@@ -265,6 +254,24 @@ class CalibratorNode(ManagedNode):
         if self._trouble:
             report.add(WARN, self._trouble)
         return report
+
+
+def _identify_bag(
+    bag: Path,
+    duration: float,
+    stated: dict[str, object],
+    time_lapse: object,
+    trigger: CommonTrigger,
+    options: dict[str, Any],
+) -> Identification:
+    # Loaded on demand, because reading bags takes long to import.
+    from omsm_ros.pipelines.recording import Recording
+
+    with Recording(bag) as recording:
+        motion = recording.motion(duration=duration, time_lapse=time_lapse, trigger=trigger)
+        settings = recording.settings(stated)
+    origin = _origin(recording.recorded_ns)
+    return _identified(motion, settings=settings, origin=origin, **options)
 
 
 def _identified(*motion: Any, **options: Any) -> Identification:

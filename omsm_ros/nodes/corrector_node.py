@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -34,13 +34,13 @@ from omsm_ros.io.calibration_file import load_calibration, load_for_others, sinc
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import resolved_within
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.background_worker import BackgroundWorker
+from omsm_ros.nodes.background_worker import BackgroundWorker, in_child
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
-from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen
+from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen, take_rest
 from omsm_ros.pipelines.measure import live_verdict, with_sources
 from omsm_ros.report.verdict import next_steps
 
@@ -49,10 +49,12 @@ PAUSE_S, _PAUSE_BLOCKS = 1.0, 3
 _STREAMS = {"axes": ("axes", AxisBlock), "distance": ("confocal", DistanceBlock)}
 # Silence before a report: longer than the pauses of a step test, or five samples [s].
 _SILENCE_S, _SILENCE_SAMPLES = 2.0, 5
+# At the end, drivers send their last block within the time of so many looks.
+_LAST_LOOKS = 20
 # Half of the two seconds for which small blocks can wait [ms].
 _DELAYED_MS = 1000.0
 # Reasons that mean a loss of data, unlike a probe without a target.
-_LOSSES = ("unmatched", "late", "overdue")
+_LOSSES = ("unmatched", "late", "overdue", "jumped")
 
 
 def verdict_values(verdict: Mapping[str, Any]) -> dict[str, object]:
@@ -296,13 +298,21 @@ class CorrectorNode(ManagedNode):
     def activate(self, undo: ExitStack) -> None:
         """Begin to correct."""
         undo.callback(self._publish_rest)
+        heard: list[Any] = []
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = self.create_timer(PAUSE_S / 2, self._settle, clock=steady)
         undo.callback(self.destroy_timer, timer)
         for stream, (topic, kind) in _STREAMS.items():
             self._waiting[stream] = []
             take, push = partial(self._take, stream), partial(self._push, stream)
-            listen(self, undo, kind, topic, take, after=push)
+            heard.append((listen(self, undo, kind, topic, take, after=push), take))
+        undo.callback(self._take_rest, heard)
+
+    def _take_rest(self, heard: Sequence[Any]) -> None:
+        """Correct what the drivers, which end at the same time, have sent last."""
+        take_rest(heard, _LAST_LOOKS)
+        for stream in _STREAMS:
+            self._push(stream)
 
     def _put_in_force(self, calibration: Calibration, since_ns: int) -> None:
         self._use(calibration)
@@ -390,7 +400,8 @@ class CorrectorNode(ManagedNode):
         if bag:
             bag = str(resolved_within(Path(bag), self.values["bag_folders"], BagError, "bag"))
         known, period = self._topic.calibration, request.sample_period
-        prediction = await self._worker.do(partial(_prediction, known, bag, request.z, period))
+        predict = partial(_prediction, known, bag, request.z, period)
+        prediction = await self._worker.do(partial(in_child, predict) if bag else predict)
         response.peak_to_valley = prediction.peak_to_valley
         response.rms = prediction.rms
         response.outside_band_fraction = prediction.outside_band_fraction

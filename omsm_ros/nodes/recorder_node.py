@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
@@ -21,7 +20,7 @@ from omsm_ros.io.bag_writer import BagWriter, next_free
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
-from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_waiting
+from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_rest
 from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
@@ -41,11 +40,8 @@ _TOPICS = {
 }
 
 _FLUSH_PERIOD_S = 0.5
-# After 20 looks (0.2 s, a hundred times the latency of a message) without a message, no more are
-# expected. Looks are counted, not time, since a busy computer may give this process no time.
-_LOOKS, _LOOK_S = 20, 0.01
-# For publishers that do not end; a launch waits for five seconds [s].
-_LONGEST_S = 3.0
+# Longer than the corrector waits for its last samples, whose points come after that.
+_LOOKS = 40
 
 
 class RecorderNode(ManagedNode):
@@ -93,7 +89,7 @@ class RecorderNode(ManagedNode):
         flush = partial(self._written, self._bag.flush)
         undo.callback(self.destroy_timer, self.create_timer(_FLUSH_PERIOD_S, flush, clock=steady))
         undo.callback(self._heard.clear)
-        undo.callback(self._take_what_is_on_its_way)
+        undo.callback(self._take_rest)
 
     def _take(self, topic: str, cdr: bytes, info: MessageInfo) -> None:
         # A bag without an index is read in the order of writing, which must be that of the
@@ -120,12 +116,8 @@ class RecorderNode(ManagedNode):
             self.fatal = self.fatal or err
             self.get_logger().error(f"{type(err).__name__}: {err}")
 
-    def _take_what_is_on_its_way(self) -> None:
-        begin, in_vain = time.monotonic(), 0
-        while in_vain < _LOOKS and time.monotonic() - begin < _LONGEST_S:
-            came = sum(take_waiting(s, partial(self._take, t)) for t, s in self._heard.items())
-            in_vain = 0 if came else in_vain + 1
-            time.sleep(_LOOK_S)
+    def _take_rest(self) -> None:
+        take_rest([(s, partial(self._take, t)) for t, s in self._heard.items()], _LOOKS)
 
     def report(self) -> StateReport:
         """Return the messages recorded and lost."""

@@ -24,6 +24,7 @@ LAUNCHED_BY = "OMSM_LAUNCHED_BY"
 """Variable with the process number of the launch that started a node, which ends with it."""
 
 _PROFILES = "FASTRTPS_DEFAULT_PROFILES_FILE"
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _PROFILES_OF_FOLDER = "DEFAULT_FASTRTPS_PROFILES.xml"  # read by Fast DDS if it exists
 _TRANSPORTS_CHOSEN = (_PROFILES, "FASTDDS_BUILTIN_TRANSPORTS")
 _MORE_FROM_PROFILE = "RMW_FASTRTPS_USE_QOS_FROM_XML"  # also memory and publication mode
@@ -104,6 +105,9 @@ def end_with_launch() -> None:
 def set_up_fast_dds() -> None:
     """Let Fast DDS use our profile (``fast_dds.xml``), unless the user has chosen another.
 
+    With ``ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST`` it is ``fast_dds_local.xml``, which uses the
+    loopback interface only: otherwise another computer reaches a node by ``ROS_STATIC_PEERS``.
+
     Messages use UDP. With shared memory, a subscriber that pauses for a second or two loses its
     queue, while its messages keep their places in the publisher's segment; once that is fragmented,
     sending again fails silently until the memory is freed.
@@ -117,7 +121,9 @@ def set_up_fast_dds() -> None:
     """
     chosen = any(os.environ.get(name) for name in _TRANSPORTS_CHOSEN)
     if not chosen and not Path(_PROFILES_OF_FOLDER).exists():
-        os.environ[_PROFILES] = str(Path(__file__).with_name("fast_dds.xml"))
+        local = os.environ.get(_RANGE, "").strip().upper() == "LOCALHOST"
+        profile = "fast_dds_local.xml" if local else "fast_dds.xml"
+        os.environ[_PROFILES] = str(Path(__file__).with_name(profile))
         if not os.environ.get(_PUBLICATION_MODE):
             os.environ.setdefault(_MORE_FROM_PROFILE, "1")
     _send_from_own_thread()

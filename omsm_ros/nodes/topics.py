@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from typing import Any, TypeAlias
@@ -121,6 +122,25 @@ def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInf
             return count
         callback(*taken)
     return _BULK
+
+
+# Between two looks for messages on their way; for publishers that do not end, the longest time: a
+# launch waits for five seconds [s].
+_LOOK_S, _LONGEST_S = 0.01, 3.0
+
+
+def take_rest(
+    takers: Sequence[tuple[Subscription, Callable[[Any, MessageInfo], None]]], looks: int
+) -> None:
+    """Take the messages on their way at the end, until ``looks`` times none has come.
+
+    A look takes 10 ms. Looks are counted, since a busy computer may give this process no time.
+    """
+    begin, in_vain = time.monotonic(), 0
+    while in_vain < looks and time.monotonic() - begin < _LONGEST_S:
+        came = sum(take_waiting(subscription, take) for subscription, take in takers)
+        in_vain = 0 if came else in_vain + 1
+        time.sleep(_LOOK_S)
 
 
 def answer_processed_counts(

@@ -5,6 +5,7 @@ import platform
 import time
 import weakref
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +14,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
-from omsm_ros.nodes.background_worker import BackgroundWorker
+from omsm_ros.errors import OmsmError
+from omsm_ros.nodes.background_worker import BackgroundWorker, in_child
+from omsm_ros.nodes.running import settings_of
 
 
 def outcome(awaited):
@@ -65,3 +68,15 @@ def test_memory_of_the_work_goes_back_to_the_system(worker):
     outcome(worker.do(work))
     assert resident_bytes() > before + 100e6
     assert soon(lambda: resident_bytes() < before + 30e6)
+
+
+def test_work_on_a_bag_from_outside_has_a_process_with_limits():
+    assert in_child(partial(int, "3")) == 3
+    with pytest.raises(OmsmError, match="settings"):
+        in_child(partial(settings_of, "["))
+    with pytest.raises(OmsmError, match="more than 1 GB"):
+        in_child(partial(bytearray, 4 << 30), most_bytes=1 << 30)
+    began = time.monotonic()
+    with pytest.raises(OmsmError, match=r"in 0\.5 s"):
+        in_child(partial(time.sleep, 60.0), seconds=0.5)
+    assert time.monotonic() - began < 20.0

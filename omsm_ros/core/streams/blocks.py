@@ -215,6 +215,7 @@ class RejectionReason(IntEnum):
     OVERDUE: one sample of the pair waited for the other longer than allowed
     BEYOND: outside the range of the calibration set
     SLIPPED: the counters of the two streams count different triggers
+    JUMPED: its count was far ahead of its time, and no block after it confirmed that
     """
 
     NONE = 0
@@ -226,6 +227,7 @@ class RejectionReason(IntEnum):
     OVERDUE = 6
     BEYOND = 7
     SLIPPED = 8
+    JUMPED = 9
 
 
 @dataclass(frozen=True)

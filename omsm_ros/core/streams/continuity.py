@@ -26,6 +26,7 @@ class Arrival:
     session: number of the run of the counter;  first: count of the block's first sample
     skip: leading samples to leave out: ``late`` ones fill a gap, the others are duplicates
     missing: trigger counts that were skipped just before the block
+    jumped: samples left out, since the count is far ahead of the time until a block confirms it
     """
 
     session: int
@@ -33,6 +34,16 @@ class Arrival:
     skip: int
     late: int
     missing: int = field(default=0, compare=False)
+    jumped: int = field(default=0, compare=False)
+
+
+def is_ahead_of_time(before: tuple[int, int], block: Block) -> bool:
+    """Return whether the count of ``block`` is far ahead of its time.
+
+    before: first count and stamp [ns] of the block before it
+    """
+    due_ns = (block.first_sample - before[0]) * block.sample_period * NANOSECONDS_PER_S
+    return due_ns > block.stamp_ns - before[1] + TIME_JUMP_S * NANOSECONDS_PER_S
 
 
 class TriggerCount:
@@ -44,6 +55,7 @@ class TriggerCount:
         self._newest_first = 0
         self._newest_stamp_ns: int | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=_MOST_GAPS)
+        self._jumped: tuple[int, int] | None = None  # count and stamp of a block that is ahead
 
     def place(self, block: Block, length: int) -> Arrival:
         """Place ``block`` of ``length`` samples after what came before."""
@@ -53,8 +65,12 @@ class TriggerCount:
             self._next = first
             self._gaps.clear()
         elif first > self._next:
+            if self._leaps(block):
+                self._jumped = (first, block.stamp_ns)
+                return Arrival(self._session, first, length, 0, jumped=length)
             self._gaps.append((self._next, first))
             missing = first - self._next
+        self._jumped = None
         end = first + length
         skip = min(max(self._next - first, 0), length)
         late = self._filled(first, first + skip) if skip else 0
@@ -62,6 +78,15 @@ class TriggerCount:
             self._next = end
             self._newest_first, self._newest_stamp_ns = block.newest
         return Arrival(self._session, first, skip, late, missing)
+
+    def _leaps(self, block: Block) -> bool:
+        """Return whether the count is ahead of the time, and of a block that was ahead before."""
+        assert self._newest_stamp_ns is not None  # of a session that has begun
+        if not is_ahead_of_time((self._newest_first, self._newest_stamp_ns), block):
+            return False
+        jumped = self._jumped
+        confirmed = jumped is not None and block.first_sample > jumped[0]
+        return jumped is None or not confirmed or is_ahead_of_time(jumped, block)
 
     def _filled(self, first: int, end: int) -> int:
         """Remove the counts ``first`` to ``end`` from the gaps; return how many there were."""

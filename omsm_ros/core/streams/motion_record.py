@@ -28,7 +28,7 @@ from omsm_ros.core.streams.blocks import (
     consecutive,
     joined,
 )
-from omsm_ros.core.streams.continuity import TIME_JUMP_S
+from omsm_ros.core.streams.continuity import TIME_JUMP_S, is_ahead_of_time
 from omsm_ros.core.streams.pairing import STAMP_TOLERANCE_S, Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import DataError
@@ -356,6 +356,12 @@ def _unfilled(
 _MANY = 100
 
 
+def _follows(before: Block, block: Block) -> bool:
+    """Return whether the count of ``block`` goes on from that of ``before``, at its time."""
+    begun = before.newest
+    return block.first_sample >= begun[0] and not is_ahead_of_time(begun, block)
+
+
 class BlockBuffer(Generic[Probed]):
     """Blocks of one topic since its trigger counter was last reset, bounded in samples.
 
@@ -369,19 +375,34 @@ class BlockBuffer(Generic[Probed]):
         self._samples = 0
         self._apart = 0  # number of the newest blocks that are not joined yet
         self.forgotten = 0
+        self._doubtful: Probed | None = None
 
     def add(self, block: Probed) -> None:
-        """Append a block; a counter that falls begins a new motion.
+        """Append a block; a counter that falls, or leaps ahead of time, begins a new motion.
 
-        If its stamp is a little older too, the block is a late or repeated one.
+        The next block has to confirm that; otherwise the one before it is dropped. If the stamp is
+        a little older too, the block is a late or repeated one.
         """
-        if not self._blocks or block.first_sample >= self._blocks[-1].first_sample:
-            self._blocks.append(block)
-        elif 0 < self._blocks[-1].stamp_ns - block.stamp_ns <= TIME_JUMP_S * NANOSECONDS_PER_S:
-            self._blocks.insert(len(self._blocks) - 1, block)
-        else:
+        before, doubtful, self._doubtful = self._newest(), self._doubtful, None
+        if doubtful is not None and block.first_sample == doubtful.end:
             self._forget(len(self._blocks))
-            self._blocks.append(block)
+            self._append(doubtful)
+            self._append(block)
+        elif before is None or _follows(before, block):
+            self.forgotten += len(doubtful) if doubtful is not None else 0
+            self._append(block)
+        elif 0 < before.stamp_ns - block.stamp_ns <= TIME_JUMP_S * NANOSECONDS_PER_S:
+            self._doubtful = doubtful
+            self._append(block, before_newest=block.first_sample < before.first_sample)
+        else:
+            self.forgotten += len(doubtful) if doubtful is not None else 0
+            self._doubtful = block
+
+    def _newest(self) -> Probed | None:
+        return self._blocks[-1] if self._blocks else None
+
+    def _append(self, block: Probed, *, before_newest: bool = False) -> None:
+        self._blocks.insert(len(self._blocks) - before_newest, block)
         self._samples += len(block)
         self._apart += 1
         if self._apart > _MANY:

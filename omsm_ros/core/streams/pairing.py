@@ -103,7 +103,9 @@ class StreamInput:
         self.tally.received += len(block)
         self.tally.missing = max(self.tally.missing + arrival.missing - arrival.late, 0)
         self.tally.count(RejectionReason.LATE, arrival.late)
-        self.tally.count(RejectionReason.DUPLICATE, arrival.skip - arrival.late)
+        repeated = arrival.skip - arrival.late - arrival.jumped
+        self.tally.count(RejectionReason.DUPLICATE, repeated)
+        self.tally.count(RejectionReason.JUMPED, arrival.jumped)
         if arrival.skip == len(block):
             return None
         arrival = replace(arrival, first=arrival.first + self._offset)

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.streams.blocks import Block
+from omsm_ros.core.streams.blocks import AccelerationBlock, Block
 from omsm_ros.core.streams.continuity import Arrival, TriggerCount
+from omsm_ros.core.streams.pairing import StreamInput
 
 
 def block(first: int, stamp_s: float) -> Block:
@@ -120,3 +121,30 @@ def test_a_clock_set_back_is_seen_after_messages_that_a_bag_joined() -> None:
             for first, stamp_ns in parts.tolist():
                 sequence.place(block(first, stamp_ns * 1e-9), 100)
         assert sequence.place(block(60_000, 55.0), 100) == Arrival(1, 60_000, 0, 0)
+
+
+def test_a_single_block_far_ahead_of_its_time_changes_nothing() -> None:
+    stream = StreamInput()
+    for first in (0, 100, 1_000_200, 200, 300):
+        stamp = (first % 1_000_000) * 1_000_000
+        block = AccelerationBlock(
+            stamp_ns=stamp, first_sample=first, sample_period=1e-3, **dict.fromkeys("xyz", ZEROS)
+        )
+        arrival = stream.new(block)
+        assert (arrival is None) == (first > 1_000_000)
+    account = stream.tally.snapshot(0)
+    assert (account.missing, account.counted) == (0, {"jumped": 100})
+
+
+def test_a_counter_that_leaps_is_followed_once_the_next_block_confirms_it() -> None:
+    stream, placed = StreamInput(), []
+    for i, first in enumerate((0, 100, 1_000_200, 1_000_300, 1_000_400)):
+        block = AccelerationBlock(
+            stamp_ns=i * 100_000_000, first_sample=first, sample_period=1e-3,
+            **dict.fromkeys("xyz", ZEROS),
+        )  # fmt: skip
+        placed.append(stream.new(block))
+    assert [a is not None and a.first for a in placed] == [0, 100, False, 1_000_300, 1_000_400]
+
+
+ZEROS = np.zeros(100)

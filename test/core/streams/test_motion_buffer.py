@@ -56,16 +56,16 @@ def test_a_block_that_comes_late_or_again_ends_no_motion():
 
 def test_a_motion_that_begins_soon_after_is_a_new_one():
     buffer = BlockBuffer(10_000)
-    for first, seconds in ((0, 0.0), (100, 0.1), (0, 0.35)):
+    for first, seconds in ((0, 0.0), (100, 0.1), (0, 0.35), (100, 0.45)):
         buffer.add(block(first, stamp_ns=round(seconds * 1e9)))
-    assert firsts(buffer) == [0]
+    assert firsts(buffer) == [0, 100]
 
 
 def test_a_recording_of_an_earlier_day_is_a_new_motion():
     buffer = BlockBuffer(10_000)
-    for first, seconds in ((0, 1e5), (100, 1e5 + 0.1), (0, 10.0)):
+    for first, seconds in ((0, 1e5), (100, 1e5 + 0.1), (0, 10.0), (100, 10.1)):
         buffer.add(block(first, stamp_ns=round(seconds * 1e9)))
-    assert firsts(buffer) == [0]
+    assert firsts(buffer) == [0, 100]
 
 
 def test_blocks_of_one_sample_are_joined_and_none_of_them_is_lost():
