@@ -30,7 +30,11 @@ _omsm_prepend() {
 if [ -d "$_omsm_root/.venv/share/rclpy" ]; then
     # ROS comes from wheels in .venv. Another ROS underneath would mix two builds of the same
     # libraries, so what its setup.sh left in the environment goes.
-    [ -z "${ROS_DISTRO-}" ] || unset ROS_DISTRO PYTHONPATH LD_LIBRARY_PATH
+    case "${AMENT_PREFIX_PATH-}" in
+        *"$_omsm_root/.venv"*) ;; # sourced again
+        *) [ -z "${ROS_DISTRO-}" ] || unset ROS_DISTRO PYTHONPATH LD_LIBRARY_PATH ;;
+    esac
+    export ROS_DISTRO=jazzy
     export AMENT_PREFIX_PATH="$_omsm_root/.venv" CMAKE_PREFIX_PATH="$_omsm_root/.venv"
     export RMW_IMPLEMENTATION=rmw_fastrtps_cpp # the only one there is in wheels
     # Python adds .venv's libraries to LD_LIBRARY_PATH as it starts, unless told that it has.

@@ -20,12 +20,15 @@ from omsm_ros.instruments.emulator_factory import EMULATED, emulated
 from omsm_ros.io.folders import runtime_folder
 from omsm_ros.nodes.start import LAUNCHED_BY
 
+Parameters = dict[str, object]
 SHARE = Path(get_package_share_directory("omsm_ros"))
 ARGUMENTS = {
     "namespace": ("omsm", "namespace of all nodes and topics; a different one for each cell", None),
     "device": ("", "connected device; empty = as in the YAML", None),
     "emulated": ("false", "start the digital twin and read it", ["true", "false"]),
     "record": ("", ".mcap file to record into; empty = none", None),
+    "frame_prefix": ("", "before each frame; empty = NAMESPACE/ unless it is omsm", None),
+    "foxglove": ("false", "start foxglove_bridge, if it is installed", ["true", "false"]),
     "view": ("false", "show the scan in a browser", ["true", "false"]),
     "rviz": ("false", "show the points in RViz", ["true", "false"]),
     "params": (str(SHARE / "config"), "folder of the nodes' YAML files", None),
@@ -47,21 +50,29 @@ def cell(context: LaunchContext) -> list[Node]:
     """Return the nodes that the arguments ask for."""
     warn_of_others(context.argv)
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    driver: dict[str, object] = {"device": given["device"]} if given["device"] else {}
+    where = given["namespace"].strip("/")
+    prefix = given["frame_prefix"] or ("" if where == "omsm" else f"{where}/")
+    framed: Parameters = {"frame_prefix": prefix} if prefix else {}
+    driver: Parameters = {"device": given["device"]} if given["device"] else {}
+    if given["record"] and not Path(given["record"]).absolute().parent.is_dir():
+        # The recorder would end alone, and the cell go on without a recording.
+        raise FileNotFoundError(f"record:={given['record']}: its folder does not exist")
     nodes = []
     if given["emulated"] == "true":
         played, driver, companion = twin(given["namespace"], given["device"] or "six_channel")
         nodes.append(node(given, "cell_emulator", played))
-        nodes += [node(given, name, parameters) for name, parameters in companion.items()]
+        nodes += [node(given, name, given_by | framed) for name, given_by in companion.items()]
     nodes += [
-        node(given, "confocal_driver", driver),
+        node(given, "confocal_driver", driver | framed),
         node(given, "calibrator", {}),
-        node(given, "corrector", {}),
+        node(given, "corrector", framed),
     ]
     if given["record"]:
         # A restarted recorder continues in a further file.
         goes_on = given["respawn"] == "true"
         nodes.append(node(given, "recorder", {"path": given["record"], "numbered": goes_on}))
+    if given["foxglove"] == "true":
+        nodes.append(foxglove_bridge())
     if given["view"] == "true":
         nodes.append(node(given, "viewer", {}))
     if given["rviz"] == "true":
@@ -97,9 +108,6 @@ def node(given: dict[str, str], name: str, parameters: dict[str, object]) -> Nod
     )
 
 
-Parameters = dict[str, object]
-
-
 def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str, Parameters]]:
     """Return the parameters of the emulator, of its driver, and of a second driver, if any."""
     if device not in EMULATED:
@@ -116,6 +124,17 @@ def twin(namespace: str, device: str) -> tuple[Parameters, Parameters, dict[str,
     second = tcp if known.second.tcp else f"{serial}_beside"
     played["link_beside"] = second
     return played, driver, {known.second.node: {"port": second, **known.second.driver}}
+
+
+def foxglove_bridge() -> Node:
+    """Return the bridge of Foxglove, on this computer only."""
+    get_package_share_directory("foxglove_bridge")  # raises an error that names the package
+    return Node(
+        package="foxglove_bridge",
+        executable="foxglove_bridge",
+        parameters=[{"address": "127.0.0.1"}],
+        output="screen",
+    )
 
 
 def rviz(namespace: str) -> Node:

@@ -43,7 +43,8 @@ def _parameters(node):
 def _declared(node):
     """Names of what a managed node can be set to."""
     names = [parameter.name for parameter in _parameters(node)]
-    return [*names, "autostart", *FRAMES.get(node, [])] if names else []
+    frames = FRAMES.get(node, [])
+    return [*names, "autostart", *frames, *["frame_prefix"] * bool(frames)] if names else []
 
 
 def _flat_items(values, prefix=""):

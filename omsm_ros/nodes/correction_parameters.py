@@ -17,6 +17,7 @@ from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.io.descriptions import load_sources
+from omsm_ros.nodes.topics import FRAME_PREFIX
 from omsm_ros.quantities import Parameter, Quantity
 
 _FROM_CALIBRATION = _NOT_REQUESTED = -1.0
@@ -71,6 +72,7 @@ PARAMETERS = (
     Parameter("workpiece_frame", "workpiece", "frame of the points"),
     Parameter("machine_frame", "machine", "frame of the axes"),
     Parameter("probe_frame", "probe", "frame of the distance"),
+    FRAME_PREFIX,
     *(
         Parameter(
             f"geometry.{field.name}",

@@ -10,13 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import LoadCalibration, PredictError
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header, String
+from std_msgs.msg import String
 
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
@@ -24,7 +22,6 @@ from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.counter_offset import LiveOffset
 from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
-from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.core.streams.blocks import Account, StreamAccount, consecutive
 from omsm_ros.core.streams.monitoring import LoadMeter, RecentIncrease, SampleFlow
 from omsm_ros.core.streams.trigger_slips import TriggerSlip
@@ -225,37 +222,6 @@ def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> N
         report.add(ERROR, "but the motion shows that equal counts are one trigger: a link is late")
 
 
-def publish_frames(
-    node: Node, undo: ExitStack, geometry: Geometry, names: Mapping[str, Any]
-) -> None:
-    """Publish machine → probe and machine → workpiece with every axis at zero, latched.
-
-    The machine's origin is where the probe finds a surface at distance zero. The probe stands
-    there and looks along its beam; the workpiece's origin lies on the spindle's axis.
-
-    names: of the frames, machine_frame, probe_frame, workpiece_frame
-    """
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:  # it is in every distribution, not in the wheels
-        node.get_logger().info("tf2_msgs is not installed: no transforms are published")
-        return
-    header = Header(stamp=node.get_clock().now().to_msg(), frame_id=names["machine_frame"])
-    x, y, z, w = beam_quaternion(geometry)
-    probe = Transform(rotation=Quaternion(x=x, y=y, z=z, w=w))
-    centre = Vector3(x=geometry.centre_x, y=geometry.centre_y)
-    placed = {"probe_frame": probe, "workpiece_frame": Transform(translation=centre)}
-    publisher = topics.publish_on(node, undo, TFMessage, "/tf_static", topics.LATCHED_QOS)
-    publisher.publish(
-        TFMessage(
-            transforms=[
-                TransformStamped(header=header, child_frame_id=names[name], transform=transform)
-                for name, transform in placed.items()
-            ]
-        )
-    )
-
-
 _COMPLAINT_PERIOD_S = 5.0
 _OVERRIDDEN = "_overridden"
 
@@ -286,7 +252,7 @@ class CorrectorNode(ManagedNode):
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
         )
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
-        publish_frames(self, undo, self._options.geometry, self.values)
+        topics.publish_frames(self, undo, self._options.geometry, self.values)
         self._worker = BackgroundWorker(self, undo)
         self._worker.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
         self._worker.serve(undo, PredictError, "~/predict_error", self._on_predict)

@@ -40,7 +40,7 @@ from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
-from omsm_ros.nodes.topics import LATCHED_QOS, publish_on
+from omsm_ros.nodes.topics import FRAME_PREFIX, LATCHED_QOS, publish_on
 from omsm_ros.quantities import Parameter
 
 _FAULTS = (
@@ -81,7 +81,7 @@ class DriverNode(ManagedNode):
         frames = [Parameter("machine_frame", "machine", "frame of the axes")] if axes else []
         if distance:
             frames.append(Parameter("probe_frame", "probe", "frame of the distance"))
-        super().__init__(name, (*parameters, *frames))
+        super().__init__(name, (*parameters, *frames, FRAME_PREFIX))
         self._make = make
         self._axes_topic, self._distance_topic = axes, distance
         self._settings_topic = settings

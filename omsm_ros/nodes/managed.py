@@ -89,10 +89,13 @@ class DeclaredParameters:
             self.check_known(
                 [name for name in self._nonempty_channels if not name.startswith(_QOS_PREFIX)]
             )
-            return {
+            values = {
                 name: parameter.checked(self._node.get_parameter(name).value)
                 for name, parameter in self._parameters.items()
             }
+            # Frames of several cells must differ.
+            prefix = values.get("frame_prefix", "")
+            return values | {n: prefix + values[n] for n in values if n.endswith("_frame")}
         except ConfigurationError as err:
             raise ConfigurationError(f"{self._node.get_name()}: {err}") from err
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from copy import copy
 from typing import Any, TypeAlias
 
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
@@ -17,11 +18,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.subscription import Subscription
+from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
+from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import json_and_yaml
+from omsm_ros.quantities import Parameter
 
 MessageInfo: TypeAlias = "dict[str, int]"
 
@@ -113,6 +117,9 @@ def listen(
     return made
 
 
+FRAME_PREFIX = Parameter("frame_prefix", "", "before each frame, as cell2/; for several cells")
+
+
 def take_waiting(subscription: Subscription, callback: Callable[[Any, MessageInfo], None]) -> int:
     """Call ``callback`` for up to some hundreds of waiting messages; return their number."""
     for count in range(_BULK):
@@ -170,3 +177,34 @@ def _overriding() -> QoSOverridingOptions:
 def _possible(qos: QoSProfile) -> SetParametersResult:
     quantities.QUEUE_DEPTH.checked(qos.depth, ConfigurationError)
     return SetParametersResult(successful=True)
+
+
+def publish_frames(
+    node: Node, undo: ExitStack, geometry: Geometry, names: Mapping[str, Any]
+) -> None:
+    """Publish machine → probe and machine → workpiece with every axis at zero, latched.
+
+    The machine's origin is where the probe finds a surface at distance zero. The probe stands
+    there and looks along its beam; the workpiece's origin lies on the spindle's axis.
+
+    names: of the frames, machine_frame, probe_frame, workpiece_frame
+    """
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:  # it is in every distribution, not in the wheels
+        node.get_logger().info("tf2_msgs is not installed: no transforms are published")
+        return
+    header = Header(stamp=node.get_clock().now().to_msg(), frame_id=names["machine_frame"])
+    x, y, z, w = beam_quaternion(geometry)
+    probe = Transform(rotation=Quaternion(x=x, y=y, z=z, w=w))
+    centre = Vector3(x=geometry.centre_x, y=geometry.centre_y)
+    placed = {"probe_frame": probe, "workpiece_frame": Transform(translation=centre)}
+    publisher = publish_on(node, undo, TFMessage, "/tf_static", LATCHED_QOS)
+    publisher.publish(
+        TFMessage(
+            transforms=[
+                TransformStamped(header=header, child_frame_id=names[name], transform=transform)
+                for name, transform in placed.items()
+            ]
+        )
+    )

@@ -16,8 +16,8 @@ from std_srvs.srv import SetBool, Trigger
 from omsm_ros.core.kinematics.kinematics import Geometry, beam_quaternion
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.corrector_node import publish_frames
 from omsm_ros.nodes.running import PacedService, refuse, serve, settings_of
+from omsm_ros.nodes.topics import publish_frames
 
 from .fake_node import FakeNode
 
