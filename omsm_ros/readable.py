@@ -167,6 +167,27 @@ def superscript(power: int) -> str:
     return str(power).translate(_SUPERSCRIPTS)
 
 
+def rounded_down(value: float, digits: int = 3) -> float:
+    """Return ``value`` rounded to ``digits`` towards zero, for advice that must not be exceeded."""
+    nearest = _rounded(value, digits)
+    # A value that is round already is not moved by its last bit.
+    if abs(nearest) <= abs(value) * (1 + 1e-9) or value == 0:
+        return nearest
+    return _rounded(nearest - math.copysign(_last_place(value, digits), value), digits)
+
+
+def rounded_up(value: float, digits: int = 3) -> float:
+    """Return ``value`` rounded to ``digits`` away from zero, for advice to reach at least."""
+    down = rounded_down(value, digits)
+    if abs(value) <= abs(down) * (1 + 1e-9):
+        return down
+    return _rounded(down + math.copysign(_last_place(value, digits), value), digits)
+
+
+def _last_place(value: float, digits: int) -> float:
+    return 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
+
+
 def _rounded(value: float, digits: int) -> float:
     """Return the number rounded to ``digits``, but not up to infinity."""
     rounded = float(f"{value:.{digits - 1}e}")

@@ -24,6 +24,8 @@ from omsm_ros.readable import (
     plain,
     probability,
     quantity,
+    rounded_down,
+    rounded_up,
     superscript,
 )
 
@@ -221,3 +223,12 @@ def test_the_largest_of_all_numbers_is_shown_and_not_rounded_up_to_infinity():
 )
 def test_no_row_of_zeros_has_to_be_counted(value, unit, expected):
     assert quantity(value, unit) == expected
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "down", "up"),
+    [(1.028, 2, 1.0, 1.1), (1.0, 2, 1.0, 1.0), (0.4417, 3, 0.441, 0.442), (99.99, 2, 99, 100)],
+)
+def test_advice_is_rounded_to_the_safe_side(value, digits, down, up):
+    assert rounded_down(value, digits) == pytest.approx(down)
+    assert rounded_up(value, digits) == pytest.approx(up)

@@ -43,7 +43,7 @@ from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.pipelines.measure import RegistrationOptions, measure
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
-from omsm_ros.readable import measured, percent, plain, quantity
+from omsm_ros.readable import measured, percent, plain, quantity, rounded_down
 from omsm_ros.report.verdict import headline, next_steps
 
 
@@ -190,7 +190,7 @@ def _show_correct(summary: Facts) -> None:
         rows += [("", text) for text in next_steps(verdict)]
     rows += [("warning", text) for text in summary.get("warnings", [])]
     if "form" in summary:
-        rows += form_rows(summary["form"])
+        rows += form_rows(summary["form"], summary.get("figures"))
     table([*rows, written(summary["files"].values(), summary["out"])])
 
 
@@ -246,7 +246,7 @@ def _limit_text(limit: Mapping[str, Any]) -> str:
 
 
 def _times(factor: float) -> str:
-    return f"{'≥ ' if factor >= FASTEST else ''}{plain(factor)} ×"
+    return f"{'≥ ' if factor >= FASTEST else ''}{plain(rounded_down(factor))} ×"
 
 
 _NO_SPHERE = (

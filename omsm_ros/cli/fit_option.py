@@ -68,8 +68,11 @@ def declare_tolerance(add: Arguments) -> None:
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 
 
-def form_rows(facts: Facts) -> list[tuple[str, str]]:
-    """Return the rows that show a form."""
+def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
+    """Return the rows that show a form.
+
+    adjusted: figures of the adjusted scan, which stand for PV and rms, if there are any
+    """
     # Here, because the page loads what draws, which a correction does without.
     from omsm_ros.report.measurement.page import correlated_moves, figure_rows
 
@@ -80,7 +83,7 @@ def form_rows(facts: Facts) -> list[tuple[str, str]]:
         (f"{n} not fitted", f"{why}{correlated_moves(facts, n)}")
         for n, why in removed["not_determined"].items()
     ]
-    rows += figure_rows(facts)
+    rows += figure_rows(facts, adjusted)
     others = ", ".join(
         f"{count(v)} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read"
     )

@@ -11,11 +11,11 @@ TEMPLATES = {
     "verdict.rejected": "the calibration was rejected; identify again",
     "verdict.refuted": (
         "{names}: found {value:plain/2} standard deviations from the declared value; check the "
-        "declaration, or accept the found value with {opt.accept}"
+        "declaration, or accept the found value with omsm adjust --accept"
     ),
     "verdict.undeclared_effect": (
         "{names}: significant, and not declared; the found value is in the uncertainty. Look for "
-        "its cause, or accept it with {opt.accept}"
+        "its cause, or accept it with omsm adjust --accept"
     ),
     "verdict.scans_disagree": (
         "scan {names} differs from the others by E_n = {value:plain/2}, at most {limit:plain/1} is "

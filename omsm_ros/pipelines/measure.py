@@ -171,11 +171,12 @@ _DOFS = ("piston", "tip", "tilt", "x", "y", "clocking")
 
 
 def _aligned(removed: Mapping[str, Any]) -> list[str]:
-    """Return the degrees of freedom that were fitted, or held because form looks like them.
+    """Return the degrees of freedom that were fitted, or would have been: form looks like them.
 
     The figures are those after best-fit alignment, which no held pose makes uncertain.
     """
-    return [name for name in _DOFS if name in removed["fitted"] or name in removed["held"]]
+    every = {*removed["fitted"], *removed["held"], *removed["not_determined"]}
+    return [name for name in _DOFS if name in every]
 
 
 def _posed(nominal: Surface, pose: Mapping[str, Mapping[str, float]]) -> Surface:

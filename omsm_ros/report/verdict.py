@@ -47,16 +47,18 @@ def page_verdict(verdict: Mapping[str, Any], more: Iterable[str] = ()) -> PageVe
 
 
 def next_steps(verdict: Mapping[str, Any]) -> list[str]:
-    """Return the scan that helps most and the reasons against green; what agrees where green."""
-    found = []
-    if (add := verdict.get("add")) is not None:
+    """Return what to do next, first of all, and the reasons against green.
+
+    This is the scan that helps most, but for heights that are contradicted what contradicts them.
+    """
+    steps = [reason["text"] for reason in verdict["reasons"]]
+    if (add := verdict.get("add")) is not None and verdict["code"] != "contradicted":
         reached = add["reached"]
         then = "" if reached is None else f": then U = {quantity(reached, 'm', 2)} (rms, k = 2)"
-        found.append(f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
-    found += [reason["text"] for reason in verdict["reasons"]]
+        steps.insert(0, f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
     if verdict["code"] == "verified":
-        found.append("the scans agree, and no declared source is refuted")
-    return found
+        steps.append("the scans agree, and no declared source is refuted")
+    return steps
 
 
 def verdict_on_measurement(summary: Mapping[str, Any]) -> PageVerdict:

@@ -209,7 +209,7 @@ def _adjusted(
         enough,
         2 * form.pv.uncertainty,
         accuracy,
-        None if enough else best_addition(scans[0], priors, surface)[:2],
+        None if enough else best_addition(scans[0], priors, surface, removed)[:2],
     )
     return Adjustment(
         form=form,

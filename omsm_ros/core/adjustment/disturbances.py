@@ -234,14 +234,22 @@ def follows_removed(view: ScanView) -> float | None:
     """Return the share of the removed error that the deviation follows; None where it does not.
 
     Regression on piston, both tilts and what the correction removed: a correction of the wrong sign
-    leaves the removed error once or twice in the heights, of either sign.
+    leaves the removed error once or twice in the heights, of either sign. A distance of the wrong
+    sign leaves the distance itself twice, with the error of the servo in it.
     """
-    columns = np.stack([np.ones(len(view)), view.x, view.y, view.removed], axis=1)
+    distance = view.distance + view.deviation
+    twice = _followed(view, distance)
+    return _followed(view, view.removed) or (twice if twice is not None and twice > 1.5 else None)
+
+
+def _followed(view: ScanView, removed: FloatArray) -> float | None:
+    """Return the share of ``removed`` (n,) [m] in the deviation, if it is one or two and most."""
+    columns = np.stack([np.ones(len(view)), view.x, view.y, removed], axis=1)
     scale = np.maximum(np.max(np.abs(columns), axis=0), 1e-300)
     if scale[3] <= 1e-12:
         return None
     pose = columns[:, :3] / scale[:3]
-    values = np.stack([view.removed, view.deviation], axis=1)
+    values = np.stack([removed, view.deviation], axis=1)
     free = values - pose @ np.linalg.lstsq(pose, values, rcond=None)[0]
     power, mixed, total = free[:, 0] @ free[:, 0], free[:, 0] @ free[:, 1], free[:, 1] @ free[:, 1]
     if power <= 0 or total <= 0:

@@ -98,7 +98,10 @@ class PlannedSet:
 
 
 def posterior_uncertainty(
-    designs: Sequence[ScanDesign], priors: Sequence[Source], nominal: Surface
+    designs: Sequence[ScanDesign],
+    priors: Sequence[Source],
+    nominal: Surface,
+    removed: Sequence[str] = POSE,
 ) -> PlannedUncertainty:
     """Return what ``designs``, adjusted together, will leave uncertain.
 
@@ -129,7 +132,7 @@ def posterior_uncertainty(
     network = Network(blocks, tuple(kept), part)
     solution = solve(network, np.zeros(len(blocks)), scales, sizes)
     return PlannedUncertainty(
-        form=form_map(solution, nominal, POSE).mean_uncertainty,
+        form=form_map(solution, nominal, removed).mean_uncertainty,
         sources={f.name: solution.uncertainty(f.name) for f in kept},
         duration=begin - _PAUSE_S,
     )
@@ -246,16 +249,16 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
 
 
 def best_addition(
-    scan: ScanData, priors: Sequence[Source], nominal: Surface
+    scan: ScanData, priors: Sequence[Source], nominal: Surface, removed: Sequence[str] = POSE
 ) -> tuple[str, float, float]:
     """Return the code of the scan to add to ``scan`` that helps most, and what form then is.
 
     Also returned: standard uncertainty of the form of ``scan`` alone, planned likewise [m].
     """
     first = design_of(scan)
-    alone = posterior_uncertainty([first], priors, nominal).form
+    alone = posterior_uncertainty([first], priors, nominal, removed).form
     reached = {
-        code: posterior_uncertainty([first, added], priors, nominal).form
+        code: posterior_uncertainty([first, added], priors, nominal, removed).form
         for code, added in additions(first).items()
     }
     best = min(reached, key=lambda code: reached[code])

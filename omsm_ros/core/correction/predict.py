@@ -42,6 +42,7 @@ from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, through
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError, Notice
+from omsm_ros.readable import rounded_down, rounded_up
 from omsm_ros.units import NANOMETRE_M
 
 # The low-pass that separates the valid band falls between this share of its end and its end.
@@ -301,18 +302,7 @@ def _longer_rest(
     plateau = calibration.certificate.undetected.plateau_s
     if plateau is None or not undetected**2 > 0.5 * residual**2:
         return None
-    return _cautious(plateau * (2 * residual / budget) ** 2, 2, np.ceil)
-
-
-def _cautious(value: float, digits: int, way: Callable[[float], float]) -> float:
-    """Return ``value`` rounded to ``digits`` up or down, so that advice is on the safe side."""
-    if value <= 0:
-        return value
-    scale = 10.0 ** (np.floor(np.log10(value)) - digits + 1)
-    # A value that is already round is not moved by its last bit.
-    nearest = round(value / scale)
-    exact = abs(value / scale - nearest) < 1e-9
-    return float(f"{(nearest if exact else way(value / scale)) * scale:.{digits}g}")
+    return rounded_up(plateau * (2 * residual / budget) ** 2, 2)
 
 
 def _message(
@@ -323,7 +313,7 @@ def _message(
     binding: SpeedLimit,
 ) -> Notice:
     residual, undetected = residuals
-    factor = _cautious(binding.speed_factor, 3, np.floor)
+    factor = rounded_down(binding.speed_factor)
     values: dict[str, object] = {"factor": factor, "limit": binding.name}
     code = "faster" if binding.speed_factor >= 1 else "slower"
     if binding.speed_factor >= FASTEST:

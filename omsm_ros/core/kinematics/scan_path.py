@@ -77,6 +77,9 @@ class ScanPathReader:
             return None
         run = max(self._runs, key=lambda run: sum(map(len, run)))
         z, x, c = (np.concatenate([getattr(b, name) for b in run])[: self._most] for name in "zxc")
+        # Controls that wrap C at a turn would seem to turn hardly at all.
+        known = np.isfinite(c)
+        c[known] = np.unwrap(c[known])
         first, end = run[0].first_sample, run[-1].first_sample + len(run[-1])
         within = [
             readings[max(first - at, 0) : max(end - at, 0)] for at, readings in self._readings

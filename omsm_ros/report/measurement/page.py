@@ -17,6 +17,7 @@ from omsm_ros.readable import (
     measured,
     plain,
     quantity,
+    rounded_down,
 )
 from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
@@ -99,8 +100,16 @@ def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
     )
 
 
-def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the figures of the deviation by name, with their expanded uncertainty."""
+# Figures that a scan has from its adjustment.
+_ADJUSTED = ("peak_to_valley", "robust_peak_to_valley", "rms", "peak_to_valley_best_fit",
+             "rms_best_fit", "rms_before_fit")  # fmt: skip
+
+
+def figure_rows(form: Mapping[str, Any], adjusted: object = None) -> list[tuple[str, str]]:
+    """Return the figures of the deviation by name, with their expanded uncertainty.
+
+    adjusted: figures of the adjusted scan, if there are any; PV and rms then are only those
+    """
     return [
         (
             figure(name),
@@ -109,12 +118,15 @@ def figure_rows(form: Mapping[str, Any]) -> list[tuple[str, str]]:
             ),
         )
         for name, entry in (part(form, "deviation") or {}).items()
+        if not (adjusted and name in _ADJUSTED)
     ]
 
 
-def form_table(form: Mapping[str, Any], curves: Mapping[str, Any]) -> Table:
+def form_table(
+    form: Mapping[str, Any], curves: Mapping[str, Any], adjusted: object = None
+) -> Table:
     """Return all figures of the part's form, and the rms of its spectral densities."""
-    rows = figure_rows(form)
+    rows = figure_rows(form, adjusted)
     band, inside = (part(curves, "psd", name) for name in ("band", "mean_square_in_band"))
     if band:
         ends = " to ".join(plain(frequency * MILLIMETRE_M) for frequency in band)
@@ -197,7 +209,7 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
             str(limit["name"]),
             _size_of(limit["value"], limit["unit"]),
             _size_of(limit["allowed"], limit["unit"]),
-            f"{plain(limit['speed_factor'])} ×",
+            f"{plain(rounded_down(limit['speed_factor']))} ×",
         )
         for limit in limits
     ]
@@ -376,7 +388,7 @@ def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
     verdict = _trust_section(report)
     found = [
-        form_table(report.form, report.curves),
+        form_table(report.form, report.curves, part(summary, "figures")),
         tables.error_table(summary),
         tables.budget_table(summary),
         tables.Table("Reasons for the verdict", (), [(reason,) for reason in verdict.reasons]),
