@@ -160,7 +160,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             by_stamps=StampJoining(args.delay, args.exposure) if args.by_stamps else None,
             stated=sources_of(args.sources),
             accuracy=args.accuracy,
-            register=RegistrationOptions(args.fit, args.aperture, args.tolerance)
+            register=RegistrationOptions(args.fit, args.aperture, args.tolerance, args.dust)
             if args.fit
             else None,
             report=not args.no_report,

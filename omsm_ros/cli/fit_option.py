@@ -6,10 +6,11 @@ import argparse
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import Facts
+from omsm_ros.core.registration.isolated_points import DustRule
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import LENGTH, TOLERANCE, shown
+from omsm_ros.quantities import COUNTER, LENGTH, TOLERANCE, shown
 from omsm_ros.readable import count, measured
 
 
@@ -19,6 +20,18 @@ def dofs(text: str) -> tuple[str, ...]:
         return parse_dofs(text)
     except ConfigurationError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def dust_rule(text: str) -> DustRule:
+    """Parse 'none', 'isolated' or a number of points."""
+    if text in ("none", "isolated"):
+        return text  # type: ignore[return-value]
+    try:
+        return int(COUNTER.checked(int(text), ConfigurationError, "dust"))
+    except (ValueError, ConfigurationError) as err:
+        raise argparse.ArgumentTypeError(
+            f"dust is {shown(text)}, expected none, isolated or a number of points"
+        ) from err
 
 
 def aperture(text: str) -> Aperture:
@@ -57,11 +70,18 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
 
 
 def declare_tolerance(add: Arguments) -> None:
-    """Add the tolerance of a registered part."""
+    """Add the tolerance of a registered part, and the rule for dust."""
+    add(
+        "--dust",
+        dust_rule,
+        "leave out no points (none), those that no neighbouring track confirms (isolated), or "
+        "clusters of N points and less; default: isolated ones, which count against the tolerance",
+        metavar="none|isolated|N",
+    )
     add(
         "--tolerance",
         TOLERANCE,
-        "tolerance of the peak to valley of 99.5 %% of the part [m]; needs --fit",
+        "tolerance of the peak to valley of the part [m]; needs --fit",
     )
 
 

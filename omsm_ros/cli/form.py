@@ -237,7 +237,9 @@ def _form(args: argparse.Namespace) -> Facts:
         else:
             refuse_cell(source, args)
         points = open_measurement(source, args.unit)
-        facts = judge_form(points, surface, out, args.fit, args.aperture, filters, args.tolerance)
+        facts = judge_form(
+            points, surface, out, args.fit, args.aperture, filters, args.tolerance, args.dust
+        )
         if not args.no_report:
             draw_form(source, out)
             facts = {**facts, "report": REPORT}
@@ -248,6 +250,7 @@ def _show_form(facts: Facts) -> None:
     verdict = []
     if held := facts.get("conformity"):
         verdict = [("tolerance", f"{held['verdict']}, {quantity(held['tolerance'], 'm')}")]
+        verdict += [("reason", text) for text in held["reasons"]]
     files = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
     table([*verdict, *form_rows(facts), written(files, facts["out"])])
 

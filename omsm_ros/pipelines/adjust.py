@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -299,7 +299,7 @@ def adjustment_facts(
 def conformity_entry(pv: Figure, tolerance: float) -> dict[str, Any] | None:
     """Return whether the peak to valley holds the ``tolerance`` [m] within its uncertainty."""
     judged = conformity(UncertainValue(pv.value, pv.uncertainty), tolerance)
-    return None if judged is None else asdict(judged)
+    return None if judged is None else judged.entry()
 
 
 def figures_entry(form: FormMap) -> dict[str, Any]:

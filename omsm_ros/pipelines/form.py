@@ -14,6 +14,7 @@ from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import conformity
 from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import (
     POSE_PARAMETERS,
     Aperture,
@@ -66,6 +67,7 @@ class MeasurementMeasuredPortions:
         asked: Sequence[str],
         aperture: Aperture | None = None,
         filters: tuple[float | None, float | None] = (None, None),
+        dust: DustRule = ISOLATED,
     ) -> FormResult:
         """Return the form of the points against ``surface``."""
         return analyse_form(
@@ -77,6 +79,7 @@ class MeasurementMeasuredPortions:
             aperture=aperture,
             even=self.even,
             filters=filters,
+            dust=dust,
         )
 
 
@@ -130,6 +133,8 @@ def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatc
         first += len(x)
 
 
+# Points left out as dust that the file lists.
+_MOST_LISTED = 2_000
 # Blocks of the areal density in each direction: enough for a figure, 70 kB in the file.
 _MOST_BLOCKS = 64
 _NO_SYSTEMATIC = (
@@ -145,6 +150,7 @@ def judge_form(
     aperture: Aperture | None = None,
     filters: tuple[float | None, float | None] = (None, None),
     tolerance: float | None = None,
+    dust: DustRule | None = None,
 ) -> dict[str, Any]:
     """Register a measurement to its nominal ``surface``; return the content of ``form.json``.
 
@@ -153,14 +159,17 @@ def judge_form(
 
     asked: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
     filters: wavelengths of the S- and the L-filter [m], None for those that the points allow
-    tolerance: of the peak to valley of 99.5 % of the part [m], None without one.
+    tolerance: of the peak to valley of the part [m], None without one
+    dust: which points far from the form are left out; None: isolated ones, which still count
+        against the tolerance, because nobody has decided that they are no defects
 
     Raises DataError for points that do not fit the surface or do not determine the pose asked for.
     """
-    form = measured.form(surface, asked, aperture, filters)
+    form = measured.form(surface, asked, aperture, filters, ISOLATED if dust is None else dust)
     facts = form_facts(form, measured, surface)
     if tolerance is not None:
-        found = conformity(form.deviation["robust_peak_to_valley"], tolerance)
+        doubts = form.doubts(tolerance) if dust is None else []
+        found = conformity(form.deviation["peak_to_valley"], tolerance, doubts)
         facts["conformity"] = found.entry() if found else None
     save_json(out / FORM, facts)
     save_json(out / CURVES, _curves(form))
@@ -226,6 +235,10 @@ def form_facts(
             "zernike": "each term is 1 at the rim; cos for m >= 0, sin for m < 0, from x to y",
         },
         "points": _counts(form, measured.missing),
+        "left_out": {
+            "largest": float(np.max(np.abs(form.dust[2]), initial=0.0)),
+            **dict(zip("xyz", form.dust[:, :_MOST_LISTED].tolist(), strict=True)),
+        },
     }
 
 
@@ -313,8 +326,7 @@ def registered(
     found = register(nominal, portions, dofs, sources=names, even=as_grid(points) is not None)
     where = [placed(nominal, found.placement, portion) for portion in portions()]
     whole = Placed(*(np.concatenate(parts, axis=-1) for parts in zip(*where, strict=True)))
-    kept = np.flatnonzero(np.isfinite(whole.deviation))
-    kept = kept[found.good(whole.part(kept))]
+    kept = np.flatnonzero(np.isfinite(whole.deviation) & found.good(0, len(points)))
     placed_points = whole.part(kept)
     return replace(
         m,

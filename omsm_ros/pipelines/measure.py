@@ -33,6 +33,7 @@ from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fi
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
+from omsm_ros.core.registration.isolated_points import DustRule
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.deviation import mismatch
@@ -249,12 +250,14 @@ class RegistrationOptions:
     """Options of the registration to the nominal surface.
 
     dofs: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
-    tolerance: of the peak to valley of 99.5 % of the part [m], None without one
+    tolerance: of the peak to valley of the part [m], None without one
+    dust: which points far from the form are left out, see :func:`judge_form`
     """
 
     dofs: Sequence[str]
     aperture: Aperture | None = None
     tolerance: float | None = None
+    dust: DustRule | None = None
 
 
 def measure(
@@ -341,6 +344,7 @@ def add_form(
         out,
         register.dofs,
         register.aperture,
+        dust=register.dust,
     )
     summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}

@@ -65,7 +65,15 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
     status, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)
     assert status == 0
     found = json.loads(path.read_text())
-    assert set(found) == {"pose", "deviation", "zernike", "removed", "aperture", "points"}
+    assert set(found) == {
+        "pose",
+        "deviation",
+        "zernike",
+        "removed",
+        "aperture",
+        "points",
+        "left_out",
+    }
     terms = {(t["n"], t["m"]): t for t in found["zernike"]}
     assert len(terms) == 37
     # As heights along z; the deviation is along the normal.
@@ -135,6 +143,11 @@ def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp
 
 def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS, "--tolerance", 1e-6)
+    status, path = form(folder, tmp_path, *words)
+    held = json.loads(path.read_text())["conformity"]
+    assert held["verdict"] == "cannot tell"
+    assert "points left out as dust" in held["reasons"][0]
+    words += ("--dust", "isolated")
     status, path = form(folder, tmp_path, *words)
     assert status == 0
     assert json.loads(path.read_text())["conformity"]["verdict"] == "holds"

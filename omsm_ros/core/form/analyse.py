@@ -39,6 +39,7 @@ from omsm_ros.core.form.texture import (
 from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import Aperture, Placed, PointBatch, PointBatches, placed
 from omsm_ros.core.registration.pose_parameters import Registration
 from omsm_ros.core.registration.register import CHUNK, register
@@ -51,13 +52,19 @@ from omsm_ros.core.surface.zernike_terms import (
     zernike_slopes,
     zernike_values,
 )
-from omsm_ros.errors import DataError
+from omsm_ros.errors import DataError, Notice
 
 ZERNIKES = first_terms(37, "fringe")
 # Points with all their effects take 50 MB. Extremes and counts are of all points.
 MOST_WEIGHED = 2**19
 # A hundred points for each Zernike term.
 _MOST_POINTS = 4_000
+
+
+def _terms(map_: DeviationMap, found: Registration) -> ZernikeFit:
+    points = (map_.x, map_.y, map_.deviation)
+    fit = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
+    return with_pose_uncertainty(fit, map_, found)
 
 
 def with_pose_uncertainty(fit: ZernikeFit, map_: DeviationMap, found: Registration) -> ZernikeFit:
@@ -159,6 +166,7 @@ class FormResult:
     deviation: figures by name;  zernike: terms of the deviation, one at the rim
     bands: wavelengths of the filters;  profiles, density: curves of the map
     counts: of the points by outcome; they add up to "read"
+    dust: x, y and deviation of the points left out as dust (3, d) [m]
     """
 
     registration: Registration
@@ -170,6 +178,16 @@ class FormResult:
     profiles: dict[str, UncertainCurve]
     density: PowerDensity
     counts: dict[str, int]
+    dust: FloatArray
+
+    def doubts(self, tolerance: float) -> list[Notice]:
+        """Return whether points left out may be a defect beyond ``tolerance`` [m]."""
+        sizes = np.abs(self.dust[2])
+        low, high = (float(end(self.map.deviation)) for end in (np.min, np.max))
+        ends = np.minimum(self.dust[2], low), np.maximum(self.dust[2], high)
+        if not len(sizes) or float(np.max(ends[1]) - np.min(ends[0])) <= tolerance:
+            return []
+        return [Notice("form.excluded_points", count=len(sizes), largest=float(sizes.max()))]
 
 
 def analyse_form(
@@ -182,6 +200,7 @@ def analyse_form(
     aperture: Aperture | None = None,
     even: bool = False,
     filters: tuple[float | None, float | None] = (None, None),
+    dust: DustRule = ISOLATED,
 ) -> FormResult:
     """Register the points and evaluate their deviations.
 
@@ -190,10 +209,12 @@ def analyse_form(
     aperture: of the part; None: the disc about the part's origin that holds all points
     even: the points form an evenly spaced grid
     filters: wavelengths of the S- and the L-filter [m], None for the defaults
+    dust: which points far from the smooth form are left out
 
     Raises DataError for points that are too few, do not fit, or do not determine the pose.
     """
-    found = register(surface, portions, asked, sources=sources, aperture=aperture, even=even)
+    how = {"sources": sources, "aperture": aperture, "even": even, "dust": dust}
+    found = register(surface, portions, asked, **how)  # type: ignore[arg-type]
     gathered = _Gathered(surface, found, aperture)
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
@@ -202,9 +223,7 @@ def analyse_form(
     # A held pose parameter has an upper bound of its offset only.
     bounded += range(len(sources), found.moved.shape[1])
     map_ = gathered.map(found, even, bounded)
-    points = (map_.x, map_.y, map_.deviation)
-    zernike = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
-    zernike = with_pose_uncertainty(zernike, map_, found)
+    zernike = _terms(map_, found)
     cells = GridCells.of(map_)
     bands = bands_of(cells, *filters)
     return FormResult(
@@ -219,6 +238,7 @@ def analyse_form(
         profiles=profiles(map_, found.disc),
         density=power_density(cells),
         counts=gathered.counts,
+        dust=gathered.dust,
     )
 
 
@@ -261,6 +281,7 @@ class _Gathered:
         self._kept = EvenSelection(MOST_WEIGHED)
         self._least, self._most = np.inf, -np.inf
         self._noise: list[float] = []
+        self._dust: list[FloatArray] = []
         self.counts = dict.fromkeys(
             ("read", "used", "not_finite", "beyond_surface", "outside_aperture", "outliers"), 0
         )
@@ -274,10 +295,11 @@ class _Gathered:
         inside = np.ones(len(finite), bool)
         if self._aperture is not None:
             inside = self._aperture.holds(whole.x, whole.y)
-        good = np.zeros(len(finite), bool)
-        chosen = has_height & inside
-        good[chosen] = found.good(whole.part(chosen))
+        usable = has_height & inside
+        good = usable & found.good(self.counts["read"], len(finite))
         self._count(finite, has_height, inside, good)
+        dust = whole.part(usable & ~good)
+        self._dust.append(np.stack([dust.x, dust.y, dust.deviation]))
         if np.any(good):
             self._keep(whole.part(good), portion.systematic[:, good])
 
@@ -301,6 +323,11 @@ class _Gathered:
         pose, along = self._found.effects(points, systematic)
         rows = [points.x, points.y, points.deviation, *pose, *along]
         self._kept.add(np.stack(rows, axis=1))
+
+    @property
+    def dust(self) -> FloatArray:
+        """Places and deviations (3, d) [m] of the points left out as dust."""
+        return np.concatenate(self._dust, axis=1)
 
     @property
     def extent(self) -> float:

@@ -7,13 +7,15 @@ of order zero), so that edges are not drawn to zero.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.statistics import noise_of
+from omsm_ros.errors import Notice
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +60,21 @@ class DeviationMap:
 
     def every(self, most: int) -> DeviationMap:
         """Return every k-th point, so that there are no more than ``most``."""
-        chosen = slice(None, None, -(-len(self) // most))
-        return DeviationMap(
-            **{name: getattr(self, name)[chosen] for name in ("x", "y", "deviation", "area")},
-            effects=self.effects[:, chosen],
-            noise=self.noise,
-            bounds=self.bounds,
-            moves=self.moves,
-            taken=self.taken,
-        )
+        return self.part(slice(None, None, -(-len(self) // most)))
+
+    def part(self, chosen: slice | IntArray) -> DeviationMap:
+        """Return the ``chosen`` points."""
+        columns = {name: getattr(self, name)[chosen] for name in _COLUMNS}
+        return replace(self, **columns, effects=self.effects[:, chosen])
+
+    def joined(self, other: DeviationMap) -> DeviationMap:
+        """Return these points and those of ``other``, a part of the same map."""
+        columns = {n: np.concatenate([getattr(m, n) for m in (self, other)]) for n in _COLUMNS}
+        effects = np.concatenate([self.effects, other.effects], axis=1)
+        return replace(self, **columns, effects=effects)
+
+
+_COLUMNS = ("x", "y", "deviation", "area")
 
 
 def root_mean_square(map_: DeviationMap) -> float:
@@ -187,23 +195,28 @@ class Conformity:
 
     verdict: HOLDS, FAILS or OPEN;  value, tolerance: [m]
     expanded: uncertainty (k = 2) [m], None if it was not evaluated
+    reasons: why it is open although the value alone would hold
     """
 
     verdict: str
     value: float
     expanded: float | None
     tolerance: float
+    reasons: tuple[Notice, ...] = ()
 
     def entry(self) -> dict[str, Any]:
         """Return the JSON values for result files."""
-        return asdict(self)
+        return {**asdict(replace(self, reasons=())), "reasons": [*map(str, self.reasons)]}
 
 
-def conformity(figure: UncertainValue, tolerance: float) -> Conformity | None:
+def conformity(
+    figure: UncertainValue, tolerance: float, doubts: Sequence[Notice] = ()
+) -> Conformity | None:
     """Return whether ``figure`` is at most ``tolerance`` [m], None for a figure without a value.
 
     It holds if it does with the expanded uncertainty added, and fails if it does with that
-    subtracted; in between the uncertainty leaves it open.
+    subtracted; in between the uncertainty leaves it open. ``doubts`` are parts of the surface that
+    the figure does not contain: with one of them nothing is known to hold.
     """
     if figure.value is None:
         return None
@@ -212,7 +225,7 @@ def conformity(figure: UncertainValue, tolerance: float) -> Conformity | None:
     expanded = COVERAGE_FACTOR * figure.uncertainty
     verdict = OPEN
     if figure.value + expanded <= tolerance:
-        verdict = HOLDS
+        verdict = OPEN if doubts else HOLDS
     elif figure.value - expanded > tolerance:
         verdict = FAILS
-    return Conformity(verdict, figure.value, expanded, tolerance)
+    return Conformity(verdict, figure.value, expanded, tolerance, tuple(doubts))

@@ -18,7 +18,8 @@ the square by an error of that size belongs to the uncertainty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,18 +27,12 @@ import numpy as np
 from omsm_ros.core.form.deviation_map import (
     DeviationMap,
     UncertainValue,
-    gaussian_weights,
     weighted_quantiles,
 )
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
-
-_MOST_ACROSS = 256
-# Cutoffs in steps of the grid, half an octave apart.
-_CUTOFFS = (2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
-_SEED_LOCAL_MEANS = 11
 
 # 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).
 ROBUST = (0.0025, 0.9975)
@@ -48,6 +43,12 @@ _ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
 _MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
 # 200 draws give a standard deviation to 5 %.
 _DRAWS, _SEED = 200, 7
+# Cells that show local features, in mean distances of the points, and points at either extreme.
+_CELLS, _HALF = (8.0, 4.0, 2.0, 1.0), 1_000
+# Standard deviations of χ² that chance does not exceed.
+_CHANCE = 3.0
+# Points at either extreme that show the form lost there.
+_EXTREME = 100
 # Draws of the noise, which give its mean effect to a sixth of its standard deviation.
 _NOISES = 40
 # Piston, both tilts and power; the terms that ISO 25178-2 removes as form; the rotationally
@@ -55,84 +56,6 @@ _NOISES = 40
 POWER = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1), ZernikeIndex(2, 0))
 _FORM = terms_up_to(4)
 SYMMETRIC = tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
-
-
-class ChosenMeans(NamedTuple):
-    """Local means of the width with the least expected error.
-
-    rest: share of the noise of a point that remains in its difference from the mean
-    error: expected mean square difference of the means from the values without noise
-    """
-
-    means: LocalMeans
-    rest: float
-    error: float
-
-
-@dataclass(frozen=True, eq=False)
-class LocalMeans:
-    """Linear operator: Gaussian means (ISO 16610) around n scattered points, on a fine grid.
-
-    nodes, weights: of the four nodes of the grid around each point (4, n)
-    along_y, along_x: weights of the Gaussian (r, r), (c, c);  total: of the points at each node
-    """
-
-    nodes: IntArray
-    weights: FloatArray
-    along_y: FloatArray
-    along_x: FloatArray
-    total: FloatArray
-
-    @classmethod
-    def of(cls, x: FloatArray, y: FloatArray, cutoff: float) -> LocalMeans:
-        """Return the means at x, y (n,) [m] of a ``cutoff`` in steps of the grid."""
-        spans = float(np.ptp(x)), float(np.ptp(y))
-        longest = max(spans) or 1.0
-        step = max(float(np.sqrt(spans[0] * spans[1] / len(x))), longest / _MOST_ACROSS)
-        across, up = (x - x.min()) / step, (y - y.min()) / step
-        rows, columns = int(up.max()) + 2, int(across.max()) + 2
-        column, row = across.astype(np.int64), up.astype(np.int64)
-        right, above = across - column, up - row
-        corners = [(a, b) for a in (0, 1) for b in (0, 1)]
-        nodes = np.stack([(row + b) * columns + column + a for a, b in corners])
-        weights = np.stack(
-            [(right if a else 1 - right) * (above if b else 1 - above) for a, b in corners]
-        )
-        made = cls(
-            nodes,
-            weights,
-            gaussian_weights(rows, cutoff),
-            gaussian_weights(columns, cutoff),
-            np.ones((rows, columns)),
-        )
-        total = np.maximum(made._on_grid(np.ones(len(x))), np.finfo(np.float64).tiny)
-        return cls(nodes, weights, made.along_y, made.along_x, total)
-
-    def __call__(self, values: FloatArray) -> FloatArray:
-        """Return the means of ``values`` (n,)."""
-        means = (self._on_grid(values) / self.total).ravel()
-        return np.asarray(np.sum(self.weights * means[self.nodes], axis=0), np.float64)
-
-    def _on_grid(self, values: FloatArray) -> FloatArray:
-        size = self.total.size
-        sums = np.bincount(self.nodes.ravel(), (self.weights * values).ravel(), size)
-        return np.asarray(self.along_y @ sums.reshape(self.total.shape) @ self.along_x, np.float64)
-
-
-def closest_means(x: FloatArray, y: FloatArray, values: FloatArray, noise: float) -> ChosenMeans:
-    """Return the means with the least expected error for ``values`` at x, y, each (n,).
-
-    Stein's unbiased risk estimate, with the trace of the operator from one draw of signs.
-    """
-    signs = np.random.default_rng(_SEED_LOCAL_MEANS).choice([-1.0, 1.0], size=len(x))
-    found = []
-    for cutoff in _CUTOFFS:
-        means = LocalMeans.of(x, y, cutoff)
-        left = float(np.mean((values - means(values)) ** 2))
-        kept = means(signs)
-        error = left - noise**2 * (1 - 2 * float(np.mean(signs * kept)))
-        found.append(ChosenMeans(means, float(np.mean((signs - kept) ** 2)), error))
-    return min(found, key=lambda each: each.error)
 
 
 def rms_of_part(map_: DeviationMap) -> UncertainValue:
@@ -166,33 +89,136 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue,
     noises = few.noise * np.random.default_rng(_SEED + 1).normal(size=(_NOISES, len(few)))
     fit = _smooth(few, disc, noises)
     base, left, blurred = _without_noise(few, fit, noises)
-    chosen = slice(None, None, -(-len(few) // _MOST_DRAWN))
-    ways = _drawn(few, fit, base, left, chosen)
-    area = few.area[chosen]
+    even = slice(None, None, -(-len(few) // _MOST_DRAWN))
+    drawn, form, noisy = few.part(even), base[even], left[:, even]
+    ends = np.array([base.min(), base.max()])
+    count, area = len(drawn), drawn.area
+    if (local := local_features(map_, fit)) is not None:
+        ends = np.array([min(ends[0], local.form.min()), max(ends[1], local.form.max())])
+        order = np.argsort(local.form)
+        some = order if len(order) <= _MOST_DRAWN else np.r_[order[:_HALF], order[-_HALF:]]
+        drawn = drawn.joined(map_.part(local.points[some]))
+        form = np.concatenate([form, local.form[some]])
+        noisy = np.concatenate([noisy, local.noise[:, some]], axis=1)
+        blurred = max(blurred, local.blurred)
+    ways = _drawn(drawn, fit, form, noisy)
 
-    def robust(deviations: FloatArray, area: FloatArray) -> FloatArray:
-        low_high = [weighted_quantiles(column, area, ROBUST) for column in deviations.T]
+    def robust(deviations: FloatArray) -> FloatArray:
+        low_high = [weighted_quantiles(column[:count], area, ROBUST) for column in deviations.T]
         return np.array([high - low for low, high in low_high])
 
-    def whole(deviations: FloatArray, _: FloatArray) -> FloatArray:
+    def whole(deviations: FloatArray) -> FloatArray:
         return np.asarray(np.ptp(deviations, axis=0), np.float64)
 
+    low, high = weighted_quantiles(base, few.area, ROBUST)
     found = []
-    for extent in (whole, robust):
-        of_all = float(extent(base[:, np.newaxis], few.area)[0])
-        of_some = float(extent(base[chosen][:, np.newaxis], area)[0])
-        again, more, likely, full, noisy = (extent(drawn, area) ** 2 for drawn in ways)
+    for extent, of_all in ((whole, float(np.ptp(ends))), (robust, high - low)):
+        of_some = float(extent(form[:, np.newaxis])[0])
+        again, more, likely, full, noise = (extent(way) ** 2 for way in ways)
         square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
         of_taken = _rms(full - np.mean(likely))
         # Where many points compete for an extreme, the mean of the draws follows the noise of the
         # figure in part, so that it counts once to twice: the factor is √2.
-        of_errors = _length(float(np.std(again)), float(np.std(noisy)))
+        of_errors = _length(float(np.std(again)), float(np.std(noise)))
         # An extent has two ends, each blurred independently.
         of_blur = 2 * of_some * float(np.sqrt(2)) * blurred
         spread = _length(of_errors, _rms(more - again), of_taken, of_blur)
         figure = _of_square(square, spread)
         found.append(UncertainValue((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
+
+
+class LocalFeatures(NamedTuple):
+    """Points (m,) of a map whose form differs from its smooth form and its local means.
+
+    points: indices in the map;  form: estimate [m];  noise: draws of what is left of it (d, m) [m]
+    blurred: rms of the form that the estimate does not resolve [m]
+    """
+
+    points: IntArray
+    form: FloatArray
+    noise: FloatArray
+    blurred: float
+
+
+def local_features(map_: DeviationMap, fit: ZernikeFit) -> LocalFeatures | None:
+    """Return what grooves, pips, scratches and edges add to the smooth form; None for nothing.
+
+    Cells of four sizes whose mean exceeds what noise makes anywhere on the map show them, as do
+    single points (D. Donoho, I. Johnstone, Biometrika 81, 425). Each of the largest cells with one
+    has the means of the size with the least expected error (Stein); all cells have, if the means of
+    one size are closer than none all over the map, as for ripple.
+    """
+    if map_.noise == 0:
+        return None
+    smooth = fit.height(map_.x, map_.y)
+    rest = map_.deviation - smooth
+    spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
+    side = float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
+    levels, differs = [], np.abs(rest) > _beyond_chance(len(map_)) * map_.noise
+    ripple = False
+    for pitch in side * np.array(_CELLS):
+        column, row = (((v - v.min()) / pitch).astype(np.int64) for v in (map_.x, map_.y))
+        levels.append(column * (int(row.max()) + 1) + row)
+        mean, error = _cell_means(levels[-1], rest, map_.noise)
+        count = int(np.sum(error > 0))
+        differs |= (np.abs(mean) > _beyond_chance(count) * error)[levels[-1]]
+        # Σ (mean / error)² of noise alone is χ² with as many degrees of freedom as cells.
+        chi_square = float(np.sum((mean[error > 0] / error[error > 0]) ** 2))
+        ripple |= chi_square - 2 * count > _CHANCE * np.sqrt(2 * count)
+    chosen = (np.bincount(levels[0], differs) > 0) | ripple
+    some = np.flatnonzero(chosen[levels[0]])
+    if not len(some):
+        return None
+    cells = [np.unique(level[some], return_inverse=True)[1] for level in levels]
+    cells.append(np.arange(len(some)))
+    best = _least_risk(cells, rest[some], map_.noise)
+
+    def means(values: FloatArray) -> FloatArray:
+        made = np.stack([_cell_means(cell, values, 0.0)[0][cell] for cell in cells])
+        return np.asarray(made[best, np.arange(len(some))], np.float64)
+
+    form = means(rest[some])
+    random = np.random.default_rng(_SEED + 2)
+    noise = [means(map_.noise * random.normal(size=len(some))) for _ in range(_NOISES)]
+    order = np.argsort(smooth[some] + form)
+    ends = np.concatenate([order[:_EXTREME], order[-_EXTREME:]])
+    missed = (rest[some] - form)[ends][best[ends] < len(levels)]
+    variance = float(np.mean(missed**2)) - map_.noise**2 if len(missed) else 0.0
+    blurred = float(np.sqrt(max(variance, 0.0)))
+    return LocalFeatures(some, smooth[some] + form, np.array(noise), blurred)
+
+
+def _least_risk(cells: Sequence[IntArray], values: FloatArray, noise: float) -> IntArray:
+    """Return the level (n,) whose cell means have the least expected error, by largest cell.
+
+    cells: number of the cell of each point at each level, each (n,), from the largest to one point
+    """
+    risks = []
+    for cell in cells:
+        mean, _ = _cell_means(cell, values, 0.0)
+        size = np.bincount(cell)[cell]
+        # Each cell follows the noise of one point.
+        risk = (values - mean[cell]) ** 2 + 2 * noise**2 / size
+        risks.append(np.bincount(cells[0], risk))
+    # A choice of its own follows the noise of a cell, so the gain must exceed that of chance.
+    usual, own = int(np.argmin(np.sum(risks, axis=1))), np.argmin(risks, axis=0)
+    gain = risks[usual] - np.min(risks, axis=0)
+    chance = _CHANCE * noise**2 * np.sqrt(2 * np.bincount(cells[0]))
+    return np.asarray(np.where(gain > chance, own, usual)[cells[0]], np.int64)
+
+
+def _cell_means(cell: IntArray, values: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of ``values`` (n,) in each cell (k,), and its standard error; zero: empty."""
+    counts = np.bincount(cell)
+    held = np.maximum(counts, 1)
+    error = np.where(counts > 0, noise / np.sqrt(held), 0.0)
+    return np.asarray(np.bincount(cell, values) / held), error
+
+
+def _beyond_chance(count: int) -> float:
+    """Return the multiple of σ that none of ``count`` normal values is likely to exceed."""
+    return float(np.sqrt(2 * np.log(max(count, 2)))) + 1.0
 
 
 def _smooth(map_: DeviationMap, disc: Aperture, noises: FloatArray) -> ZernikeFit:
@@ -211,21 +237,14 @@ def _without_noise(
 ) -> tuple[FloatArray, FloatArray, float]:
     """Return the denoised deviations (n,), the remaining noise (d, n), and the lost form, rms [m].
 
-    The residual of the smooth terms is replaced by local means where these have the smaller
-    expected error; a Wiener filter takes the rest. ``noises`` are draws (d, n) filtered alike; the
-    part that the terms follow is in their covariance.
+    A Wiener filter takes the residual of the smooth terms. ``noises`` are draws (d, n) filtered
+    alike; the part that the terms follow is in their covariance.
     """
     terms = zernike_values(*fit.disc.scaled(map_.x, map_.y), fit.terms)
     smooth = fit.coefficients @ terms
     rest, noise = map_.deviation - smooth, noises - fit.effects.T @ terms
     share, lost = _share_of_form(rest, map_.noise)
-    found = closest_means(map_.x, map_.y, rest, map_.noise)
-    if found.error >= share * map_.noise**2:
-        return np.asarray(smooth + share * rest, np.float64), share * noise, lost
-    near, noise_near = found.means(rest), np.array([found.means(each) for each in noise])
-    share, lost = _share_of_form(rest - near, map_.noise * float(np.sqrt(found.rest)))
-    base = smooth + near + share * (rest - near)
-    return np.asarray(base, np.float64), noise_near + share * (noise - noise_near), lost
+    return np.asarray(smooth + share * rest, np.float64), share * noise, lost
 
 
 def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
@@ -236,9 +255,9 @@ def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
 
 
 def _drawn(
-    map_: DeviationMap, fit: ZernikeFit, base: FloatArray, left: FloatArray, chosen: slice
+    map_: DeviationMap, fit: ZernikeFit, base: FloatArray, left: FloatArray
 ) -> tuple[FloatArray, ...]:
-    """Return the ``chosen`` deviations with five kinds of errors drawn anew, each (m, draws).
+    """Return the deviations with five kinds of errors drawn anew, each (m, draws).
 
     All errors that are present; these and the upper bounds; the form that the fit has probably
     taken; the form that it may have taken at most; the remaining noise alone.
@@ -246,14 +265,14 @@ def _drawn(
     base: without errors (n,);  left: draws of the noise that is left in it (d, n)
     """
     random = np.random.default_rng(_SEED)
-    terms = zernike_values(*fit.disc.scaled(map_.x[chosen], map_.y[chosen]), fit.terms)
-    effects, still = map_.effects[:, chosen], base[chosen][:, np.newaxis]
+    terms = zernike_values(*fit.disc.scaled(map_.x, map_.y), fit.terms)
+    effects, still = map_.effects, base[:, np.newaxis]
     taken = effects[: len(map_.taken)]
 
     def anew(ways: FloatArray) -> FloatArray:
         return np.asarray(ways.T @ random.normal(size=(len(ways), _DRAWS)), np.float64)
 
-    noisy = still + np.tile(left[:, chosen].T, _DRAWS // _NOISES)
+    noisy = still + np.tile(left.T, _DRAWS // _NOISES)
     drawn = noisy + anew(np.concatenate([effects[_real(map_)], _root(fit.covariance) @ terms]))
     bounded = drawn + anew(effects[map_.bounds])
     return drawn, bounded, still + anew(_root(map_.taken) @ taken), still + anew(taken), noisy

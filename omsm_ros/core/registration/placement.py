@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.posed import Pose
@@ -104,7 +104,7 @@ class Placed(NamedTuple):
     normal: FloatArray
     from_origin: FloatArray
 
-    def part(self, chosen: BoolArray) -> Placed:
+    def part(self, chosen: BoolArray | IntArray) -> Placed:
         """Return the chosen points (n,)."""
         return Placed(*(values[..., chosen] for values in self))
 

@@ -171,7 +171,8 @@ class Registration:
     spread: standard uncertainty of each pose parameter asked for [m], [rad] or [1/m]
     correlated_moves: for each undetermined pose parameter at its largest plausible offset: the
         effect on each fitted one, in first and second order (2,)
-    limit: deviation from the smooth form beyond which a point is an outlier [m]
+    limit: deviation from the smooth form beyond which a point is dust unless others confirm it [m]
+    dust: indices of the points left out as dust, in the order of reading (d,)
     disc: the aperture, or a disc that holds all points
     form: coefficients of the smooth form in ``basis`` (k,) [m rms]
     noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
@@ -188,6 +189,7 @@ class Registration:
     spread: dict[str, float]
     correlated_moves: dict[str, dict[str, FloatArray]]
     limit: float
+    dust: IntArray
     disc: Aperture
     basis: FormBasis
     form: FloatArray
@@ -256,10 +258,12 @@ class Registration:
         held = np.arange(first, fitted + sources, 2)
         return np.asarray([*range(fitted), *held], np.int64)
 
-    def good(self, points: Placed) -> BoolArray:
-        """Return which points (n,) are no outliers."""
-        smooth = self.form @ self.basis.columns(points.x, points.y)
-        return np.asarray(np.abs(points.deviation - smooth) <= self.limit)
+    def good(self, first: int, count: int) -> BoolArray:
+        """Return which of ``count`` points from ``first`` on, as they are read, are no dust."""
+        good = np.ones(count, bool)
+        low, high = np.searchsorted(self.dust, (first, first + count))
+        good[self.dust[low:high] - first] = False
+        return good
 
 
 def held_dof_effects(

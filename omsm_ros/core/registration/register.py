@@ -26,6 +26,7 @@ from omsm_ros.core.registration.form_model import (
     outlier_limit,
     relaxation_factor,
 )
+from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule, FarPoints
 from omsm_ros.core.registration.placement import (
     LEAST_POINTS,
     POSE_PARAMETERS,
@@ -137,12 +138,14 @@ def register(
     sources: Sequence[str] = (),
     aperture: Aperture | None = None,
     even: bool = False,
+    dust: DustRule = ISOLATED,
 ) -> Registration:
     """Fit the pose parameters ``asked`` for, or "auto", of a part to its nominal ``surface``.
 
     portions: reads the points;  sources: names of their ``systematic`` rows
     aperture: of the part, beyond which points are ignored; None for all points
     even: the points form an evenly spaced grid
+    dust: which points far from the smooth form are left out
 
     Raises DataError for too few points, a pose parameter that the surface does not determine,
     or a fit that does not converge.
@@ -165,7 +168,7 @@ def register(
     open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
     if AUTO in asked:
         fit, stand, open_ = _useful(fit, stand, chosen, asked, open_)
-    return _over_all(fit, stand, portions, sources, open_)
+    return _over_all(fit, stand, portions, sources, open_, dust)
 
 
 def _determined(
@@ -275,9 +278,14 @@ class _PoseFit:
         portion: PointBatch,
         held_effects: FloatArray,
         sums: FormNormalEquations,
-    ) -> None:
-        """Add the points of a ``portion`` to ``sums``, with residuals from the free fit."""
-        at, like, limit = stand.at, stand.like, stand.limit
+        far: FarPoints | None = None,
+    ) -> PointBatch:
+        """Add the points of a ``portion`` to ``sums``, with residuals from the free fit.
+
+        Returns those beyond the outlier limit; with ``far`` they are recorded there and not added.
+        """
+        at, like = stand.at, stand.like
+        beyond = np.zeros(len(portion.x), bool)
         for begin in range(0, len(portion.x), CHUNK):
             part = PointBatch(*(v[..., begin : begin + CHUNK] for v in portion))
             whole = placed(self.surface, at, part)
@@ -291,8 +299,12 @@ class _PoseFit:
             z = self.basis.columns(points.x, points.y)
             columns = np.concatenate([-dof_columns(at, points, self.names), z])
             residual = points.deviation - like @ columns
-            near = np.abs(residual) <= limit
+            near = np.ones(len(residual), bool)
+            if far is not None:
+                near = ~far.add(points, residual, good)
+                beyond[begin + np.flatnonzero(good)[~near]] = True
             sums.add(columns[:, near], points.deviation[near], systematic[:, near], residual[near])
+        return PointBatch(*(v[..., beyond] for v in portion))
 
     def solved(self, at: Placement, sums: FormNormalEquations) -> tuple[Estimate, float]:
         """Return the estimate, and the variance of one point's noise [m²]."""
@@ -352,16 +364,25 @@ def _over_all(
     portions: PointBatches,
     sources: Sequence[str],
     open_: OpenUncertainty,
+    dust: DustRule,
 ) -> Registration:
-    """Return the registration from one pass over all points at the converged pose."""
+    """Return the registration from one pass over all points at the converged pose.
+
+    Points far from the smooth form are added last, once all of them tell form from dust.
+    """
     free, held = len(fit.names), root_of(open_.held)
     sums = fit.new_sums(len(sources) + 2 * len(held))
     square = points = 0.0
+    far, beyond = FarPoints(stand.limit), []
     for portion in portions():
-        fit.sums(stand, portion, held, sums)
+        beyond.append(fit.sums(stand, portion, held, sums, far))
         before = placed(fit.surface, Placement(), portion).deviation
         square += float(np.nansum(before**2))
         points += float(np.sum(np.isfinite(before)))
+    left_out, form = far.dust(dust)
+    for portion in beyond:
+        chosen, form = form[: len(portion.x)], form[len(portion.x) :]
+        fit.sums(stand, PointBatch(*(v[..., chosen] for v in portion)), held, sums)
     found, variance = fit.solved(stand.at, sums)
     gain = found.covariance[:free] / found.noise
     # Each column is the step of the pose for one standard uncertainty of a source.
@@ -380,6 +401,7 @@ def _over_all(
         spread=open_.spread(fit.dofs, by_source),
         correlated_moves=open_.unknown,
         limit=stand.limit,
+        dust=left_out,
         disc=fit.basis.disc,
         basis=fit.basis,
         form=found.form,

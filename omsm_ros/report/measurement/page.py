@@ -32,7 +32,7 @@ _SIGNED = ("Ssk",)
 _CONFORMITY = {
     "holds": ("good", "The part meets its tolerance"),
     "fails": ("bad", "The part exceeds its tolerance"),
-    "cannot tell": ("care", "Conformity not decided, the uncertainty is too large: tolerance"),
+    "cannot tell": ("care", "Conformity not decided: tolerance"),
 }
 _POSE_UNITS = {
     "piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad",
@@ -60,6 +60,7 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
         words.append("no tolerance given (--tolerance): conformity not assessed")
         return PageVerdict("unknown", "Form deviation", tuple(words))
     level, word = _CONFORMITY[held["verdict"]]
+    words = [*(held.get("reasons") or ()), *words]
     if level == "good" and part(summary, "verdict", "code") != "verified":
         level, word = "care", f"Not verified: {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
@@ -67,9 +68,8 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
 
 
 def _form_figures(form: Mapping[str, Any]) -> dict[str, Any]:
-    """Return PV of 99.5 % of the part and rms of a registered form; none without them."""
-    names = {"peak_to_valley": "robust_peak_to_valley", "rms": "rms"}
-    found = {key: part(form, "deviation", name) for key, name in names.items()}
+    """Return PV and rms of a registered form; none without them."""
+    found = {key: part(form, "deviation", key) for key in ("peak_to_valley", "rms")}
     if not all(one and one["value"] is not None for one in found.values()):
         return {}
     return {

@@ -17,7 +17,6 @@ from omsm_ros.core.form.deviation_map import (
     weighted_quantiles,
 )
 from omsm_ros.core.form.part_figures import (
-    LocalMeans,
     asymmetric,
     extents_of_part,
     rms_of_part,
@@ -274,15 +273,3 @@ def test_a_profile_is_uncertain_by_its_noise_over_the_root_of_its_points_and_its
     points = np.bincount(place, minlength=180)
     expected = np.hypot(8e-9 / np.sqrt(points[points > 0]), 3e-9)
     np.testing.assert_allclose(found.uncertainty, expected)
-
-
-def test_local_means_do_not_know_order_place_and_unit():
-    values = RNG.normal(size=3000)
-    usual = LocalMeans.of(X, Y, 8.0)(values)
-    order = RNG.permutation(3000)
-    mixed = LocalMeans.of(X[order], Y[order], 8.0)(values[order])
-    np.testing.assert_allclose(mixed, usual[order], atol=1e-12)
-    elsewhere = LocalMeans.of(1e3 * (X + 1.0), 1e3 * (Y - 2.0), 8.0)(values)
-    np.testing.assert_allclose(elsewhere, usual, atol=1e-6)
-    # Means lie between the least and the largest of what they are of.
-    assert values.min() <= usual.min() <= usual.max() <= values.max()

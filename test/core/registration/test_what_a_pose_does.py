@@ -97,11 +97,10 @@ def test_what_the_pose_may_be_off_by_displaces_the_places_of_the_part(found, poi
     assert found.undetermined_displacements(x, y).shape == (0, 2, len(x))
 
 
-def test_points_far_from_the_smooth_form_are_no_good_ones(found, points):
-    smooth = found.form @ found.basis.columns(points.x, points.y)
-    beyond = smooth + np.where(np.arange(len(points.x)) % 2, 1.01, 0.99) * found.limit
-    good = found.good(points._replace(deviation=beyond))
-    np.testing.assert_array_equal(good, np.arange(len(points.x)) % 2 == 0)
+def test_the_points_left_out_are_those_of_their_place_in_the_file(found):
+    marked = replace(found, dust=np.array([3, 17, 18, 40]))
+    assert np.flatnonzero(~marked.good(0, 60)).tolist() == [3, 17, 18, 40]
+    assert np.flatnonzero(~marked.good(10, 9)).tolist() == [7, 8]
 
 
 def test_a_machine_whose_zero_is_elsewhere_finds_the_part_elsewhere(found):

@@ -1,0 +1,240 @@
+"""Tell dust from form: points far from the smooth form that no neighbouring track confirms.
+
+Successive far points of one track are one event. Events of neighbouring tracks, or of repeated
+scans, with the same sign and a similar size confirm each other. Dust lies at random, so clusters of
+it occur by chance; a cluster is form if one of its size is improbable at the density of single
+events, or if it is long along its track, like a scratch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from omsm_ros.core.registration.placement import Placed
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+
+DustRule = Literal["none", "isolated"] | int
+ISOLATED: DustRule = "isolated"
+NO_DUST: DustRule = "none"
+# Neighbouring places are at most this many spacings of the tracks apart.
+_REACH = 1.5
+# Far points of a track with one point between them belong to one event.
+_GAP = 2
+# An event that is longer along its track, in reaches, is no grain of dust.
+_LONG = 4.0
+# Events of one defect differ in size by less than this factor.
+_SIMILAR = 2.0
+# A point little beyond the limit is form if this share of the points around is half as far; noise
+# alone is as far at one in 160.
+_SHARE_AROUND = 0.05
+# Far points that are compared with their surroundings at a time.
+_AT_A_TIME = 4096
+# Least number of such points where larger ones are judged by it.
+_FEW = 2.0
+# The density of dust near a cluster is counted within this many reaches.
+_NEARBY = 5.0
+# Expected number of clusters by chance that are mistaken for form, in a whole measurement.
+_BY_CHANCE = 0.01
+# A cluster of more events than this is always form.
+_MOST_BY_CHANCE = 30
+# A step longer than so many usual ones is a jump to another line, no part of the path.
+_JUMP = 10.0
+# Points narrower than this share of their length lie on a line.
+_LINE = 1e-3
+
+
+@dataclass(eq=False)
+class FarPoints:
+    """Collects the points beyond the outlier limit, and the length of the path of all points.
+
+    limit: of the residual, beyond which a point is far [m]
+    rows, near: index in the order of reading, x, y, residual and step to the next point, of the far
+        points, and of those beyond half the limit, portions of (5, k)
+    read, points: number of points so far, and of those with a deviation;  path: [m]
+    """
+
+    limit: float
+    rows: list[FloatArray] = field(default_factory=lambda: [np.empty((5, 0))])
+    near: list[FloatArray] = field(default_factory=lambda: [np.empty((5, 0))])
+    read: int = 0
+    points: int = 0
+    path: float = 0.0
+    low: FloatArray = field(default_factory=lambda: np.full(2, np.inf))
+    high: FloatArray = field(default_factory=lambda: np.full(2, -np.inf))
+
+    def add(self, points: Placed, residual: FloatArray, good: BoolArray) -> BoolArray:
+        """Take the ``good`` (n,) of the next points; return which of them (m,) are far."""
+        size = np.abs(residual)
+        far = size > self.limit
+        steps = np.hypot(np.diff(points.x), np.diff(points.y))
+        index = self.read + np.flatnonzero(good)
+        self.read += len(good)
+        if not len(steps):
+            return np.zeros(len(far), bool)
+        table = np.stack([index, points.x, points.y, residual, np.append(steps, steps[-1])])
+        self.rows.append(table[:, far])
+        self.near.append(table[:, ~far & (size > self.limit / 2)])
+        self.points += len(residual)
+        self.path += float(np.sum(np.minimum(steps, _JUMP * np.median(steps))))
+        self.low = np.minimum(self.low, [points.x.min(), points.y.min()])
+        self.high = np.maximum(self.high, [points.x.max(), points.y.max()])
+        return far
+
+    def dust(self, rule: DustRule) -> tuple[IntArray, BoolArray]:
+        """Return the indices of dust by ``rule``, rising, and which far points (k,) are form.
+
+        rule: "none", "isolated", or the most points that a cluster of dust has
+        """
+        rows = np.concatenate(self.rows, axis=1)
+        index, (x, y, residual) = rows[0].astype(np.int64), rows[1:4]
+        form = np.ones(len(index), bool)
+        if rule != NO_DUST and len(index):
+            space = self._space()
+            event = np.arange(len(index))
+            if not space.line:
+                event = _events(index, x, y, residual, space.reach)
+            cluster, space.similar = _clusters(event, x, y, residual, space.reach)
+            if rule == ISOLATED:
+                form = _confirmed(event, cluster, rows, space, self.points)
+                for begin in range(0, len(form), _AT_A_TIME):
+                    open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
+                    form[open_] = self._like_surroundings(open_, event, rows, space)
+            else:
+                form = np.bincount(cluster)[cluster] > int(rule)
+        return index[~form], form
+
+    def _like_surroundings(
+        self, at: IntArray, event: IntArray, rows: FloatArray, space: _Space
+    ) -> BoolArray:
+        """Return which far points ``at`` (m,) are like a good share of the points around.
+
+        A slope of the form crosses the limit between two points, and a pip in the centre of a
+        spiral is crossed by few turns. Points of the same event do not count.
+        """
+        from scipy.spatial import cKDTree
+
+        if not len(at):
+            return np.zeros(0, bool)
+        others = np.concatenate([rows, *self.near], axis=1)
+        events = np.append(event, np.full(others.shape[1] - len(event), -1))
+        pairs = cKDTree(rows[1:3, at].T).sparse_distance_matrix(
+            cKDTree(others[1:3].T), space.reach, output_type="coo_matrix"
+        )
+        ratio = others[3][pairs.col] / rows[3][at][pairs.row]
+        little = np.abs(rows[3][at]) <= 2 * self.limit
+        like = (ratio > 1 / _SIMILAR) & ((ratio < _SIMILAR) | little[pairs.row])
+        like &= events[pairs.col] != event[at][pairs.row]
+        count = np.bincount(pairs.row[like], minlength=len(at))
+        # Where few points are around, dust too has company; only clusters tell.
+        around = space.around(rows[4][at])
+        decided = little | (around >= _FEW / _SHARE_AROUND)
+        return np.asarray(
+            decided & (count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW))
+        )
+
+    def _space(self) -> _Space:
+        spans = np.sort(self.high - self.low)
+        if spans[0] < _LINE * spans[1]:
+            reach = _REACH * float(spans[1]) / self.points
+            return _Space(reach, 2 * reach / float(spans[1]), True, reach / _REACH)
+        area = float(np.prod(spans))
+        spacing = max(float(np.sqrt(area / self.points)), area / (self.path or np.inf))
+        reach = _REACH * spacing
+        return _Space(reach, np.pi * reach**2 / area, False, spacing)
+
+
+@dataclass(slots=True)
+class _Space:
+    """Distance of neighbours [m], its share of the whole, and whether the points are on a line.
+
+    spacing: of the tracks, or of the points on a line [m]
+    similar: share of pairs of events that are similar by chance
+    """
+
+    reach: float
+    share: float
+    line: bool
+    spacing: float
+    similar: float = 1.0
+
+    def around(self, step: FloatArray) -> FloatArray:
+        """Return the number of points within the reach where the track has steps (k,) [m]."""
+        along = 2 * self.reach / np.maximum(step, 1e-3 * self.spacing)
+        return np.asarray(along if self.line else along * 2 * self.reach / self.spacing)
+
+    def larger(self, factor: float) -> float:
+        """Return how much more space a ``factor`` of the reach covers."""
+        return factor if self.line else factor**2
+
+
+def _events(
+    index: IntArray, x: FloatArray, y: FloatArray, residual: FloatArray, reach: float
+) -> IntArray:
+    """Return the event (k,) of each far point: successive similar ones belong together."""
+    apart = np.hypot(np.diff(x), np.diff(y)) > reach
+    ratio = residual[1:] / residual[:-1]
+    new = (np.diff(index) > _GAP) | apart | (ratio < 1 / _SIMILAR) | (ratio > _SIMILAR)
+    return np.concatenate([[0], np.cumsum(new)])
+
+
+def _clusters(
+    event: IntArray, x: FloatArray, y: FloatArray, residual: FloatArray, reach: float
+) -> tuple[IntArray, float]:
+    """Return the cluster (k,) of each far point, and the share of pairs that are similar."""
+    # Imported here, because clean measurements do not need them.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    # One point for each half reach along an event, the farthest from the form, is enough.
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    first = np.concatenate([[0], np.flatnonzero(np.diff(event)) + 1])
+    part = np.floor((way - way[first][event]) / (reach / 2)).astype(np.int64)
+    order = np.lexsort((-np.abs(residual), part, event))
+    ahead = np.ones(len(order), bool)
+    ahead[1:] = (np.diff(event[order]) != 0) | (np.diff(part[order]) != 0)
+    some = order[ahead]
+    pairs = cKDTree(np.column_stack([x, y])[some]).query_pairs(reach, output_type="ndarray")
+    one, other = some[pairs[:, 0]], some[pairs[:, 1]]
+    ratio = residual[one] / residual[other]
+    linked = (ratio > 1 / _SIMILAR) & (ratio < _SIMILAR)
+    links = np.ones(int(linked.sum())), (event[one[linked]], event[other[linked]])
+    count = int(event[-1]) + 1
+    group = connected_components(coo_array(links, (count, count)), directed=False)[1]
+    sizes = np.log(np.abs(residual[some[: 2 * (len(some) // 2)]])).reshape(2, -1)
+    near = np.abs(sizes[0] - sizes[1]) < np.log(_SIMILAR)
+    return group[event], float(np.mean(near)) if near.size else 1.0
+
+
+def _confirmed(
+    event: IntArray, cluster: IntArray, rows: FloatArray, space: _Space, points: int
+) -> BoolArray:
+    """Return which far points (k,) are form.
+
+    The expected number of similar events around one follows from the single events, in all and
+    nearby, because a spiral has more points, and so more dust, about its centre.
+    """
+    from scipy.spatial import cKDTree
+
+    begins = np.concatenate([[0], np.flatnonzero(np.diff(event)) + 1])
+    of_event, places = cluster[begins], rows[1:3, begins].T
+    sizes = np.bincount(of_event)
+    single = sizes[of_event] == 1
+    trees = cKDTree(places), cKDTree(places[single])
+    some = np.asarray(trees[1].query_ball_point(places, _NEARBY * space.reach, return_length=True))
+    nearby = np.zeros(len(sizes))
+    np.maximum.at(nearby, of_event, np.maximum(some - single, 0) + 1.0)
+    total = float(np.sum(single))
+    dense = np.zeros(len(sizes))
+    np.maximum.at(dense, of_event, space.around(rows[4, begins]) / points)
+    chance = np.maximum(nearby / space.larger(_NEARBY), total * np.maximum(dense, space.share))
+    chance *= space.similar
+    expected = total * np.minimum(chance, 0.99) ** (np.minimum(sizes, _MOST_BY_CHANCE) - 1)
+    form = ((expected < _BY_CHANCE) & (sizes > 1)) | (sizes > _MOST_BY_CHANCE)
+    steps = np.where(np.diff(event) == 0, np.hypot(*np.diff(rows[1:3])), 0.0)
+    lengths = np.add.reduceat(np.concatenate([steps, [0.0]]), begins)
+    form[of_event[lengths > _LONG * space.reach]] = True
+    return np.asarray(form[cluster])

@@ -1,0 +1,89 @@
+"""Dust on parts with real defects, from an independent generator in plain numpy."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.registration.placement import PointBatch
+from omsm_ros.core.registration.register import register
+from omsm_ros.core.surface.nominal import Flat
+
+R, NOISE, POINTS = 12.7e-3, 10e-9, 40_000
+
+
+def spiral():
+    r, c = np.linspace(R, 0, POINTS), np.linspace(0, 200 * np.pi, POINTS)
+    return r * np.cos(c), r * np.sin(c)
+
+
+def raster():
+    across = np.linspace(-R, R, 226)
+    x, y = np.meshgrid(across, across)
+    x[1::2] = x[1::2, ::-1]
+    inside = np.hypot(x, y) <= R
+    return x[inside], y[inside]
+
+
+def rolled_edge(x, y):
+    return -400e-9 * np.clip((np.hypot(x, y) - 0.9 * R) / (0.1 * R), 0, None) ** 3
+
+
+def groove(x, y):
+    return -60e-9 * (np.abs(0.6 * x + 0.8 * y - 2e-3) < 0.2e-3)
+
+
+def pip(x, y):
+    return 80e-9 * np.exp(-((x / 0.25e-3) ** 2) - (y / 0.25e-3) ** 2)
+
+
+def scratch(x, y):
+    along, across = 0.8 * x - 0.6 * y, 0.6 * x + 0.8 * y
+    return -200e-9 * ((np.abs(across) < 0.06e-3) & (np.abs(along) < 4e-3))
+
+
+def nothing(x, y):
+    return np.zeros_like(x)
+
+
+def registered(path, defect, share, rule="isolated", seed=1):
+    rng = np.random.default_rng(seed)
+    x, y = path()
+    dusty = rng.random(len(x)) < share
+    height = 50e-9 * (x**2 - y**2) / R**2 + defect(x, y) + rng.normal(0, NOISE, len(x))
+    height[dusty] += rng.lognormal(np.log(1e-6), 1.0, int(dusty.sum()))
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"), dust=rule)
+    return found, np.flatnonzero(dusty), height
+
+
+@pytest.mark.parametrize("path", [spiral, raster])
+@pytest.mark.parametrize("defect", [rolled_edge, groove, pip, scratch])
+def test_form_stays_and_dust_goes(path, defect):
+    found, dusty, height = registered(path, defect, 1e-3)
+    lost = np.setdiff1d(found.dust, dusty)
+    assert len(lost) <= 2
+    kept = np.setdiff1d(dusty, found.dust)
+    # Grains as small as the limit are no outliers.
+    assert np.all(np.abs(height[kept]) < 4 * found.limit)
+
+
+@pytest.mark.parametrize("path", [spiral, raster])
+def test_dense_dust_does_not_confirm_itself(path):
+    found, dusty, height = registered(path, nothing, 1e-2)
+    kept = np.setdiff1d(dusty, found.dust)
+    assert np.all(np.abs(height[kept]) < 3 * found.limit)
+    assert len(found.dust) > 0.9 * len(dusty)
+
+
+def test_the_rule_none_leaves_out_nothing_and_a_number_limits_the_cluster():
+    assert not len(registered(spiral, pip, 1e-3, "none")[0].dust)
+    few, more = (len(registered(raster, pip, 1e-3, n)[0].dust) for n in (1, 100))
+    assert few < more
+
+
+def test_the_ends_of_a_profile_stay():
+    x = np.linspace(-0.1, 0.1, 400)
+    height = 1e-9 * np.sin(300 * x) - 60e-9 * (np.abs(x) > 0.097)
+    height[200] += 80e-9
+    batch = PointBatch(x, np.zeros_like(x), height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tilt"))
+    assert found.dust.tolist() == [200]
