@@ -31,7 +31,7 @@ class WireCounts(SimpleNamespace):
     """Counts of a decoder: ``bytes_received = in samples + bytes_discarded + bytes_pending``."""
 
     def __init__(self, received: int, kept: int, pending: int, **counts: int) -> None:
-        """kept: bytes of what was decoded;  counts: of what it was, by name."""
+        """kept: bytes that were decoded;  counts: number of what they held, by name."""
         discarded = received - kept - pending
         super().__init__(
             bytes_received=received, bytes_discarded=discarded, bytes_pending=pending, **counts

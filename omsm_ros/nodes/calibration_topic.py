@@ -1,8 +1,8 @@
 """Publishes and receives the calibration in force on the topic ``calibration``.
 
 Its stamp is the time since which it is in force. Each node that uses calibrations subscribes, and
-publishes a newer one again: so all latched messages hold the newest one, and any node may be
-restarted without its loss.
+publishes a newer one again. So every latched message holds the newest calibration, and a node can
+be restarted without losing it.
 """
 
 from __future__ import annotations

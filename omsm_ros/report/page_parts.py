@@ -15,7 +15,7 @@ from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 
 _SPACE = "\N{NARROW NO-BREAK SPACE}"
-# A minus sign, not a hyphen: not after a letter or a digit, as in 1e-9 or a date.
+# A hyphen that is a minus sign: it does not follow a letter or a digit, as in 1e-9 or a date.
 _MINUS = re.compile(r"(?<![\w.\-])-(?=\d)")
 _UNITS = r"(?:[nµmkM]?(?:m|s|Hz|rad|g|N/m|N·s/m)(?:/s²?)?|ppm|%|°|rpm|·)"
 # Spaces that must not break, as in "12.5 nm" and "254 000".

@@ -57,7 +57,7 @@ class Family:
 
     name, unit: of the source;  size: number of columns
     columns: change of the heights [m] per unit, (size, n)
-    wide: as large as a machine in need of repair has it: prior once it is refuted [unit]
+    wide: size on a machine in need of repair, the prior once the family is refuted [unit]
     default: prior where nothing is declared [unit]; None leaves the family out until it shows
     shown_by: code of the scan that shows it best
     named: False for columns that detect, but have no cause of their own
@@ -350,7 +350,7 @@ def _of_each_scan(r: Ranges) -> list[Family]:
 
     ``decentre`` and ``clocking`` are the pose of the part against its nominal surface, which looks
     like form; ``part_shift`` and ``part_turn`` are the pose of a scan against the first.
-    The machine warms on from scan to scan: one rate over all of them, and what differs is a walk.
+    Warming continues from scan to scan: all scans share one rate, and the rest is a random walk.
     """
     found = [
         _drift(r),
@@ -417,7 +417,7 @@ DIFFERS = "scan_differs"
 
 
 def _different(k: int, radius: float) -> Family:
-    """Return low orders of form that scan ``k`` alone has: detects, and names nothing."""
+    """Return low orders of form of scan ``k`` alone, which show a difference without its cause."""
 
     def columns(v: ScanView) -> FloatArray:
         return zernike_values(v.x / radius, v.y / radius, DIFFERENT_TERMS)

@@ -71,7 +71,7 @@ def start_scales(network: Network, walk: float | None) -> Scales:
 
 
 def settled(solution: Solution, steps: int) -> Solution:
-    """Return the solution after ``steps`` estimates of its scales, fewer where they stand."""
+    """Return the solution after ``steps`` estimates of its scales, fewer once they are constant."""
     for _ in range(steps):
         scales = estimate_scales(solution)
         still = _alike(scales, solution.scales)

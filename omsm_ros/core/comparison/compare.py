@@ -34,13 +34,13 @@ AGREE, DIFFER, CANNOT_TELL = "agree", "differ", "cannot tell"
 _LEAST_PROBABILITY = 0.01
 # Significance level of the χ² test where a term has |E_n| > 1 as well.
 _UNLIKELY = 0.05
-# From this |E_n| on a single term or figure shows a difference; between 1 and it is undecided.
+# A single term or figure differs from this |E_n| on; between 1 and this it is undecided.
 _CLEARLY_BEYOND = 1.25
 # Share of the smaller area below which the figures describe different surfaces.
 _LEAST_SHARED = 0.5
 MOST_ACROSS = 200
 """Places across the map of a difference: thirty in half a wave of the sixth order."""
-# Finer places would take minutes, and lie between means of the same cells.
+# A finer grid would take minutes, and only interpolate between means of the same cells.
 _MOST_PLACES = (MOST_ACROSS + 1) ** 2
 # Correlation length of errors of unknown form over the radius, for which most of their variance
 # lies in the low-order terms that are compared.
