@@ -23,7 +23,7 @@ def pytest_configure():
     Hypothesis limits an example to 200 ms, but each test has its own time-out. A background shell
     ignores SIGINT, and so would every node that a test starts.
     """
-    hypothesis.settings.register_profile("whole tests are timed", deadline=None)
+    hypothesis.settings.register_profile("whole tests are timed", deadline=None, max_examples=30)
     hypothesis.settings.load_profile("whole tests are timed")
     pytest.approx = approx
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

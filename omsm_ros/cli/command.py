@@ -15,7 +15,7 @@ from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.errors import printable
 from omsm_ros.pipelines.progress import Progress, no_progress
 
-Facts: TypeAlias = "dict[str, Any]"
+Facts: TypeAlias = dict[str, Any]
 
 
 @dataclass(frozen=True)
