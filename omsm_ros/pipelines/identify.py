@@ -111,15 +111,16 @@ def text_of_run(record: SampledRecord, run: FreeRun, period: float) -> str:
     return "\n".join([",".join(head), *lines]) + "\n"
 
 
-PAGE, MODEL_PAGE = "certificate.html", "model.html"
+PAGE, DCC, MODEL_PAGE = "certificate.html", "certificate_dcc.xml", "model.html"
 
 
 def write_certificate(out: Path, identified: Identification, *, source: str = "") -> Path:
-    """Write certificate.html into ``out``; return its path.
+    """Write certificate.html and certificate_dcc.xml into ``out``; return the page's path.
 
     source: name of the recording, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
+    from omsm_ros.report.certificate.dcc import render_dcc
     from omsm_ros.report.certificate.page import (
         CertificatePage,
         certificate_figures_of,
@@ -134,7 +135,8 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
         version=__version__,
         figures=certificate_figures_of(calibration, fitted_record(identified)),
     )
-    with result_folder(out, (PAGE,)) as folder:
+    with result_folder(out, (PAGE, DCC)) as folder:
+        save_bytes(folder / DCC, render_dcc(calibration, __version__).encode("utf-8", "replace"))
         save_bytes(folder / PAGE, render(certificate).encode("utf-8", "replace"))
     return out / PAGE
 

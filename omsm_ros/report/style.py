@@ -25,7 +25,8 @@ INK = "#1F2933"
 MUTED = "#66727F"
 FAINT = "#D9DEE3"
 MISSING = "#ECEFF2"
-MAP_COLOURS = "viridis"
+# Diverging about zero, its middle unlike the grey of missing pixels, for all colour vision.
+MAP_COLOURS = "RdYlBu_r"
 
 # Margins of the axes [inch]: a layout computed for each figure would take longer than drawing.
 _LEFT_IN, _RIGHT_IN, _BOTTOM_IN, _TOP_IN = 0.78, 0.14, 0.46, 0.34

@@ -81,8 +81,8 @@ def test_points_are_drawn_counted_and_reported_again_after_a_restart(page):
     assert page.troubles == []
 
     first.stop()
-    wait_for(page, "document.getElementById('link').textContent.includes('lost')")
-    assert "Nothing is heard" in page.inner_text("#light")
+    wait_for(page, "document.getElementById('link').textContent.includes('has ended')")
+    assert "Nothing" not in page.inner_text("#light")
     again = LiveServer(view, render("Cell 1"), "127.0.0.1", port)
     again.start()
     frames = page.evaluate("livePage.frames")

@@ -13,7 +13,7 @@ from omsm_ros.errors import FileError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.pipelines.identify import PAGE, write_certificate
+from omsm_ros.pipelines.identify import DCC, PAGE, write_certificate
 from omsm_ros.twin.cell import blocks_of
 
 
@@ -33,7 +33,7 @@ def test_identify_writes_the_certificate_it_is_asked_for(capsys, bag, tmp_path):
     assert cli.main([str(a) for a in arguments]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["report"] == str(folder / PAGE)
-    assert {p.name for p in folder.iterdir()} == {PAGE}
+    assert {p.name for p in folder.iterdir()} == {PAGE, DCC}
     identity = load_calibration(out).id
     text = (folder / PAGE).read_text(encoding="utf-8")
     assert identity in text

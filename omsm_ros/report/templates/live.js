@@ -1,5 +1,5 @@
 
-// The page of a running scan: a socket that tells what is new, drawn as it comes.
+// The page of a running scan: draws what the socket sends.
 class LivePage {
   constructor(root) {
     const data = root.dataset;
@@ -33,9 +33,15 @@ class LivePage {
     socket.onmessage = (message) =>
       typeof message.data === "string" ? this.state(JSON.parse(message.data)) : this.news(message.data);
     socket.onclose = () => {
-      link.textContent = "connection lost; trying again";
-      document.getElementById("light").className = "light red";
-      document.querySelector("#light strong").textContent = "Nothing is heard of the cell";
+      // A scan that has ended keeps its last state on the page.
+      const ended = this.latest && this.latest.points > 0;
+      link.textContent = ended
+        ? `the viewer has ended; this is the state of ${new Date().toLocaleTimeString()}`
+        : "no connection to the viewer; trying again";
+      if (!ended) {
+        document.getElementById("light").className = "light amber";
+        document.querySelector("#light strong").textContent = "Waiting for the viewer";
+      }
       setTimeout(() => this.connect(Math.min(2 * pause, 5000)), pause);
     };
   }
@@ -75,7 +81,7 @@ class LivePage {
       this.map.set(scaled, this.cells, this.cells, extent, shown, unit);
       this.fresh = false;
     } else {
-      // In place: who has enlarged a part goes on looking at it.
+      // In place, so that an enlarged part stays enlarged.
       Object.assign(this.map, { heights: scaled, unit, extent });
       this.map.colour(shown);
     }
@@ -90,7 +96,7 @@ class LivePage {
     const light = document.getElementById("light");
     light.className = `light ${view.light.colour}`;
     light.querySelector("strong").textContent =
-      { green: "All is well", amber: "With reservations", red: "Not to be trusted" }[view.light.colour];
+      { green: "In order", amber: "With reservations", red: "Not valid" }[view.light.colour];
     list(light.querySelector("ul"), view.light.reasons);
     document.querySelector("button[data-layer='0']").textContent = view.compared ? "Deviation" : "Height";
     this.numbers(view);
@@ -129,9 +135,9 @@ class LivePage {
     const rows = nodes.map((node) => {
       const row = document.createElement("tr");
       row.className = `level-${node.silent ? "ERROR" : node.level}`;
-      const said = element("td", node.silent ? "says nothing any more" : node.message);
+      const said = element("td", node.silent ? "no message for 10 s" : node.message);
       said.className = "said";
-      row.append(element("th", node.name), element("td", node.silent ? "GONE" : node.level), said);
+      row.append(element("th", node.name), element("td", node.silent ? "SILENT" : node.level), said);
       return row;
     });
     document.querySelector("#nodes tbody").replaceChildren(...rows);
