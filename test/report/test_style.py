@@ -44,11 +44,16 @@ def lab(rgb, sight):
 
 
 @pytest.mark.parametrize("sight", SIGHTS.values(), ids=SIGHTS)
-def test_the_map_grows_lighter_all_the_way(sight):
-    colours = matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, 64))[:, :3]
-    lightness = lab(colours, sight)[:, 0]
-    assert np.all(np.diff(lightness) > 0)
-    assert np.ptp(lightness) > 60
+def test_the_map_is_lightest_at_zero_and_its_ends_differ(sight):
+    """A diverging scale: darker all the way to both ends, which differ for every sight."""
+    colours = lab(matplotlib.colormaps[style.MAP_COLOURS](np.linspace(0, 1, 64))[:, :3], sight)
+    lightness = colours[:, 0]
+    middle = int(np.argmax(lightness))
+    assert abs(middle - 31.5) < 2
+    assert np.all(np.diff(lightness[: middle + 1]) > 0)
+    assert np.all(np.diff(lightness[middle:]) < 0)
+    assert min(lightness[middle] - lightness[0], lightness[middle] - lightness[-1]) > 50
+    assert np.linalg.norm(colours[0] - colours[-1]) > 50
 
 
 @pytest.mark.parametrize("sight", SIGHTS.values(), ids=SIGHTS)

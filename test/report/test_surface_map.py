@@ -12,11 +12,13 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 from matplotlib.image import imread
 
 from omsm_ros.errors import DataError
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.measurement.surface_map import Layer, embedded, policy_of, script
+from omsm_ros.report.style import MAP_COLOURS
 
 
 def layer(count=20_000, unit="nm", symmetric=True, seed=0):
@@ -111,7 +113,7 @@ def test_a_browser_draws_it_from_a_file(tmp_path):
     )  # fmt: skip
     picture = imread(tmp_path / "page.png")[..., :3]
     # The ends of the palette are on the map and on its bar.
-    for colour in ((68, 1, 84), (253, 231, 37)):
+    for colour in (255 * np.array(colormaps[MAP_COLOURS](end)[:3]) for end in (0.0, 1.0)):
         near = np.all(np.abs(255 * picture - colour) < 12, axis=2)
         assert near.sum() > 300, found.stderr[-500:]
 
