@@ -72,7 +72,7 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
     _calibration(folder / "cal.json", rate)
     messages = message_mapping.ros_messages()
     turn = [
-        (message_mapping.axis_message(messages, a), message_mapping.distance_message(messages, d))
+        (message_mapping.block_message(messages, a), message_mapping.block_message(messages, d))
         for a, d in _turn(rate, size)
     ]
     rclpy.init()

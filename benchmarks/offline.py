@@ -22,7 +22,7 @@ from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.calibration_file import save_calibration
-from omsm_ros.io.message_mapping import axis_message, bag_messages, distance_message
+from omsm_ros.io.message_mapping import bag_messages, block_message
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -67,11 +67,11 @@ def write_two_drivers(path: Path, samples: int, seed: int = 0) -> None:
                 axes = _axes(first, n, samples)
                 count = first + TWO_DRIVERS_OFFSET
                 axes = replace(axes, first_sample=count, stamp_ns=axes.stamp_ns + late)
-                bag.write(bags.AXES_TOPIC, received, axis_message(messages, axes))
+                bag.write(bags.AXES_TOPIC, received, block_message(messages, axes))
             else:
                 distance = _distance(first, noise[:n])
                 distance = replace(distance, stamp_ns=distance.stamp_ns + late)
-                bag.write(bags.DISTANCE_TOPIC, received, distance_message(messages, distance))
+                bag.write(bags.DISTANCE_TOPIC, received, block_message(messages, distance))
 
 
 def _axes(first: int, n: int, samples: int) -> AxisBlock:

@@ -219,17 +219,17 @@ class BagWriter:
 
     def write_axes(self, block: AxisBlock) -> None:
         """Append a block of the axes at its own stamp."""
-        message = message_mapping.axis_message(bag_messages(), block)
+        message = message_mapping.block_message(bag_messages(), block)
         self.write(AXES_TOPIC, block.stamp_ns, message)
 
     def write_distance(self, block: DistanceBlock, topic: str = DISTANCE_TOPIC) -> None:
         """Append a block of the probe, or of another sensor's ``topic``, at its own stamp."""
-        message = message_mapping.distance_message(bag_messages(), block)
+        message = message_mapping.block_message(bag_messages(), block)
         self.write(topic, block.stamp_ns, message)
 
     def write_acceleration(self, block: AccelerationBlock) -> None:
         """Append a block of the accelerometer at its own stamp."""
-        message = message_mapping.acceleration_message(bag_messages(), block)
+        message = message_mapping.block_message(bag_messages(), block)
         self.write(ACCELERATION_TOPIC, block.stamp_ns, message)
 
     def __exit__(self, *_: object) -> None:

@@ -11,9 +11,9 @@ import array
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -35,7 +35,13 @@ from omsm_ros.units import NANOSECONDS_PER_S
 MAX_JSON_CHARACTERS = 2_000_000
 _SET = "calibration_set"
 
-_AXES = ("x", "y", "z", "b", "c")
+T = TypeVar("T", AxisBlock, DistanceBlock, AccelerationBlock)
+# Channels of each kind of block, with their types.
+_CHANNELS: dict[Any, dict[str, Any]] = {
+    AxisBlock: dict.fromkeys("xyzbc", np.float64),
+    DistanceBlock: {"distance": np.float64, "intensity": np.float32, "status": np.uint8},
+    AccelerationBlock: dict.fromkeys("xyz", np.float64),
+}
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
 _PLACES: Mapping[str, Any] = POINT_DTYPE.fields or {}
 # Name, offset [bytes], type and count of each field of a point.
@@ -83,34 +89,20 @@ def stamp_of(message: Any) -> int:
     return int(stamp.sec) * NANOSECONDS_PER_S + int(stamp.nanosec)
 
 
-def _block_fields(message: Any) -> dict[str, Any]:
-    return {
-        "stamp_ns": stamp_of(message),
-        "first_sample": int(message.first_sample),
-        "sample_period": float(message.sample_period),
-    }
-
-
-def axis_block(message: Any) -> AxisBlock:
-    """Return the record of an ``omsm_msgs/AxisBlock``; DataError if its channels do not fit."""
-    channels: Any = {name: np.asarray(getattr(message, name), np.float64) for name in _AXES}
-    return AxisBlock(**_block_fields(message), **channels)
-
-
-def distance_block(message: Any) -> DistanceBlock:
-    """Return the record of an ``omsm_msgs/DistanceBlock``; DataError if its channels do not fit."""
-    return DistanceBlock(
-        **_block_fields(message),
-        distance=np.asarray(message.distance, np.float64),
-        intensity=np.asarray(message.intensity, np.float32),
-        status=np.asarray(message.status, np.uint8),
+def block_of(kind: type[T], message: Any) -> T:
+    """Return the record of a message of blocks; DataError if its channels do not fit."""
+    channels = {name: np.asarray(getattr(message, name), t) for name, t in _CHANNELS[kind].items()}
+    return kind(
+        stamp_ns=stamp_of(message),
+        first_sample=int(message.first_sample),
+        sample_period=float(message.sample_period),
+        **channels,
     )
 
 
-def acceleration_block(message: Any) -> AccelerationBlock:
-    """Return the record of an ``omsm_msgs/AccelerationBlock``; DataError if channels do not fit."""
-    channels: Any = {name: np.asarray(getattr(message, name), np.float64) for name in "xyz"}
-    return AccelerationBlock(**_block_fields(message), **channels)
+axis_block = partial(block_of, AxisBlock)
+distance_block = partial(block_of, DistanceBlock)
+acceleration_block = partial(block_of, AccelerationBlock)
 
 
 def calibration(message: Any) -> Calibration:
@@ -201,35 +193,19 @@ def header(messages: Messages, stamp_ns: int, frame: str) -> Any:
     )
 
 
-def _block_message(messages: Messages, block: Block, frame: str) -> dict[str, Any]:
-    return {
-        "header": header(messages, block.stamp_ns, frame),
-        "first_sample": block.first_sample,
-        "sample_period": block.sample_period,
-    }
-
-
-def axis_message(messages: Messages, block: AxisBlock, frame: str = "machine") -> Any:
-    """Return ``omsm_msgs/AxisBlock`` of a record."""
-    channels = {n: messages.sequence(getattr(block, n), np.float64) for n in _AXES}
-    return messages.make("AxisBlock", **_block_message(messages, block, frame), **channels)
-
-
-def distance_message(messages: Messages, block: DistanceBlock, frame: str = "probe") -> Any:
-    """Return ``omsm_msgs/DistanceBlock`` of a record."""
+def block_message(messages: Messages, block: Block, frame: str | None = None) -> Any:
+    """Return the message of a record; frame: None = machine for axes, probe for the others."""
+    kind = type(block)
+    if frame is None:
+        frame = "machine" if kind is AxisBlock else "probe"
+    channels = {n: messages.sequence(getattr(block, n), t) for n, t in _CHANNELS[kind].items()}
     return messages.make(
-        "DistanceBlock",
-        **_block_message(messages, block, frame),
-        distance=messages.sequence(block.distance, np.float64),
-        intensity=messages.sequence(block.intensity, np.float32),
-        status=messages.sequence(block.status, np.uint8),
+        kind.__name__,
+        header=header(messages, block.stamp_ns, frame),
+        first_sample=block.first_sample,
+        sample_period=block.sample_period,
+        **channels,
     )
-
-
-def acceleration_message(messages: Messages, block: AccelerationBlock, frame: str = "probe") -> Any:
-    """Return ``omsm_msgs/AccelerationBlock`` of a record."""
-    channels = {n: messages.sequence(getattr(block, n), np.float64) for n in "xyz"}
-    return messages.make("AccelerationBlock", **_block_message(messages, block, frame), **channels)
 
 
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:

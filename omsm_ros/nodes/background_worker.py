@@ -15,10 +15,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 from omsm_ros.errors import OmsmError
-from omsm_ros.nodes.diagnostics import log_internal_error
 from omsm_ros.nodes.memory import return_free_memory
-from omsm_ros.nodes.running import PacedService, refuse
-from omsm_ros.nodes.topics import REQUESTS_QOS
+from omsm_ros.nodes.running import offer, refusing
 
 T = TypeVar("T")
 
@@ -105,19 +103,11 @@ class BackgroundWorker:
         """Offer the service ``name``, as ``running.serve``, with an asynchronous ``answer``."""
 
         async def callback(request: Any, response: Any) -> Any:
-            try:
+            with refusing(self._node, response):
                 await answer(request, response)
-            except OmsmError as err:
-                refuse(response, str(err))
-            except Exception as err:
-                refuse(response, log_internal_error(self._node, err))
             return response
 
-        group = PacedService(self._node, undo)
-        made = self._node.create_service(
-            kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group
-        )
-        undo.callback(self._node.destroy_service, made)
+        offer(self._node, undo, kind, name, callback)
 
     def _run(self) -> None:
         patience: float | None = None

@@ -139,9 +139,7 @@ class CellEmulatorNode(ManagedNode):
     def _publish_acceleration(self) -> None:
         block = self._feed.due(self._player.played) if self._feed else None
         if block is not None:
-            self._acceleration_lines.publish(
-                message_mapping.acceleration_message(self._messages, block)
-            )
+            self._acceleration_lines.publish(message_mapping.block_message(self._messages, block))
 
     def _on_start(self, motion_of: Any, request: Any, response: Any) -> None:
         if not self.active:

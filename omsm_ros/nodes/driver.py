@@ -126,14 +126,13 @@ class DriverNode(ManagedNode):
     def _publish(self, blocks: Sequence[BlockPair]) -> None:
         self._publish_settings()
         for axes, distance in blocks:
-            if axes is not None and self._axes is not None:
-                frame = self.values["machine_frame"]
-                self._axes.publish(message_mapping.axis_message(self._messages, axes, frame))
-            if distance is not None and self._distance is not None:
-                frame = self.values["probe_frame"]
-                self._distance.publish(
-                    message_mapping.distance_message(self._messages, distance, frame)
-                )
+            for block, publisher, frame in (
+                (axes, self._axes, "machine_frame"),
+                (distance, self._distance, "probe_frame"),
+            ):
+                if block is not None and publisher is not None:
+                    frame = self.values[frame]
+                    publisher.publish(message_mapping.block_message(self._messages, block, frame))
 
     def _publish_settings(self) -> None:
         """Publish changed settings, before the first samples that were taken with them."""
@@ -252,7 +251,7 @@ class AccelerometerDriverNode(DriverNode):
             return
         frame = self.values["accelerometer_frame"]
         for block in blocks:
-            message = message_mapping.acceleration_message(self._messages, block, frame)
+            message = message_mapping.block_message(self._messages, block, frame)
             self._acceleration.publish(message)
 
     def _outputs_by_topic(self) -> list[tuple[str, Publisher]]:

@@ -11,8 +11,8 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -220,14 +220,28 @@ def serve(
     """
 
     def callback(request: Any, response: Any) -> Any:
-        try:
+        with refusing(node, response):
             answer(request, response)
-        except OmsmError as err:
-            refuse(response, str(err))
-        except Exception as err:
-            refuse(response, log_internal_error(node, err))
         return response
 
+    offer(node, undo, kind, name, callback)
+
+
+@contextmanager
+def refusing(node: Node, response: Any) -> Iterator[None]:
+    """Answer an exception as not successful, with the reason."""
+    try:
+        yield
+    except OmsmError as err:
+        refuse(response, str(err))
+    except Exception as err:
+        refuse(response, log_internal_error(node, err))
+
+
+def offer(
+    node: Node, undo: ExitStack, kind: Any, name: str, callback: Callable[[Any, Any], Any]
+) -> None:
+    """Create a service that takes its requests at a pace, until ``undo``."""
     group = PacedService(node, undo)
     made = node.create_service(kind, name, callback, qos_profile=REQUESTS_QOS, callback_group=group)
     undo.callback(node.destroy_service, made)

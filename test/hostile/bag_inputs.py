@@ -35,8 +35,8 @@ def messages_of(blocks: list[tuple[Any, Any]]) -> list[tuple[str, Any]]:
         item
         for axes, distance in blocks
         for item in (
-            (bags.AXES_TOPIC, message_mapping.axis_message(classes, axes)),
-            (bags.DISTANCE_TOPIC, message_mapping.distance_message(classes, distance)),
+            (bags.AXES_TOPIC, message_mapping.block_message(classes, axes)),
+            (bags.DISTANCE_TOPIC, message_mapping.block_message(classes, distance)),
         )
     ]
 

@@ -29,7 +29,7 @@ def records(path, *topics):
 
 @pytest.fixture
 def message(small_scan_blocks):
-    return message_mapping.axis_message(message_mapping.bag_messages(), small_scan_blocks[0][0])
+    return message_mapping.block_message(message_mapping.bag_messages(), small_scan_blocks[0][0])
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_all_channels_of_a_topic_are_read(tmp_path, small_scan_blocks):
     """rosbags writes one channel a topic; a second recorder's is made of it by hand."""
     blocks = [axes for axes, _ in small_scan_blocks[:10]]
     messages = [
-        message_mapping.axis_message(message_mapping.bag_messages(), block) for block in blocks
+        message_mapping.block_message(message_mapping.bag_messages(), block) for block in blocks
     ]
     folder = tmp_path / "two"
     store = message_mapping.typestore()

@@ -149,7 +149,7 @@ def write_axes(writer, pairs):
     with writer:
         connection = writer.add_connection(bags.AXES_TOPIC, kind, typestore=store)
         for axes, _ in pairs:
-            message = message_mapping.axis_message(message_mapping.bag_messages(), axes)
+            message = message_mapping.block_message(message_mapping.bag_messages(), axes)
             writer.write(connection, axes.stamp_ns, store.serialize_cdr(message, kind))
 
 

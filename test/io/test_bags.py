@@ -44,7 +44,7 @@ def test_folders_of_rosbag2_are_read(tmp_path, small_scan_blocks, plugin):
             bags.TOPIC_TYPES[bags.AXES_TOPIC],
             typestore=message_mapping.typestore(),
         )
-        message = message_mapping.axis_message(
+        message = message_mapping.block_message(
             message_mapping.bag_messages(), small_scan_blocks[0][0]
         )
         raw = message_mapping.typestore().serialize_cdr(message, bags.TOPIC_TYPES[bags.AXES_TOPIC])
@@ -104,7 +104,7 @@ def test_a_topic_of_another_type_is_refused(tmp_path):
 
 def test_a_block_that_contradicts_itself_is_refused(tmp_path, small_scan_blocks):
     path = tmp_path / "odd.mcap"
-    message = message_mapping.axis_message(message_mapping.bag_messages(), small_scan_blocks[0][0])
+    message = message_mapping.block_message(message_mapping.bag_messages(), small_scan_blocks[0][0])
     message.x = message.x[:3]
     with BagWriter(path, TOPICS) as writer:
         writer.write(bags.AXES_TOPIC, 0, message)

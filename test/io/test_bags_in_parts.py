@@ -41,8 +41,8 @@ def part(folder, pairs, plugin, mode):
         ]
         for axes, distance in pairs:
             messages = (
-                message_mapping.axis_message(made, axes),
-                message_mapping.distance_message(made, distance),
+                message_mapping.block_message(made, axes),
+                message_mapping.block_message(made, distance),
             )
             for connection, message in zip(to, messages, strict=True):
                 raw = store.serialize_cdr(message, connection.msgtype)

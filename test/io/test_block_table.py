@@ -41,10 +41,10 @@ def distance(first: int, samples: int, optional: str = "both") -> DistanceBlock:
 
 def serialised(block: Block, frame: str = "machine") -> bytes:
     if isinstance(block, AxisBlock):
-        message = message_mapping.axis_message(message_mapping.bag_messages(), block, frame)
+        message = message_mapping.block_message(message_mapping.bag_messages(), block, frame)
         kind = "AxisBlock"
     else:
-        message = message_mapping.distance_message(message_mapping.bag_messages(), block, frame)
+        message = message_mapping.block_message(message_mapping.bag_messages(), block, frame)
         kind = "DistanceBlock"
     return bytes(message_mapping.typestore().serialize_cdr(message, f"omsm_msgs/msg/{kind}"))
 
@@ -154,7 +154,7 @@ def test_a_bag_gives_the_same_samples_either_way(tmp_path) -> None:
 
 def test_a_block_without_samples_is_a_damaged_bag(tmp_path) -> None:
     path = tmp_path / "empty.mcap"
-    message = message_mapping.axis_message(message_mapping.bag_messages(), axes(0, 1))
+    message = message_mapping.block_message(message_mapping.bag_messages(), axes(0, 1))
     for name in "xyzbc":
         setattr(message, name, np.empty(0))
     with BagWriter(path, (bags.AXES_TOPIC,)) as bag:

@@ -22,7 +22,7 @@ def cells(tmp_path, small_scan_blocks):
         with Writer(folder, version=9, storage_plugin=plugin) as writer:
             for count, name in enumerate(names):
                 connection = writer.add_connection(name, AXES, typestore=store)
-                message = message_mapping.axis_message(
+                message = message_mapping.block_message(
                     message_mapping.bag_messages(), small_scan_blocks[count][0]
                 )
                 writer.write(connection, count, store.serialize_cdr(message, AXES))

@@ -127,7 +127,7 @@ def same(one, other):
 def test_axes_are_the_bytes_of_the_standard(block, frame):
     raw = axes_by_hand(block, frame)
     ours = written(
-        message_mapping.axis_message(bag_messages(), block, frame), "omsm_msgs/msg/AxisBlock"
+        message_mapping.block_message(bag_messages(), block, frame), "omsm_msgs/msg/AxisBlock"
     )
     assert ours.rstrip(b"\0") == raw.rstrip(b"\0")
     same(message_mapping.axis_block(read(raw, "omsm_msgs/msg/AxisBlock")), block)
@@ -139,7 +139,7 @@ def test_distances_are_the_bytes_of_the_standard(block, frame):
     """The record has NaN where the probe says that a reading is none; the rest is as it was."""
     raw = distance_by_hand(block, frame)
     kind = "omsm_msgs/msg/DistanceBlock"
-    ours = written(message_mapping.distance_message(bag_messages(), block, frame), kind)
+    ours = written(message_mapping.block_message(bag_messages(), block, frame), kind)
     assert ours.rstrip(b"\0") == raw.rstrip(b"\0")
     same(message_mapping.distance_block(read(raw, kind)), block)
 
@@ -152,7 +152,7 @@ def test_accelerations_are_the_bytes_of_the_standard(count):
         **{name: rng.normal(size=count) for name in "xyz"},
     )  # fmt: skip
     raw, kind = acceleration_by_hand(block, "probe"), "omsm_msgs/msg/AccelerationBlock"
-    ours = written(message_mapping.acceleration_message(bag_messages(), block), kind)
+    ours = written(message_mapping.block_message(bag_messages(), block), kind)
     assert ours.rstrip(b"\0") == raw.rstrip(b"\0")
     same(message_mapping.acceleration_block(read(raw, kind)), block)
 
@@ -311,7 +311,7 @@ def test_a_block_that_cannot_be_is_a_malformed_message_of_its_bag(
     tmp_path, small_scan_blocks, change, reported
 ):
     path = tmp_path / "a.mcap"
-    message = message_mapping.axis_message(bag_messages(), small_scan_blocks[0][0])
+    message = message_mapping.block_message(bag_messages(), small_scan_blocks[0][0])
     for name, value in change.items():
         setattr(message, name, value)
     with BagWriter(path, (bags.AXES_TOPIC,)) as bag:

@@ -25,9 +25,7 @@ from omsm_ros.nodes.diagnostics import OK, STALE, WARN
 from omsm_ros.nodes.vibration_monitor_node import VibrationMonitorNode, _edges
 
 RATE, LINE_HZ = 2000.0, 120.0
-EMPTY = SimpleNamespace(
-    stamp_ns=0, first_sample=0, sample_period=1 / RATE, x=np.empty(0), y=np.empty(0), z=np.empty(0)
-)
+EMPTY = AccelerationBlock(sample_period=1 / RATE)  # a message without samples
 LIMIT_M = 20e-9
 
 
@@ -77,7 +75,7 @@ def shake(monitor, seconds, amplitude_m, along="z"):
         record = AccelerationBlock(
             stamp_ns=0, first_sample=monitor.sent, sample_period=1 / RATE, **axes
         )
-        message = message_mapping.acceleration_message(message_mapping.ros_messages(), record)
+        message = message_mapping.block_message(message_mapping.ros_messages(), record)
         monitor._take(message, {})
         monitor.sent += block
         monitor.now[0] += 0.1
@@ -178,7 +176,7 @@ def test_a_block_that_is_none_is_refused_by_its_reason(made):
         y=np.zeros(3),
         z=np.zeros(3),
     )
-    message = message_mapping.acceleration_message(message_mapping.ros_messages(), record)
+    message = message_mapping.block_message(message_mapping.ros_messages(), record)
     message.sample_period = 0.0
     monitor._take(message, {})
     report = monitor.report()
@@ -189,7 +187,7 @@ def test_a_block_that_is_none_is_refused_by_its_reason(made):
 
 def test_a_refusal_of_long_ago_is_a_number_only(made, now):
     monitor = made()
-    monitor._take(message_mapping.acceleration_message(message_mapping.ros_messages(), EMPTY), {})
+    monitor._take(EMPTY, {})
     assert "refused" in monitor.report().text
     for _ in range(3):
         now[0] += 6.0

@@ -31,10 +31,10 @@ def write(path, blocks, ahead=0):
             stamp = k * 100_000_000
             messages = message_mapping.bag_messages()
             if k < len(blocks):
-                message = message_mapping.axis_message(messages, blocks[k][0])
+                message = message_mapping.block_message(messages, blocks[k][0])
                 bag.write(bags.AXES_TOPIC, stamp, message)
             if k >= ahead:
-                message = message_mapping.distance_message(messages, blocks[k - ahead][1])
+                message = message_mapping.block_message(messages, blocks[k - ahead][1])
                 bag.write(bags.DISTANCE_TOPIC, stamp, message)
     return path
 

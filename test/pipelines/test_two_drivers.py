@@ -50,8 +50,8 @@ def record(path, blocks, lengths, seed, lost):
             stamp = EPOCH + block.stamp_ns + round(random.normal(0, 2e4))
             block = replace(block, first_sample=first, stamp_ns=stamp)
             received = stamp + length * 1_000_000 + round(random.uniform(0, 2e7))
-            make = message_mapping.axis_message if of_axes else message_mapping.distance_message
-            sent.append((received, TOPICS[not of_axes], make(messages, block)))
+            message = message_mapping.block_message(messages, block)
+            sent.append((received, TOPICS[not of_axes], message))
     with BagWriter(path, TOPICS) as bag:
         for received, topic, message in sorted(sent, key=lambda item: item[0]):
             bag.write(topic, received, message)

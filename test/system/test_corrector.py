@@ -44,8 +44,8 @@ class Feed:
         self._distance = cell.publisher("confocal", DistanceMessage)
 
     def send(self, axes, distance):
-        self._axes.publish(message_mapping.axis_message(self._messages, axes))
-        self._distance.publish(message_mapping.distance_message(self._messages, distance))
+        self._axes.publish(message_mapping.block_message(self._messages, axes))
+        self._distance.publish(message_mapping.block_message(self._messages, distance))
 
     def answer(self, axes, distance):
         """The next cloud."""

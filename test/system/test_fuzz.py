@@ -122,8 +122,8 @@ def test_messages(cell, true_calibration, small_scan_blocks, count):
         cell.settle(node, "blocks_refused")
     before = cell.settle("corrector", "axes_received")
     for pair in small_scan_blocks[:20]:
-        axes.publish(message_mapping.axis_message(messages, pair[0]))
-        distance.publish(message_mapping.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.block_message(messages, pair[0]))
+        distance.publish(message_mapping.block_message(messages, pair[1]))
     sent = sum(len(pair[0]) for pair in small_scan_blocks[:20])
     cell.wait(
         "the good blocks",

@@ -126,15 +126,15 @@ def test_hostile_messages_are_refused_and_survived(cell, true_calibration, small
         for period, first in ((1e300, 0), (1e-300, 0), (NAN, 0), (1e-3, 2**64 - 1), (1e-3, 2**53)):
             for to, make, block in zip(
                 (axes, distance),
-                (message_mapping.axis_message, message_mapping.distance_message),
+                (message_mapping.block_message, message_mapping.block_message),
                 pair,
                 strict=True,
             ):
                 message = make(messages, block)
                 message.sample_period, message.first_sample = period, first
                 to.publish(message)
-        axes.publish(message_mapping.axis_message(messages, pair[0]))
-        distance.publish(message_mapping.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.block_message(messages, pair[0]))
+        distance.publish(message_mapping.block_message(messages, pair[1]))
     cell.wait(
         "the good blocks to be counted",
         lambda: cell.operator.value("corrector", "axes_received") >= 2000,

@@ -116,8 +116,8 @@ def test_two_hundred_calls_at_once_are_all_answered(cell, step_test):
     axes, distance = cell.publisher("axes", AxisBlock), cell.publisher("confocal", DistanceBlock)
     messages = message_mapping.ros_messages()
     for pair in blocks_of(step_test):
-        axes.publish(message_mapping.axis_message(messages, pair[0]))
-        distance.publish(message_mapping.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.block_message(messages, pair[0]))
+        distance.publish(message_mapping.block_message(messages, pair[1]))
     held = len(step_test.axes)
     cell.wait("all of it", lambda: cell.operator.value("calibrator", "axes_held") == held)
     client = cell.operator.create_client(Identify, "/omsm/calibrator/identify")
@@ -146,8 +146,8 @@ def test_a_prediction_does_not_stop_the_samples(cell, true_calibration, small_sc
     z = [1e-6 * (k % 50) for k in range(200_000)]
     futures = [client.call_async(PredictError.Request(z=z, sample_period=1e-3)) for _ in range(3)]
     for pair in small_scan_blocks[:100]:
-        axes.publish(message_mapping.axis_message(messages, pair[0]))
-        distance.publish(message_mapping.distance_message(messages, pair[1]))
+        axes.publish(message_mapping.block_message(messages, pair[0]))
+        distance.publish(message_mapping.block_message(messages, pair[1]))
     sent = sum(len(pair[0]) for pair in small_scan_blocks[:100])
     cell.wait("all samples", lambda: cell.operator.value("corrector", "distance_received") == sent)
     cell.wait("all answers", lambda: all(future.done() for future in futures))

@@ -52,7 +52,7 @@ class Source:
                 sample_period=1e-3,
                 **self._zeros,
             )
-            self._publisher.publish(message_mapping.axis_message(self._messages, block))
+            self._publisher.publish(message_mapping.block_message(self._messages, block))
             self.published += 1
             time.sleep(pause)
 

@@ -38,9 +38,9 @@ def test_a_reference_over_dds_is_distinguished_and_can_be_the_input(cell, step_t
     publishers = {topic: cell.publisher(topic, kind) for topic, kind in kinds.items()}
     for axes, distance in blocks_of(step_test):
         reference = reference_block(axes, random)
-        publishers["axes"].publish(message_mapping.axis_message(messages, axes))
-        publishers["confocal"].publish(message_mapping.distance_message(messages, distance))
-        publishers["reference"].publish(message_mapping.distance_message(messages, reference))
+        publishers["axes"].publish(message_mapping.block_message(messages, axes))
+        publishers["confocal"].publish(message_mapping.block_message(messages, distance))
+        publishers["reference"].publish(message_mapping.block_message(messages, reference))
     samples = len(step_test.axes)
     for count in ("axes_held", "distance_held", "reference_held"):
         cell.wait(count, lambda c=count: cell.operator.value("calibrator", c) == samples)
@@ -68,8 +68,8 @@ def test_without_a_reference_it_cannot_be_the_input(cell, step_test):
     axes_to = cell.publisher("axes", AxisMessage)
     distance_to = cell.publisher("confocal", DistanceMessage)
     for axes, distance in blocks_of(step_test):
-        axes_to.publish(message_mapping.axis_message(messages, axes))
-        distance_to.publish(message_mapping.distance_message(messages, distance))
+        axes_to.publish(message_mapping.block_message(messages, axes))
+        distance_to.publish(message_mapping.block_message(messages, distance))
     samples = len(step_test.axes)
     cell.wait("all", lambda: cell.operator.value("calibrator", "distance_held") == samples)
     answer = cell.call(Identify, "calibrator/identify", input="reference")

@@ -51,8 +51,8 @@ def test_a_gap_is_reported_while_recent_and_then_only_counted(
 
     def send(pair, period=None):
         made = (
-            message_mapping.axis_message(messages, pair[0]),
-            message_mapping.distance_message(messages, pair[1]),
+            message_mapping.block_message(messages, pair[0]),
+            message_mapping.block_message(messages, pair[1]),
         )
         for publisher, message in zip((axes, distance), made, strict=True):
             message.sample_period = period or message.sample_period

@@ -55,7 +55,7 @@ def test_the_alarm_ends_when_it_is_quiet(cell):
         block = AccelerationBlock(
             stamp_ns=0, first_sample=4000 * k, sample_period=2.5e-4, x=0 * z, y=0 * z, z=z
         )
-        publisher.publish(message_mapping.acceleration_message(messages, block))
+        publisher.publish(message_mapping.block_message(messages, block))
     cell.wait("all samples", lambda: said("samples") == "16000")
     assert (said("alarms"), said("alarm")) == ("1", "False")
     cell.wait("the report of silence", lambda: "no acceleration for" in said("message"))
