@@ -9,6 +9,8 @@ import pytest
 
 pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
+from omsm_msgs import msg
+
 from omsm_ros.core.ripple.accelerometer import (
     PROBE,
     SLIDE,
@@ -25,7 +27,7 @@ from omsm_ros.nodes.diagnostics import OK, STALE, WARN
 from omsm_ros.nodes.vibration_monitor_node import VibrationMonitorNode, _edges
 
 RATE, LINE_HZ = 2000.0, 120.0
-EMPTY = AccelerationBlock(sample_period=1 / RATE)  # a message without samples
+EMPTY = msg.AccelerationBlock(sample_period=1 / RATE)  # a message without samples
 LIMIT_M = 20e-9
 
 
