@@ -120,11 +120,11 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     source: name of the recording, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.dcc import render_dcc
     from omsm_ros.report.certificate.page import (
         CertificatePage,
         certificate_figures_of,
         render,
+        render_dcc,
     )
 
     calibration = identified.calibration

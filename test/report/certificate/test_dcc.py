@@ -10,7 +10,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from omsm_ros.report.certificate.dcc import quantities, render_dcc
+from omsm_ros.report.certificate.page import dcc_quantities, render_dcc
 
 SI = "{https://ptb.de/si}"
 
@@ -30,7 +30,7 @@ def test_pydcc_reads_the_same_values_and_uncertainties(certified, text, monkeypa
     assert read.uid() == certified.id
     assert read.version() == "3.2.1"
     reals = [entry["real"] for _, entry in read.get_calibration_results("name")]
-    stated = quantities(certified)
+    stated = dcc_quantities(certified)
     assert [float(r["value"]) for r in reals] == [q.value for q in stated]
     assert [r["unit"] for r in reals] == [q.unit for q in stated]
     for real, one in zip(reals, stated, strict=True):
@@ -45,9 +45,9 @@ def test_values_and_uncertainties_are_those_of_the_calibration(certified, text):
     assert lag.find(f"{SI}unit").text == r"\second"
     # Gain and phase in the band, against the response itself; U from the covariance by sampling.
     top = certified.valid_up_to
-    at = [q for q in quantities(certified) if q.name == f"gain at {top:.6g} Hz"]
+    at = [q for q in dcc_quantities(certified) if q.name == f"gain at {top:.6g} Hz"]
     assert at[0].value == pytest.approx(abs(certified.dynamics.response([top])[0]))
-    assert len(reals) == len(quantities(certified)) == 15
+    assert len(reals) == len(dcc_quantities(certified)) == 15
     factor = {float(e.text) for e in ET.fromstring(text).iter(f"{SI}coverageFactor")}
     assert factor == {2.0}
     assert all(np.isfinite(float(r.find(f"{SI}value").text)) for r in reals)
