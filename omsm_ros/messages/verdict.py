@@ -17,6 +17,10 @@ TEMPLATES = {
         "{names}: significant, and not declared; the found value is in the uncertainty. Look for "
         "its cause, or accept it with omsm adjust --accept"
     ),
+    "verdict.unidentified": (
+        "the scans show an error ({value:plain/2} standard deviations) that no single source "
+        "explains: look for what changed between step test and scans, and scan again"
+    ),
     "verdict.scans_disagree": (
         "scan {names} differs from the others by E_n = {value:plain/2}, at most {limit:plain/1} is "
         "expected; look for what changed between the scans"

@@ -132,9 +132,8 @@ def on_one_clock(scans: Sequence[AdjustedScan]) -> list[AdjustedScan]:
 
 # Declared names that the adjustment calls otherwise.
 _RENAMED = {"probe_noise": "noise"}
-# Declared sources that no scan adjusts: single readings, and periodic errors of unknown phase.
-NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "discretisation",
-                "encoder_interpolation", "probe_periodic", "probe_slope")  # fmt: skip
+# Declared sources that no scan adjusts: those of single readings.
+NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "discretisation")
 
 
 # Where the gain's growth with the square of the frequency is read from its covariance [Hz].
@@ -181,7 +180,9 @@ def _prior(source: StatedSource, abbe_arm: float) -> Source:
         name = f"{name}/{source.parameters['per_turn']:.3g}"
     if name == "pitch":
         size *= source.parameters.get("arm", abbe_arm)
-    return Source(name, size, source.parameters.get("correlation_length"), source.how == EVALUATED)
+    parameters = source.parameters
+    return Source(name, size, parameters.get("correlation_length"), source.how == EVALUATED,
+                  parameters.get("period"))  # fmt: skip
 
 
 def adjust_bags(

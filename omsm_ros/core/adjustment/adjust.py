@@ -13,7 +13,6 @@ from omsm_ros.core.adjustment.disturbances import (
     follows_removed,
     line_family,
     lines_of,
-    network_with,
     step_family,
     steps_of,
 )
@@ -27,11 +26,12 @@ from omsm_ros.core.adjustment.families import (
     ranges_of,
 )
 from omsm_ros.core.adjustment.figures import POSE, FormMap, effects_on_form, form_map
-from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_squares
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
 from omsm_ros.core.adjustment.refutation import (
     Refutation,
+    completed,
     fit_and_refute,
     settled,
     start_scales,
@@ -43,11 +43,9 @@ from omsm_ros.core.adjustment.scan_data import (
     view_of,
 )
 from omsm_ros.core.adjustment.verdict import (
-    POSITION_ONLY,
     Verdict,
     not_evaluated,
     open_limit,
-    position_only,
     reasons_of,
     redundant,
     rests_on,
@@ -186,26 +184,24 @@ def _adjusted(
     begin = float(min(s.time[0] for s in scans))
     views = [view_of(s, k, begin, surface) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, priors)
-    walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
-    solution, refutations = _fitted(network, views, sizes, priors)
+    detecting, refutations = _fitted(network, views, sizes, priors)
+    evidences = _evidences(detecting, refutations)
+    solution = completed(detecting, refutations)
+    families = solution.network.families
     form = form_map(solution, surface, removed)
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
     declared = {p.name for p in priors}
-    found_walk = float(np.sqrt(solution.scales.walk))
     contradictions = reasons_of(
-        refutations, declared, agreement, wrong, (found_walk, walk), accepted
+        refutations, declared, agreement, wrong, _walk(detecting, priors), accepted
     )
-    evidences = _evidences(solution, refutations)
-    effects = effects_on_form(solution, evidences, surface, removed)
+    effects = effects_on_form(solution, surface, removed)
+    limit = open_limit(accuracy)
     enough = redundant(scans)
     verdict = verdict_of(
         contradictions,
-        (
-            *not_evaluated(evidences, effects, priors, accuracy),
-            *position_only(scans, _plausible(solution), declared, open_limit(accuracy)),
-        ),
-        rests_on(evidences, effects, declared),
+        not_evaluated(families, effects, priors, limit),
+        rests_on(families, effects, limit),
         enough,
         2 * form.pv.uncertainty,
         accuracy,
@@ -213,7 +209,7 @@ def _adjusted(
     )
     return Adjustment(
         form=form,
-        sources=_findings(solution, evidences, effects, priors, refutations),
+        sources=_findings(detecting, evidences, effects, priors, refutations),
         refutations=refutations,
         agreement=agreement,
         wrong_sign=wrong,
@@ -226,12 +222,16 @@ def _adjusted(
     )
 
 
-def _plausible(solution: Solution) -> float:
-    """Return the rms that the bow of Z may have in the heights, of its plausible size [m]."""
-    net = solution.network
-    family = next(f for f in net.families if f.name == POSITION_ONLY)
-    variance = np.sum(np.atleast_2d(net.column(POSITION_ONLY).T * family.wide) ** 2, axis=0)
-    return float(np.sqrt(np.average(variance, weights=net.blocks.count)))
+def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float, float | None]:
+    """Return the drift after one second, found, its relative uncertainty, and declared [m].
+
+    A declared drift that fades may move by its size within any second.
+    """
+    stated = {p.name: p.uncertainty for p in priors}
+    walk = stated.get("drift_walk")
+    allowed = None if walk is None else float(np.hypot(walk, stated.get("drift", 0.0)))
+    _, determined = walk_squares(solution)
+    return float(np.sqrt(solution.scales.walk)), float((2 * max(determined, 1.0)) ** -0.5), allowed
 
 
 def _network(
@@ -256,7 +256,7 @@ def _fitted(
         extra += map(line_family, lines_of(first, view))
         extra += map(step_family, steps_of(first, view.index))
     if extra:
-        network = network_with(network, extra, block_columns(views, extra))
+        network = network.with_families(extra, block_columns(views, extra))
     return fit_and_refute(network, y, first.scales, {**sizes, **prior_sizes(extra, priors)})
 
 
@@ -278,7 +278,7 @@ def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[E
 def _findings(
     solution: Solution,
     evidences: Sequence[Evidence],
-    effects: Mapping[str, float],
+    effects: Mapping[str, tuple[float, float]],
     priors: Sequence[Source],
     refutations: Sequence[Refutation],
 ) -> tuple[SourceFinding, ...]:
@@ -300,7 +300,7 @@ def _findings(
                     solution.uncertainty(family.name) if takes_part else evidence.uncertainty
                 ),
                 effect=evidence.effect,
-                possible=effects[family.name],
+                possible=effects.get(family.name, (0.0, 0.0))[0],
                 shown=evidence.shown,
                 shown_by=family.shown_by,
                 deviate=evidence.deviate,

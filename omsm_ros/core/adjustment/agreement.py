@@ -17,14 +17,12 @@ from scipy import special
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import DIFFERS
 from omsm_ros.core.adjustment.figures import Figure, pv_and_rms
-from omsm_ros.core.adjustment.network import Network, Solution, solve
+from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 
 # Share of adjustments with agreeing scans in which any E_n exceeds its limit.
 _BY_CHANCE = 0.005
-# Declared errors without columns add this to a term of one scan, k = 1 [m].
-_UNMODELLED_M = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,21 +55,18 @@ def agreement_of(
     if blocks.scans < 2:
         return ()
     y = solution.y - solution.network.of_families(solution.values, list(solution.sizes))
-    alone = [_alone(solution, y, blocks.scan == k, nominal, removed) for k in range(blocks.scans)]
+    alone = [_alone(solution, y, k, nominal, removed) for k in range(blocks.scans)]
     return tuple(_compared(solution, k, alone) for k in range(blocks.scans))
 
 
 def _alone(
-    solution: Solution, y: FloatArray, mine: BoolArray, nominal: Surface | None,
-    removed: Sequence[str],
+    solution: Solution, y: FloatArray, scan: int, nominal: Surface | None, removed: Sequence[str],
 ) -> tuple[Figure, Figure]:  # fmt: skip
-    """Return PV and rms of the form by the blocks ``mine`` alone."""
-    net = solution.network
-    blocks = net.blocks.only(mine)
-    part = replace(net.part, cell=net.part.cell[mine])
-    scans = np.unique(net.blocks.scan[mine])
-    scales = replace(solution.scales, noise=solution.scales.noise[scans])
-    return pv_and_rms(solve(Network(blocks, (), part), y[mine], scales, {}), nominal, removed)
+    """Return PV and rms of the form by ``scan`` alone."""
+    net = solution.network.alone(scan)
+    scales = replace(solution.scales, noise=solution.scales.noise[[scan]])
+    mine = solution.network.blocks.scan == scan
+    return pv_and_rms(solve(net, y[mine], scales, {}), nominal, removed)
 
 
 def _compared(
@@ -82,7 +77,7 @@ def _compared(
     name = f"{DIFFERS}@{scan}"
     family = next(f for f in solution.network.families if f.name == name)
     evidence = evidence_of(solution, family)
-    terms = np.abs(evidence.values) / (2 * np.hypot(evidence.uncertainty, _UNMODELLED_M))
+    terms = np.abs(evidence.values) / (2 * evidence.uncertainty)
     number = len(alone) * (len(terms) + 2)
     return ScanAgreement(
         scan=scan,

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from omsm_ros.core.adjustment.families import REPEATED_TRACK, VIBRATION, Family, only
-from omsm_ros.core.adjustment.network import Network, Solution
+from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -258,8 +258,3 @@ def _followed(view: ScanView, removed: FloatArray) -> float | None:
     whole = min(max(round(abs(share)), 1), 2)
     wrong = explained > _FOLLOWS and abs(abs(share) - whole) < _NEAR_WHOLE
     return float(share) if wrong else None
-
-
-def network_with(network: Network, extra: list[Family], columns: FloatArray) -> Network:
-    """Return ``network`` with further families, whose block means are ``columns`` (b, k)."""
-    return Network(network.blocks.with_columns(columns), (*network.families, *extra), network.part)

@@ -17,8 +17,8 @@ from omsm_ros.core.adjustment.families import Family
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.streams.blocks import FloatArray
 
-# The scans show a direction if they remove at least this share of its prior variance.
-_LEAST_SHOWN = 0.1
+# A share of the prior variance that is removed by less is rounding.
+_LEAST_TAKEN = 1e-8
 # Share of a column's information that the other columns must leave; less is rounding.
 _LEAST_LEFT = 1e-10
 # Effect of a column of zeros, over its noise: a speed that is the same in all scans.
@@ -33,11 +33,11 @@ class Evidence:
         shown, 0 and the plausible size
     chi_square, dof: against the declared size, of the directions that the scans show
     effect: rms of the family's share of the heights [m], by ``values``
-    gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``
-        instead of the declared one; a family that could explain anything gains less (Occam)
-    spread: root of the covariance of ``values``, (size, size); of a family that takes part, after
-        the adjustment
-    open: True if a direction of it is not shown by the scans
+    gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``, or
+        that which was found, instead of the declared one; a family that could explain anything
+        gains less (Occam)
+    free: root of the covariance (size, size) that the scans leave if the declaration is worth
+        nothing, and the family may be as large as ``wide``
     deviate: of a normal distribution, as rare as χ² is
     """
 
@@ -48,8 +48,7 @@ class Evidence:
     dof: int
     effect: float
     gain: float
-    spread: FloatArray
-    open: bool
+    free: FloatArray
 
     @property
     def shown(self) -> bool:
@@ -82,24 +81,27 @@ def evidence_of(solution: Solution, family: Family) -> Evidence:
 
 def _of_declared(solution: Solution, family: Family) -> Evidence:
     here = solution.network.place[family.name]
-    size = max(solution.sizes[family.name], 1e-15)
-    share, axes = np.linalg.eigh(solution.covariance_of(here) / size**2)
-    moved = axes.T @ solution.values[here] / size
-    taken = 1 - np.clip(share, 0.0, 1.0)
-    shown = taken > _LEAST_SHOWN
+    size = np.broadcast_to(np.maximum(solution.sizes[family.name], 1e-15), family.size)
+    share, axes = np.linalg.eigh(solution.covariance_of(here) / np.outer(size, size))
+    share = np.clip(share, 1e-300, 1.0)
+    moved = axes.T @ (solution.values[here] / size)
+    taken = 1 - share
+    # By the data alone: variance once the prior is taken out again. A direction is tested if
+    # the scans know it better than its plausible size, however small the declared one is.
+    own = share / np.maximum(taken, _LEAST_TAKEN)
+    wide = np.sqrt(axes.T**2 @ np.maximum(family.wide / size, 1.0) ** 2)
+    shown = (taken > _LEAST_TAKEN) & (own < wide**2)
     chi_square = float(np.sum(moved[shown] ** 2 / taken[shown]))
-    # By the data alone: mean and variance once the prior is taken out again.
     alone = np.where(shown, moved / np.where(shown, taken, 1.0), moved)
-    variance = np.where(shown, share / np.where(shown, taken, 1.0), share)
     values = size * (axes @ alone)
-    uncertainty = size * np.sqrt(np.sum(axes**2 * variance, axis=1))
-    spread = size * axes * np.sqrt(share)
-    gain = 0.0
-    for m, t, p in zip(moved[shown], taken[shown], share[shown], strict=True):
-        own = p / t
-        gain += _gain((m / t) ** 2, own + 1.0, own + (family.wide / size) ** 2)
+    uncertainty = size * np.sqrt(np.sum(axes**2 * np.where(shown, own, share), axis=1))
+    free = size[:, np.newaxis] * axes / np.sqrt(np.maximum(taken, 0.0) / share + wide**-2)
+    gain = sum(
+        _gain((m / t) ** 2, o + 1.0, o + max(w**2, (m / t) ** 2))
+        for m, t, o, w in zip(moved[shown], taken[shown], own[shown], wide[shown], strict=True)
+    )
     tested = chi_square, int(np.sum(shown)), gain
-    return _evidence(solution, family, values, uncertainty, tested, spread)
+    return _evidence(solution, family, values, uncertainty, tested, free)
 
 
 def _gain(square: float, before: float, after: float) -> float:
@@ -126,15 +128,15 @@ def _of_absent(solution: Solution, family: Family) -> Evidence:
     # A direction that is not shown keeps the plausible size of the family.
     variance = 1 / (np.maximum(information, 0.0) + plausible)
     uncertainty = np.sqrt(axes**2 @ variance) / scale
-    spread = axes * np.sqrt(variance) / scale[:, np.newaxis]
+    free = axes * np.sqrt(variance) / scale[:, np.newaxis]
     chi_square = float(np.sum(np.where(shown, moved**2 / known, 0.0)))
     ratio = (family.wide * np.median(scale)) ** 2
     gain = sum(
-        _gain(m**2 / i**2, 1 / i, 1 / i + ratio)
+        _gain(m**2 / i**2, 1 / i, 1 / i + max(ratio, m**2 / i**2))
         for m, i in zip(moved[shown], information[shown], strict=True)
     )
     tested = chi_square, int(np.sum(shown)), gain
-    return _evidence(solution, family, values, uncertainty, tested, spread)
+    return _evidence(solution, family, values, uncertainty, tested, free)
 
 
 def _evidence(
@@ -143,17 +145,14 @@ def _evidence(
     values: FloatArray,
     uncertainty: FloatArray,
     tested: tuple[float, int, float],
-    spread: FloatArray,
+    free: FloatArray,
 ) -> Evidence:
     """Return the evidence with the size of what the family does to the heights.
 
-    tested: χ², its degrees of freedom, and the gain;  spread: root of the covariance (size, size)
+    tested: χ², its degrees of freedom, and the gain;  free: root of the covariance (size, size)
     """
     net = solution.network
     change = net.column(family.name) @ values
     effect = float(np.sqrt(np.average(change**2, weights=net.blocks.count)))
     chi_square, dof, gain = tested
-    return Evidence(
-        family, values, uncertainty, chi_square, dof, effect, gain, spread,
-        dof < family.size,
-    )  # fmt: skip
+    return Evidence(family, values, uncertainty, chi_square, dof, effect, gain, free)

@@ -33,6 +33,7 @@ class Source:
     name: of the family, such as ``"centre_x"`` or ``"spindle_axial/2"``
     uncertainty: standard uncertainty of each of its components [unit of the family]
     correlation_length: of an unknown curve over its axis [m]; None: half of the axis' range
+    period: of a periodic error over Z or over the distance [m]
     evaluated: True if a recording on this machine gave the figure; what is only declared, and not
         shown by the scans, cannot turn a verdict green
 
@@ -43,6 +44,7 @@ class Source:
     uncertainty: float
     correlation_length: float | None = None
     evaluated: bool = False
+    period: float | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.uncertainty < np.inf:
@@ -80,6 +82,8 @@ class Ranges:
     speed: mean magnitude, speeds: of each, with sign [rad/s];  duration: of all [s]
     motion, distance, radius: half ranges [m]
     slide, lift: least and greatest slide x and motion [m];  clampings: number of each scan's
+    durations, feeds: of each scan [s], of slide x [m/s]
+    lengths, periods: declared, by family [m]
     """
 
     speed: float
@@ -91,7 +95,10 @@ class Ranges:
     slide: tuple[float, float]
     lift: tuple[float, float]
     clampings: tuple[int, ...]
+    durations: tuple[float, ...]
+    feeds: tuple[float, ...]
     lengths: Mapping[str, float] = field(default_factory=dict)
+    periods: Mapping[str, float] = field(default_factory=dict)
 
 
 # A probe that is driven through less of its range shows no error of it.
@@ -121,24 +128,29 @@ def ranges_of(
         slide=ends("slide_x"),
         lift=lift,
         clampings=tuple(clampings),
+        durations=tuple(float(v.since[-1]) or 1.0 for v in views),
+        feeds=tuple(float((v.slide_x[-1] - v.slide_x[0]) / (v.since[-1] or 1.0)) for v in views),
         lengths={p.name: p.correlation_length for p in priors if p.correlation_length is not None},
+        periods={p.name: p.period for p in priors if p.period is not None},
     )
 
 
 # Harmonics of the spindle that are looked for; above them little is left of a rolling bearing's
 # synchronous motion, and a block of a turn's points begins to smooth.
-SPINDLE_HARMONICS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+SPINDLE_HARMONICS = tuple(range(1, 13))
 # Rolling elements and belts come round every second or third turn (ISO 230-7, asynchronous).
 SUB_HARMONICS = (1 / 2, 3 / 2, 5 / 2, 1 / 3, 2 / 3, 4 / 3, 5 / 3)
-_TILT_HARMONICS, _RADIAL_HARMONICS, _C_HARMONICS = (2, 3, 4), (2, 3), (1, 2)
+_TILT_HARMONICS, _RADIAL_HARMONICS, _C_HARMONICS = (2, 3, 4), (1, 2, 3), (1, 2)
 
 
+FREE = ("tilt", "decentre", "clocking")
+"""Families whose size is no statement about the machine: where the part lies."""
 VIBRATION = "vibration"
 """Declared source of all lines in time, ``vibration/frequency@scan``."""
 # Declared sources without columns of their own: scales of noise and drift, lines that are looked
 # for in the residuals, and what one scan alone cannot have.
-_ELSEWHERE = ("drift_walk", "noise", VIBRATION, "tilt", "part_shift", "part_turn", "expansion",
-              "lag_speed", "lag_direction")  # fmt: skip
+_ELSEWHERE = ("drift_walk", "noise", VIBRATION, "tilt", "part_shift", "part_turn", "lag_speed",
+              "lag_direction", "probe_periodic", "encoder_interpolation")  # fmt: skip
 
 
 def base_name(family: str) -> str:
@@ -201,7 +213,7 @@ _SAME_SPEED = 0.01
 def _dynamic(r: Ranges) -> list[Family]:
     """Lag since the step test and what may change it, latency, asymmetry and backlash."""
     far = max(abs(r.slide[0]), abs(r.slide[1]))
-    middle = sum(r.lift) / 2
+    middle, fast = sum(r.lift) / 2, r.motion * r.speed
     found = [
         # A step test leaves less than 0.1 ms of lag unknown; the default covers its change.
         _one("lag_change", "s", lambda v: v.motion_rate, 3e-4, OTHER_SPEED, 1e-4),
@@ -212,26 +224,61 @@ def _dynamic(r: Ranges) -> list[Family]:
         _one("lag_motion", "s", lambda v: v.motion_rate * (v.motion - middle) / r.motion, 1e-4,
              OTHER_SPEED),
         _one("lag_x", "s", lambda v: v.motion_rate * (v.slide_x / far - 0.5), 1e-4, OTHER_SPEED),
-        _one("lag_time", "s", lambda v: v.motion_rate * (v.time / r.duration - 0.5), 1e-4,
+        _lag_time(r),
+        _one("lag_rate", "s", lambda v: v.motion_rate * np.abs(v.motion_rate) / fast, 1e-4,
              OTHER_SPEED),
+        Family("lag_c", "s", 2, lambda v: v.motion_rate * np.stack(_waves(v.c, 1)), 1e-4,
+               RECLOCKED),
         _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
         _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
-        _one("removed", "1", lambda v: v.removed, 2.0, OTHER_SPEED),
+        Family("removed", "1", 1, lambda v: v.removed[np.newaxis], 2.0, OTHER_SPEED, named=False),
     ]  # fmt: skip
     speeds = np.abs(r.speeds)
     # With one speed, or one direction, the column is that of the lag itself.
     if np.ptp(speeds) > _SAME_SPEED * r.speed:
         found.append(_one("lag_speed", "s", lambda v: v.motion_rate * (abs(v.speed) / r.speed - 1),
                           5e-5, OTHER_SPEED))  # fmt: skip
+        found += [
+            _one("part_bow_speed", "m", lambda v: (v.x**2 + v.y**2) * (v.speed / r.speed / r.radius)
+                 ** 2, 1e-7, OTHER_SPEED),
+            Family("unbalance", "m", 2, lambda v: (v.speed / r.speed) ** 2 * np.stack(
+                _waves(v.c, 1)), 1e-7, OTHER_SPEED),
+        ]  # fmt: skip
     if min(r.speeds) < 0 < max(r.speeds):
         found.append(_one("lag_direction", "s", lambda v: v.motion_rate * np.sign(v.speed), 5e-5,
                           OTHER_SPEED))  # fmt: skip
     return found
 
 
+def _lag_time(r: Ranges) -> Family:
+    """Return a lag that changes from the first scan on, and from the beginning of each."""
+    return Family("lag_time", "s", 2, lambda v: v.motion_rate * np.stack(
+        [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4,
+        OTHER_SPEED)  # fmt: skip
+
+
+def _of_each_direction(r: Ranges) -> list[Family]:
+    """Return errors of the X slide that differ between scans inwards and outwards."""
+    if not min(r.feeds) < 0 < max(r.feeds):
+        return []
+    way = np.sign(r.feeds)
+    return [
+        _one("x_late", "s", lambda v: v.across(r.feeds[v.index], 0.0), 5e-2, OTHER_DIRECTION),
+        _one("x_backlash", "m", lambda v: v.across(way[v.index], 0.0), 1e-5, OTHER_DIRECTION),
+        _curve("straightness_hysteresis", "m", r.slide, r,
+               lambda v, w: way[v.index] * w(v.slide_x), 1e-7, OTHER_DIRECTION),
+    ]  # fmt: skip
+
+
 def _geometric(r: Ranges) -> list[Family]:
     """Centre, squareness, straightness, pitch and scale of the slides."""
     return [
+        *_of_each_direction(r),
+        # Scales of glass and good screws; what scans to the centre leave open is not tested.
+        _one("expansion", "1", lambda v: v.lateral_error(v.x, v.y), 3e-5, REFERENCE, 5e-6),
+        _curve("positioning_x", "m", r.slide, r, lambda v, w: np.stack(
+            [v.across(*way) for bow in w(v.slide_x) for way in ((bow, 0.0), (0.0, bow))]),
+            1e-6, BEYOND_CENTRE, 2, 5e-8),
         _one("centre_x", "m", lambda v: v.across(1.0, 0.0), 2e-5, BEYOND_CENTRE),
         _one("centre_y", "m", lambda v: v.across(0.0, 1.0), 2e-5, BEYOND_CENTRE),
         Family("parallelism", "rad", 2, lambda v: np.stack(
@@ -246,6 +293,10 @@ def _geometric(r: Ranges) -> list[Family]:
     ]  # fmt: skip
 
 
+_OVER = (("straightness_x", "positioning_x", "straightness_hysteresis"),
+         ("straightness_z", "pitch"))  # fmt: skip
+
+
 def _curve(
     name: str,
     unit: str,
@@ -255,24 +306,39 @@ def _curve(
     wide: float,
     shown_by: str,
     ways: int = 1,
+    default: float | None = None,
 ) -> Family:
     """Return a family of an unknown curve between ``ends``: components of unit variance.
 
     ways: directions in which each component acts
     """
+    # Curves over one axis are resolved alike, so that none explains what another cannot.
+    same = next(names for names in _OVER if name in names)
     nodes = np.linspace(*ends, 129) if ends[1] > ends[0] else np.array([ends[0], ends[0] + 1.0])
-    length = r.lengths.get(name, (nodes[-1] - nodes[0]) / 2)
+    lengths = [length for n, length in r.lengths.items() if n in same]
+    length = min(lengths, default=(nodes[-1] - nodes[0]) / 2)
     parts = components(smooth(length), nodes)
 
     def over(position: FloatArray) -> FloatArray:
         return np.stack([np.interp(position, nodes, part) for part in parts])
 
-    return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by)
+    return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by,
+                  default)  # fmt: skip
 
 
 def _of_the_probe(r: Ranges) -> list[Family]:
-    """Scale, linearity and slope errors of the probe, and its beam."""
+    """Scale, linearity, slope and periodic errors of probe and encoder of Z, and the beam."""
+    fast = r.motion * r.speed
+    places = {"encoder_interpolation": "motion", "probe_periodic": "distance"}
     return [
+        *(Family(name, "m", 2, _periodic(places[name], period), 1e-7, OTHER_STAND_OFF)
+          for name, period in r.periods.items() if name in places),
+        Family("probe_slope", "m/rad", 2, lambda v: np.stack(
+            [v.across(-1.0, 0.0), v.across(0.0, -1.0)]), 2e-7, REFERENCE),
+        _one("probe_slope_fourth", "m", lambda v: (v.slope_x**2 + v.slope_y**2) ** 2, 1e-5,
+             REFERENCE),
+        _one("probe_slope_moving", "m", lambda v: np.hypot(v.slope_x, v.slope_y)
+             * np.abs(v.motion_rate) / fast, 1e-7, OTHER_SPEED),
         _one("static_gain", "1", lambda v: -v.distance, 1e-2, OTHER_STAND_OFF),
         _one("probe_square", "m", lambda v: (v.distance / r.distance) ** 2, 1e-7, OTHER_STAND_OFF),
         _one("probe_linearity", "m", lambda v: (v.distance / r.distance) ** 3, 1e-7,
@@ -281,6 +347,10 @@ def _of_the_probe(r: Ranges) -> list[Family]:
         Family("beam", "1", 2, lambda v: np.stack(
             [v.across(v.distance, 0.0), v.across(0.0, v.distance)]), 1e-2, OTHER_STAND_OFF),
     ]  # fmt: skip
+
+
+def _periodic(place: str, period: float) -> _Columns:
+    return lambda v: np.stack(_waves(getattr(v, place), 2 * np.pi / period))
 
 
 def _waves(angle: FloatArray, per_turn: float) -> tuple[FloatArray, FloatArray]:
@@ -297,8 +367,8 @@ def _tilting(n: float) -> _Columns:
 
 def _radial(n: float) -> _Columns:
     def columns(v: ScanView) -> FloatArray:
-        along, across = _waves(v.c, n)
-        return np.stack([v.across(along, across), v.across(-across, along)])
+        return np.stack([v.across(*way) for wave in _waves(v.c, n)
+                         for way in ((wave, 0.0), (0.0, wave))])  # fmt: skip
 
     return columns
 
@@ -320,17 +390,19 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         known = {order_name(name, n) for n in usual}
         return [*usual, *(n for n in more if order_name(name, n) not in known)]
 
-    table: tuple[tuple[str, str, Sequence[float], Callable[[float], _Columns], float], ...] = (
-        ("spindle_axial", "m", (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
-        ("spindle_tilt", "rad", _TILT_HARMONICS, _tilting, 1e-5),
-        ("spindle_radial", "m", _RADIAL_HARMONICS, _radial, 1e-6),
-        ("c_error", "rad", _C_HARMONICS, _angular, 5e-5),
+    table: tuple[tuple[str, str, int, Sequence[float], Callable[[float], _Columns], float], ...] = (
+        ("spindle_axial", "m", 2, (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
+        ("spindle_tilt", "rad", 2, _TILT_HARMONICS, _tilting, 1e-5),
+        ("spindle_radial", "m", 4, _RADIAL_HARMONICS, _radial, 1e-6),
+        ("c_error", "rad", 2, _C_HARMONICS, _angular, 2e-5),
     )
     return [
-        Family(order_name(name, n), unit, 2, columns(n), wide, RECLOCKED)
-        for name, unit, usual, columns, wide in table
+        # Once a turn, a radial motion looks like a decentred part: only its size tells.
+        Family(order_name(name, n), unit, size, columns(n), wide, RECLOCKED,
+               5e-8 if (name, n) == ("spindle_radial", 1) else None)
+        for name, unit, size, usual, columns, wide in table
         for n in orders(name, usual)
-    ]
+    ]  # fmt: skip
 
 
 # Movement of a clamped part by a warming chuck, as in self_calibration.
@@ -354,6 +426,8 @@ def _of_each_scan(r: Ranges) -> list[Family]:
     """
     found = [
         _drift(r),
+        _turning(r),
+        _tilting_away(r),
         _one("drift_rate", "m/s", lambda v: v.time, 1e-8, REPEATED_TRACK, _RATE_M_S),
         Family("decentre", "m", 2, lambda v: np.stack(
             [v.lateral_error(1.0, 0.0), v.lateral_error(0.0, 1.0)]), 3e-5, REFERENCE, named=False),
@@ -410,6 +484,28 @@ def _drift(r: Ranges) -> Family:
         return made
 
     return Family("drift", "m", own * len(r.clampings), columns, 1e-7, REPEATED_TRACK)
+
+
+def _turning(r: Ranges) -> Family:
+    """Return a part that creeps about the axis, or counts of C that are lost one by one."""
+
+    def columns(v: ScanView) -> FloatArray:
+        made = np.zeros((len(r.durations), len(v)))
+        made[v.index] = v.lateral_error(-v.y, v.x) * v.since / r.durations[v.index]
+        return made
+
+    return Family("c_drift", "rad", len(r.durations), columns, 5e-5, REPEATED_TRACK)
+
+
+def _tilting_away(r: Ranges) -> Family:
+    """Return a part that tilts in its clamping: fading, and steadily."""
+    times = r.duration * np.array(_FADING)
+
+    def columns(v: ScanView) -> FloatArray:
+        courses = [*(np.exp(-v.time / time) for time in times), v.time / r.duration - 0.5]
+        return np.stack([course * place for course in courses for place in (v.x, v.y)])
+
+    return Family("tilt_drift", "rad", 2 * len(times) + 2, columns, 1e-6, REPEATED_TRACK)
 
 
 DIFFERS = "scan_differs"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import linalg, sparse
 
-from omsm_ros.core.adjustment.evidence import Evidence
+from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.registration.placement import Aperture
@@ -127,30 +127,28 @@ def pv_and_rms(
 
 
 def effects_on_form(
-    solution: Solution,
-    evidences: Sequence[Evidence],
-    nominal: Surface | None,
-    removed: Sequence[str] = POSE,
-) -> dict[str, float]:
+    solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE
+) -> dict[str, tuple[float, float]]:
     """Return by family what it may do to the form, rms over the part, k = 1 [m].
 
-    As far as the scans, and the size of the family, leave it open; all others are fitted
-    together with it.
+    First what scans and prior leave open, then what the scans alone leave open if the prior is
+    worth nothing and the family may have its size ``wide``. All others are fitted together with it.
     """
     made = _Made.of(solution, nominal, removed)
     # L P, with P the covariance of the parameters that take part.
-    through = made.rows[:, solution.active] @ solution.covariance
+    through = made.free(made.rows[:, solution.active] @ solution.covariance)
     found = {}
-    for one in evidences:
-        here = solution.network.place[one.family.name]
-        if one.family.name in solution.sizes:
-            first = int(np.searchsorted(solution.active, here.start))
-            own = through[:, first : first + one.family.size]
-            change = own @ np.linalg.pinv(solution.covariance_of(here), rcond=1e-10)
-        else:
-            change = through @ solution.matrix[solution.active, here] - made.rows[:, here]
-        moved = made.free(change @ one.spread)
-        found[one.family.name] = float(np.sqrt(np.sum(made.places.area @ moved**2)))
+    for family in solution.network.families:
+        if family.name not in solution.sizes:
+            continue
+        here = solution.network.place[family.name]
+        first = int(np.searchsorted(solution.active, here.start))
+        covariance = solution.covariance_of(here)
+        change = through[:, first : first + family.size] @ np.linalg.pinv(covariance, rcond=1e-10)
+        share, axes = np.linalg.eigh(covariance)
+        roots = axes * np.sqrt(np.maximum(share, 0.0)), evidence_of(solution, family).free
+        left, free = (float(np.sqrt(np.sum(made.places.area @ (change @ r) ** 2))) for r in roots)
+        found[family.name] = left, max(left, free)
     return found
 
 

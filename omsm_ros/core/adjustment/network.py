@@ -19,8 +19,8 @@ from omsm_ros.core.adjustment.families import Family
 from omsm_ros.core.adjustment.part_terms import PartModel
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
-# A walk between two knots of a third of a turn stays below the noise of a block.
-_KNOTS_A_TURN, _MOST_KNOTS = 3, 400
+# A walk between two knots of half a turn stays below the noise of a block.
+_KNOTS_A_TURN, _MOST_KNOTS = 2, 300
 # Blocks at a time: 28 MB of rows.
 _PORTION = 4096
 # The level of a scan: no prior; drift begins at zero with the first, so that the part has its own.
@@ -56,7 +56,7 @@ class Network:
     knots: tuple[slice, ...] = field(init=False)
     steps: tuple[float, ...] = field(init=False)
     terms: slice = field(init=False)
-    _values: FloatArray = field(init=False)
+    _values: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     _hats: sparse.csr_array = field(init=False)
     _member: sparse.csr_array = field(init=False)
     _sums: list[tuple[FloatArray, FloatArray]] = field(init=False, default_factory=list)
@@ -66,7 +66,7 @@ class Network:
         for family in self.families:
             place[family.name] = slice(begin, begin + family.size)
             begin += family.size
-        values = self.part.values(blocks.x, blocks.y, blocks.span)
+        values = self._values if self._values.size else _terms_at(self.part, blocks)
         end = begin + values.shape[1]
         hats, knots, steps = _hats_of(blocks, end)
         number = len(blocks)
@@ -99,6 +99,21 @@ class Network:
         """Return the variance of each cell after its blocks, 1 / (Σw + 1/s²) [m²]."""
         total = self._member @ weights
         return np.asarray(1 / (total + 1 / max(scales.cells, _LEAST_VARIANCE)))
+
+    def alone(self, scan: int) -> Network:
+        """Return the part by the blocks of ``scan``, without families; the sums are not made anew."""
+        mine = self.blocks.scan == scan
+        part = replace(self.part, cell=self.part.cell[mine])
+        made = Network(self.blocks.only(mine), (), part, _values=self._values[mine])
+        matrix, sums = self._by_scan()[scan]
+        begin = self.terms.start
+        made._sums.append((matrix[begin:, begin:], sums[:, begin:]))
+        return made
+
+    def with_families(self, extra: Sequence[Family], columns: FloatArray) -> Network:
+        """Return the network with further families, whose block means are ``columns`` (b, k)."""
+        blocks, families = self.blocks.with_columns(columns), (*self.families, *extra)
+        return Network(blocks, families, self.part, _values=self._values)
 
     def _own(self, scan: int) -> IntArray:
         """Return the parameters that blocks of ``scan`` depend on: all but others' knots."""
@@ -186,7 +201,7 @@ class Network:
         """Return the columns of family ``name``, (b, size)."""
         return np.asarray(self.blocks.columns[:, self.place[name]])
 
-    def active(self, sizes: Mapping[str, float]) -> BoolArray:
+    def active(self, sizes: Mapping[str, float | FloatArray]) -> BoolArray:
         """Return which parameters take part where the families in ``sizes`` do, (size,)."""
         made = np.ones(self.size, np.bool_)
         for name, here in self.place.items():
@@ -194,7 +209,7 @@ class Network:
         return made
 
     def add_prior(
-        self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Mapping[str, float]
+        self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Mapping[str, float | FloatArray]
     ) -> None:
         """Add the precision before the scans to ``matrix`` (a, a) of the parameters ``active``.
 
@@ -202,7 +217,7 @@ class Network:
         """
         diagonal = np.zeros(self.size)
         for name, size in sizes.items():
-            diagonal[self.place[name]] = 1 / max(size, _LEAST_SIZE) ** 2
+            diagonal[self.place[name]] = 1 / np.maximum(size, _LEAST_SIZE) ** 2
         free, degrees = self.part.free, self.part.degrees
         variance = np.array(
             [f**2 if f else scales.bands[int(d)] for f, d in zip(free, degrees, strict=True)]
@@ -218,6 +233,15 @@ class Network:
             )
             level = _FIRST_LEVEL_M if knots is self.knots[0] else _LEVEL_M
             matrix[here.start, here.start] += level**-2
+
+
+def _terms_at(part: PartModel, blocks: Blocks) -> FloatArray:
+    """Return terms of the part at all blocks, (b, k), a portion at a time."""
+    made = np.empty((len(blocks), len(part.degrees)))
+    for first in range(0, len(blocks), _PORTION):
+        here = slice(first, first + _PORTION)
+        made[here] = part.values(blocks.x[here], blocks.y[here], blocks.span[here])
+    return made
 
 
 # Square of a picometre: keeps what is exactly known regular.
@@ -298,7 +322,7 @@ class Solution:
 
     values: of all parameters, 0 where they take no part
     matrix, right: normal equations of all, without priors
-    sizes: prior standard deviations of the families that took part
+    sizes: prior standard deviations of the families that took part, of one or of each column
     active: parameters that take part (a,);  factor: of their normal matrix, priors included
     covariance: of those, (a, a)
     """
@@ -306,7 +330,7 @@ class Solution:
     network: Network
     y: FloatArray
     scales: Scales
-    sizes: Mapping[str, float]
+    sizes: Mapping[str, float | FloatArray]
     values: FloatArray
     covariance: FloatArray
     matrix: FloatArray
@@ -330,7 +354,7 @@ class Solution:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance_of(here)), 0.0)))
 
 
-def solve(network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float]) -> Solution:
+def solve(network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float | FloatArray]) -> Solution:
     """Return the solution for given scales and prior sizes of the families that take part."""
     matrix, right = network.normal_matrix(scales), network.right_side(scales, y)
     active = np.flatnonzero(network.active(sizes))
@@ -364,7 +388,7 @@ def estimate_scales(solution: Solution) -> Scales:
     determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, _LEAST_VARIANCE)))
     return replace(
         scales,
-        walk=_walk(solution),
+        walk=_variance(*walk_squares(solution), scales.walk),
         bands=bands,
         cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells),
         noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
@@ -380,7 +404,8 @@ def _variance(square: float, determined: float, before: float) -> float:
     return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), _VANISHED))
 
 
-def _walk(solution: Solution) -> float:
+def walk_squares(solution: Solution) -> tuple[float, float]:
+    """Return the sum of squares of the drift's moves [m²/s], and how many the data determine."""
     net, square, determined = solution.network, 0.0, 0.0
     before = solution.scales.walk
     for here, step in zip(net.knots, net.steps, strict=True):
@@ -390,7 +415,7 @@ def _walk(solution: Solution) -> float:
         variance = d[1:] + d[:-1] - 2 * np.diag(covariance, 1)
         square += float(np.sum(moves**2)) / step
         determined += float(np.sum(1 - variance / (before * step)))
-    return _variance(square, determined, before)
+    return square, determined
 
 
 def _noise(solution: Solution, residual: FloatArray, determined_cells: float) -> FloatArray:

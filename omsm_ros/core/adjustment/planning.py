@@ -26,6 +26,7 @@ from omsm_ros.core.adjustment.families import (
 from omsm_ros.core.adjustment.figures import POSE, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, RINGS, SYMMETRIC, part_model
+from omsm_ros.core.adjustment.refutation import completed
 from omsm_ros.core.adjustment.scan_data import ScanData, view_of
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
@@ -118,10 +119,9 @@ def posterior_uncertainty(
     sizes = prior_sizes(families, priors)
     # All is over sooner by ``shorter``: what grows with time has to grow faster.
     sizes["drift_rate"] *= shorter
-    kept = [f for f in families if f.name in sizes]
     stated = {p.name: p.uncertainty for p in priors}
     noise = stated.get("noise", _NOISE_M)
-    blocks = blocks_of(views, [s.weight for s in scans], kept, noise)
+    blocks = blocks_of(views, [s.weight for s in scans], families, noise)
     part = part_model(blocks, min(s.turns for s in scans), _DEGREE)
     scales = Scales(
         walk=stated.get("drift_walk", _WALK_M) ** 2 * shorter,
@@ -129,11 +129,11 @@ def posterior_uncertainty(
         cells=_CELLS_M**2,
         noise=np.ones(len(scans)),
     )
-    network = Network(blocks, tuple(kept), part)
-    solution = solve(network, np.zeros(len(blocks)), scales, sizes)
+    network = Network(blocks, families, part)
+    solution = completed(solve(network, np.zeros(len(blocks)), scales, sizes))
     return PlannedUncertainty(
         form=form_map(solution, nominal, removed).mean_uncertainty,
-        sources={f.name: solution.uncertainty(f.name) for f in kept},
+        sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
     )
 
@@ -260,6 +260,7 @@ def best_addition(
     reached = {
         code: posterior_uncertainty([first, added], priors, nominal, removed).form
         for code, added in additions(first).items()
+        if code != REPEATED_TRACK  # leaves the set without redundancy
     }
     best = min(reached, key=lambda code: reached[code])
     return best, reached[best], alone

@@ -6,13 +6,13 @@ together with it, are one group whose members these scans do not separate.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
-from omsm_ros.core.adjustment.families import base_name
+from omsm_ros.core.adjustment.families import FREE, base_name
 from omsm_ros.core.adjustment.network import (
     Network,
     Scales,
@@ -33,30 +33,41 @@ _LEAST_GAIN = 10.0
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
+# Of a χ²: two families that are that independent are two causes.
+_UNCHANGED = 0.3
+# A lag that depends on something has an unknown mean, which is no further cause.
+_OFFSET = "lag_change"
 _MOST_RELEASED = 8
+# Before the scans: of ten errors that nobody declared, a machine has one.
+_ODDS_ABSENT, _SURE = 9.0, 50.0
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
 _WALK_START, _BAND_START_M, _CELLS_START_M = 1e-18, 3e-9, 3e-9
 _FIRST_STEPS, _FURTHER_STEPS = 5, 3
 # Of a variance: 2 % of a standard deviation.
 _SETTLED = 0.04
-# Families that are free on principle: their size is no statement about the machine.
-_FREE = ("tilt", "decentre", "clocking")
 
 
 @dataclass(frozen=True, eq=False)
 class Refutation:
     """A family that the scans show beyond what was declared.
 
-    evidence: when it was released;  alike: other families that explain the same
+    evidence: when it was released;  others: of the families that explain the same
+    explains: True if it, or one that is alike, explains all that belongs together
     """
 
     evidence: Evidence
-    alike: tuple[str, ...]
+    others: tuple[Evidence, ...]
+    explains: bool = True
 
     @property
     def name(self) -> str:
         """Name of the family that was released."""
         return self.evidence.family.name
+
+    @property
+    def alike(self) -> tuple[str, ...]:
+        """Names of the families that explain the same."""
+        return tuple(e.family.name for e in self.others)
 
 
 def start_scales(network: Network, walk: float | None) -> Scales:
@@ -94,6 +105,7 @@ def fit_and_refute(
 ) -> tuple[Solution, tuple[Refutation, ...]]:
     """Return the solution with all refuted families released, and which they are."""
     solution = settled(solve(network, y, scales, sizes), _FIRST_STEPS)
+    before = {f.name: evidence_of(solution, f).chi_square for f in network.families}
     found: list[Refutation] = []
     while len(found) < _MOST_RELEASED:
         beyond = refuted_by(solution, [r.name for r in found])
@@ -101,19 +113,47 @@ def fit_and_refute(
             break
         best = _culprit(beyond)
         family = best.family
-        released = {**solution.sizes, family.name: family.wide}
-        solution = settled(solve(network, y, solution.scales, released), _FURTHER_STEPS)
+        # As large as it was found, if that is more than plausible.
+        size = max(family.wide, float(np.sqrt(np.mean(best.values**2))))
+        solution = settled(
+            solve(network, y, solution.scales, {**solution.sizes, family.name: size}),
+            _FURTHER_STEPS,
+        )
         still = {e.family.name for e in refuted_by(solution, [*(r.name for r in found)])}
-        alike = [e.family.name for e in beyond if e is not best and _as_good(e, best)]
-        found.append(Refutation(best, tuple(n for n in alike if n not in still)))
-    return solution, tuple(_merged(found))
+        alike = [e for e in beyond if e is not best and e.family.named and _as_good(e, best)]
+        found.append(Refutation(best, tuple(e for e in alike if e.family.name not in still)))
+    return solution, tuple(_grouped(found, before))
 
 
-def refuted_by(solution: Solution, released: list[str]) -> list[Evidence]:
+def _grouped(found: Sequence[Refutation], before: Mapping[str, float]) -> list[Refutation]:
+    """Return causes: what was released because of an earlier one belongs to it.
+
+    A family that was as significant before anything was released is a cause of its own. What
+    became so, or less so, by a release is what that one leaves; more than a model error's share of
+    it, and no single family explains what the scans show.
+    before: χ² of each family before the first release
+    """
+    causes: list[Refutation] = []
+    left: list[float] = []
+    for one in found:
+        chi = one.evidence.chi_square
+        first = before[one.name]
+        if not causes or abs(chi - first) < _UNCHANGED * max(chi, first):
+            causes.append(one)
+            left.append(0.0)
+        elif one.name != _OFFSET:
+            left[0] += chi
+    return [
+        replace(c, explains=more <= max(_ALIKE, _ALIKE_SHARE * c.evidence.chi_square))
+        for c, more in zip(causes, left, strict=True)
+    ]
+
+
+def refuted_by(solution: Solution, released: Sequence[str]) -> list[Evidence]:
     """Return the evidence of the families beyond their declaration, strongest first."""
     found = []
     for family in solution.network.families:
-        if family.name in released or base_name(family.name) in _FREE:
+        if family.name in released or base_name(family.name) in FREE:
             continue
         declared = family.name in solution.sizes
         evidence = evidence_of(solution, family)
@@ -129,13 +169,30 @@ def _as_good(one: Evidence, best: Evidence) -> bool:
 
 
 def _culprit(beyond: list[Evidence]) -> Evidence:
-    """Return the strongest; a named family before one that only detects."""
+    """Return the simplest of those that explain as much; a named one before one that detects."""
     as_good = [e for e in beyond if _as_good(e, beyond[0])]
-    named = [e for e in as_good if e.family.named]
-    return (named or as_good)[0]
+    return min(as_good, key=lambda e: (not e.family.named, e.family.size))
 
 
-def _merged(found: list[Refutation]) -> list[Refutation]:
-    """Leave out of a group what was released by itself later."""
-    names = {r.name for r in found}
-    return [replace(r, alike=tuple(n for n in r.alike if n not in names)) for r in found]
+def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Solution:
+    """Return ``solution`` with every family taking part that has a name.
+
+    What is neither declared nor seen in the residuals may be there, as large as the residuals and
+    its plausible size allow: the form's uncertainty counts its mean square, which is that size
+    times the probability that it is there (Hoeting et al., Statist. Sci. 14, 382). Families that
+    explain what was seen as well as the one that was released count by their odds against it.
+    """
+    sizes: dict[str, float | FloatArray] = dict(solution.sizes)
+    for family in solution.network.families:
+        if family.named and family.name not in sizes:
+            one = evidence_of(solution, family)
+            there = 1 / (1 + _ODDS_ABSENT * np.exp(-min(one.gain, _SURE) / 2))
+            size = np.sqrt(there) * np.hypot(one.values, one.uncertainty)
+            sizes[family.name] = np.minimum(size, family.wide)
+    for refutation in refutations:
+        for other in refutation.others:
+            odds = np.exp(min(other.gain - refutation.evidence.gain, 0.0) / 2)
+            size = np.sqrt(odds / (1 + odds)) * np.hypot(other.values, other.uncertainty)
+            name = other.family.name
+            sizes[name] = np.maximum(sizes.get(name, 0.0), size)
+    return solve(solution.network, solution.y, solution.scales, sizes)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import DataError
 
 # A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.
@@ -136,7 +136,7 @@ class ScanView:
     def __len__(self) -> int:
         return len(self.time)
 
-    def part(self, points: slice) -> ScanView:
+    def part(self, points: slice | IntArray) -> ScanView:
         """Return the view of some of the points."""
         arrays: dict[str, Any] = {
             name: values[points]

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
-from omsm_ros.core.adjustment.evidence import Evidence
-from omsm_ros.core.adjustment.families import RECLOCKED, Source, base_name
+from omsm_ros.core.adjustment.families import FREE, Family, Source, base_name
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
 
@@ -23,13 +22,10 @@ CONTRADICTED, TOO_UNCERTAIN = "contradicted", "too_uncertain"
 REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
 UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redundant", "uncertainty"
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
+UNIDENTIFIED = "unidentified"
 
-# Periodic errors of encoder, probe and slides add to the walk that is found; of ten drawn
-# machines whose declarations are true the largest ratio was 1.9.
-_WALK_RATIO = 3.0
-# What is smaller is found and corrected, with its uncertainty, and contradicts nothing: declared
-# errors without columns (periodic ones, texture) make as much.
-_LEAST_CONTRADICTION_M = 3e-9
+# Of the normal distribution: drift that is rarer than this is not the declared one.
+_RARE_WALK = 3.7
 # Speeds nearer to each other than a tenth leave a lag as open as one scan does.
 _OTHER_SPEED = 0.1
 
@@ -82,29 +78,33 @@ def reasons_of(
     declared: Collection[str],
     agreement: Sequence[ScanAgreement],
     wrong_sign: Sequence[tuple[int, float]],
-    walk: tuple[float, float | None],
+    walk: tuple[float, float, float | None],
     accepted: Collection[str],
 ) -> tuple[Reason, ...]:
     """Return what contradicts the scans or their declarations.
 
     declared: names of the declared sources;  wrong_sign: scan, and share that it follows
-    walk: of the drift after one second, found and declared [m]
+    walk: of the drift after one second, found, its relative uncertainty, and declared [m]
     accepted: names of families whose found value somebody has accepted
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
-    if walk[1] is not None and walk[0] > _WALK_RATIO * walk[1] and "drift_walk" not in accepted:
-        found.append(Reason(REFUTED, ("drift_walk",), walk[0], walk[1]))
     for refutation in refutations:
         names = (refutation.name, *refutation.alike)
-        small = refutation.evidence.effect < _LEAST_CONTRADICTION_M
-        if small or refutation.name in accepted:
+        if refutation.name in accepted:
             continue
         known = base_name(refutation.name) in declared
         code = REFUTED if known else UNDECLARED_EFFECT
+        if not refutation.explains:
+            code, names = UNIDENTIFIED, ()
         found.append(Reason(code, names, refutation.evidence.deviate, 3.0))
     for one in agreement:
         if one.largest >= one.limit:
             found.append(Reason(DISAGREE, (str(one.scan),), one.largest, one.limit))
+    size, spread, stated = walk
+    # Any other error that is left in the residuals passes for drift.
+    if not found and stated is not None and "drift_walk" not in accepted:
+        if size > stated * (1 + _RARE_WALK * spread):
+            found.append(Reason(REFUTED, ("drift_walk",), size, stated))
     return tuple(found)
 
 
@@ -120,64 +120,42 @@ def open_limit(accuracy: float | None) -> float:
 
 
 def not_evaluated(
-    evidences: Sequence[Evidence],
-    effects: Mapping[str, float],
+    families: Sequence[Family],
+    effects: Mapping[str, tuple[float, float]],
     priors: Sequence[Source],
-    accuracy: float | None,
+    limit: float,
 ) -> tuple[Reason, ...]:
     """Return families that nobody evaluated, that these scans leave open, and that may matter.
 
-    effects: of each family on the form, k = 1 [m]
+    effects: of each family on the form, left by scans and prior and by the scans alone, k = 1 [m]
+    limit: effect from which on a source matters [m]
 
-    What is declared only is taken as large as it plausibly is (``Family.wide``); families with a
-    default count with that or their declaration. The second name of a reason is the scan or
-    artefact that would show the family.
+    The second name of a reason is the scan or artefact that would show the family.
     """
-    stated = {p.name: p for p in priors}
-    limit = open_limit(accuracy)
+    stated = {base_name(p.name): p for p in priors}
     found = []
-    for one in evidences:
-        family = one.family
+    for family in families:
         prior = stated.get(base_name(family.name))
-        if not family.named or family.default is not None:
+        if not family.named or family.default is not None or (prior and prior.evaluated):
             continue
-        possible, code = effects[family.name], NOT_EVALUATED
-        if prior is not None:
-            if not one.open:
-                continue
-            possible *= 0.0 if prior.evaluated else family.wide / max(prior.uncertainty, 1e-15)
-            code = DECLARED_ONLY
-        if possible > limit:
-            found.append(Reason(code, (family.name, family.shown_by), possible, limit))
+        _, free = effects.get(family.name, (0.0, 0.0))
+        if free > limit:
+            code = NOT_EVALUATED if prior is None else DECLARED_ONLY
+            found.append(Reason(code, (family.name, family.shown_by), free, limit))
     return tuple(found)
 
 
-# A function of place alone is form for scans that hold the part at one angle. The scans seem to
-# show it only as far as the part is smooth.
-POSITION_ONLY = "straightness_z"
-
-
-def position_only(
-    scans: Sequence[ScanData], effect: float, declared: Collection[str], limit: float
-) -> tuple[Reason, ...]:
-    """Return the bow of Z where it was not declared and no scan turned the part on the chuck.
-
-    effect: of its plausible size on the heights, rms [m];  limit: beyond which it matters [m]
-    """
-    turned = len({round(scan.clocking, 6) for scan in scans}) > 1
-    if turned or POSITION_ONLY in declared or not effect > limit:
-        return ()
-    return (Reason(NOT_EVALUATED, (POSITION_ONLY, RECLOCKED), effect, limit),)
-
-
 def rests_on(
-    evidences: Sequence[Evidence], effects: Mapping[str, float], declared: Collection[str]
+    families: Sequence[Family], effects: Mapping[str, tuple[float, float]], limit: float
 ) -> tuple[tuple[str, float], ...]:
-    """Return the declared sources that these scans leave as they were declared."""
+    """Return the sources that count as they were declared, for these scans do not show them.
+
+    With the standard uncertainty of the heights by each as declared [m], the largest first.
+    """
     found = [
-        (e.family.name, effects[e.family.name])
-        for e in evidences
-        if base_name(e.family.name) in declared and e.open
+        (f.name, effects[f.name][0])
+        for f in families
+        if base_name(f.name) not in FREE and effects.get(f.name, (0.0, 0.0))[1] > limit
     ]
     return tuple(sorted(found, key=lambda pair: -pair[1]))
 
@@ -207,11 +185,9 @@ def verdict_of(
         reasons.append(Reason(UNCERTAINTY, (), expanded, limit))
     if contradictions:
         code = CONTRADICTED
-    elif not is_redundant:
-        code = NOT_VERIFIED
     elif too_large or not np.isfinite(expanded):
         code = TOO_UNCERTAIN
-    elif open_sources:
+    elif open_sources or not is_redundant:
         code = NOT_VERIFIED
     else:
         code = VERIFIED
