@@ -193,8 +193,9 @@ def _adjusted(
     wrong = _wrong_signs(views)
     declared = {p.name for p in priors}
     contradictions = reasons_of(
-        refutations, declared, agreement, wrong, _walk(detecting, priors), accepted
-    )
+        refutations, declared, agreement, wrong, _walk(detecting, priors),
+        detecting.scales.texture, accepted,
+    )  # fmt: skip
     effects = effects_on_form(solution, surface, removed)
     limit = open_limit(accuracy)
     enough = redundant(scans)

@@ -77,7 +77,7 @@ def _compared(
     name = f"{DIFFERS}@{scan}"
     family = next(f for f in solution.network.families if f.name == name)
     evidence = evidence_of(solution, family)
-    terms = np.abs(evidence.values) / (2 * evidence.uncertainty)
+    terms = np.abs(evidence.values) / (2 * np.hypot(evidence.uncertainty, solution.scales.texture))
     number = len(alone) * (len(terms) + 2)
     return ScanAgreement(
         scan=scan,

@@ -318,6 +318,9 @@ def _curve(
     lengths = [length for n, length in r.lengths.items() if n in same]
     length = min(lengths, default=(nodes[-1] - nodes[0]) / 2)
     parts = components(smooth(length), nodes)
+    if ways == 2:
+        # Their mean is the place of the spindle axis, a source of its own.
+        parts = parts - np.mean(parts, axis=1, keepdims=True)
 
     def over(position: FloatArray) -> FloatArray:
         return np.stack([np.interp(position, nodes, part) for part in parts])

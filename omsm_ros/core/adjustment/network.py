@@ -16,8 +16,11 @@ from scipy import linalg, sparse
 
 from omsm_ros.core.adjustment.blocks import Blocks
 from omsm_ros.core.adjustment.families import Family
-from omsm_ros.core.adjustment.part_terms import PartModel
+from omsm_ros.core.adjustment.part_terms import RINGS, PartModel
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+
+Sizes = Mapping[str, float | FloatArray]
+"""Prior standard deviations of the families that take part, of all columns or of each."""
 
 # A walk between two knots of half a turn stays below the noise of a block.
 _KNOTS_A_TURN, _MOST_KNOTS = 2, 300
@@ -39,6 +42,11 @@ class Scales:
     bands: Mapping[int, float]
     cells: float
     noise: FloatArray
+
+    @property
+    def texture(self) -> float:
+        """Standard deviation of the part by cells and rings, which no smooth term describes [m]."""
+        return float(np.sqrt(self.cells + self.bands.get(RINGS, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +109,7 @@ class Network:
         return np.asarray(1 / (total + 1 / max(scales.cells, _LEAST_VARIANCE)))
 
     def alone(self, scan: int) -> Network:
-        """Return the part by the blocks of ``scan``, without families; the sums are not made anew."""
+        """Return the part by the blocks of ``scan``, without families; sums are not made anew."""
         mine = self.blocks.scan == scan
         part = replace(self.part, cell=self.part.cell[mine])
         made = Network(self.blocks.only(mine), (), part, _values=self._values[mine])
@@ -201,7 +209,7 @@ class Network:
         """Return the columns of family ``name``, (b, size)."""
         return np.asarray(self.blocks.columns[:, self.place[name]])
 
-    def active(self, sizes: Mapping[str, float | FloatArray]) -> BoolArray:
+    def active(self, sizes: Sizes) -> BoolArray:
         """Return which parameters take part where the families in ``sizes`` do, (size,)."""
         made = np.ones(self.size, np.bool_)
         for name, here in self.place.items():
@@ -209,7 +217,7 @@ class Network:
         return made
 
     def add_prior(
-        self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Mapping[str, float | FloatArray]
+        self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Sizes
     ) -> None:
         """Add the precision before the scans to ``matrix`` (a, a) of the parameters ``active``.
 
@@ -330,7 +338,7 @@ class Solution:
     network: Network
     y: FloatArray
     scales: Scales
-    sizes: Mapping[str, float | FloatArray]
+    sizes: Sizes
     values: FloatArray
     covariance: FloatArray
     matrix: FloatArray
@@ -354,7 +362,7 @@ class Solution:
         return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance_of(here)), 0.0)))
 
 
-def solve(network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float | FloatArray]) -> Solution:
+def solve(network: Network, y: FloatArray, scales: Scales, sizes: Sizes) -> Solution:
     """Return the solution for given scales and prior sizes of the families that take part."""
     matrix, right = network.normal_matrix(scales), network.right_side(scales, y)
     active = np.flatnonzero(network.active(sizes))

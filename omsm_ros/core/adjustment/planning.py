@@ -130,9 +130,9 @@ def posterior_uncertainty(
         noise=np.ones(len(scans)),
     )
     network = Network(blocks, families, part)
-    solution = completed(solve(network, np.zeros(len(blocks)), scales, sizes))
+    solution = solve(network, np.zeros(len(blocks)), scales, sizes)
     return PlannedUncertainty(
-        form=form_map(solution, nominal, removed).mean_uncertainty,
+        form=form_map(completed(solution), nominal, removed).mean_uncertainty,
         sources={f.name: solution.uncertainty(f.name) for f in families if f.name in sizes},
         duration=begin - _PAUSE_S,
     )

@@ -33,7 +33,7 @@ _LEAST_GAIN = 10.0
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
-# Of a χ²: two families that are that independent are two causes.
+# Of a value: a family that changes by less is a cause of its own.
 _UNCHANGED = 0.3
 # A lag that depends on something has an unknown mean, which is no further cause.
 _OFFSET = "lag_change"
@@ -105,7 +105,7 @@ def fit_and_refute(
 ) -> tuple[Solution, tuple[Refutation, ...]]:
     """Return the solution with all refuted families released, and which they are."""
     solution = settled(solve(network, y, scales, sizes), _FIRST_STEPS)
-    before = {f.name: evidence_of(solution, f).chi_square for f in network.families}
+    before = {f.name: evidence_of(solution, f).values for f in network.families}
     found: list[Refutation] = []
     while len(found) < _MOST_RELEASED:
         beyond = refuted_by(solution, [r.name for r in found])
@@ -125,24 +125,25 @@ def fit_and_refute(
     return solution, tuple(_grouped(found, before))
 
 
-def _grouped(found: Sequence[Refutation], before: Mapping[str, float]) -> list[Refutation]:
+def _grouped(
+    found: Sequence[Refutation], before: Mapping[str, FloatArray]
+) -> list[Refutation]:
     """Return causes: what was released because of an earlier one belongs to it.
 
-    A family that was as significant before anything was released is a cause of its own. What
+    A family that was found as large before anything was released is a cause of its own. What
     became so, or less so, by a release is what that one leaves; more than a model error's share of
     it, and no single family explains what the scans show.
-    before: χ² of each family before the first release
+    before: found value of each family before the first release
     """
     causes: list[Refutation] = []
     left: list[float] = []
     for one in found:
-        chi = one.evidence.chi_square
-        first = before[one.name]
-        if not causes or abs(chi - first) < _UNCHANGED * max(chi, first):
+        moved = np.linalg.norm(one.evidence.values - before[one.name])
+        if not causes or moved < _UNCHANGED * np.linalg.norm(one.evidence.values):
             causes.append(one)
             left.append(0.0)
         elif one.name != _OFFSET:
-            left[0] += chi
+            left[0] += one.evidence.chi_square
     return [
         replace(c, explains=more <= max(_ALIKE, _ALIKE_SHARE * c.evidence.chi_square))
         for c, more in zip(causes, left, strict=True)
@@ -192,7 +193,7 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
     for refutation in refutations:
         for other in refutation.others:
             odds = np.exp(min(other.gain - refutation.evidence.gain, 0.0) / 2)
-            size = np.sqrt(odds / (1 + odds)) * np.hypot(other.values, other.uncertainty)
+            size = np.sqrt(odds / (1 + odds)) * np.abs(other.values)
             name = other.family.name
             sizes[name] = np.maximum(sizes.get(name, 0.0), size)
     return solve(solution.network, solution.y, solution.scales, sizes)

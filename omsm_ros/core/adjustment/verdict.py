@@ -79,18 +79,21 @@ def reasons_of(
     agreement: Sequence[ScanAgreement],
     wrong_sign: Sequence[tuple[int, float]],
     walk: tuple[float, float, float | None],
+    texture: float,
     accepted: Collection[str],
 ) -> tuple[Reason, ...]:
     """Return what contradicts the scans or their declarations.
 
     declared: names of the declared sources;  wrong_sign: scan, and share that it follows
     walk: of the drift after one second, found, its relative uncertainty, and declared [m]
+    texture: of the part, which differs from track to track: an effect within k = 2 of it
+        contradicts nothing [m]
     accepted: names of families whose found value somebody has accepted
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
     for refutation in refutations:
         names = (refutation.name, *refutation.alike)
-        if refutation.name in accepted:
+        if refutation.name in accepted or refutation.evidence.effect < 2 * texture:
             continue
         known = base_name(refutation.name) in declared
         code = REFUTED if known else UNDECLARED_EFFECT
@@ -100,11 +103,11 @@ def reasons_of(
     for one in agreement:
         if one.largest >= one.limit:
             found.append(Reason(DISAGREE, (str(one.scan),), one.largest, one.limit))
-    size, spread, stated = walk
+    size, spread, stated = walk[0], walk[1], walk[2] or 0.0
     # Any other error that is left in the residuals passes for drift.
-    if not found and stated is not None and "drift_walk" not in accepted:
-        if size > stated * (1 + _RARE_WALK * spread):
-            found.append(Reason(REFUTED, ("drift_walk",), size, stated))
+    alone = not found and walk[2] is not None and "drift_walk" not in accepted
+    if alone and size > stated * (1 + _RARE_WALK * spread):
+        found.append(Reason(REFUTED, ("drift_walk",), size, stated))
     return tuple(found)
 
 

@@ -36,9 +36,9 @@ def table():
 
 
 def test_a_second_speed_takes_away_what_one_scan_cannot(table):
-    """Form error within what is stated, 40 nm of one scan and 5 of two."""
+    """Form error within what is stated, 75 nm of one scan and 5 of two."""
     machine, _, found = table
-    for adjustment, least, most in zip(found, (20e-9, 0, 0), (60e-9, 5e-9, 4.5e-9), strict=True):
+    for adjustment, least, most in zip(found, (20e-9, 0, 0), (100e-9, 5e-9, 4.5e-9), strict=True):
         *_, error = normalised(machine, adjustment)
         assert least < adjustment.form.mean_uncertainty < most
         assert error < 2 * adjustment.form.mean_uncertainty
@@ -53,9 +53,10 @@ def test_the_lag_is_found_to_a_fifth_of_a_microsecond(table):
     assert one.source("lag_change").uncertainty[0] > 0.9 * LAG_S
 
 
-def test_one_scan_is_not_verified_and_names_the_scan_to_add(table):
+def test_one_scan_is_too_uncertain_and_names_the_scan_to_add(table):
     _, _, (one, two, three) = table
-    assert one.verdict.code == NOT_VERIFIED
+    assert one.verdict.code == TOO_UNCERTAIN
+    assert {"not_redundant", "uncertainty"} <= {r.code for r in one.verdict.reasons}
     assert one.verdict.add in ("other_speed", "other_direction", "beyond_centre", "reclocked")
     assert one.verdict.reached < 0.4 * 2 * one.form.mean_uncertainty
     assert two.verdict.code == three.verdict.code == VERIFIED
@@ -101,11 +102,11 @@ def test_what_is_only_declared_does_not_turn_green(table):
     stated = [Source(p.name, p.uncertainty) for p in PRIORS]
     found = adjust(scans[:2], stated, nominal=MIRROR, accuracy=25e-9)
     assert found.verdict.code == NOT_VERIFIED
-    names = {r.names[0]: r for r in found.verdict.reasons}
+    names = {r.names[0]: r for r in found.verdict.reasons if r.names}
     assert names["straightness_x"].code == "declared_only"
     assert names["straightness_x"].names[1] == "beyond_centre"
     nothing = adjust(scans[:2], (), nominal=MIRROR, accuracy=25e-9)
-    missing = {r.names[0]: r.code for r in nothing.verdict.reasons}
+    missing = {r.names[0]: r.code for r in nothing.verdict.reasons if r.names}
     assert missing["straightness_x"] == missing["encoder_scale"] == "not_evaluated"
     # 12, 9 and 5 nm of the spindle, which nobody declared, are seen all the same.
     assert missing["spindle_axial/2"] == missing["spindle_axial/3"] == "undeclared_effect"
@@ -127,9 +128,9 @@ def test_spindle_reversed_shows_the_lag():
     lag = found.source("lag_change")
     assert abs(lag.found[0] - 35e-6) < 3 * lag.uncertainty[0] < 1.5e-6
     # A lag that differs with the direction, or falls with the speed, would look like the part.
-    names = {r.names[0] for r in found.verdict.reasons}
+    names = {n for r in found.verdict.reasons for n in r.names}
     assert "lag_direction" in names
-    assert {r.code for r in found.verdict.reasons} == {"not_evaluated"}
+    assert {r.code for r in found.verdict.reasons} == {"not_evaluated", "uncertainty"}
 
 
 def test_a_pose_is_projected_out_of_the_form():
@@ -142,7 +143,7 @@ def test_a_pose_is_projected_out_of_the_form():
         for s in scans
     ]  # fmt: skip
     plain, posed = (adjust(s, PRIORS, nominal=MIRROR) for s in (scans, lifted))
-    np.testing.assert_allclose(posed.form.height, plain.form.height, atol=0.3e-9)
+    np.testing.assert_allclose(posed.form.height, plain.form.height, atol=0.6e-9)
     np.testing.assert_allclose(posed.form.pose - plain.form.pose, [3e-7, -1e-5, -2e-5], rtol=1e-2)
     ones = np.ones(len(plain.form.x))
     assert np.sqrt(plain.form.area @ (plain.form.covariance @ (ones * plain.form.area)) ** 2) < (

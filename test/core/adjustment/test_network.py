@@ -47,7 +47,7 @@ def test_eliminated_cells_equal_generalised_least_squares(small):
 
 
 def test_blocks_are_means_of_points(small):
-    """Count, deviation and a column of each block, by a loop."""
+    """Count, deviation and a column of each block, by a loop; the column by six of its points."""
     views, network, _ = small
     blocks, first = network.blocks, 0
     for view in views:
@@ -61,7 +61,7 @@ def test_blocks_are_means_of_points(small):
                 np.mean(view.deviation[part]), abs=1e-15
             )
             assert network.column("lag_change")[first + k, 0] == pytest.approx(
-                np.mean(view.motion_rate[part]), rel=1e-9, abs=1e-12
+                np.mean(view.motion_rate[part]), rel=1e-3, abs=1e-8
             )
         first += len(edges) - 1
     assert first == len(blocks)
