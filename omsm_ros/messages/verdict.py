@@ -4,6 +4,11 @@ from __future__ import annotations
 
 TEMPLATES = {
     "verdict.verified": "verified by {scans:count} scans",
+    "verdict.except": "{text}, except for {number} sources as declared or assumed",
+    "verdict.rests_on": (
+        "not shown by these scans, counted as declared or assumed: {names} (in all {value:m/2} of "
+        "the heights, k = 1)"
+    ),
     "verdict.not_verified": "not verified",
     "verdict.contradicted": "contradicted by the scans",
     "verdict.too_uncertain": "uncertainty too large",
@@ -78,6 +83,22 @@ SOURCE_NAMES = {
     "lag_motion": "lag that depends on Z",
     "lag_x": "lag that depends on X",
     "lag_time": "lag that changes with time",
+    "lag_rate": "lag that depends on the speed of Z",
+    "lag_c": "lag that depends on C",
+    "creep": "creep of the structure",
+    "part_bow_speed": "bow of the part that grows with the speed",
+    "unbalance": "unbalance of the spindle",
+    "x_late": "late latch of X",
+    "x_backlash": "backlash of X",
+    "positioning_x": "positioning error of X",
+    "straightness_hysteresis": "straightness of X that depends on the direction",
+    "probe_slope": "error of the probe in proportion to the slope",
+    "probe_slope_fourth": "error of the probe on steep slopes",
+    "probe_slope_moving": "error of the probe on slopes while Z moves",
+    "probe_periodic": "periodic error of the probe",
+    "encoder_interpolation": "interpolation error of the Z encoder",
+    "c_drift": "angle of C that changes with time",
+    "tilt_drift": "tilt of the part that changes with time",
     "lag_curvature": "change of the curvature of G",
     "removed": "sign or size of the correction",
     "centre_x": "spindle centre in x",
@@ -104,11 +125,11 @@ SOURCE_NAMES = {
     "tilt": "tilt of the part",
     "decentre": "decentre of the part",
     "clocking": "clocking of the part",
-    "expansion": "expansion of the part",
+    "expansion": "expansion of the part, or scale of X",
     "scan_differs": "form that one scan alone shows",
-    "line": "vibration",
+    "vibration": "vibration",
     "height_step": "step of the height",
-    "angle_step": "jump of C",
+    "c_lost": "lost counts of C",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -382,6 +383,17 @@ def verdict_entry(
             *against,
         ],
     }
+    if verdict.rests_on:
+        names = ", ".join(source_name(name) for name, _ in verdict.rests_on)
+        size = math.hypot(*(effect for _, effect in verdict.rests_on))
+        entry["rests_on"] = {
+            "names": [name for name, _ in verdict.rests_on],
+            "effect": number(size),
+            "text": sentence("verdict.rests_on", {"names": names, "value": size}),
+        }
+        if code == VERIFIED:
+            values = {"text": entry["text"], "number": len(verdict.rests_on)}
+            entry["text"] = sentence("verdict.except", values)
     if verdict.add:
         entry["add"] = {
             "code": verdict.add,

@@ -11,7 +11,6 @@ from omsm_ros.core.adjustment.adjust import (
     adjust,
     corrected_heights,
 )
-from omsm_ros.core.adjustment.families import Source
 from omsm_ros.core.adjustment.figures import Figure, FormMap
 from omsm_ros.core.adjustment.planning import (
     PlannedSet,
@@ -22,6 +21,7 @@ from omsm_ros.core.adjustment.planning import (
     usual_sets,
 )
 from omsm_ros.core.adjustment.scan_data import ScanData
+from omsm_ros.core.adjustment.sources import Source
 from omsm_ros.core.adjustment.verdict import (
     CONTRADICTED,
     NOT_VERIFIED,

@@ -17,14 +17,7 @@ from omsm_ros.core.adjustment.disturbances import (
     steps_of,
 )
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
-from omsm_ros.core.adjustment.families import (
-    Family,
-    Source,
-    base_name,
-    families_of,
-    prior_sizes,
-    ranges_of,
-)
+from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.figures import POSE, FormMap, effects_on_form, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_squares
 from omsm_ros.core.adjustment.part_terms import part_model
@@ -42,6 +35,7 @@ from omsm_ros.core.adjustment.scan_data import (
     fitted_surface,
     view_of,
 )
+from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes
 from omsm_ros.core.adjustment.verdict import (
     Verdict,
     not_evaluated,
@@ -202,7 +196,7 @@ def _adjusted(
     verdict = verdict_of(
         contradictions,
         not_evaluated(families, effects, priors, limit),
-        rests_on(families, effects, limit),
+        rests_on(families, effects, form.mean_uncertainty),
         enough,
         2 * form.pv.uncertainty,
         accuracy,

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from omsm_ros.core.adjustment.families import Family
 from omsm_ros.core.adjustment.scan_data import ScanView
+from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
 # 0.8 mm of the rim of a part of 25 mm; the 12th harmonic of a turn loses 2.6 %.
 SECTORS = 96
-# Points of a block at which columns are computed, in pairs about its middle: half a sample aside
-# turns a column by 2 mrad.
+# Points of a block at which columns are computed, in pairs about its middle: half a sample off
+# it turns a column by 2 mrad.
 _NODES = 6
 # Blocks whose columns are held at a time: 170 columns of their points are 14 MB.
 _CHUNK = 2048

@@ -11,9 +11,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from omsm_ros.core.adjustment.families import REPEATED_TRACK, VIBRATION, Family, only
+from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.scan_data import ScanView
+from omsm_ros.core.adjustment.sources import VIBRATION, Family
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Over its neighbours a bin of white noise is beyond 30 once in 10 000 scans of 250 000 points.

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from omsm_ros.core.adjustment.families import Family
 from omsm_ros.core.adjustment.network import Solution
+from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.streams.blocks import FloatArray
 
 # A share of the prior variance that is removed by less is rounding.

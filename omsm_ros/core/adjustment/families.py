@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from omsm_ros.core.adjustment.scan_data import ScanView
+from omsm_ros.core.adjustment.sources import VIBRATION, Columns, Family, Source, base_name
 from omsm_ros.core.correction.source_kinds import components, smooth
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
@@ -22,57 +23,6 @@ from omsm_ros.errors import ConfigurationError
 OTHER_SPEED, OTHER_DIRECTION, RECLOCKED = "other_speed", "other_direction", "reclocked"
 BEYOND_CENTRE, REPEATED_TRACK = "beyond_centre", "repeated_track"
 OTHER_STAND_OFF, REFERENCE = "other_stand_off", "reference_artefact"
-
-_Columns = Callable[[ScanView], FloatArray]
-
-
-@dataclass(frozen=True)
-class Source:
-    """A declared source: the prior of one family.
-
-    name: of the family, such as ``"centre_x"`` or ``"spindle_axial/2"``
-    uncertainty: standard uncertainty of each of its components [unit of the family]
-    correlation_length: of an unknown curve over its axis [m]; None: half of the axis' range
-    period: of a periodic error over Z or over the distance [m]
-    evaluated: True if a recording on this machine gave the figure; what is only declared, and not
-        shown by the scans, cannot turn a verdict green
-
-    Raises ConfigurationError for an uncertainty that is no finite number of zero or more.
-    """
-
-    name: str
-    uncertainty: float
-    correlation_length: float | None = None
-    evaluated: bool = False
-    period: float | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.uncertainty < np.inf:
-            raise ConfigurationError(
-                f"{self.name}: standard uncertainty {self.uncertainty!r}, expected zero or more"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class Family:
-    """Columns with one cause.
-
-    name, unit: of the source;  size: number of columns
-    columns: change of the heights [m] per unit, (size, n)
-    wide: size on a machine in need of repair, the prior once the family is refuted [unit]
-    default: prior where nothing is declared [unit]; None leaves the family out until it shows
-    shown_by: code of the scan that shows it best
-    named: False for columns that detect, but have no cause of their own
-    """
-
-    name: str
-    unit: str
-    size: int
-    columns: _Columns
-    wide: float
-    shown_by: str
-    default: float | None = None
-    named: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,34 +93,10 @@ SUB_HARMONICS = (1 / 2, 3 / 2, 5 / 2, 1 / 3, 2 / 3, 4 / 3, 5 / 3)
 _TILT_HARMONICS, _RADIAL_HARMONICS, _C_HARMONICS = (2, 3, 4), (1, 2, 3), (1, 2)
 
 
-FREE = ("tilt", "decentre", "clocking")
-"""Families whose size is no statement about the machine: where the part lies."""
-VIBRATION = "vibration"
-"""Declared source of all lines in time, ``vibration/frequency@scan``."""
 # Declared sources without columns of their own: scales of noise and drift, lines that are looked
 # for in the residuals, and what one scan alone cannot have.
 _ELSEWHERE = ("drift_walk", "noise", VIBRATION, "tilt", "part_shift", "part_turn", "lag_speed",
               "lag_direction", "probe_periodic", "encoder_interpolation")  # fmt: skip
-
-
-def base_name(family: str) -> str:
-    """Return the name of the declared source of ``family``, without the scan's number.
-
-    Lines in time have one declared source, at whatever frequency they stand.
-    """
-    name = family.split("@")[0]
-    return VIBRATION if name.startswith(f"{VIBRATION}/") else name
-
-
-def prior_sizes(families: Sequence[Family], priors: Sequence[Source]) -> dict[str, float]:
-    """Return the standard deviations of the families that take part: declared, or by default."""
-    stated = {p.name: p.uncertainty for p in priors}
-    sizes = {}
-    for family in families:
-        size = stated.get(base_name(family.name), family.default)
-        if size is not None:
-            sizes[family.name] = size
-    return sizes
 
 
 def order_name(name: str, per_turn: float) -> str:
@@ -201,7 +127,7 @@ def families_of(ranges: Ranges, priors: Sequence[Source]) -> tuple[Family, ...]:
 
 
 def _one(
-    name: str, unit: str, column: _Columns, wide: float, shown_by: str, default: float | None = None
+    name: str, unit: str, column: Columns, wide: float, shown_by: str, default: float | None = None
 ) -> Family:
     return Family(name, unit, 1, lambda v: column(v)[np.newaxis], wide, shown_by, default)
 
@@ -352,7 +278,7 @@ def _of_the_probe(r: Ranges) -> list[Family]:
     ]  # fmt: skip
 
 
-def _periodic(place: str, period: float) -> _Columns:
+def _periodic(place: str, period: float) -> Columns:
     return lambda v: np.stack(_waves(getattr(v, place), 2 * np.pi / period))
 
 
@@ -360,15 +286,15 @@ def _waves(angle: FloatArray, per_turn: float) -> tuple[FloatArray, FloatArray]:
     return np.cos(per_turn * angle), np.sin(per_turn * angle)
 
 
-def _axial(n: float) -> _Columns:
+def _axial(n: float) -> Columns:
     return lambda v: np.stack(_waves(v.c, n))
 
 
-def _tilting(n: float) -> _Columns:
+def _tilting(n: float) -> Columns:
     return lambda v: v.slide_x * np.stack(_waves(v.c, n))
 
 
-def _radial(n: float) -> _Columns:
+def _radial(n: float) -> Columns:
     def columns(v: ScanView) -> FloatArray:
         return np.stack([v.across(*way) for wave in _waves(v.c, n)
                          for way in ((wave, 0.0), (0.0, wave))])  # fmt: skip
@@ -376,7 +302,7 @@ def _radial(n: float) -> _Columns:
     return columns
 
 
-def _angular(n: float) -> _Columns:
+def _angular(n: float) -> Columns:
     def columns(v: ScanView) -> FloatArray:
         # C in error by ε turns the reported place by −ε about the spindle.
         return v.across(0.0, -v.slide_x) * np.stack(_waves(v.c, n))
@@ -393,11 +319,11 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         known = {order_name(name, n) for n in usual}
         return [*usual, *(n for n in more if order_name(name, n) not in known)]
 
-    table: tuple[tuple[str, str, int, Sequence[float], Callable[[float], _Columns], float], ...] = (
+    table: tuple[tuple[str, str, int, Sequence[float], Callable[[float], Columns], float], ...] = (
         ("spindle_axial", "m", 2, (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
         ("spindle_tilt", "rad", 2, _TILT_HARMONICS, _tilting, 1e-5),
         ("spindle_radial", "m", 4, _RADIAL_HARMONICS, _radial, 1e-6),
-        ("c_error", "rad", 2, _C_HARMONICS, _angular, 2e-5),
+        ("c_error", "rad", 2, _C_HARMONICS, _angular, 5e-5),
     )
     return [
         # Once a turn, a radial motion looks like a decentred part: only its size tells.
@@ -459,13 +385,13 @@ def _of_each_scan(r: Ranges) -> list[Family]:
 
 
 def _of_scan(
-    k: int, name: str, unit: str, size: int, columns: _Columns, wide: float,
+    k: int, name: str, unit: str, size: int, columns: Columns, wide: float,
     default: float | None = None,
 ) -> Family:  # fmt: skip
     return Family(f"{name}@{k}", unit, size, only(k, size, columns), wide, REPEATED_TRACK, default)
 
 
-def only(k: int, size: int, columns: _Columns) -> _Columns:
+def only(k: int, size: int, columns: Columns) -> Columns:
     """Return ``columns`` of scan ``k``, zero in the others."""
     return lambda v: columns(v) if v.index == k else np.zeros((size, len(v)))
 

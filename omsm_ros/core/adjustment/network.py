@@ -15,8 +15,8 @@ import numpy as np
 from scipy import linalg, sparse
 
 from omsm_ros.core.adjustment.blocks import Blocks
-from omsm_ros.core.adjustment.families import Family
 from omsm_ros.core.adjustment.part_terms import RINGS, PartModel
+from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
 Sizes = Mapping[str, float | FloatArray]
@@ -216,9 +216,7 @@ class Network:
             made[here] = name in sizes
         return made
 
-    def add_prior(
-        self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Sizes
-    ) -> None:
+    def add_prior(self, matrix: FloatArray, active: IntArray, scales: Scales, sizes: Sizes) -> None:
         """Add the precision before the scans to ``matrix`` (a, a) of the parameters ``active``.
 
         sizes: standard deviations of the families that take part

@@ -18,9 +18,7 @@ from omsm_ros.core.adjustment.families import (
     OTHER_SPEED,
     RECLOCKED,
     REPEATED_TRACK,
-    Source,
     families_of,
-    prior_sizes,
     ranges_of,
 )
 from omsm_ros.core.adjustment.figures import POSE, form_map
@@ -28,6 +26,7 @@ from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, RINGS, SYMMETRIC, part_model
 from omsm_ros.core.adjustment.refutation import completed
 from omsm_ros.core.adjustment.scan_data import ScanData, view_of
+from omsm_ros.core.adjustment.sources import Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
-from omsm_ros.core.adjustment.families import FREE, base_name
 from omsm_ros.core.adjustment.network import (
     Network,
     Scales,
@@ -21,6 +20,7 @@ from omsm_ros.core.adjustment.network import (
     solve,
 )
 from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, HIGHEST_DEGREE, RINGS, SYMMETRIC
+from omsm_ros.core.adjustment.sources import FREE, base_name
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Of some sixty families one in five hundred clean adjustments has one beyond: 4.2 σ each.
@@ -125,9 +125,7 @@ def fit_and_refute(
     return solution, tuple(_grouped(found, before))
 
 
-def _grouped(
-    found: Sequence[Refutation], before: Mapping[str, FloatArray]
-) -> list[Refutation]:
+def _grouped(found: Sequence[Refutation], before: Mapping[str, FloatArray]) -> list[Refutation]:
     """Return causes: what was released because of an earlier one belongs to it.
 
     A family that was found as large before anything was released is a cause of its own. What

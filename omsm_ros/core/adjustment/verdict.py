@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
-from omsm_ros.core.adjustment.families import FREE, Family, Source, base_name
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
+from omsm_ros.core.adjustment.sources import FREE, Family, Source, base_name
 
 VERIFIED, NOT_VERIFIED = "verified", "not_verified"
 CONTRADICTED, TOO_UNCERTAIN = "contradicted", "too_uncertain"
@@ -153,7 +153,8 @@ def rests_on(
 ) -> tuple[tuple[str, float], ...]:
     """Return the sources that count as they were declared, for these scans do not show them.
 
-    With the standard uncertainty of the heights by each as declared [m], the largest first.
+    Also what each does to the heights as declared, k = 1 [m], the largest first.
+    limit: a source that may do more if its declaration is worth nothing is one of them [m]
     """
     found = [
         (f.name, effects[f.name][0])
