@@ -73,6 +73,7 @@ _MARK = "made_by_omsm_demo.txt"
 _EVALUATED = {
     "encoder_scale": 1e-6,
     "squareness": 1e-8,
+    "parallelism": 1e-6,
     "pitch": 1e-6,
     "straightness_x": 2e-9,
     "straightness_z": 2e-9,
