@@ -128,7 +128,8 @@ def fit_and_refute(
 def _grouped(found: Sequence[Refutation], before: Mapping[str, FloatArray]) -> list[Refutation]:
     """Return causes: what was released because of an earlier one belongs to it.
 
-    A family that was found as large before anything was released is a cause of its own. What
+    A family that was found as large before anything was released is a cause of its own, as is the
+    same cause in another scan. What
     became so, or less so, by a release is what that one leaves; more than a model error's share of
     it, and no single family explains what the scans show.
     before: found value of each family before the first release
@@ -137,7 +138,8 @@ def _grouped(found: Sequence[Refutation], before: Mapping[str, FloatArray]) -> l
     left: list[float] = []
     for one in found:
         moved = np.linalg.norm(one.evidence.values - before[one.name])
-        if not causes or moved < _UNCHANGED * np.linalg.norm(one.evidence.values):
+        again = base_name(one.name) in {base_name(c.name) for c in causes}
+        if not causes or again or moved < _UNCHANGED * np.linalg.norm(one.evidence.values):
             causes.append(one)
             left.append(0.0)
         elif one.name != _OFFSET:
