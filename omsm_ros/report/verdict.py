@@ -57,15 +57,10 @@ def next_steps(verdict: Mapping[str, Any]) -> list[str]:
         then = "" if reached is None else f": then U = {quantity(reached, 'm', 2)} (rms, k = 2)"
         steps.insert(0, f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
     if verdict["code"] == "verified":
-<<<<<<< HEAD
         steps.append("the scans agree, and no declared source is refuted")
-    return steps
-=======
-        found.append("the scans agree, and no declared source is refuted")
         if (resting := verdict.get("rests_on")) is not None:
-            found.append(resting["text"])
-    return found
->>>>>>> b410fba1 (Verdict says which sources count as declared; sources of error in their own file)
+            steps.append(resting["text"])
+    return steps
 
 
 def verdict_on_measurement(summary: Mapping[str, Any]) -> PageVerdict:
