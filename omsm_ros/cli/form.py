@@ -13,24 +13,35 @@ import numpy as np
 from omsm_ros.cli.arguments import Arguments, cell_of, number, refuse_cell
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
-from omsm_ros.core.form.compensation import ToolPath, compensation, path_gcode, spiral_offsets
+from omsm_ros.core.form.compensation import (
+    CutSurface,
+    ToolPath,
+    check_last_cut,
+    compensation,
+    cut_path,
+    path_gcode,
+    spiral_offsets,
+)
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
+from omsm_ros.core.kinematics.planner import plan_path
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import AUTO
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import gradient_of
-from omsm_ros.errors import DataError
+from omsm_ros.errors import ConfigurationError, DataError, FileError
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_limits, load_surface
 from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT, save_bytes, save_text
 from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
+from omsm_ros.io.gcode_file import path_gcode as program_of
 from omsm_ros.pipelines.form import MeasurementMeasuredPortions as OpenedMeasurement
 from omsm_ros.pipelines.form import draw_form, judge_form, open_measurement
 from omsm_ros.quantities import (
     FEED,
+    LENGTH,
     PROBE_ANGLE,
     SAMPLE_PERIOD,
     SPACING,
@@ -39,7 +50,7 @@ from omsm_ros.quantities import (
     STEP,
 )
 from omsm_ros.readable import count, percent, plain, quantity
-from omsm_ros.units import DEGREE_RAD, RPM_HZ
+from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
 FIGURE = "surface.png"
 _ACROSS = 401
@@ -127,14 +138,35 @@ def _path(surface: Surface, scan: Scan) -> ScanPath:
     return ScanPath(z=axes.z, sample_period=period, x=axes.x, c=axes.c)
 
 
-COMPENSATION, PATH = "compensation.csv", "compensation.nc"
+COMPENSATION, PATH, CUT = "compensation.csv", "compensation.nc", "cut.nc"
+# Bound on the distance of the executed cut from its path [m].
+_CUT_ERROR_M = 10 * NANOMETRE_M
+# Cycle of the controller's planner [s].
+_SERVO_PERIOD_S = 1e-3
 # Coverage factor beyond which an offset is significant, at 95 %.
 _COVERAGE = 2.0
 # With a smaller share of the area significant, the cut follows the noise of the measurement.
 _LEAST_SIGNIFICANT_SHARE = 0.5
 # A cut that leaves a larger share of the rms is not worth while.
 _LARGEST_REMAINDER = 0.9
-_HEAD = "x_m,y_m,offset_m,uncertainty_m\n"
+_HEAD = "x_m,y_m,offset_m,uncertainty_m"
+# In the table of a first cut, which has no more columns, the offsets are the change.
+_COLUMNS = 4
+
+
+_SIGN = (
+    "add offset_m to the height of the surface that is cut, along z, positive away from the part; "
+    "x and y are those of the nominal surface"
+)
+
+
+@dataclass(frozen=True)
+class NextCut:
+    """The next cut.  feed: a turn [m];  speed: [rpm];  tool_radius: of its nose [m]."""
+
+    feed: float
+    speed: float
+    tool_radius: float
 
 
 def compensate_form(
@@ -145,40 +177,75 @@ def compensate_form(
     asked: Sequence[str],
     aperture: Aperture | None = None,
     spiral: tuple[float, int] | None = None,
+    cut: NextCut | None = None,
+    previous: Path | None = None,
 ) -> dict[str, Any]:
     """Write compensation.csv into ``out``: offsets to add to the height of the next cut.
 
     asked, aperture: as for ``omsm form``
     low_pass: cutoff wavelength, of which half is compensated [m]
     spiral: feed per turn [m] and points per turn of the next cut, for compensation.nc; None: none
+    cut: for cut.nc, a complete program;  previous: compensation.csv of the cut that made this part
 
-    Raises DataError as ``omsm form`` does, and for a wavelength that the points do not resolve.
+    Raises DataError for a wavelength below the points, and where the previous cut went wrong.
     """
     form = measured.form(surface, asked, aperture)
     found = compensation(form.map, surface, low_pass)
-    x, y = np.meshgrid(found.x, found.y)
-    known = np.isfinite(found.offset)
-    columns = [values[known].tolist() for values in (x, y, found.offset, found.uncertainty)]
-    lines = (",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True))
-    save_text(out / COMPENSATION, _HEAD + "\n".join(lines) + "\n")
+    (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
+    share, total = None, found.offset
+    if previous is not None:
+        before, change = _offsets(previous, x, y)
+        share, total = check_last_cut(found, change), total + before
+    columns = (x, y, total, found.uncertainty, *([found.offset] if previous else []))
+    _write_offsets(out, [values[known].tolist() for values in columns])
     path = {} if spiral is None else _along(spiral_offsets(found, *spiral), out)
-    sure = np.abs(found.offset[known]) > _COVERAGE * found.uncertainty[known]
-    return {
+    if cut is not None:
+        rim = float(np.max(np.hypot(x[known], y[known])))
+        path |= _program(CutSurface(surface, found.x, found.y, total), rim, cut, out)
+    offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
+    sure = float(np.mean(offset > _COVERAGE * spread))
+    return path | {
         "file": COMPENSATION,
-        **path,
         "places": int(np.sum(known)),
         "low_pass": low_pass,
         "removed": list(form.registration.dofs.fitted),
         "rms_before": found.before,
         "rms_after": found.after,
-        "largest_offset": float(np.max(np.abs(found.offset[known]))),
-        "largest_uncertainty": float(np.max(found.uncertainty[known])),
-        "significant_share": float(np.mean(sure)),
-        "warnings": _warnings(float(np.mean(sure)), found.before, found.after),
-        "sign": "add offset_m to the height of the surface that is cut, along z, positive away from"
-        " the part; x and y are those of the nominal surface",
+        "largest_offset": float(np.max(offset)),
+        "largest_uncertainty": float(np.max(spread)),
+        "significant_share": sure,
+        "last_cut": share,
+        "warnings": _warnings(sure, found.before, found.after),
+        "sign": _SIGN,
         "not_evaluated": [] if measured.systematic else ["systematic errors of the measurement"],
     }
+
+
+def _write_offsets(out: Path, columns: list[list[float]]) -> None:
+    lines = (",".join(f"{value:.9g}" for value in row) for row in zip(*columns, strict=True))
+    head = _HEAD if len(columns) == _COLUMNS else f"{_HEAD},change_m"
+    save_text(out / COMPENSATION, "\n".join([head, *lines]) + "\n")
+
+
+def _offsets(previous: Path, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return total and last offsets (r, c) [m] of an earlier compensation.csv; FileError."""
+    from scipy.interpolate import NearestNDInterpolator  # takes 0.3 s to load
+
+    try:
+        table = np.loadtxt(previous, delimiter=",", skiprows=1, ndmin=2)
+        values = table[:, [2, -1]] if table.shape[1] > _COLUMNS else table[:, [2, 2]]
+    except (ValueError, IndexError, OSError) as err:
+        raise FileError(f"{str(previous)!r} is no {COMPENSATION}: {err}") from err
+    found = NearestNDInterpolator(table[:, :2], values)(x, y)
+    return found[..., 0], found[..., 1]
+
+
+def _program(surface: Surface, rim: float, cut: NextCut, out: Path) -> dict[str, Any]:
+    path, duration = cut_path(surface, rim, cut.feed, cut.speed, cut.tool_radius)
+    planned = plan_path(path, duration, _SERVO_PERIOD_S, _CUT_ERROR_M)
+    remark = f"cut at {cut.speed:g} rpm with a nose of {cut.tool_radius / MILLIMETRE_M:g} mm"
+    save_text(out / CUT, program_of(planned, [remark], measures=False))
+    return {"cut": CUT, "path_error": planned.error, "cut_duration": duration}
 
 
 def _along(path: ToolPath, out: Path) -> dict[str, Any]:
@@ -274,16 +341,25 @@ def _declare_compensate(add: Arguments) -> None:
         metavar="FEED",
     )
     add("--per-turn", SPIRAL_PLACES, "points per turn of the spiral", default=360)
+    add("--tool-radius", LENGTH, f"nose of the tool [m]: write {CUT}, the complete next cut")
+    add("--rpm", SPEED, "spindle speed of the cut [rpm]", default=60.0)
+    add("--previous", COMPENSATION, "of the cut that made this part: its effect is checked, and "
+        "the offsets are added to it")  # fmt: skip
     declare_fit(add, (AUTO,))
 
 
 def _compensate(args: argparse.Namespace) -> Facts:
     surface = load_surface(args.nominal)
     spiral = (args.spiral, int(args.per_turn)) if args.spiral else None
-    with result_folder(args.out, (COMPENSATION, PATH)) as out:
+    cut = None
+    if args.tool_radius:
+        if not args.spiral:
+            raise ConfigurationError("--tool-radius needs the feed of the cut: give --spiral FEED")
+        cut = NextCut(args.spiral, args.rpm, args.tool_radius)
+    with result_folder(args.out, (COMPENSATION, PATH, CUT)) as out:
         points = open_measurement(args.measured, args.unit)
         facts = compensate_form(
-            points, surface, out, args.low_pass, args.fit, args.aperture, spiral
+            points, surface, out, args.low_pass, args.fit, args.aperture, spiral, cut, args.previous
         )
     return {**facts, "out": str(args.out)}
 
@@ -298,6 +374,11 @@ def _show_compensate(facts: Facts) -> None:
     if "path" in facts:
         rows.append(("points on the spiral", count(facts["path_places"])))
         files.append(facts["path"])
+    if "cut" in facts:
+        rows.append(("path error of the cut", quantity(facts["path_error"], "m")))
+        files.append(facts["cut"])
+    if facts["last_cut"] is not None:
+        rows.append(("effect of the last cut", f"{facts['last_cut']:.2f} of what was asked for"))
     table([*rows, ("sign", facts["sign"]), written(files, facts["out"])])
 
 

@@ -125,3 +125,29 @@ def test_offsets_below_their_uncertainty_are_warned_of(folder, tmp_path, capsys)
 def test_a_spiral_too_fine_for_a_controller_is_refused(folder, tmp_path, capsys):
     assert compensate(folder, tmp_path / "o", "--low-pass", "0.004", "--spiral", "1e-8") == 2
     assert "take a wider feed" in capsys.readouterr().err
+
+
+def test_a_complete_program_and_the_effect_of_the_last_cut(folder, tmp_path, capsys):
+    """The part of the fixture again, after a cut with the wrong sign: the next one is refused."""
+    cut = ("--low-pass", "0.004", "--spiral", "1e-3", "--tool-radius", "0.005", "--json")
+    assert compensate(folder, tmp_path / "first", *cut) == 0
+    facts = json.loads(capsys.readouterr().out)
+    program = (tmp_path / "first" / "cut.nc").read_text().splitlines()
+    assert sum(line.startswith("G1 ") for line in program) > 500
+    assert program[-1] == "M2"
+    assert facts["path_error"] < 1e-7
+    previous = tmp_path / "first" / "compensation.csv"
+    worse = tmp_path / "worse"
+    worse.mkdir()
+    points = np.loadtxt(folder / "part.xyz")
+    points[:, 2] += FORM.height(points[:, 0], points[:, 1])
+    np.savetxt(worse / "part.xyz", points, fmt="%.15g")
+    (worse / "mirror.yaml").write_text((folder / "mirror.yaml").read_text())
+    again = ("--low-pass", "0.004", "--previous", previous)
+    assert compensate(worse, tmp_path / "second", *again) == 2
+    assert "sign" in capsys.readouterr().err
+    assert not (tmp_path / "second" / "cut.nc").exists()
+    points[:, 2] -= 1.9 * FORM.height(points[:, 0], points[:, 1])
+    np.savetxt(worse / "part.xyz", points, fmt="%.15g")
+    assert compensate(worse, tmp_path / "third", *again, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["last_cut"] == pytest.approx(0.9, abs=0.05)

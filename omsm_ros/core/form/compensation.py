@@ -12,10 +12,11 @@ import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells
 from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.kinematics.planner import Path
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M
+from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, RPM_HZ, RPM_RAD_S
 
 # Cells in the shortest wavelength, so that neighbouring cells resolve it.
 _LEAST_CELLS = 4.0
@@ -158,3 +159,92 @@ def path_gcode(path: ToolPath) -> str:
         path.radius / MILLIMETRE_M, path.angle / DEGREE_RAD, path.offset / MILLIMETRE_M, strict=True
     )
     return "\n".join([*_HEAD, *(f"X{x:.6f} C{c:.5f} Z{z:+.8f}" for x, c, z in rows)]) + "\n"
+
+
+# A cut that changes the form by another share of what was asked for is not repeated.
+_GAINS = (0.5, 1.5)
+# Cells around what was measured, in which the slope of the offsets decays.
+_MARGIN = 4
+# Iterations of the place where the nose of the tool touches.
+_TOUCHES = 12
+# Step of the difference of slopes, small against any form [m].
+_STEP_M = 1e-5
+
+
+def check_last_cut(found: Compensation, change: FloatArray) -> float | None:
+    """Return the share of the offsets ``change`` [m] of the last cut that it made in the part.
+
+    change: as ``found.offset``, (r, c), NaN where unknown;  None: too small to tell
+
+    Raises DataError unless the share is near 1: reversed, the next cut would make the form worse.
+    """
+    both = np.isfinite(change) & np.isfinite(found.offset)
+    asked, now = change[both] - np.mean(change[both]), -found.offset[both]
+    # Before the last cut the deviation was the negative of what was asked for.
+    made = now - np.mean(now) + asked
+    if np.std(asked) < 2 * np.sqrt(np.mean(found.uncertainty[both] ** 2)):
+        return None
+    share = float(asked @ made / (asked @ asked))
+    if not _GAINS[0] <= share <= _GAINS[1]:
+        raise DataError("form.last_cut", share=share, asked=float(np.std(asked)))
+    return share
+
+
+class CutSurface:
+    """The surface to cut: the nominal one plus ``offset`` (r, c) [m] on the grid x, y [m].
+
+    Beyond what was measured the offset of the nearest cell holds.
+    """
+
+    def __init__(self, nominal: Surface, x: FloatArray, y: FloatArray, offset: FloatArray) -> None:
+        from scipy import interpolate, ndimage  # takes 0.3 s to load
+
+        place = ndimage.distance_transform_edt(
+            ~np.isfinite(offset), return_distances=False, return_indices=True
+        )
+        self._nominal = nominal
+        known = np.pad(offset[tuple(place)], _MARGIN, mode="edge")
+        x, y = (v[0] + (v[1] - v[0]) * np.arange(-_MARGIN, len(v) + _MARGIN) for v in (x, y))
+        self._offset = interpolate.RectBivariateSpline(y, x, known)
+        self._limits = (x[0], x[-1], y[0], y[-1])
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m], of their shape."""
+        left, right, low, high = self._limits
+        added = self._offset.ev(np.clip(y, low, high), np.clip(x, left, right))
+        return np.asarray(self._nominal.height(x, y) + added, np.float64)
+
+
+def cut_path(
+    surface: Surface, radius: float, feed: float, rpm: float, tool_radius: float
+) -> tuple[Path, float]:
+    """Return the path of the tip of a round-nosed tool that cuts ``surface``, and its duration [s].
+
+    The tool goes from ``radius`` [m] to the centre with ``feed`` [m] a turn at ``rpm``. Where the
+    surface is inclined by s along X the nose touches at a distance of R s/√(1 + s²) from the tip.
+
+    Raises ConfigurationError where the nose is blunter than the surface is hollow.
+    """
+
+    def path(time: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        c = rpm * RPM_RAD_S * time
+        tip = radius - feed * rpm * RPM_HZ * time
+        along_x, along_y = np.cos(c), -np.sin(c)
+
+        def touching(away: FloatArray) -> FloatArray:
+            """Return where a nose touches that has the slope of the surface at ``away``."""
+            x, y = (tip + away) * along_x, (tip + away) * along_y
+            slopes = gradient_of(surface, x, y)
+            slope = slopes[0] * along_x + slopes[1] * along_y
+            return np.asarray(tool_radius * slope / np.sqrt(1 + slope**2))
+
+        away = np.zeros_like(tip)
+        for _ in range(_TOUCHES):
+            away = touching(away)
+        # Where the surface is more curved than the nose, the nose touches at two places.
+        if np.any(touching(away + _STEP_M) - touching(away - _STEP_M) >= 2 * _STEP_M):
+            raise ConfigurationError("form.tool_too_blunt", tool_radius=tool_radius)
+        height = surface.height((tip + away) * along_x, (tip + away) * along_y)
+        return tip, height - tool_radius + np.sqrt(tool_radius**2 - away**2), c
+
+    return path, radius / (feed * abs(rpm) * RPM_HZ)
