@@ -283,6 +283,7 @@ def coarser(problem: Problem, every: int) -> Problem:
         background=np.column_stack([thinned(column) for column in problem.background.T]),
         noise=problem.noise / np.sqrt(every),
         plateau=None,
+        input_rounding=problem.input_rounding / every,
         errors_in_variables=None,
     )
 

@@ -43,14 +43,31 @@ _SHARED = 1 + 2 * ((4 / 6) ** 2 + (1 / 6) ** 2)
 
 
 def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatArray:
-    """Return the effects of rounding and jitter on ``columns`` (k, c), one independent error a row.
+    """Return the effects of rounding, of the encoder's noise and of jitter on ``columns`` (k, c), one independent error a row.
 
     Each row is the effect of one standard deviation: rows E have the covariance EᵀE.
     scatter: variance of the time of a reading [s²], see :func:`scatter_in_time`
     """
     return np.concatenate(
-        [_rounding_rows(problem, columns), _timing_rows(problem, columns, scatter)]
+        [
+            _rounding_rows(problem, columns),
+            _input_rows(problem, columns),
+            _timing_rows(problem, columns, scatter),
+        ]
     )
+
+
+def _input_rows(problem: Problem, columns: FloatArray) -> FloatArray:
+    """Return rows of errors of a quantised encoder, one for each reading while it moves.
+
+    Where it is stationary, they are a constant or were taken out.
+    """
+    if problem.input_rounding == 0:
+        return np.zeros((0, columns.shape[1]))
+    taken = problem.errors_in_variables
+    variance = problem.input_rounding + (0.0 if taken is None else float(np.mean(taken**2)))
+    square = rate_of(problem)[problem.used] ** 2
+    return np.asarray(np.sqrt(variance) * columns[square > _STILL * np.max(square)])
 
 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:

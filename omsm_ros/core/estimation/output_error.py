@@ -101,6 +101,7 @@ class Problem:
     fits_initial_condition: fit the response to the unknown motion before the first sample too
     plateau: number of the plateau of a sample, (n,), -1 elsewhere; or None
     shared: variance of the rounding error that the readings of a plateau share [m²]
+    input_rounding: variance of the rounding error of the input while it moves [m²]
     errors_in_variables: noise that was taken out of the input, (n,) [m]; or None
     """
 
@@ -114,6 +115,7 @@ class Problem:
     fits_initial_condition: bool = False
     plateau: IntArray | None = None
     shared: float = 0.0
+    input_rounding: float = 0.0
     errors_in_variables: FloatArray | None = None
 
     @cached_property

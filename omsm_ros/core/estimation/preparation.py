@@ -84,10 +84,11 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
-    """Return the problem with the variance of the rounding errors that plateaus share."""
+    """Return the problem with the variances of rounding errors of both readings."""
     plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
     shared = plateau_variance(output, plateau[problem.used], reading_step(output))
-    return replace(problem, plateau=plateau, shared=shared)
+    step = reading_step(problem.input)
+    return replace(problem, plateau=plateau, shared=shared, input_rounding=step**2 / 12)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:

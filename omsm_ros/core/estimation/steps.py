@@ -27,6 +27,9 @@ NOISE_FACTOR = 20.0
 TRAVEL_PART = 2e-3
 # Orders of differences from which noise is estimated: the motion vanishes in the higher ones.
 _DIFFERENCES = (2, 4, 6, 8)
+# Share of second differences that are zero above which a signal mostly repeats its value, and
+# samples of a window: at 0.2 steps of noise it has two changes.
+_REPEATING, _WINDOW = 0.1, 200
 # The axis is stationary if it stays in place for this time; then an edge ends.
 _STATIONARY_S = 20e-3
 
@@ -59,8 +62,13 @@ def sample_noise(values: FloatArray) -> float:
     """Return the standard deviation of white noise on a smooth signal, from its differences.
 
     Motion adds to the differences of each order, so the smallest estimate is taken. Each is a
-    median, which the few samples at edges do not change.
+    median, which the few samples at edges do not change. Where a signal mostly repeats its value,
+    because its steps exceed its noise, the median is of windows.
     """
+    second = np.diff(values, 2)
+    if len(second) >= _WINDOW and np.mean(second == 0) > _REPEATING:
+        windows = second[: len(second) // _WINDOW * _WINDOW].reshape(-1, _WINDOW)
+        return float(np.sqrt(np.median(np.mean(windows**2, axis=1)) / 6))
     orders = [order for order in _DIFFERENCES if order < len(values)]
     return min((_difference_noise(values, order) for order in orders), default=0.0)
 

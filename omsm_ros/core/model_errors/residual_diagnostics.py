@@ -176,7 +176,7 @@ class ResidualSpace:
         noise = smoothed_noise_spectrum(residual, self._places, samples, length)
         noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
         even = weighted_gram(rows, length, noise)
-        if self._scatter == 0 and self.problem.shared == 0:
+        if self._scatter == 0 and self.problem.shared == self.problem.input_rounding == 0:
             return even
         uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
         return np.asarray(even + uneven.T @ uneven)
