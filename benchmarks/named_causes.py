@@ -60,6 +60,20 @@ _MADE = {
 }
 
 
+# Causes of a finding that names several.
+_WORDS = {"nonlinear scale of the probe": "linearity", "periodic error": "periodic"}
+
+
+def _causes(finding: Finding) -> tuple[str, ...]:
+    """Return the causes that a finding names as possible ones, none for others."""
+    subject = finding.code.partition(".")[2].removeprefix("unmodelled_")
+    if subject == "undecided":
+        causes = finding.values["causes"]
+        assert isinstance(causes, list)
+        return tuple(_WORDS.get(cause, cause) for cause in causes)
+    return _NAMED.get(subject, ())
+
+
 def judged(name: str, findings: Iterable[Finding]) -> str:
     """Return whether the causes that ``findings`` name are those of the disturbance ``name``.
 
@@ -75,8 +89,7 @@ def judged(name: str, findings: Iterable[Finding]) -> str:
         if part.startswith(start)
         for cause in causes
     }
-    subjects = [finding.code.partition(".")[2].removeprefix("unmodelled_") for finding in findings]
-    named = [_NAMED[subject] for subject in subjects if subject in _NAMED]
+    named = [causes for finding in findings if (causes := _causes(finding))]
     if not named:
         return UNKNOWN
     return RIGHT if all(made.intersection(causes) for causes in named) else WRONG

@@ -16,7 +16,7 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 | ``{lost:counts}`` | mapping of counts, ``3 not ok, 1 duplicate`` |
 | ``{factor:plain/2}`` | number without unit, to 2 digits |
 | ``{names:list}`` | items separated by commas |
-| ``{names:and}`` | items joined by "and" |
+| ``{names:and}``, ``{names:or}`` | items joined by "and", "or" |
 | ``{name:figure}``, ``{term:zernike}`` | figure of form by its field, Zernike term ``(n, m)`` |
 | ``{source:words}`` | name with spaces instead of underscores |
 | ``{opt.dwell}`` | ``--dwell``, ``parameter 'dwell'`` or ``'dwell'``, for the audience |
@@ -92,6 +92,7 @@ _WRITERS: dict[str, Callable[[Any], str]] = {
     "counts": readable.counts_text,
     "list": lambda items: ", ".join(map(str, items)) or "none",
     "and": lambda items: " and ".join(map(str, items)),
+    "or": lambda items: " or ".join(map(str, items)),
     "words": lambda name: str(name).replace("_", " "),
     "figure": readable.figure,
     "zernike": lambda term: readable.zernike(*term),

@@ -58,6 +58,10 @@ TEMPLATES: dict[str, str] = {
         )
         for name, (words, remedy) in _NAMES.items()
     },
+    "identification.undecided": (
+        "an error of {size_m:m} that looks like {causes:or}; it is modelled in addition to the "
+        "response: rule out each of them, with steps of other heights and longer rests"
+    ),
     # The record and its channels.
     "identification.exchanged_channels": (
         "the probe moves {lead_s:s} before the encoder, and the encoder is noisier "

@@ -43,9 +43,9 @@ _SHARED = 1 + 2 * ((4 / 6) ** 2 + (1 / 6) ** 2)
 
 
 def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatArray:
-    """Return the effects of rounding, of the encoder's noise and of jitter on ``columns`` (k, c), one independent error a row.
+    """Return effects of rounding, encoder noise and jitter on ``columns`` (k, c), as rows.
 
-    Each row is the effect of one standard deviation: rows E have the covariance EᵀE.
+    Each row is the effect of one independent error of one standard deviation.
     scatter: variance of the time of a reading [s²], see :func:`scatter_in_time`
     """
     return np.concatenate(

@@ -9,7 +9,7 @@ have taken a part of that explanation.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -17,8 +17,9 @@ from scipy import stats
 from omsm_ros.core.calibration.certificate import ModelError, ModelErrors
 from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, Finding
 from omsm_ros.core.estimation.covariance import parameter_covariance
+from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.identification.evidence import IdentificationEvidence
-from omsm_ros.core.identification.model_error_search import SearchResult
+from omsm_ros.core.identification.model_error_search import ModelledTerm, SearchResult
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
@@ -32,7 +33,11 @@ from omsm_ros.core.model_errors.families import (
     VIBRATION,
     ModelErrorTerm,
 )
-from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
+from omsm_ros.core.model_errors.residual_diagnostics import (
+    FALSE_ALARM,
+    ResidualDiagnostics,
+    ScoreTest,
+)
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Standard uncertainty of a height over the size of an error: the rms of a sine. Backlash and
@@ -59,6 +64,20 @@ _UNMODELLED_CODES = {
     MODE: "identification.unmodelled_mode",
     STIFFENING: "identification.unmodelled_stiffening",
 }
+# Families of which one may explain the residual of another, as causes in words.
+_MAY_LOOK_ALIKE = {
+    BACKLASH: "backlash",
+    FRICTION: "friction",
+    LINEARITY: "nonlinear scale of the probe",
+    PERIODIC: "periodic error",
+    DRIFT: "drift",
+    CREEP: "creep",
+}
+# Log odds below which the data do not decide between two of them. None of the terms is exactly what
+# a machine does, so this is twice what counts as very strong (Kass and Raftery 1995).
+_UNDECIDED = 10.0
+# Iterations of the fit without a term.
+_REFITTED = 3
 # Name of the parameter of a family in the values of a finding.
 _PARAMETERS = {
     CREEP: "time_constant_s",
@@ -92,17 +111,43 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
         yield Finding(_UNMODELLED_CODES[judged.term.family], REJECTS, values, limits)
     sizes, _ = _sizes(searched)
     pairs = zip(searched.nuisance_terms, sizes, strict=True)
-    shown = [(modelled.term, found.value) for modelled, found in pairs if found.significant]
-    drifts = any(term.family == DRIFT for term, _ in shown)
-    for term, size in shown:
+    shown = [(modelled, found.value) for modelled, found in pairs if found.significant]
+    drifts = any(modelled.term.family == DRIFT for modelled, _ in shown)
+    for modelled, size in shown:
+        term = modelled.term
         # A drift that wanders has power at low frequencies, where a line is a part of it.
         slow = term.parameter * searched.diagnostics.plateau < 1
         if not (drifts and slow and term.family == VIBRATION):
-            values = _values(term, size, period)
-            yield Finding(_NUISANCE_CODES[term.family], RESERVATION, values)
+            yield _finding(searched, modelled, _values(term, size, period))
     for term in searched.added_poles:
         values = _values(term, None, period)
         yield Finding(_IN_RESPONSE_CODES[term.family], RESERVATION, values)
+
+
+def _finding(searched: SearchResult, modelled: ModelledTerm, values: dict[str, object]) -> Finding:
+    """Return the reservation for a nuisance term, which names all causes that look alike."""
+    family = modelled.term.family
+    alike = _alike(searched, modelled) if family in _MAY_LOOK_ALIKE else []
+    if not alike:
+        return Finding(_NUISANCE_CODES[family], RESERVATION, values)
+    names = [_MAY_LOOK_ALIKE[name] for name in (family, *alike)]
+    return Finding("identification.undecided", RESERVATION, {**values, "causes": names})
+
+
+def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:
+    """Return the other families that explain about as much as ``modelled``, fitted without it."""
+    problem, fitted = searched.prepared.problem, searched.model.chosen.fit
+    kept = np.ones(problem.background.shape[1], np.bool_)
+    kept[modelled.columns] = False
+    without = replace(problem, background=problem.background[:, kept])
+    again = fit(without, fitted.structure, [fitted.nonlinear], _REFITTED)
+    tested = ResidualDiagnostics(without, again, searched.prepared.steps, {*_MAY_LOOK_ALIKE})
+    own = tested.evidence(ScoreTest(modelled.term, tested.space.score(modelled.term.columns)))
+    return [
+        name
+        for name, test in tested.best.items()
+        if name != modelled.term.family and tested.evidence(test) > own - _UNDECIDED
+    ]
 
 
 def model_errors_of(searched: SearchResult, duration: float) -> ModelErrors:
