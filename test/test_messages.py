@@ -83,7 +83,7 @@ def test_every_code_of_a_calibration_is_a_literal_of_the_core_and_the_reverse() 
 
 @pytest.mark.parametrize("code", [c for c in templates() if c.startswith("identification.")])
 def test_a_sentence_of_a_finding_is_written_from_its_values(code: str) -> None:
-    values = dict.fromkeys(fields(templates()[code]), 0.5)
+    values = {name: [0.5] if name == "causes" else 0.5 for name in fields(templates()[code])}
     sentence = str(Finding(code, REJECTS, values))
     assert sentence != code
     assert "{" not in sentence

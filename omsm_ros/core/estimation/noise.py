@@ -234,7 +234,10 @@ def correct_errors_in_variables(
     """
     if problem.noise <= 0 or problem.errors_in_variables is not None:
         return None
-    smooth, left = smoothed(problem.input, problem.noise, edges)
+    # Readings that change by one step agree with a constant.
+    reach = max(problem.noise, 0.5 * float(np.sqrt(12 * problem.input_rounding)))
+    smooth, left = smoothed(problem.input, reach, edges)
+    left *= problem.noise / reach
     noise = problem.input - smooth
     quiet = replace(problem, input=smooth, noise=left)
     made = np.where(problem.used, problem.modelled(fitted) - quiet.modelled(fitted), 0.0)

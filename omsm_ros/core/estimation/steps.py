@@ -63,12 +63,16 @@ def sample_noise(values: FloatArray) -> float:
 
     Motion adds to the differences of each order, so the smallest estimate is taken. Each is a
     median, which the few samples at edges do not change. Where a signal mostly repeats its value,
-    because its steps exceed its noise, the median is of windows.
+    because its steps exceed its noise, the median is of windows without travel.
     """
     second = np.diff(values, 2)
-    if len(second) >= _WINDOW and np.mean(second == 0) > _REPEATING:
+    size, rounding = np.abs(second), 1e-9 * float(np.max(np.abs(values), initial=0.0))
+    if len(second) >= _WINDOW and np.mean(size <= rounding) > _REPEATING:
         windows = second[: len(second) // _WINDOW * _WINDOW].reshape(-1, _WINDOW)
-        return float(np.sqrt(np.median(np.mean(windows**2, axis=1)) / 6))
+        moved = np.abs(np.diff(values[: len(second) + 1 : _WINDOW]))[: len(windows)]
+        step = np.min(size[size > rounding], initial=np.inf)
+        rests = windows[: len(moved)][moved <= 1.5 * step]
+        return float(np.sqrt(np.median(np.mean(rests**2, axis=1)) / 6)) if len(rests) else 0.0
     orders = [order for order in _DIFFERENCES if order < len(values)]
     return min((_difference_noise(values, order) for order in orders), default=0.0)
 
