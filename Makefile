@@ -48,6 +48,7 @@ bench: $(PEERS)
 
 soak: setup
 	$(RUN) python -m pytest -m soak --timeout=0
+	$(RUN) OMSM_MISSED_TRIGGERS=200 python -m pytest test/instruments/test_missed_triggers.py
 
 # The manual, in out/docs.
 docs: setup

@@ -180,7 +180,7 @@ _LEAST_ARRIVALS = 3
 # Spans whose earliest arrivals are the reference; how many it needs, and how many show a drift.
 _SPANS, _LEAST_SPANS, _DRIFT_SPANS = 15, 4, 8
 # The last sample of a portion may be nearly a period old, so only a delay of this is one [period].
-_LATE_PERIODS = 0.75
+_LATE_PERIODS, _AGE_PERIODS, _AGES_OF_FEW = 0.75, 0.25, 1.5
 # Limit of lateness over the range of the earliest arrivals, of many and of few spans [1].
 _RANGES, _RANGES_OF_FEW = 2.0, 3.0
 
@@ -273,8 +273,12 @@ class MissedTriggerDetector:
         many = len(begin) >= _DRIFT_SPANS
         self._drift = float(np.polyfit(since, late, 1)[0]) if many else 0.0
         rest = late - self._drift * since
-        self._since, self._expected = float(begin[-1]), float(rest[-_LEAST_SPANS:].min())
-        scatter = (_RANGES if many else _RANGES_OF_FEW) * float(np.ptp(rest))
+        self._since, self._expected = float(begin[-1]), float(rest.min())
+        scatter = float(np.ptp(rest))
+        if scatter < self._period:  # it is of the ages, which are below a period
+            scatter = (1 if many else _AGES_OF_FEW) * scatter + _AGE_PERIODS * self._period
+        else:
+            scatter *= _RANGES if many else _RANGES_OF_FEW
         self._limit = max(_LATE_PERIODS * self._period, scatter)
         self.seen_from = int(np.ceil(self._limit / self._period))
 
