@@ -49,8 +49,7 @@ from omsm_ros.pipelines.measure import Judgement, with_sources
 from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report import response_figures, style
-from omsm_ros.report.measurement.figures import levelled, overview_figure, surface_figures
-from omsm_ros.report.measurement.surface_map import CloudView
+from omsm_ros.report.measurement.figures import surface_figures
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth
 from omsm_ros.twin.disturbances import NOTHING, Disturbances, TrueResponse
@@ -64,7 +63,6 @@ _FIRST_PORT, _PORTS = 20_000, 10_000
 # sample allows 7.6 times real time; with two devices one may lag behind.
 _LAPSE, _RADIUS_M = 20.0, 12.7e-3
 _SLOW_LAPSE, _SMALL_RADIUS_M = 3.0, 3e-3
-OVERVIEW = "overview.png"
 SCAN_REPORT = "scan_report.html"
 # Form deviation that a mirror of this kind may have, peak to valley.
 TOLERANCE_M = 250e-9
@@ -85,7 +83,7 @@ _LENGTHS = {
     "straightness_z": {"correlation_length": 1e-3},
 }
 _RESULTS = (
-    CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, SCAN_REPORT, OVERVIEW,
+    CLOUD, SYSTEMATIC, FORM, DEVIATION, SUMMARY, REPORT, SCAN_REPORT,
     ADJUSTMENT, ADJUSTED_CLOUD,
 )  # fmt: skip
 
@@ -270,7 +268,7 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     summary = measurement.summarise(plan.bag, done, calibration, judgement)
     measurement.add_form(plan.out, summary, PAPER_MIRROR, _REGISTERING)
     measurement.add_verdict(summary, done, calibration, judgement)
-    summary["files"] |= {"scan_report": SCAN_REPORT, "overview": OVERVIEW}
+    summary["files"] |= {"scan_report": SCAN_REPORT}
     summary["files"] |= {"calibration": plan.calibration_file.name, "bag": plan.bag.name}
     summary |= truth_entries(recording, cloud)  # replaces the estimated error by the true one
     true = true_response(step_test)
@@ -280,7 +278,6 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     summary["live_points"] = len(live)
     figures = surface_figures(view, PAPER_MIRROR)
     figures["bode"] = style.png(response_figures.bode(calibration, true, plan.sample_period))
-    (plan.out / OVERVIEW).write_bytes(overview(view, calibration, true))
     surface = publication.map_of(view, PAPER_MIRROR, plan.out)
     publication.publish(plan.out, TITLE, summary, calibration, figures, surface)
     (plan.out / REPORT).replace(plan.out / SCAN_REPORT)
@@ -369,13 +366,6 @@ def response_errors(calibration: Calibration, true: TrueResponse) -> list[dict[s
         {"frequency": float(f), "gain_error": float(g), "phase_error_deg": float(p)}
         for f, g, p in zip(frequency, gain, phase, strict=True)
     ]
-
-
-def overview(view: CloudView, calibration: Calibration, true: TrueResponse) -> bytes:
-    """Draw the maps before [µm] and after [nm], and the identified and true response."""
-    raw, corrected = (levelled(view, h, PAPER_MIRROR) for h in (view.raw_height, view.height))
-    figure = overview_figure(view.x, view.y, raw, corrected, calibration, true)
-    return style.png(figure, dpi=120)
 
 
 def live_points(bag: Path) -> NDArray[np.void]:

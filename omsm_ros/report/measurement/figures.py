@@ -1,4 +1,4 @@
-"""Figures of a measured surface: deviation maps, profiles, dynamic error, and the overview.
+"""Figures of a measured surface: deviation maps, profiles, dynamic error.
 
 Every function returns a matplotlib Figure; arguments are in SI units, labels state the unit drawn.
 """
@@ -13,7 +13,6 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
-from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface import deviation as form
@@ -21,7 +20,6 @@ from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.report import style
 from omsm_ros.report.measurement.surface_map import CloudView, Raster, rasterise
-from omsm_ros.report.response_figures import HasResponse, draw_gain, draw_phase, frequencies
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 UNITS_M = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "mm": MILLIMETRE_M}
@@ -167,33 +165,6 @@ def _draw_envelope(
     axes.fill_between(at, low / scale, high / scale, color=colour, linewidth=0.6)
     axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
     axes.margins(x=0.01)
-
-
-def overview_figure(
-    x: FloatArray,
-    y: FloatArray,
-    raw: FloatArray,
-    corrected: FloatArray,
-    identified: Calibration,
-    true: HasResponse | None = None,
-) -> Figure:
-    """Draw a result as one wide figure: raw map [µm], corrected map [nm], Bode plot.
-
-    raw, corrected: deviations (n,) [m] at x, y [m]
-    """
-    made = style.empty(13.0, 3.75)
-    left, middle, right = made.subfigures(1, 3, squeeze=False)[0]
-    _draw_map(left, rasterise(x, y, raw), "µm", "Uncorrected, in micrometres")
-    _draw_map(middle, rasterise(x, y, corrected), "nm", "Corrected, in nanometres")
-    places = {"left": 0.16, "right": 0.97, "bottom": 0.13, "top": 0.895, "hspace": 0.12}
-    gain, phase = right.subplots(2, 1, sharex=True, gridspec_kw=places)
-    for axes in (gain, phase):
-        style.quiet(axes)
-    at = frequencies(identified)
-    draw_gain(gain, at, identified, true, title="Response of the probe to the axis")
-    draw_phase(phase, at, identified, true)
-    right.align_ylabels()
-    return made
 
 
 def _unit(name: str) -> float:

@@ -10,9 +10,7 @@ from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.report import style
 from omsm_ros.report.measurement import figures
-from omsm_ros.twin.plant import Plant
 
 
 @pytest.fixture(scope="module")
@@ -136,15 +134,3 @@ class TestDynamicError:
         figure = figures.dynamic_error(cloud.time, cloud.dynamic_error)
         assert len(figure.get_axes()) == 1
         assert {"before [µm]", "time [s]"} <= texts(figure)
-
-
-def test_the_overview_has_two_maps_in_two_units_and_a_bode_plot(cloud, deviations, certified):
-    figure = figures.overview_figure(
-        cloud.x, cloud.y, deviations["raw"], deviations["corrected"], certified, Plant().dynamics
-    )
-    assert {
-        "deviation [µm]", "deviation [nm]", "gain [1]", "phase [deg]", "frequency [Hz]", "true",
-    } <= texts(figure)  # fmt: skip
-    width, height = figure.get_size_inches()
-    assert width > 3 * height
-    assert style.png(figure, dpi=50).startswith(b"\x89PNG")
