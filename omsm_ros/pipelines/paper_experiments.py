@@ -116,7 +116,7 @@ def _steps(out: Path, seed: int) -> Done:
             "probe": (time[one], (confocal - np.mean(confocal[rest]))[one] / MICROMETRE_M),
             "reference": (time[one], capacitive[one] / MICROMETRE_M),
             "error": (time[one], error[one] / MICROMETRE_M)}),
-        Panel("Gain of Eq. 12 (Fig. 6d)", "frequency [Hz]", "1", {
+        Panel("Gain of Eq. 12 (Fig. 6d)", "frequency [Hz]", "gain", {
             "": (_GRID_HZ, np.abs(PAPER_DYNAMICS.response(_GRID_HZ)))}, power=True),
     )  # fmt: skip
     caption = "Static gain and lag together, as the paper shows them."
@@ -228,7 +228,7 @@ def _circles(out: Path, seed: int) -> Done:
         ours = float(np.std(scan.studied.formless.residual))
         _, wavelength = _highest(scan)
         rows += [
-            compared(f"{name}, {rpm:g} rpm: mean speed of Z", f"{speed * 1e3:.3g} mm/s", speed,
+            compared(f"{name}, {rpm:g} rpm: mean speed of Z", quantity(speed, "m/s"), speed,
                      _mean_speed(rpm), "m/s", "F1 is misprinted" if name == "F1" else ""),
             compared(f"{name}: sampling distance", quantity(distance, "m", 5), distance, path, "m",
                      "printed for a radius of 21.6 mm (erratum 8)"),
