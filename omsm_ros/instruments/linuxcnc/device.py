@@ -28,4 +28,4 @@ def make(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice
         given["columns"] = COLUMNS
     for axis, usual in _COUNTS_PER_UNIT.items():
         given[f"{axis}.counts_per_unit"] = given[f"{axis}.counts_per_unit"] or usual
-    return make_text(given, transport, now_ns, _PARTS)
+    return make_text(given, transport, now_ns, _PARTS, clocked=True)

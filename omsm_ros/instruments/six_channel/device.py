@@ -31,7 +31,7 @@ from omsm_ros.instruments.six_channel.protocol import (
 )
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Transport, parts_of
-from omsm_ros.units import NANOMETRE_M
+from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
 
 _SEQUENCE_RANGE = 2**32
 
@@ -109,7 +109,7 @@ class CsvSettings(BlockSettings):
     """Settings of the text stream.
 
     columns: of a line, in order;  scaling: counts ↔ SI;  modulus: of the sequence
-    parts: of a count that are resolved
+    parts: of a count that are resolved;  clocked: the sequence counts periods of the sender's clock
     An axis without a column stays at its offset.
     """
 
@@ -117,6 +117,7 @@ class CsvSettings(BlockSettings):
     scaling: StreamScaling = field(default_factory=StreamScaling)
     modulus: int = 2**32
     parts: int = PARTS
+    clocked: bool = False
 
 
 class CsvStreamDevice(StreamDevice):
@@ -132,7 +133,8 @@ class CsvStreamDevice(StreamDevice):
         self._unread = 0
         self._columns, self._probe = settings.columns, settings.scaling.probe
         self._parts = settings.parts
-        timed = "device_time" in settings.columns
+        timed = "device_time" in settings.columns or settings.clocked
+        self._clocked = settings.clocked
         has_axes = bool(set(AXES) & set(settings.columns))
         in_parts = (_in_parts(axis, settings.parts) for axis in settings.scaling.axes)
         axes = tuple(in_parts) if has_axes else None
@@ -154,7 +156,10 @@ class CsvStreamDevice(StreamDevice):
         samples = np.zeros(len(rows), SAMPLE)
         samples["counter"] = rows["sequence"]
         samples["intensity"] = np.nan
-        if self.channels.timed:
+        if self._clocked:
+            period_ns = self._settings.sample_period * NANOSECONDS_PER_S
+            samples["time"] = np.rint(rows["sequence"] * period_ns)
+        elif self.channels.timed:
             samples["time"] = rows["device_time"]
         if "distance" in self._columns:
             measured = rows["distance"] != self._probe.invalid
@@ -201,14 +206,14 @@ def make_binary(values: Values, transport: Transport, now_ns: NowNs) -> GenericS
 
 
 def make_text(
-    values: Values, transport: Transport, now_ns: NowNs, parts: int = PARTS
+    values: Values, transport: Transport, now_ns: NowNs, parts: int = PARTS, clocked: bool = False
 ) -> CsvStreamDevice:
     """Return the device that ``values`` describe, which resolves ``parts`` of a count."""
     columns = tuple(values["columns"].replace(",", " ").split())
     read = [axis for axis in AXES if axis in columns]
     scaling = StreamScaling(**axes_of(values, read), probe=_probe_scaling(values))
     settings = CsvSettings(
-        **_stream_settings(values), columns=columns, scaling=scaling, parts=parts
+        **_stream_settings(values), columns=columns, scaling=scaling, parts=parts, clocked=clocked
     )
     return CsvStreamDevice(transport, settings, now_ns)
 
