@@ -137,14 +137,11 @@ def form_table(
     return Table("Figures of the form", (), [row for row in rows if row[1] != NOTHING])
 
 
-def removed_table(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Table:
+def removed_table(form: Mapping[str, Any]) -> Table:
     """Return the removed pose, and the degrees of freedom that were not fitted."""
     title, columns = "Removed pose", ("value", "standard uncertainty")
     if not form:
-        rows = []
-        if part(summary, "deviation", "corrected"):
-            rows = [("piston (the probe's stand-off is unknown)", "mean over the area", NOTHING)]
-        return Table(title, columns, rows)
+        return Table(title, columns, [])
     fitted = []
     for name in part(form, "removed", "fitted") or ():
         pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
@@ -323,7 +320,7 @@ def render(report: Report) -> str:
         report=report,
         on_part=verdict_on_part(report.summary, report.form),
         verdict=_trust_section(report),
-        removed=removed_table(report.summary, report.form),
+        removed=removed_table(report.form),
         script=drawing,
         script_policy=policy_of(drawing),
         headlines=headlines(report.summary),
