@@ -190,19 +190,19 @@ class DemoStage:
     """Shows the progress of a stage: a bar on a terminal, a line elsewhere."""
 
     def __init__(self, quiet: bool) -> None:
-        self._skip_unremarkable = quiet
+        self._quiet = quiet
 
     @contextmanager
     def __call__(self, title: str, total: int = 0) -> Iterator[Callable[[int], None]]:
         plain = not sys.stderr.isatty()
-        if plain and not self._skip_unremarkable:
+        if plain and not self._quiet:
             print(f"· {title}", file=sys.stderr, flush=True)
         layout = (
             "{desc:<44} {percentage:3.0f}% |{bar:24}| {remaining} left"
             if total
             else "{desc} {elapsed}"
         )
-        silent = self._skip_unremarkable or plain
+        silent = self._quiet or plain
         with (
             tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
             refresh_in_thread(partial(tick, bar)),

@@ -62,7 +62,7 @@ class DeclaredParameters:
         self._parameters = {parameter.name: parameter for parameter in parameters}
         self._wrong: dict[str, ConfigurationError] = {}
         # rclpy ignores parameters that are not declared; here they are errors.
-        self._nonempty_channels = dict(node._parameter_overrides)
+        self._given = dict(node._parameter_overrides)
         for parameter in parameters:
             self._declare(parameter)
         node.add_on_set_parameters_callback(self._on_set)
@@ -72,9 +72,9 @@ class DeclaredParameters:
 
     def _declare(self, parameter: Parameter) -> None:
         value: Any = parameter.default
-        if parameter.name in self._nonempty_channels:
+        if parameter.name in self._given:
             try:
-                value = parameter.checked(self._nonempty_channels[parameter.name].value)
+                value = parameter.checked(self._given[parameter.name].value)
             except ConfigurationError as err:
                 self._wrong[parameter.name] = err
         self._node.declare_parameter(
@@ -86,9 +86,7 @@ class DeclaredParameters:
         try:
             for err in self._wrong.values():
                 raise err
-            self.check_known(
-                [name for name in self._nonempty_channels if not name.startswith(_QOS_PREFIX)]
-            )
+            self.check_known([name for name in self._given if not name.startswith(_QOS_PREFIX)])
             values = {
                 name: parameter.checked(self._node.get_parameter(name).value)
                 for name, parameter in self._parameters.items()
@@ -101,7 +99,7 @@ class DeclaredParameters:
 
     def check_overrides(self) -> None:
         """Raise ConfigurationError for a qos_overrides.* of a topic that the node does not have."""
-        self.check_known([name for name in self._nonempty_channels if name.startswith(_QOS_PREFIX)])
+        self.check_known([name for name in self._given if name.startswith(_QOS_PREFIX)])
 
     def check_known(self, names: Sequence[str]) -> None:
         """Raise ConfigurationError for an unknown parameter, with the nearest name."""

@@ -162,18 +162,18 @@ def _points(
     metres = LengthUnits(1.0, 1.0)
     scale = metres if ours else needed(units, what)
     height = "height" if "height" in names else "z"
-    spread = _skip_unremarkable(table["uncertainty"]) if ours and "uncertainty" in names else None
+    spread = _scaled(table["uncertainty"]) if ours and "uncertainty" in names else None
     return measured(
-        _skip_unremarkable(table["x"], scale.lateral),
-        _skip_unremarkable(table["y"], scale.lateral),
-        _skip_unremarkable(table[height], scale.height),
+        _scaled(table["x"], scale.lateral),
+        _scaled(table["y"], scale.lateral),
+        _scaled(table[height], scale.height),
         None if spread is None or not np.any(np.isfinite(spread)) else spread,
         notes=(NOT_USED,) if ours and units not in (None, metres) else (),
         sample=table["sample"] if ours and "sample" in names else None,
     )
 
 
-def _skip_unremarkable(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
+def _scaled(values: NDArray[Any], scale: float = 1.0) -> NDArray[np.float64]:
     """Return ``scale`` times values (n,), without signalling NaN, which damaged bytes may be."""
     with np.errstate(invalid="ignore"):
         found = values.astype(np.float64)
