@@ -451,8 +451,10 @@ def _sandwich(gram: FloatArray, score: FloatArray) -> FloatArray:
     scale[scale == 0] = 1.0
     values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
     inverse = directions / np.maximum(values, _RANK_TOLERANCE * values[-1]) @ directions.T
-    bread = inverse / np.outer(scale, scale)
-    return np.asarray(bread @ score @ bread)
+    powers, turned = np.linalg.eigh(score / np.outer(scale, scale))
+    # By a root, so that rounding leaves no negative variance.
+    root = inverse @ (turned * np.sqrt(np.maximum(powers, 0.0))) / scale[:, np.newaxis]
+    return np.asarray(root @ root.T)
 
 
 def _relocate(

@@ -34,11 +34,16 @@ from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOSECONDS_PER_S, PPM
 def mode_table(calibration: Calibration) -> Table:
     """Return the poles as terms of Eq. 8, and whether the band reaches them."""
     modes = known_modes(calibration.dynamics, calibration.covariance)
+    # Beyond the sampling rate a pole acts as a constant or a delay.
+    fastest = 1 / calibration.sample_period
     rows = [
         (
             f"mode {index}" if mode.residue is not None else f"real pole {index}",
-            measured(mode.frequency, mode.frequency_uncertainty, "Hz"),
-            *_oscillation(mode),
+            *(
+                (measured(mode.frequency, mode.frequency_uncertainty, "Hz"), *_oscillation(mode))
+                if mode.frequency <= fastest
+                else (f"not resolved (faster than {quantity(fastest, 'Hz')})", NOTHING, NOTHING)
+            ),
             "yes" if mode.frequency <= calibration.valid_up_to else "no",
         )
         for index, mode in enumerate(modes, start=1)
