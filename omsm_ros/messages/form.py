@@ -11,6 +11,10 @@ TEMPLATES: dict[str, str] = {
         "L-filter of {l_filter!r} m is not longer than the S-filter of {s_filter!r} m that the "
         "points allow; give a longer {opt.l_filter}, or measure more points"
     ),
+    "form.uncovered": (
+        "{share:%} of the aperture has no points, and all figures are of the rest; scan it all, or "
+        "state the aperture that counts with {opt.aperture}"
+    ),
     "form.excluded_points": (
         "{count:count} points left out as dust, up to {largest:m} off, may be defects; "
         "inspect them, then exclude them with {opt.dust} isolated or keep them with {opt.dust} none"

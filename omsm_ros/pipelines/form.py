@@ -168,7 +168,7 @@ def judge_form(
     form = measured.form(surface, asked, aperture, filters, ISOLATED if dust is None else dust)
     facts = form_facts(form, measured, surface)
     if tolerance is not None:
-        doubts = form.doubts(tolerance) if dust is None else []
+        doubts = [n for n in form.doubts(tolerance) if dust is None or n.code == "form.uncovered"]
         found = conformity(form.deviation["peak_to_valley"], tolerance, doubts)
         facts["conformity"] = found.entry() if found else None
     save_json(out / FORM, facts)
@@ -223,10 +223,12 @@ def form_facts(
                 *measured.notes,
                 *_mismatch_text(form, nominal),
                 *_advice(form),
+                *(str(n) for n in form.doubts(np.inf)),
             ],
         },
         "aperture": {
             "radius": form.aperture.radius,
+            "uncovered": form.uncovered,
             "x": form.aperture.x,
             "y": form.aperture.y,
             "s_filter": form.bands.s_filter,

@@ -9,7 +9,9 @@ import pytest
 from omsm_ros.cli import main
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import ScanFields
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, ZernikeSurface
+from omsm_ros.core.form.analyse import analyse_form
+from omsm_ros.core.registration.placement import Aperture, PointBatch
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, ZernikeSurface
 from omsm_ros.io.files import CLOUD, SYSTEMATIC
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import CloudFile, PlyWriter, save_fields
@@ -289,3 +291,18 @@ def test_a_fitted_move_that_masks_form_gives_a_warning(folder, tmp_path):
         notes[fit] = reported["removed"]["notes"]
     assert any("hold it: --fit piston,tip,tilt" in note for note in notes["auto"])
     assert not any("hold it" in note for note in notes["piston,tip,tilt"])
+
+
+def test_a_missing_sector_keeps_the_tolerance_open(tmp_path):
+    rng = np.random.default_rng(1)
+    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-10e-3, 10e-3, 150)] * 2))
+    for sector, expected in ((np.pi, 0.0), (0.6 * np.pi, 0.4)):
+        chosen = (np.hypot(x, y) <= 10e-3) & (np.abs(np.arctan2(y, x)) <= sector)
+        batch = PointBatch(x[chosen], y[chosen], rng.normal(0, 1e-9, int(chosen.sum())),
+                           np.empty((0, int(chosen.sum()))))  # fmt: skip
+        for given in (None, Aperture(10e-3)):
+            found = analyse_form(Flat(), [batch].copy, ("piston", "tip", "tilt"), aperture=given)
+            assert found.uncovered == pytest.approx(expected, abs=0.05 if given else 0.3)
+            assert bool(found.doubts(1e-6)) == (expected > 0)
+    square = PointBatch(x, y, rng.normal(0, 1e-9, len(x)), np.empty((0, len(x))))
+    assert analyse_form(Flat(), lambda: [square], ("piston",)).uncovered < 0.02

@@ -55,6 +55,9 @@ from omsm_ros.core.surface.zernike_terms import (
 from omsm_ros.errors import DataError, Notice
 
 ZERNIKES = first_terms(37, "fringe")
+# A larger share of the aperture without points keeps a tolerance open. Cells are this many tracks
+# wide, or this share of the radius.
+_COVERED_WELL, _TRACKS_PER_CELL, _CELLS_PER_RADIUS = 0.02, 2.5, 64
 # Points with all their effects take 50 MB. Extremes and counts are of all points.
 MOST_WEIGHED = 2**19
 # A hundred points for each Zernike term.
@@ -167,6 +170,8 @@ class FormResult:
     bands: wavelengths of the filters;  profiles, density: curves of the map
     counts: of the points by outcome; they add up to "read"
     dust: x, y and deviation of the points left out as dust (3, d) [m]
+    uncovered: share of the aperture without points; of a disc, an ellipse or a rectangle around the
+        points if no aperture was asked for
     """
 
     registration: Registration
@@ -179,15 +184,22 @@ class FormResult:
     density: PowerDensity
     counts: dict[str, int]
     dust: FloatArray
+    uncovered: float
 
     def doubts(self, tolerance: float) -> list[Notice]:
         """Return whether points left out may be a defect beyond ``tolerance`` [m]."""
+        missing = []
+        if self.uncovered > _COVERED_WELL:
+            missing = [Notice("form.uncovered", share=self.uncovered)]
         sizes = np.abs(self.dust[2])
         low, high = (float(end(self.map.deviation)) for end in (np.min, np.max))
         ends = np.minimum(self.dust[2], low), np.maximum(self.dust[2], high)
         if not len(sizes) or float(np.max(ends[1]) - np.min(ends[0])) <= tolerance:
-            return []
-        return [Notice("form.excluded_points", count=len(sizes), largest=float(sizes.max()))]
+            return missing
+        return [
+            *missing,
+            Notice("form.excluded_points", count=len(sizes), largest=float(sizes.max())),
+        ]
 
 
 def analyse_form(
@@ -239,7 +251,29 @@ def analyse_form(
         density=power_density(cells),
         counts=gathered.counts,
         dust=gathered.dust,
+        uncovered=_uncovered(map_, found, aperture),
     )
+
+
+def _uncovered(map_: DeviationMap, found: Registration, aperture: Aperture | None) -> float:
+    """Return the share of the aperture, asked for or around the points, that has no points."""
+    disc = found.disc
+    pitch = max(_TRACKS_PER_CELL * found.spacing, disc.radius / _CELLS_PER_RADIUS)
+    count = int(np.ceil(2 * disc.radius / pitch))
+    if min(np.ptp(map_.x), np.ptp(map_.y)) < pitch:
+        return 0.0  # a profile
+    edges = [np.linspace(c - disc.radius, c + disc.radius, count + 1) for c in (disc.x, disc.y)]
+    filled = np.histogram2d(map_.x, map_.y, edges)[0] > 0
+    u, v = np.meshgrid(*[(e[1:] + e[:-1]) / 2 for e in edges], indexing="ij")
+    # Cells at the rim are covered in part.
+    shapes = [np.hypot(u - disc.x, v - disc.y) < disc.radius - pitch]
+    if aperture is None:
+        away = [
+            np.abs(2 * cells - p.max() - p.min()) / (np.ptp(p) - pitch)
+            for cells, p in ((u, map_.x), (v, map_.y))
+        ]
+        shapes += [np.maximum(*away) < 1, np.hypot(*away) < 1]
+    return float(min(1 - np.mean(filled[inside]) for inside in shapes if np.any(inside)))
 
 
 def _figures(

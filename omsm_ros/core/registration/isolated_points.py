@@ -92,7 +92,7 @@ class FarPoints:
         index, (x, y, residual) = rows[0].astype(np.int64), rows[1:4]
         form = np.ones(len(index), bool)
         if rule != NO_DUST and len(index):
-            space = self._space()
+            space = self.space()
             event = np.arange(len(index))
             if not space.line:
                 event = _events(index, x, y, residual, space.reach)
@@ -135,7 +135,8 @@ class FarPoints:
             decided & (count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW))
         )
 
-    def _space(self) -> _Space:
+    def space(self) -> _Space:
+        """Return how far apart neighbouring tracks are."""
         spans = np.sort(self.high - self.low)
         if spans[0] < _LINE * spans[1]:
             reach = _REACH * float(spans[1]) / self.points

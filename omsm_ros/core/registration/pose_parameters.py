@@ -173,6 +173,7 @@ class Registration:
         effect on each fitted one, in first and second order (2,)
     limit: deviation from the smooth form beyond which a point is dust unless others confirm it [m]
     dust: indices of the points left out as dust, in the order of reading (d,)
+    spacing: of the tracks [m]
     disc: the aperture, or a disc that holds all points
     form: coefficients of the smooth form in ``basis`` (k,) [m rms]
     noise: of one point about the smooth form [m];  before: rms deviation before the fit [m]
@@ -190,6 +191,7 @@ class Registration:
     correlated_moves: dict[str, dict[str, FloatArray]]
     limit: float
     dust: IntArray
+    spacing: float
     disc: Aperture
     basis: FormBasis
     form: FloatArray

@@ -402,6 +402,7 @@ def _over_all(
         correlated_moves=open_.unknown,
         limit=stand.limit,
         dust=left_out,
+        spacing=far.space().spacing,
         disc=fit.basis.disc,
         basis=fit.basis,
         form=found.form,

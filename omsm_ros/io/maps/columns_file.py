@@ -36,6 +36,8 @@ _ROLES = {
     "u": "uncertainty",
     "sample": "sample",
 }
+# Lines of more numbers without names are rows of a matrix, not points.
+_LEAST_OF_A_MATRIX = 16
 _PORTION = 100_000
 
 
@@ -56,12 +58,13 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         table = _numbers(body, len(header), first, cells, sorted(names.values()), what)
     at = {name: sorted(names.values()).index(place) for name, place in names.items()}
     column = {name: table[:, place] * scales[name] for name, place in at.items()}
+    profile = "y" not in column
     return measured(
         column["x"],
-        column["y"],
+        np.zeros_like(column["x"]) if profile else column["y"],
         column["height"],
         column.get("uncertainty"),
-        _notes(names, cells),
+        (*_notes(names, cells), *(["a profile along x"] if profile else [])),
         sample=column.get("sample"),
     )
 
@@ -118,11 +121,13 @@ def _columns(
     named, count = _roles(header, _cells(first), what)
     places = {role: place for role, (place, _) in named.items()}
     if not named:
-        if count < 3:
+        other = count == 2 and any(_named(_names(line)) for line in header)
+        if other or not 2 <= count < _LEAST_OF_A_MATRIX:
             raise FileError(
-                f"{what} has {count} columns, expected x, y and height in each line; write it again"
+                f"{what} has {count} columns, expected x, y and height in each line, "
+                "or x and height of a profile; write a matrix of heights with its x and y"
             )
-        places = {"x": 0, "y": 1, "height": 2}
+        places = {"x": 0, "height": 1} if count == 2 else {"x": 0, "y": 1, "height": 2}
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
     for role in places:
@@ -156,7 +161,7 @@ def _roles(
     for place in reversed(range(len(header))):
         names = _names(header[place])
         found = _named(names)
-        if not {"x", "y", "height"} <= set(found):
+        if not ({"x", "height"} if cells[0] == 2 else {"x", "y", "height"}) <= set(found):
             continue
         if not cells[0] <= len(names) <= cells[1]:
             if header[place].startswith(_COMMENTS):  # a comment with such words
@@ -293,12 +298,12 @@ def load_dabam(path: Path) -> DabamProfile:
     header = _header(path.with_suffix(".txt"))
     form, skip = header.get("FILE_FORMAT"), header.get("FILE_HEADER_LINES")
     factors = [header.get(key) for key in ("X1_FACTOR", "Y1_FACTOR")]
-    numbers = [n for n in factors if isinstance(n, float | int) and n > 0]
+    numbers = [n for n in factors if isinstance(n, float | int) and n != 0]
     known = form in (*_SLOPES, *_HEIGHTS) and isinstance(skip, int) and 0 <= skip <= 1000
     if not known or len(numbers) != 2:
         raise FileError(
             f"{what}: its header says FILE_FORMAT {form!r}, FILE_HEADER_LINES {skip!r}, factors "
-            f"{factors!r}; expected 1 to 4, a count, and numbers above zero"
+            f"{factors!r}; expected 1 to 4, a count, and numbers other than zero"
         )
     assert isinstance(skip, int)
     with open_regular(path, FileError, "profile") as stream:

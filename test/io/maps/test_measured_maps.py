@@ -12,6 +12,7 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import FileError
 from omsm_ros.io.maps.columns_file import load_dabam
 from omsm_ros.io.maps.read_map import read_points
+from omsm_ros.units import LengthUnits
 
 DATA = Path(__file__).parents[4] / "shared" / "data" / "surfaces"
 pytestmark_data = pytest.mark.skipif(
@@ -110,7 +111,7 @@ def test_slopes_of_a_circle_integrate_to_it(tmp_path):
     [
         (HEADER.replace('FORMAT": 2', 'FORMAT": 7'), None, "FILE_FORMAT 7"),
         (HEADER.replace("0.001", "null"), None, "factors"),
-        (HEADER.replace("1e-9", "-1"), None, "factors"),
+        (HEADER.replace("1e-9", "0"), None, "factors"),
         (HEADER, "x h\n1 2\n3 four\n", "line 3: '3 four' is no row"),
         (HEADER, "x h\n", "no points"),
     ],
@@ -119,3 +120,22 @@ def test_a_profile_that_does_not_fit_its_header(tmp_path, header, data, reported
     path = _dabam(tmp_path, header, *([] if data is None else [data]))
     with pytest.raises(FileError, match=reported):
         read_points(path)
+
+
+def test_two_columns_are_a_profile_and_a_matrix_is_no_table(tmp_path):
+    profile, matrix = tmp_path / "p.csv", tmp_path / "m.txt"
+    profile.write_text("x [mm],height [nm]\n" + "".join(f"{k},{2 * k}\n" for k in range(30)))
+    found = read_points(profile)
+    assert len(found) == 30
+    assert not np.any(found.y)
+    np.testing.assert_allclose(found.height, 2e-9 * np.arange(30))
+    np.testing.assert_allclose(found.x, 1e-3 * np.arange(30))
+    np.savetxt(matrix, np.ones((20, 20)))
+    with pytest.raises(FileError, match="matrix"):
+        read_points(matrix, LengthUnits(1e-3, 1e-9))
+
+
+def test_a_negative_factor_turns_the_profile(tmp_path):
+    header = '{"FILE_FORMAT": 2, "FILE_HEADER_LINES": 0, "X1_FACTOR": 0.001, "Y1_FACTOR": -1e-9}'
+    path = _dabam(tmp_path, header, "1 2\n2 3\n3 5\n")
+    np.testing.assert_allclose(read_points(path).height, [-2e-9, -3e-9, -5e-9])
