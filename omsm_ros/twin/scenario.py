@@ -180,10 +180,10 @@ def source_recording(
         ball = PosedSurface(Sphere(SPHERE_RADIUS_M), Pose(x=SPHERE_OFFSET_M))
         return record(cell, Spiral(ball, 4e-3, 2e-4, scenario.spindle_speed), ball)
     flat = Flat()
-    motion: Motion = {
+    motions: dict[str, Motion] = {
         STILL: Commanded(60.0, lambda _: (0.0, 0.0, 0.0)),
         PASSES: Commanded(40.0, lambda t: (5e-3 * (1 - np.cos(np.pi / 2 * t)), 0.0, 0.0)),
         TURNED: Spiral(flat, 1e-2, 4e-4, scenario.spindle_speed),
         STAND_OFFS: _ring_of_stand_offs(1e-2, scenario.spindle_speed, 4e-5, 20),
-    }[kind]
-    return record(cell, motion, flat)
+    }
+    return record(cell, motions[kind], flat)

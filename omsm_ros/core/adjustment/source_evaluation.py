@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, optimize
 
-from omsm_ros.core.adjustment.families import Family, families_of, ranges_of
+from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, view_of
+from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.kinematics.kinematics import Geometry, Surface
 from omsm_ros.core.registration.probe_alignment import Alignment
 from omsm_ros.core.streams.blocks import FloatArray
@@ -238,7 +239,7 @@ class _Model:
     def walk(self) -> tuple[float, tuple[float, float]]:
         """Return the ratio of the variances of walk and noise, and the walk with u [m/√s]."""
         ends = np.log([_LEAST_RATIO, _LARGEST_RATIO])
-        grid = np.linspace(*ends, 16)
+        grid = np.linspace(ends[0], ends[1], 16)
         start = grid[int(np.argmin([self._likelihood(p)[0] for p in grid]))]
         step = float(grid[1] - grid[0])
         bounds = (max(start - step, ends[0]), min(start + step, ends[1]))
