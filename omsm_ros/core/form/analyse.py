@@ -233,8 +233,7 @@ def analyse_form(
             gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
     bounded = [n for n, name in enumerate(sources) if name in bounds]
     # A held pose parameter has an upper bound of its offset only.
-    bounded += range(len(sources), found.moved.shape[1])
-    map_ = gathered.map(found, even, bounded)
+    map_ = gathered.map(found, even, [*bounded, *range(len(sources), found.moved.shape[1])])
     zernike = _terms(map_, found)
     cells = GridCells.of(map_)
     bands = bands_of(cells, *filters)
