@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from omsm_ros import __version__
-from omsm_ros.core.adjustment import Verdict, adjust
+from omsm_ros.core.adjustment import Figure, Verdict, adjust
 from omsm_ros.core.adjustment.families import OTHER_SPEED
 from omsm_ros.core.adjustment.figures import POSE
+from omsm_ros.core.adjustment.scan_data import ARRAYS, ScanData
 from omsm_ros.core.adjustment.verdict import verdict_of
 from omsm_ros.core.calibration.calibration import Calibration, age_at, excess_latency_text
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
@@ -125,17 +126,20 @@ def add_verdict(
     done: Correction,
     calibration: Calibration,
     judgement: Judgement,
-    tolerance: float | None = None,
+    register: RegistrationOptions | None = None,
 ) -> None:
     """Add ``verdict`` and ``figures`` of a single scan to its summary: its adjustment alone.
 
-    tolerance: of the peak to valley [m], None: conformity is not assessed
+    register: aperture and tolerance of the registration, if there was one
 
     The pose that ``summary["form"]`` aligned is removed; without it piston, tip and tilt. A scan
     that is no spiral is not adjusted: its heights are not verified, and its figures are those of
     the registration.
     """
     scan, form = done.scan, summary.get("form")
+    tolerance = None if register is None else register.tolerance
+    if scan is not None and register is not None and register.aperture is not None:
+        scan = _within(scan, register.aperture)
     doubts = [*done.faults, *map(str, _losses(done))]
     if scan is None or scan.turns < _LEAST_TURNS:
         systematic = summary["budget"]["systematic"]
@@ -154,9 +158,19 @@ def add_verdict(
         verdict = found.verdict
         if nominal is not None:
             summary["figures"] = figures_entry(found.form)
-            if tolerance is not None:
-                summary["conformity"] = conformity_entry(found.form.pv, tolerance)
+    if tolerance is not None and (figures := summary.get("figures")):
+        pv = Figure(*figures["peak_to_valley"].values())
+        summary["conformity"] = conformity_entry(pv, tolerance)
     summary["verdict"] = verdict_entry(verdict, calibration, doubts=doubts)
+
+
+def _within(scan: ScanData, aperture: Aperture) -> ScanData | None:
+    """Return the points within the aperture; None if they are too few for a scan."""
+    kept = aperture.holds(scan.x, scan.y)
+    try:
+        return replace(scan, **{name: getattr(scan, name)[kept] for name in ARRAYS})
+    except DataError:
+        return None
 
 
 def untested_verdict(expanded: float, accuracy: float | None) -> Verdict:
@@ -292,13 +306,12 @@ def measure(
         bag, calibration, out / CLOUD, options=used, admission=admission, nominal=nominal,
         lateral=lateral, by_stamps=by_stamps, progress=progress,
     )  # fmt: skip
-    tolerance = register.tolerance if register is not None else None
     judgement = Judgement(used, stated, accuracy, out)
     summary = summarise(bag, done, calibration, judgement)
     if done.statistics:
         if register is not None and nominal is not None:
             add_form(out, summary, nominal, register)
-        add_verdict(summary, done, calibration, judgement, tolerance)
+        add_verdict(summary, done, calibration, judgement, register)
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)

@@ -156,7 +156,7 @@ def test_an_aperture_limits_what_is_fitted_and_a_tolerance_judges_it(corrected, 
     assert sum(outside) == pytest.approx(len(cloud) - inside, abs=2)
     # Some nanometres, known to some tens: far within one tolerance, far beyond the other.
     for summary, tolerance, holds in ((whole, 1e-6, True), (part, 1e-12, False)):
-        held = summary["form"]["conformity"]
+        held = summary["conformity"]
         assert held["tolerance"] == tolerance
         assert (held["verdict"] == "holds") is holds
     assert "--fit auto" in corrected("--tolerance", 1e-9, status=2)
