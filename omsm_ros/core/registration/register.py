@@ -384,9 +384,8 @@ def _over_all(
         chosen, form = form[: len(portion.x)], form[len(portion.x) :]
         fit.sums(stand, PointBatch(*(v[..., chosen] for v in portion)), held, sums)
     found, variance = fit.solved(stand.at, sums)
-    gain = found.covariance[:free] / found.noise
     # Each column is the step of the pose for one standard uncertainty of a source.
-    moved = gain @ sums.gram[:, sums.columns + 1 :]
+    moved = found.covariance[:free] / found.noise @ sums.gram[:, sums.columns + 1 :]
     covariance = found.covariance[:free, :free]
     by_source = open_.by_source(fit.names, covariance, (*sources, *[HELD] * 2 * len(held)), moved)
     return Registration(
