@@ -107,7 +107,9 @@ def reasons_of(
     # Any other error that is left in the residuals passes for drift.
     alone = not found and walk[2] is not None and "drift_walk" not in accepted
     if alone and size > stated * (1 + _RARE_WALK * spread):
-        found.append(Reason(REFUTED, ("drift_walk",), size, stated))
+        # In one scan to the centre, time and slide are one.
+        names = ("drift_walk",) if agreement else ("drift_walk", "straightness_x")
+        found.append(Reason(REFUTED, names, size, stated))
     return tuple(found)
 
 
