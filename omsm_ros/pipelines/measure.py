@@ -32,6 +32,7 @@ from omsm_ros.core.correction.machine_sources import (
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fields
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
+from omsm_ros.core.form.deviation_map import HOLDS, OPEN
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
 from omsm_ros.core.registration.isolated_points import DustRule
@@ -160,7 +161,11 @@ def add_verdict(
             summary["figures"] = figures_entry(found.form)
     if tolerance is not None and (figures := summary.get("figures")):
         pv = Figure(*figures["peak_to_valley"].values())
-        summary["conformity"] = conformity_entry(pv, tolerance)
+        summary["conformity"] = held = conformity_entry(pv, tolerance)
+        # Parts without points and dust are doubts of the registration.
+        registered = (form or {}).get("conformity")
+        if held and registered and registered["reasons"] and held["verdict"] == HOLDS:
+            held |= {"verdict": OPEN, "reasons": registered["reasons"]}
     summary["verdict"] = verdict_entry(verdict, calibration, doubts=doubts)
 
 
@@ -357,10 +362,13 @@ def add_form(
         out,
         register.dofs,
         register.aperture,
+        tolerance=register.tolerance,
         dust=register.dust,
     )
     summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
+    if register.tolerance is not None:
+        summary["form"]["conformity"] = facts["conformity"]
 
 
 def summarise(

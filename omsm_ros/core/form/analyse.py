@@ -272,7 +272,8 @@ def _uncovered(map_: DeviationMap, found: Registration, aperture: Aperture | Non
             for cells, p in ((u, map_.x), (v, map_.y))
         ]
         shapes += [np.maximum(*away) < 1, np.hypot(*away) < 1]
-    return float(min(1 - np.mean(filled[inside]) for inside in shapes if np.any(inside)))
+    shares = (1 - np.mean(filled[inside]) for inside in shapes if np.any(inside))
+    return float(min(shares, default=0.0))  # A disc of a few cells is its rim alone.
 
 
 def _figures(
