@@ -158,7 +158,9 @@ def test_an_aperture_limits_what_is_fitted_and_a_tolerance_judges_it(corrected, 
     for summary, tolerance, holds in ((whole, 1e-6, True), (part, 1e-12, False)):
         held = summary["conformity"]
         assert held["tolerance"] == tolerance
-        assert (held["verdict"] == "holds") is holds
+        # A part of the disc has no points, which alone keeps the tolerance open.
+        open_only = held["verdict"] == "cannot tell" and bool(held["reasons"])
+        assert (held["verdict"] == "holds" or open_only) is holds, held
     assert "--fit auto" in corrected("--tolerance", 1e-9, status=2)
 
 
