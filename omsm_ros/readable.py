@@ -197,7 +197,8 @@ def _rounded(value: float, digits: int) -> float:
 def _exponent(value: float, unit: str) -> int:
     """Return the power of ten of the prefix."""
     if unit in _WITHOUT_PREFIX or not value:
-        return 0
+        # A deviation of zero stands among nanometres.
+        return -9 if unit == "m" else 0
     exponent = 3 * (math.floor(math.log10(abs(value))) // 3)
     # No millihertz, which is easily read as megahertz.
     least = 0 if unit == "Hz" else min(_PREFIXES)

@@ -128,7 +128,9 @@ def plan_facts(
             {field: getattr(path, field) for field in ("error", "rms", "segment", "c_acceleration")}
             for path in paths
         ],
-        "files": [f"scan_{k + 1}.{end}" for k in range(len(paths)) for end in ("csv", "nc")],
+        "files": [
+            str(out / f"scan_{k + 1}.{end}") for k in range(len(paths)) for end in ("csv", "nc")
+        ],
     }
 
 

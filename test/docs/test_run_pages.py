@@ -27,7 +27,6 @@ NOT_RUN = {
     r"\. \./env\.sh": "the tests run in the shell that it makes",
     r"python -m benchmarks": "minutes to an hour; test_benchmarks.py runs their parts",
     r"dask |.*--scheduler ": "Dask is optional; benchmarks of campaigns run two workers of it",
-    r"ros2 bag ": "rosbag2 is in no wheel; rosbags writes and reads those bags in the tests",
     r"ros2 security ": "the wheels' Fast DDS is built without security",
     r"ros2 run omsm_ros replay$": "the name of a node; it is run with its bag in recordings.md",
     r"omsm (demo|history)$": "the name of a command; both are run with their options elsewhere",
