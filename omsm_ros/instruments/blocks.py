@@ -105,6 +105,7 @@ class BlockCutter:
 
     delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
     restarted_at_zero: the encoders lost their positions with a restart, so nothing is handed over
+    perhaps_at_zero: they are at zero after a silence, as after a restart or a move to the origin
     missed: triggers without a sample of the device, by the arrivals of the others
     period_deviation: relative, from nominal: of the last full block's device time, or of the
         arrivals of a device without time stamps [1]
@@ -123,7 +124,7 @@ class BlockCutter:
         self._detector = MissedTriggerDetector(settings.sample_period) if watched else None
         self._waiting: list[CountedRun] = []
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
-        self.restarted_at_zero = False
+        self.restarted_at_zero = self.perhaps_at_zero = self.lost_settings = False
         # Time less that of the count, of the last samples and of spoilt ones, and arrival [ns].
         self._usual: tuple[int, int] | None = None
         self._due = self._doubtful = 0
@@ -205,11 +206,22 @@ class BlockCutter:
                 yield from self._flush()
                 self._first = run.first_sample
             if run.restarted and self._channels.axes is not None:
-                self.restarted_at_zero |= _begin_at_zero(self._counts, run.samples["counts"][0])
+                self._judge_restart(run, after_silence and i == 0)
             self._counts = run.samples["counts"][-1]
             if i == 0 or run.restarted:
                 self._set_clock(runs[i:], times[i:], arrival_ns, after_silence and i == 0)
             yield from self._append(run, times[i])
+
+    def _judge_restart(self, run: CountedRun, after_silence: bool) -> None:
+        """Decide whether the encoders lost their positions with the restart before ``run``.
+
+        During a silence the axes may have moved to their origin and the counter may have been
+        reset on purpose, unless the device lost its settings too.
+        """
+        at_zero = _begin_at_zero(self._counts, run.samples["counts"][0])
+        self.restarted_at_zero |= at_zero and (self.lost_settings or not after_silence)
+        self.perhaps_at_zero = at_zero and not self.restarted_at_zero
+        self.lost_settings = False
 
     def _set_clock(
         self,

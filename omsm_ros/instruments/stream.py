@@ -170,6 +170,11 @@ class StreamDevice:
                 f"samples arrive at {self._rates()}: set sample_period to the trigger's, unless "
                 "a recording is played in time lapse"
             )
+        if self._cutter.perhaps_at_zero:
+            return (
+                f"{self._transport.name}: counter and encoders are at zero after a silence; if the "
+                "device was switched off, home the axes and start this driver again"
+            )
         return ""
 
     def _rates(self) -> str:

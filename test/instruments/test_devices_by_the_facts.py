@@ -378,6 +378,24 @@ def test_encoders_that_begin_at_zero_are_not_published(absolute: bool) -> None:
     assert ("home the axes" in device.trouble) != absolute
 
 
+def test_a_scan_that_begins_at_the_origin_after_a_pause_is_published() -> None:
+    """The axes moved to their origin and the counter was reset on purpose meanwhile."""
+    now = 0.0
+    before, after = frames_of(np.arange(5000, 5300)), frames_of(np.arange(0, 300))
+    before["counts"] += 1_000_000
+    portions = [encode_frames(f[i : i + 50]) for f in (before, after) for i in range(0, 300, 50)]
+    device = GenericStreamDevice(Script(*portions), StreamSettings())
+    device._monotonic = lambda: now
+    device.open()
+    found = []
+    for number in range(len(portions)):
+        now += 5.0 if number == 6 else 0.05
+        found += device.poll(0.0)
+    assert sum(len(pair.axes) for pair in found) == 600
+    assert device.trouble == ""
+    assert "home the axes" in device.caution
+
+
 def test_an_intensity_taken_for_a_distance_is_refused() -> None:
     """Frames hold distance and intensity; the setting states the other order."""
     frame = wires.three_bytes(131_000) + wires.three_bytes(700, first=False)

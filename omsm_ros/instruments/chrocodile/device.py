@@ -235,6 +235,7 @@ class Chrocodile(StreamDevice):
         if not intact:
             self._try(TRIGGERS[wanted.trigger])  # some of these reset the counter
             self._tracker.restart_count()
+            self._cutter.lost_settings = self._ever_set_up
         self._ever_set_up = True
         self._finish()
         self._asked = self._monotonic()
