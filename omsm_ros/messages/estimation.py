@@ -79,6 +79,14 @@ TEMPLATES: dict[str, str] = {
     "estimation.unstable": (
         "sections {sections!r} are no stable response that can be computed; identify it again"
     ),
+    "estimation.old_model": (
+        "the polynomials of this model of schema 1 have no accurate sum of sections (difference "
+        "{misfit:.1e}); identify it again"
+    ),
+    "estimation.old_model_part": (
+        "this model of schema 1 has no polynomials with a covariance for a {hold} input; identify "
+        "it again"
+    ),
     "estimation.model_sizes": (
         "the parts of the model are not those of one model of {inputs} inputs; identify it again"
     ),

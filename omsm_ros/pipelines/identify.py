@@ -13,7 +13,7 @@ from omsm_ros import __version__
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse, use_of_motion
 from omsm_ros.core.estimation.parallel_sections import HOLDS
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
-from omsm_ros.core.estimation.sampled_model import SCHEMA, FreeRun, SampledModel
+from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, FreeRun, SampledModel
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.core.streams.motion_record import MotionRecord
@@ -188,6 +188,32 @@ _PROPERTIES = {
     "certificate": {"type": "object"},
 }
 _FORM = form(_PROPERTIES, tuple(_PROPERTIES))
+# Schema 1: one input, polynomials of 20 poles.
+_COEFFICIENTS = {"type": "array", "items": NUMBER, "minItems": 1, "maxItems": 21}
+
+
+def _ratio_of(delay: str, kind: str) -> dict[str, object]:
+    parts = {
+        "numerator": _COEFFICIENTS,
+        "denominator": _COEFFICIENTS,
+        delay: {"type": kind},
+        "covariance": {"type": ["array", "null"], "items": NUMBER, "maxItems": 42**2},
+    }
+    return {**form(parts, tuple(parts)), "type": ["object", "null"]}
+
+
+_PROPERTIES_1 = {
+    "schema": {"const": SCHEMA_1},
+    "hold": _PROPERTIES["hold"],
+    "sample_period": NUMBER,
+    "discrete": _ratio_of("delay_samples", "integer"),
+    "continuous": _ratio_of("delay", "number"),
+    "working_point": _PAIR,
+    "valid_from": NUMBER,
+    "valid_up_to": NUMBER,
+    "certificate": {"type": "object"},
+}
+_FORM_1 = form(_PROPERTIES_1, tuple(_PROPERTIES_1))
 
 
 def save_model(path: Path | str, model: SampledModel) -> None:
@@ -196,14 +222,15 @@ def save_model(path: Path | str, model: SampledModel) -> None:
 
 
 def load_model(path: Path | str) -> SampledModel:
-    """Read ``MODEL.json``.
+    """Read ``MODEL.json``, of schema 1 too.
 
     Raises CalibrationError if it is malformed or cannot be computed with.
     """
     what = f"model {str(path)!r}"
     text = read_text(path, _MAX_BYTES, CalibrationError, "model")
     content = json_and_yaml.object_of(text, CalibrationError, what)
-    check_form(content, _FORM, CalibrationError, what)
+    old = content.get("schema") == SCHEMA_1
+    check_form(content, _FORM_1 if old else _FORM, CalibrationError, what)
     try:
         return SampledModel.from_content(content)
     except CalibrationError as err:

@@ -7,17 +7,24 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from omsm_ros.core.calibration.plausibility import MAX_DELAY_SAMPLES as LONGEST_DELAY_SAMPLES
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.steps import LEAST_SAMPLES
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction, ascending_roots
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import CalibrationError, IdentificationError
-from omsm_ros.linear_algebra import least_squares
+from omsm_ros.linear_algebra import least_squares, unit_columns
 from omsm_ros.quantities import FREQUENCY, SAMPLE_PERIOD, SIGNAL
 
-SCHEMA = "omsm-model/2"
+SCHEMA, SCHEMA_1 = "omsm-model/2", "omsm-model/1"
+# Largest relative difference of the sections of a model of schema 1 from its polynomials.
+_SAME_RESPONSE = 1e-6
+# Part of the largest response below which a difference counts as of that part.
+_FAINT = 1e-3
+# Largest relative difference of its uncertainties, beyond which they are left out.
+_SAME_BAND = 0.01
 # Most poles whose polynomials are stated, too: beyond, their coefficients lose too many digits.
 _POLYNOMIAL_POLES = 12
 # Largest d1, d2 and numerators per power of the sample period: 1e9 samples.
@@ -76,10 +83,12 @@ class SampledModel:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> SampledModel:
-        """Return the inverse of :meth:`content`, for values of the right types.
+        """Return the inverse of :meth:`content`, for values of the right types; also of schema 1.
 
         Raises CalibrationError for an inconsistent model, or one that cannot be computed.
         """
+        if content["schema"] == SCHEMA_1:
+            content = _from_version_1(content)
         period = SAMPLE_PERIOD.checked(content["sample_period"], CalibrationError)
         sections = _sections_of(content, period)
         valid = [
@@ -98,13 +107,14 @@ class SampledModel:
 
 
 def _sections_of(content: Mapping[str, Any], period: float) -> ParallelSections:
+    names = ("denominators", "numerators", "direct", "delays")
     try:
-        down, up, direct, delays = (
-            SIGNAL.checked_all(np.asarray(content[name], np.float64), CalibrationError, name)
-            for name in ("denominators", "numerators", "direct", "delays")
-        )
+        arrays = [np.ravel(np.asarray(content[name], np.float64)) for name in names]
     except ValueError as err:
         raise CalibrationError("estimation.model_sizes", inputs=len(content["direct"])) from err
+    for name, array in zip(names, arrays, strict=True):
+        SIGNAL.checked_all(array, CalibrationError, name)
+    down, up, direct, delays = arrays
     inputs, count = len(direct), len(content["denominators"])
     fits = up.size == 2 * inputs * count and down.size == 2 * count and len(delays) == inputs
     if not (inputs and fits):
@@ -124,6 +134,121 @@ def _sections_of(content: Mapping[str, Any], period: float) -> ParallelSections:
     return ParallelSections(
         **{**vars(sections), "covariance": _square(content["covariance"], size)}
     )
+
+
+def _from_version_1(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of a model of schema 1, a ratio of two polynomials, as sections.
+
+    The polynomials are in s for a band-limited input, else in z⁻¹. The sections have the same
+    poles; their numerators follow from the response at many w, the covariance from its derivatives.
+    There is none where rounding would change the uncertainty of the response.
+    """
+    held = content["hold"] != BAND_LIMITED
+    period = SAMPLE_PERIOD.checked(content["sample_period"], CalibrationError)
+    old = content["discrete" if held else "continuous"]
+    if old is None or old["covariance"] is None:
+        raise CalibrationError("estimation.old_model_part", hold=content["hold"])
+    up, down = (np.asarray(old[name], np.float64) for name in ("numerator", "denominator"))
+    covariance = _square(old["covariance"], len(up) + len(down) - held)
+    with np.errstate(all="ignore"):
+        roots = _roots_in_w(up, down, period if held else 0.0)
+        w = _grid(roots, period)
+        variable = (2 - period * w) / (2 + period * w) if held else w
+        powers = variable[:, np.newaxis] ** np.arange(max(len(up), len(down)))
+        before = powers / polyval(variable, down)[:, np.newaxis]
+        value = before[:, : len(up)] @ up
+        by_pole = -before[:, 1 : len(down)] * value[:, np.newaxis]
+        before = np.column_stack([before[:, : len(up)], by_pole])
+        weight = 1 / np.maximum(np.abs(value), _FAINT * np.max(np.abs(value)))
+        sections = _denominators_of(roots)
+        basis, by_d = _section_columns(sections, w)
+        found = _solved(basis, value[:, np.newaxis], weight)[:, 0]
+        parts = (basis * found)[:, 1:].reshape(len(w), -1, 2).sum(axis=2)
+        after = np.column_stack([basis, np.repeat(parts, 2, axis=1) * by_d])
+        misfit = float(np.max(np.abs(basis @ found - value) * weight))
+        if not misfit <= _SAME_RESPONSE:
+            raise CalibrationError("estimation.old_model", misfit=misfit)
+        jacobian = np.pad(_solved(after, before, weight), (0, 1))
+        jacobian[-1, -1] = not held  # the delay of a held input is exact
+        root = _root_of(covariance)
+        moved = jacobian[:, : len(root)] @ root
+        new, count = moved @ moved.T, before.shape[1]
+        spread = np.linalg.norm(before @ root[:count], axis=1)
+        kept = np.einsum("np,pq,nq->n", after, new[:-1, :-1], after.conj()).real
+        apart = np.abs(np.sqrt(kept) - spread)
+        same = np.all(apart <= _SAME_BAND * spread + _SAME_RESPONSE * np.abs(value))
+    return {
+        **content,
+        "denominators": sections,
+        "numerators": found[np.newaxis, 1:],
+        "direct": found[:1],
+        "delays": [old["delay_samples"] * period if held else old["delay"]],
+        "covariance": new.ravel() if same else None,
+        "valid": [(content["valid_from"], content["valid_up_to"])],
+    }
+
+
+def _grid(roots: ComplexArray, period: float) -> ComplexArray:
+    """Return imaginary w over and beyond all poles, and near each."""
+    size = np.abs(roots) if len(roots) else np.full(1, 1 / period)
+    near = np.outer(np.linspace(-3, 3, 13), roots.real) + abs(roots.imag)
+    grid = np.geomspace(1e-2 * size.min(), 1e2 * size.max(), 100 * (len(roots) + 1))
+    return np.asarray(1j * np.concatenate([grid, near[near > 0]]))
+
+
+def _roots_in_w(up: FloatArray, down: FloatArray, period: float) -> ComplexArray:
+    """Return the poles in w; period: of a held input [s], 0 for polynomials in s.
+
+    Raises CalibrationError for an unstable model.
+    """
+    if period:
+        z = np.roots(np.pad(down, (0, max(len(up) - len(down), 0))))
+        roots = np.asarray(2 / period * (z - 1) / (z + 1), np.complex128)
+    else:
+        try:
+            roots = ascending_roots(down)
+        except np.linalg.LinAlgError:
+            roots = np.full(1, np.nan + 0j)
+    if down[0] != 1 or not np.all(np.isfinite(roots) & (roots.real < 0)):
+        raise CalibrationError("estimation.unstable", sections=[down.tolist()])
+    return roots
+
+
+def _denominators_of(roots: ComplexArray) -> FloatArray:
+    """Return d1, d2 (k, 2) of sections with poles ``roots``, two neighbours on the axis in one."""
+    real = np.sort(roots[roots.imag == 0].real)
+    pairs = [(p, np.conj(p)) for p in roots if p.imag > 0]
+    pairs += list(zip(real[0:-1:2], real[1::2], strict=True))
+    found = [(-float(((p + q) / (p * q)).real), float((1 / (p * q)).real)) for p, q in pairs]
+    single = [(-1 / p, 0.0) for p in real[len(real) - len(real) % 2 :]]
+    return np.reshape(found + single, (-1, 2))
+
+
+def _section_columns(sections: FloatArray, w: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return d H/d(direct, b0, b1 …) (n, 1 + 2k), and what d1, d2 multiply a part by (n, 2k)."""
+    w = w[:, np.newaxis]
+    basis, second = 1 / (1 + sections[:, 0] * w + sections[:, 1] * w * w), sections[:, 1] > 0
+    pairs = np.stack([basis, basis * w * second], axis=2).reshape(len(w), -1)
+    moved = -np.stack([basis * w, basis * w * w * second], axis=2).reshape(len(w), -1)
+    return np.column_stack([np.ones(len(w)), pairs]), moved
+
+
+def _solved(columns: ComplexArray, values: ComplexArray, weight: FloatArray) -> FloatArray:
+    """Return the real x (q, r) by which complex ``columns`` (n, q) come nearest to ``values``."""
+    left, right = (weight[:, np.newaxis] * part for part in (columns, values))
+    if not (np.all(np.isfinite(left)) and np.all(np.isfinite(right))):
+        raise CalibrationError("estimation.old_model", misfit=np.inf)
+    unit, scale = unit_columns(np.concatenate([left.real, left.imag]))
+    found = np.linalg.lstsq(unit, np.concatenate([right.real, right.imag]), rcond=None)[0]
+    return np.asarray(found / scale[:, np.newaxis])
+
+
+def _root_of(covariance: FloatArray) -> FloatArray:
+    """Return B with B Bᵀ = covariance, whose parts may have any units."""
+    spread = np.sqrt(np.diag(covariance))
+    spread[spread == 0] = 1.0
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    return np.asarray(spread[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _check_runs(sections: ParallelSections) -> None:
