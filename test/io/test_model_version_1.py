@@ -1,7 +1,7 @@
 """Test that model files of version 1 are read, with the response, band and run of old.
 
-``models_version_1.json`` holds two files that omsm_ros wrote before version 2, with what it computed
-from them then.
+``models_version_1.json`` holds two files that omsm_ros wrote before version 2, with what it
+computed from them then.
 """
 
 import json

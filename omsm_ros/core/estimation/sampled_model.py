@@ -233,7 +233,7 @@ def _section_columns(sections: FloatArray, w: ComplexArray) -> tuple[ComplexArra
     return np.column_stack([np.ones(len(w)), pairs]), moved
 
 
-def _solved(columns: ComplexArray, values: ComplexArray, weight: FloatArray) -> FloatArray:
+def _solved(columns: ComplexArray, values: Any, weight: FloatArray) -> FloatArray:
     """Return the real x (q, r) by which complex ``columns`` (n, q) come nearest to ``values``."""
     left, right = (weight[:, np.newaxis] * part for part in (columns, values))
     if not (np.all(np.isfinite(left)) and np.all(np.isfinite(right))):
