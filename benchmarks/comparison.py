@@ -15,12 +15,12 @@ import numpy as np
 
 from benchmarks.correction import identified_calibration
 from benchmarks.row import Row, at_least, at_most, shown
-from omsm_ros.cli.difference import ComparisonOptions, compare_measurements
 from omsm_ros.core.calibration.calibration import Calibration, with_latency
 from omsm_ros.core.calibration.latency import declared_latency
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
+from omsm_ros.pipelines.difference import ComparisonOptions, compare_measurements
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.disturbances import Disturbances

@@ -64,8 +64,8 @@ def read(path: Path | str, columns: Path | str | None = None) -> Recording:
 
 
 def _read_table(path: Path, columns: Path) -> Recording:
-    from omsm_ros.cli.importing import import_recording
     from omsm_ros.io.tables.table import load_column_map
+    from omsm_ros.pipelines.importing import import_recording
 
     mapped, form = load_column_map(columns)
     with tempfile.TemporaryDirectory() as folder:
@@ -254,11 +254,11 @@ def difference(
     fit: pose parameters of the move;  uncertainty: standard, of heights that state none [m]
     Raises DataError for measurements that hardly overlap, or cover no area.
     """
-    from omsm_ros.cli.difference import facts_of
     from omsm_ros.core.comparison.compare import compare_measurements_of_part
     from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
     from omsm_ros.core.surface.deviation import deviation
     from omsm_ros.core.surface.measured_points import MeasuredPoints
+    from omsm_ros.pipelines.difference import facts_of
 
     measured = []
     for name, side in (("a", a), ("b", b)):

@@ -18,7 +18,7 @@ def named(page):
         if "://" not in target:
             yield page.parent / target
     for name in re.findall(r"`([\w./]+\.(?:py|yaml|md))`", text):
-        # A page shows a file that it adds itself as a block of code, or by a command that writes it.
+        # A page shows a file that it adds itself as a block of code, or that a command writes.
         if "/" in name and f": `{name}`" not in text and f"--out {name}" not in text:
             yield next(
                 (b / name for b in (ROOT, ROOT / "omsm_ros") if (b / name).exists()), Path(name)

@@ -1,9 +1,10 @@
-"""Commands for recordings: record a device; inspect: streams and faults of a bag, its repair."""
+"""Commands for recordings: record a device; inspect or repair a bag; import other recordings."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_
 from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.io import bags
 from omsm_ros.io.json_and_yaml import mapping_of
+from omsm_ros.io.tables.table import load_column_map
 from omsm_ros.io.topics import AnyBag, relative
+from omsm_ros.pipelines.importing import import_recording
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import DURATION, SILENCE
@@ -196,7 +199,39 @@ def _show_record(facts: Facts) -> None:
     table([*counted, written([facts["bag"]])])
 
 
+def _declare_import(add: Arguments) -> None:
+    add("files", "FILE", nargs="+")
+    add("--map", "MAP.yaml", "columns, units, signs, period", required=True)
+    add("--out", "BAG.mcap", required=True)
+
+
+def _import(args: argparse.Namespace) -> Facts:
+    mapped, form = load_column_map(args.map)
+    with progress_bar("importing", args.json, " samples") as progress:
+        found = import_recording(args.files, mapped, form, args.out, progress)
+    return {"bag": str(args.out), "files": [asdict(file) for file in found]}
+
+
+def _show_import(facts: Facts) -> None:
+    for file in facts["files"]:
+        kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
+        say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
+        for count, meaning in (
+            ("missing", "missing trigger numbers"),
+            ("invalid", "invalid probe readings"),
+            ("lost", "rows with an axis that is not a number"),
+            ("repeated_names", "repeated header lines"),
+            ("passed_over", "messages without any of the columns"),
+        ):
+            if file[count]:
+                say(f"    {meaning}: {file[count]}")
+    if any(file["own_clock"] for file in facts["files"]):
+        say("probe and axes have separate clocks: identify and correct with --by-stamps")
+    table([written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")])
+
+
 COMMANDS = (
+    CliCommand("import", _declare_import, _import, _show_import),
     CliCommand("record", _declare_record, _record, _show_record),
     CliCommand("inspect", _declare_inspect, _inspect, _show_inspect),
 )

@@ -29,7 +29,7 @@ TASKS: dict[str, dict[str, Word]] = {
         "record": Word("recordings", "record a device to a bag without ROS"),
         "inspect": Word("recordings", "list the streams and faults of a bag, or repair it"),
         "import": Word(
-            "importing",
+            "recordings",
             "convert CSV, NumPy, MATLAB, HDF5 or TDMS files, or other ROS topics, to a bag",
         ),
     },

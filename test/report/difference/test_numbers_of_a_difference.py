@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from page_tables import PageTables, says
 
-from omsm_ros.cli.difference import facts_of, write_difference
 from omsm_ros.core.comparison.compare import compare_measurements_of_part
 from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.pipelines.difference import facts_of, write_difference
 from omsm_ros.readable import figure
 
 RADIUS = 5e-3

@@ -9,10 +9,10 @@ from html import unescape
 import numpy as np
 import pytest
 
-from omsm_ros.cli.difference import facts_of
 from omsm_ros.core.comparison.compare import compare_measurements_of_part
 from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
 from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.pipelines.difference import facts_of
 from omsm_ros.report.difference import CAPTIONS, headlines, map_of, records, render
 
 ATTACK = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"

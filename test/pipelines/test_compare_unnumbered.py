@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.cli.difference import ComparisonOptions, compare_measurements
 from omsm_ros.core.surface.aspheres import Asphere
+from omsm_ros.pipelines.difference import ComparisonOptions, compare_measurements
 from omsm_ros.units import units_of
 
 RADIUS, DRIFT = 8e-3, 10e-9

@@ -10,12 +10,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from omsm_ros.cli.importing import Origin, RowCounter, import_recording
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.streams.imported_columns import Column, ColumnMap
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.io import bags
 from omsm_ros.io.tables.table import load_column_map
+from omsm_ros.pipelines.importing import Origin, RowCounter, import_recording
 from omsm_ros.pipelines.recording import Recording
 
 METRES = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "inch": 0.0254}

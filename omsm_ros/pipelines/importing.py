@@ -1,18 +1,15 @@
-"""The command import: convert recordings of other programs to a bag."""
+"""Convert recordings of other programs to a bag."""
 
 from __future__ import annotations
 
-import argparse
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from omsm_ros.cli.arguments import Arguments
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.core.streams.imported_columns import (
     AXES,
@@ -32,10 +29,13 @@ from omsm_ros.core.streams.imported_columns import (
 from omsm_ros.errors import DataError, FileError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import atomic_bag
-from omsm_ros.io.tables.table import ForeignTable, TableForm, load_column_map, stated_unit
+from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import shown
 from omsm_ros.units import DATE
+
+_ARRAYS = (".npy", ".npz", ".mat", ".h5", ".hdf5")
+_BAGS = (".mcap", ".bag", ".db3")
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,44 +339,6 @@ class _Source:
         time = self._mapped.columns.get("time")
         dates = [n for n in names if time is not None and time.unit == DATE and n == time.name]
         return self._table.pieces(names, dates)
-
-
-def _declare_import(add: Arguments) -> None:
-    add("files", "FILE", nargs="+")
-    add("--map", "MAP.yaml", "columns, units, signs, period", required=True)
-    add("--out", "BAG.mcap", required=True)
-
-
-def _import(args: argparse.Namespace) -> Facts:
-    mapped, form = load_column_map(args.map)
-    with progress_bar("importing", args.json, " samples") as progress:
-        found = import_recording(args.files, mapped, form, args.out, progress)
-    return {"bag": str(args.out), "files": [asdict(file) for file in found]}
-
-
-def _show_import(facts: Facts) -> None:
-    for file in facts["files"]:
-        kinds = " and ".join(kind for kind in ("axes", "distance") if file[kind])
-        say(f"{file['file']}: {file['rows']} rows of {kinds} at {1 / file['sample_period']:g} Hz")
-        for count, meaning in (
-            ("missing", "missing trigger numbers"),
-            ("invalid", "invalid probe readings"),
-            ("lost", "rows with an axis that is not a number"),
-            ("repeated_names", "repeated header lines"),
-            ("passed_over", "messages without any of the columns"),
-        ):
-            if file[count]:
-                say(f"    {meaning}: {file[count]}")
-    if any(file["own_clock"] for file in facts["files"]):
-        say("probe and axes have separate clocks: identify and correct with --by-stamps")
-    table([written([facts["bag"]]), ("next", "check the bag with 'omsm inspect'")])
-
-
-COMMANDS = (CliCommand("import", _declare_import, _import, _show_import),)
-
-
-_ARRAYS = (".npy", ".npz", ".mat", ".h5", ".hdf5")
-_BAGS = (".mcap", ".bag", ".db3")
 
 
 def open_tables(path: Path, form: TableForm, wanted: Sequence[str]) -> list[ForeignTable]:

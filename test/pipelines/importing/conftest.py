@@ -2,9 +2,9 @@
 
 import pytest
 
-from omsm_ros.cli.importing import import_recording
 from omsm_ros.io import bags
 from omsm_ros.io.tables.table import load_column_map
+from omsm_ros.pipelines.importing import import_recording
 from omsm_ros.pipelines.recording import Recording
 
 

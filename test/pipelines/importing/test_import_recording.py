@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.cli.importing import import_recording
 from omsm_ros.core.streams.imported_columns import Column, ColumnMap
 from omsm_ros.errors import BagError, FileError, OmsmError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.tables.table import TableForm, load_column_map
+from omsm_ros.pipelines.importing import import_recording
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.twin.cell import blocks_of
 
