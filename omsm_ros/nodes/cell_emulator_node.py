@@ -157,8 +157,10 @@ class CellEmulatorNode(ManagedNode):
         response.success, response.message = True, f"{self._player.played} samples played"
 
     def report(self) -> StateReport:
-        """Return whether a motion is played."""
-        words = "playing" if self._player.playing else "waiting"
+        """Return whether a motion is played, and how fast."""
+        lapse = self.values["time_lapse"]
+        faster = f", {lapse:g} times as fast as the machine" if lapse != 1 else ""
+        words = f"playing{faster}" if self._player.playing else "waiting"
         return StateReport(words, {"samples_played": self._player.played})
 
 

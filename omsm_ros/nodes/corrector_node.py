@@ -380,13 +380,13 @@ class CorrectorNode(ManagedNode):
             self.get_logger().info(f"{stream}: begins at trigger {message.first_sample}")
         period = message.sample_period
         self._state.heard(stream, message.first_sample, samples, period, time.monotonic())
-        self._state.arrived(info["received_timestamp"])
         if self._corrector is None:
             self._state.uncalibrated[stream] += samples
             self._warn(
                 self._foreign or "samples arrive without a calibration: call identify or load one"
             )
             return
+        self._state.arrived(info["received_timestamp"])
         convert = message_mapping.axis_block if stream == "axes" else message_mapping.distance_block
         try:
             block = convert(message)

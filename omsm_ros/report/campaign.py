@@ -21,6 +21,8 @@ from omsm_ros.units import DAY_S, MICROSECOND_S, NANOMETRE_M, NANOSECONDS_PER_S
 
 # Relative differences that three digits do not show are not reported.
 _VISIBLE_CHANGE = 0.005
+# Names that fit on the axis of a figure without times, and their last characters.
+_MOST_NAMES, _LONGEST_NAME = 6, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +219,7 @@ def _row(
 
 
 def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries]) -> bytes:
-    """Draw each series over time, or over the order of names if times are unknown."""
+    """Draw each series over time, or over the names of the bags if times are unknown."""
     times = _times(measurements)
     timed = np.any(np.isfinite(times)) and np.nanmax(times) > np.nanmin(times)
     x = (times - np.nanmin(times)) / DAY_S if timed else np.arange(len(measurements))
@@ -233,10 +235,12 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
             panel.set_ylim(
                 min(0.0, float(np.nanmin(values))), 1.05 * (float(np.nanmax(values)) or 1.0)
             )
-        if not timed:
-            panel.xaxis.get_major_locator().set_params(integer=True)
         style.label(panel, y=unit, title=one.series.name)
-    style.label(axes[-1, 0], x="days since the first recording" if timed else "measurement")
+    style.label(axes[-1, 0], x="days since the first recording" if timed else "")
+    if not timed:
+        shown = range(0, len(measurements), 1 + (len(measurements) - 1) // _MOST_NAMES)
+        names = [style.named(measurements[i].name)[-_LONGEST_NAME:] for i in shown]
+        axes[-1, 0].set_xticks(shown, names)
     return style.png(made, dpi=120)
 
 
@@ -256,7 +260,7 @@ def draw(machines: Sequence[HistoryLike]) -> bytes:
 
     Rejected calibrations are crosses.
     """
-    made, axes = style.figure(10.0, 7.0, rows=3)
+    made, axes = style.figure(10.0, 7.0, rows=3, sharex=True)
     lag, gain, form = axes[:, 0]
     for i, machine in enumerate(machines):
         colour = _COLOURS[i % len(_COLOURS)]
@@ -269,10 +273,15 @@ def draw(machines: Sequence[HistoryLike]) -> bytes:
     style.label(lag, y="µs", title="Low-frequency delay, k = 2")
     style.label(gain, title="Static gain, k = 2")
     style.label(form, y="nm", title="Form deviation, rms", x="recorded (UTC)")
-    for panel in (lag, gain, form):
+    bare = [panel for panel in (lag, gain, form) if not panel.containers]
+    for panel in bare:
+        panel.set_yticks([])
+        panel.text(0.5, 0.5, "none recorded", transform=panel.transAxes, ha="center")
+    if len(bare) == len(axes):
+        form.set_xticks([])  # without a date the axis would begin in 1970
+    else:
         locator = AutoDateLocator()
-        panel.xaxis.set_major_locator(locator)
-        panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        form.xaxis.set(major_locator=locator, major_formatter=ConciseDateFormatter(locator))
     if machines:
         style.legend_above(lag)
     return style.png(made, dpi=120)

@@ -80,6 +80,9 @@ def quiet(axes: Axes) -> None:
         spine.set_visible(side in ("left", "bottom"))
         spine.set_color(MUTED)
         spine.set_linewidth(0.7)
+    # No common offset, and a common factor left of the title, which it would cover.
+    axes.ticklabel_format(axis="y", useOffset=False)
+    axes.yaxis.get_offset_text().set(horizontalalignment="right", fontsize=TEXT_PT)
     axes.grid(True, color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
 

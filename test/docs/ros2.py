@@ -174,7 +174,7 @@ def play(motion):
     )  # fmt: skip
     service("call", f"/omsm/{KEPT}/{motion}", "std_srvs/srv/Trigger")
     until = time.monotonic() + DEADLINE_S
-    while not ("playing" in said and said[-1] == "waiting"):
+    while not (any("playing" in one for one in said) and said[-1] == "waiting"):
         assert time.monotonic() < until, said[-3:]
         rclpy.spin_once(NODE, timeout_sec=0.1)
 

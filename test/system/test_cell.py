@@ -81,7 +81,7 @@ def start_scan_of_new_emulator(cell):
                 Trigger, "/omsm/cell_emulator/scan", Trigger.Request(), patience=3.0
             ).success
         except DeviceTimeoutError:
-            if cell.operator.text("cell_emulator", "message") != "playing":
+            if not cell.operator.text("cell_emulator", "message").startswith("playing"):
                 continue
         return
     pytest.fail("the new emulator never answered")
