@@ -185,6 +185,8 @@ def _show_correct(summary: Facts) -> None:
         rows.append((stream, text))
     if summary.get("figures"):
         rows.append(("form deviation", headline(summary)))
+        reasons = (summary.get("conformity") or {}).get("reasons", ())
+        rows += [("reason", text) for text in reasons]
     if verdict := summary.get("verdict"):  # absent if no sample was corrected
         rows.append(("verdict", verdict["text"]))
         rows += [("", text) for text in next_steps(verdict)]

@@ -176,6 +176,7 @@ _VERDICT = {
     "reasons": rows({"text": TEXT}),
 }
 _VALUE = group({"value": _NUMBER, "standard_uncertainty": NUMBER_OR_NULL})
+_OPEN = rows({"reason": TEXT, "peak_to_valley": NUMBER_OR_NULL})
 _FORM = group(
     {},
     bag=TEXT,
@@ -209,7 +210,7 @@ _FORM = group(
     verdict=or_none(group(_VERDICT, add=or_none(group({"text": TEXT, "reached": NUMBER_OR_NULL})))),
     figures=or_none(group({}, peak_to_valley=_VALUE, rms=_VALUE, removed=TEXTS)),
     conformity=or_none(group(CONFORMITY)),
-    form=or_none(group({}, deviation=each(FIGURE))),
+    form=or_none(group({}, deviation=each(FIGURE), open=_OPEN)),
 )
 
 
@@ -248,6 +249,7 @@ _FORM_SCHEMA = group(
     deviation=each(FIGURE),
     pose=each(FIGURE),
     removed=_REMOVED,
+    open=_OPEN,
     conformity=or_none(group(CONFORMITY)),
 )
 _COLUMNS = ("position", "value", "uncertainty")

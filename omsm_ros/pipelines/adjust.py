@@ -30,7 +30,7 @@ from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import EVALUATED
-from omsm_ros.core.form.deviation_map import UncertainValue, conformity
+from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
 from omsm_ros.core.streams.blocks import Account, AxisBlock
@@ -298,9 +298,15 @@ def adjustment_facts(
     return facts
 
 
-def conformity_entry(pv: Figure, tolerance: float) -> dict[str, Any] | None:
-    """Return whether the peak to valley holds the ``tolerance`` [m] within its uncertainty."""
-    judged = conformity(UncertainValue(pv.value, pv.uncertainty), tolerance)
+def conformity_entry(
+    pv: Figure, tolerance: float, doubts: Sequence[Mapping[str, Any]] = ()
+) -> dict[str, Any] | None:
+    """Return whether the peak to valley holds the ``tolerance`` [m] within its uncertainty.
+
+    doubts: ``open`` of the registration
+    """
+    figure = UncertainValue(pv.value, pv.uncertainty)
+    judged = conformity(figure, tolerance, [Doubt(**doubt) for doubt in doubts])
     return None if judged is None else judged.entry()
 
 

@@ -167,8 +167,9 @@ def judge_form(
     """
     form = measured.form(surface, asked, aperture, filters, ISOLATED if dust is None else dust)
     facts = form_facts(form, measured, surface)
+    doubts = form.doubts(decided=dust is not None)
+    facts["open"] = [{"reason": str(d.reason), "peak_to_valley": d.peak_to_valley} for d in doubts]
     if tolerance is not None:
-        doubts = [n for n in form.doubts(tolerance) if dust is None or n.code == "form.uncovered"]
         found = conformity(form.deviation["peak_to_valley"], tolerance, doubts)
         facts["conformity"] = found.entry() if found else None
     save_json(out / FORM, facts)
@@ -223,12 +224,13 @@ def form_facts(
                 *measured.notes,
                 *_mismatch_text(form, nominal),
                 *_advice(form),
-                *(str(n) for n in form.doubts(np.inf)),
+                *(str(d.reason) for d in form.doubts(decided=True)),
             ],
         },
         "aperture": {
             "radius": form.aperture.radius,
             "uncovered": form.uncovered,
+            "outline": form.outline,
             "x": form.aperture.x,
             "y": form.aperture.y,
             "s_filter": form.bands.s_filter,

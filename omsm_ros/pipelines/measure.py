@@ -32,7 +32,6 @@ from omsm_ros.core.correction.machine_sources import (
 from omsm_ros.core.correction.predict import predict_error
 from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fields
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
-from omsm_ros.core.form.deviation_map import HOLDS, OPEN
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
 from omsm_ros.core.registration.isolated_points import DustRule
@@ -161,11 +160,7 @@ def add_verdict(
             summary["figures"] = figures_entry(found.form)
     if tolerance is not None and (figures := summary.get("figures")):
         pv = Figure(*figures["peak_to_valley"].values())
-        summary["conformity"] = held = conformity_entry(pv, tolerance)
-        # Parts without points and dust are doubts of the registration.
-        registered = (form or {}).get("conformity")
-        if held and registered and registered["reasons"] and held["verdict"] == HOLDS:
-            held |= {"verdict": OPEN, "reasons": registered["reasons"]}
+        summary["conformity"] = conformity_entry(pv, tolerance, (form or {}).get("open", ()))
     summary["verdict"] = verdict_entry(verdict, calibration, doubts=doubts)
 
 
@@ -349,6 +344,10 @@ def _publish(
     publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
 
 
+# Of the registration in the summary.
+_OF_FORM = ("pose", "deviation", "removed", "points", "open")
+
+
 def add_form(
     out: Path, summary: dict[str, Any], nominal: Surface, register: RegistrationOptions
 ) -> None:
@@ -362,13 +361,10 @@ def add_form(
         out,
         register.dofs,
         register.aperture,
-        tolerance=register.tolerance,
         dust=register.dust,
     )
-    summary["form"] = {name: facts[name] for name in ("pose", "deviation", "removed", "points")}
+    summary["form"] = {name: facts[name] for name in _OF_FORM}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
-    if register.tolerance is not None:
-        summary["form"]["conformity"] = facts["conformity"]
 
 
 def summarise(

@@ -40,7 +40,7 @@ from omsm_ros.pipelines.spectrum import (
 )
 from omsm_ros.readable import date_text, quantity
 from omsm_ros.report import style
-from omsm_ros.report.measurement.figures import levelled, surface_figures
+from omsm_ros.report.measurement.figures import levelled, registered_map, surface_figures
 from omsm_ros.report.measurement.form_figures import form_figures
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.measurement.surface_map import CloudView, EmbeddedMap, Layer, embedded
@@ -108,6 +108,10 @@ def publish(
     curves = read_curves(out / CURVES) if (out / CURVES).is_file() else {}
     if form:
         figures = {**figures, **form_figures(form, curves)}
+        if (out / DEVIATION).is_file():
+            part = read_points(out / DEVIATION)
+            drawn = registered_map(part.x, part.y, part.height, form)
+            figures["form_map"] = style.png(drawn)
     date = date_text(datetime.now(timezone.utc))
     page = render(Report(title, date, summary, calibration, figures, form, curves, surface))
     save_text(out / REPORT, page)

@@ -89,12 +89,22 @@ def _accounting(summary: Mapping[str, object]) -> list[str]:
 
 _CONFORMITY = {"holds": "tolerance held", "fails": "tolerance exceeded"}
 _OPEN = "conformity open: the tolerance lies within the uncertainty"
+_INCOMPLETE = "conformity open: parts of the surface are in no figure"
+
+
+def covered(form: Mapping[str, Any] | None) -> str:
+    """Return the words behind an extent if some of the aperture has no points, else none."""
+    found = part(form or {}, "open") or ()
+    return " of the covered part" * any(doubt["peak_to_valley"] is None for doubt in found)
 
 
 def headline(facts: Mapping[str, Any]) -> str:
     """Return the result in one line: "PV 175 nm ± 12 nm (k = 2), tolerance held"."""
     pv = facts["figures"]["peak_to_valley"]
-    text = f"PV {expanded(pv['value'], pv['standard_uncertainty'], 'm')}"
+    text = (
+        f"PV {expanded(pv['value'], pv['standard_uncertainty'], 'm')}{covered(facts.get('form'))}"
+    )
     if (judged := facts.get("conformity")) is not None:
-        text += f", {_CONFORMITY.get(judged['verdict'], _OPEN)}"
+        open_ = _INCOMPLETE if judged.get("reasons") else _OPEN
+        text += f", {_CONFORMITY.get(judged['verdict'], open_)}"
     return text

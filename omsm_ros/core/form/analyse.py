@@ -9,6 +9,7 @@ import numpy as np
 
 from omsm_ros.core.form.deviation_map import (
     DeviationMap,
+    Doubt,
     GridCells,
     UncertainValue,
     neighbour_noise,
@@ -170,8 +171,8 @@ class FormResult:
     bands: wavelengths of the filters;  profiles, density: curves of the map
     counts: of the points by outcome; they add up to "read"
     dust: x, y and deviation of the points left out as dust (3, d) [m]
-    uncovered: share of the aperture without points; of a disc, an ellipse or a rectangle around the
-        points if no aperture was asked for
+    uncovered, outline: share of the aperture without points, and its shape: the "disc"; without an
+        aperture asked for, also the "rectangle" or "ellipse" around the points that is best covered
     """
 
     registration: Registration
@@ -185,21 +186,19 @@ class FormResult:
     counts: dict[str, int]
     dust: FloatArray
     uncovered: float
+    outline: str
 
-    def doubts(self, tolerance: float) -> list[Notice]:
-        """Return whether points left out may be a defect beyond ``tolerance`` [m]."""
-        missing = []
+    def doubts(self, *, decided: bool = False) -> list[Doubt]:
+        """Return what the figures do not contain.  decided: that points left out are no defects."""
+        found = []
         if self.uncovered > _COVERED_WELL:
-            missing = [Notice("form.uncovered", share=self.uncovered)]
-        sizes = np.abs(self.dust[2])
-        low, high = (float(end(self.map.deviation)) for end in (np.min, np.max))
-        ends = np.minimum(self.dust[2], low), np.maximum(self.dust[2], high)
-        if not len(sizes) or float(np.max(ends[1]) - np.min(ends[0])) <= tolerance:
-            return missing
-        return [
-            *missing,
-            Notice("form.excluded_points", count=len(sizes), largest=float(sizes.max())),
-        ]
+            found.append(Doubt(Notice("form.uncovered", share=self.uncovered), None))
+        away = self.dust[2]
+        if len(away) and not decided:
+            largest = float(np.max(np.abs(away)))
+            reason = Notice("form.excluded_points", count=len(away), largest=largest)
+            found.append(Doubt(reason, float(np.ptp(np.append(self.map.deviation, away)))))
+        return found
 
 
 def analyse_form(
@@ -235,6 +234,7 @@ def analyse_form(
     # A held pose parameter has an upper bound of its offset only.
     map_ = gathered.map(found, even, [*bounded, *range(len(sources), found.moved.shape[1])])
     zernike = _terms(map_, found)
+    uncovered, outline = _uncovered(map_, found, aperture)
     cells = GridCells.of(map_)
     bands = bands_of(cells, *filters)
     return FormResult(
@@ -250,30 +250,35 @@ def analyse_form(
         density=power_density(cells),
         counts=gathered.counts,
         dust=gathered.dust,
-        uncovered=_uncovered(map_, found, aperture),
+        uncovered=uncovered,
+        outline=outline,
     )
 
 
-def _uncovered(map_: DeviationMap, found: Registration, aperture: Aperture | None) -> float:
-    """Return the share of the aperture, asked for or around the points, that has no points."""
+def _uncovered(
+    map_: DeviationMap, found: Registration, aperture: Aperture | None
+) -> tuple[float, str]:
+    """Return the share of the aperture that has no points, and its shape."""
     disc = found.disc
     pitch = max(_TRACKS_PER_CELL * found.spacing, disc.radius / _CELLS_PER_RADIUS)
+    pitch = min(pitch, disc.radius / 2)
     count = int(np.ceil(2 * disc.radius / pitch))
     if min(np.ptp(map_.x), np.ptp(map_.y)) < pitch:
-        return 0.0  # a profile
+        return 0.0, "disc"  # a profile
     edges = [np.linspace(c - disc.radius, c + disc.radius, count + 1) for c in (disc.x, disc.y)]
     filled = np.histogram2d(map_.x, map_.y, edges)[0] > 0
     u, v = np.meshgrid(*[(e[1:] + e[:-1]) / 2 for e in edges], indexing="ij")
-    # Cells at the rim are covered in part.
-    shapes = [np.hypot(u - disc.x, v - disc.y) < disc.radius - pitch]
+    # Cells at the rim, which lie within the aperture in part, count only if they have points.
+    shapes = {"disc": filled | (np.hypot(u - disc.x, v - disc.y) < disc.radius - pitch)}
     if aperture is None:
         away = [
             np.abs(2 * cells - p.max() - p.min()) / (np.ptp(p) - pitch)
             for cells, p in ((u, map_.x), (v, map_.y))
         ]
-        shapes += [np.maximum(*away) < 1, np.hypot(*away) < 1]
-    shares = (1 - np.mean(filled[inside]) for inside in shapes if np.any(inside))
-    return float(min(shares, default=0.0))  # A disc of a few cells is its rim alone.
+        shapes |= {"rectangle": np.maximum(*away) < 1, "ellipse": np.hypot(*away) < 1}
+    return min(
+        (float(1 - np.mean(filled[cells])), shape) for shape, cells in shapes.items() if cells.any()
+    )
 
 
 def _figures(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -202,30 +202,43 @@ class Conformity:
     value: float
     expanded: float | None
     tolerance: float
-    reasons: tuple[Notice, ...] = ()
+    reasons: tuple[Notice | str, ...] = ()
 
     def entry(self) -> dict[str, Any]:
         """Return the JSON values for result files."""
         return {**asdict(replace(self, reasons=())), "reasons": [*map(str, self.reasons)]}
 
 
+class Doubt(NamedTuple):
+    """A part of the surface that no figure contains.
+
+    reason: as a sentence;  peak_to_valley: of the surface with it [m], None if it is unknown
+    """
+
+    reason: Notice | str
+    peak_to_valley: float | None
+
+
 def conformity(
-    figure: UncertainValue, tolerance: float, doubts: Sequence[Notice] = ()
+    figure: UncertainValue, tolerance: float, doubts: Sequence[Doubt] = ()
 ) -> Conformity | None:
     """Return whether ``figure`` is at most ``tolerance`` [m], None for a figure without a value.
 
     It holds if it does with the expanded uncertainty added, and fails if it does with that
-    subtracted; in between the uncertainty leaves it open. ``doubts`` are parts of the surface that
-    the figure does not contain: with one of them nothing is known to hold.
+    subtracted; in between the uncertainty leaves it open. With a doubt that may exceed the
+    ``tolerance`` nothing is known to hold.
     """
     if figure.value is None:
         return None
     if figure.uncertainty is None:
         return Conformity(OPEN, figure.value, None, tolerance)
     expanded = COVERAGE_FACTOR * figure.uncertainty
+    reasons = tuple(
+        d.reason for d in doubts if d.peak_to_valley is None or d.peak_to_valley > tolerance
+    )
     verdict = OPEN
     if figure.value + expanded <= tolerance:
-        verdict = OPEN if doubts else HOLDS
+        verdict = OPEN if reasons else HOLDS
     elif figure.value - expanded > tolerance:
         verdict = FAILS
-    return Conformity(verdict, figure.value, expanded, tolerance, tuple(doubts))
+    return Conformity(verdict, figure.value, expanded, tolerance, reasons)

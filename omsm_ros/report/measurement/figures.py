@@ -5,12 +5,14 @@ Every function returns a matplotlib Figure; arguments are in SI units, labels st
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
+from matplotlib.patches import Ellipse, Patch, Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from omsm_ros.core.kinematics.kinematics import Surface
@@ -31,6 +33,7 @@ _SHOWN_SHARE = 0.998
 _BREAK_AT_GAPS = 4
 # Left, bottom, width, height relative to the figure.
 _MAP_PLACE = (0.125, 0.13, 0.66, 0.765)
+_FULL_WIDTH = 6.1, 5.1
 _BAR_PLACE = (0.815, 0.19, 0.026, 0.645)
 
 
@@ -63,6 +66,38 @@ def deviation_map(
     """
     made = style.empty(4.0, 3.35)
     _draw_map(made, rasterise(x, y, deviation), unit, title, limits, quantity)
+    return made
+
+
+def registered_map(
+    x: FloatArray, y: FloatArray, deviation: FloatArray, form: Mapping[str, Any]
+) -> Figure:
+    """Draw the deviation (n,) [m] of a registered part, points left out, and where none are.
+
+    form: content of ``form.json``
+    """
+    made = style.empty(*_FULL_WIDTH)
+    _draw_map(made, rasterise(x, y, deviation), "nm", "Registered deviation [nm]")
+    axes = made.axes[0]
+    if "outline" in (aperture := form.get("aperture") or {}):
+        middle, size = [aperture["x"], aperture["y"]], [2 * aperture["radius"]] * 2
+        if aperture["outline"] != "disc":
+            middle = [(v.max() + v.min()) / 2 for v in (x, y)]
+            size = [float(np.ptp(v)) for v in (x, y)]
+        (u, v), (width, height) = np.array([middle, size]) / MILLIMETRE_M
+        look: dict[str, Any] = {"fc": style.MISSING, "ec": style.MUTED, "hatch": "////"}
+        # Below the image, whose pixels without a point are transparent.
+        outline: Patch = Ellipse((u, v), width, height, zorder=-1, lw=0, **look)
+        if aperture["outline"] == "rectangle":
+            corner = (u - width / 2, v - height / 2)
+            outline = Rectangle(corner, width, height, zorder=-1, lw=0, **look)
+        axes.add_patch(outline)
+        axes.set_xlim(u - 0.51 * width, u + 0.51 * width)
+        axes.set_ylim(v - 0.51 * height, v + 0.51 * height)
+    dust = form.get("left_out") or {}
+    if "x" in dust:
+        at = [np.array(dust[name], np.float64) / MILLIMETRE_M for name in "xy"]
+        axes.plot(*at, "x", color=style.INK, markersize=4, markeredgewidth=0.8)
     return made
 
 

@@ -23,7 +23,7 @@ from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
 from omsm_ros.report.page_parts import Headline, check_places, fill, picture
 from omsm_ros.report.tables import Table, part
-from omsm_ros.report.verdict import PageVerdict, verdict_on_measurement
+from omsm_ros.report.verdict import PageVerdict, covered, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
 _SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
@@ -49,8 +49,9 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
     figures = part(summary, "figures") or _form_figures(form)
     if not figures:
         return None
+    open_ = covered(form or part(summary, "form"))
     words = [
-        f"{name} {_expanded(figures[key])}"
+        f"{name} {_expanded(figures[key])}{open_}"
         for key, name in (("peak_to_valley", "PV"), ("rms", "rms"))
     ]
     words.append(f"removed: {', '.join(figures['removed'])}")
@@ -104,6 +105,8 @@ def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
 _ADJUSTED = ("peak_to_valley", "robust_peak_to_valley", "rms", "peak_to_valley_best_fit",
              "rms_best_fit", "rms_before_fit")  # fmt: skip
 
+_EXTENTS = ("rms", "iso10110_A", "iso10110_B", "iso10110_C")
+
 
 def figure_rows(form: Mapping[str, Any], adjusted: object = None) -> list[tuple[str, str]]:
     """Return the figures of the deviation by name, with their expanded uncertainty.
@@ -115,7 +118,8 @@ def figure_rows(form: Mapping[str, Any], adjusted: object = None) -> list[tuple[
             figure(name),
             expanded(
                 entry["value"], entry["uncertainty"], _OTHER_UNITS.get(name, "m"), name in _SIGNED
-            ),
+            )
+            + covered(form) * (name in _EXTENTS or "peak_to_valley" in name),
         )
         for name, entry in (part(form, "deviation") or {}).items()
         if not (adjusted and name in _ADJUSTED)
@@ -272,6 +276,7 @@ DYNAMICS = {
     "step_response": Caption("One edge of the step test, and the residual of the model."),
 }
 FORM = {
+    "form_map": Caption("Pose removed. ×: left out as dust. Hatched: aperture without points."),
     "form_lines": Caption("Along the normal, pose removed, mean over 1/50 of the radius; k = 2."),
     "form_rings": Caption("Mean of each ring, and around the outer third of the radius; k = 2."),
     "zernike_terms": Caption("Terms, 1 at the rim, k = 2. Grey: within the uncertainty."),
@@ -342,7 +347,8 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     found = []
     if figures := part(summary, "figures"):
         detail = f"rms {_expanded(figures['rms'])}"
-        found.append(Headline("Form deviation, PV", _expanded(figures["peak_to_valley"]), detail))
+        pv = _expanded(figures["peak_to_valley"]) + covered(part(summary, "form"))
+        found.append(Headline("Form deviation, PV", pv, detail))
     before = part(summary, "dynamic_error_before")
     if before:
         found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))

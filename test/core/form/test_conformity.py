@@ -2,7 +2,7 @@
 
 import pytest
 
-from omsm_ros.core.form.deviation_map import FAILS, HOLDS, OPEN, UncertainValue, conformity
+from omsm_ros.core.form.deviation_map import FAILS, HOLDS, OPEN, Doubt, UncertainValue, conformity
 
 
 @pytest.mark.parametrize(
@@ -28,3 +28,14 @@ def test_with_its_expanded_uncertainty(value, uncertainty, verdict):
 
 def test_nothing_is_said_of_a_figure_without_a_value():
     assert conformity(UncertainValue(None, None), 100e-9) is None
+
+
+@pytest.mark.parametrize(
+    ("reaches", "verdict"), [(None, OPEN), (101e-9, OPEN), (99e-9, HOLDS), (0.0, HOLDS)]
+)
+def test_what_no_figure_contains_keeps_it_open_if_it_may_exceed_the_tolerance(reaches, verdict):
+    found = conformity(UncertainValue(80e-9, 1e-9), 100e-9, [Doubt("a hole", reaches)])
+    assert found.verdict == verdict
+    assert found.reasons == ("a hole",) * (verdict == OPEN)
+    failed = conformity(UncertainValue(120e-9, 1e-9), 100e-9, [Doubt("a hole", reaches)])
+    assert failed.verdict == FAILS

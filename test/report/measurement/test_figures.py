@@ -134,3 +134,28 @@ class TestDynamicError:
         figure = figures.dynamic_error(cloud.time, cloud.dynamic_error)
         assert len(figure.get_axes()) == 1
         assert {"before [µm]", "time [s]"} <= texts(figure)
+
+
+def test_a_registered_map_shows_points_left_out_and_what_no_point_covers():
+    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-5e-3, 5e-3, 120)] * 2))
+    kept = (np.hypot(x, y) <= 5e-3) & ((x < 1e-3) | (y < 1e-3))
+    form = {
+        "aperture": {"x": 0.0, "y": 0.0, "radius": 5e-3, "outline": "disc"},
+        "left_out": {"x": [-2e-3], "y": [-1e-3]},
+    }
+    figure = figures.registered_map(x[kept], y[kept], 0 * x[kept], form)
+    axes = figure.axes[0]
+    assert axes.lines[0].get_xydata() == pytest.approx(np.array([[-2.0, -1.0]]))
+    figure.canvas.draw()
+    pixels = np.asarray(figure.canvas.buffer_rgba())[::-1]
+
+    def colours(u, v):
+        """Return the number of colours within 0.5 mm around u, v [mm]."""
+        (left, low), (right, high) = (
+            axes.transData.transform((u + s, v + s)).astype(int) for s in (-0.5, 0.5)
+        )
+        return len(np.unique(pixels[low:high, left:right].reshape(-1, 4), axis=0))
+
+    assert colours(2.5, 2.5) > 3
+    assert colours(-3.0, 2.0) == 1
+    assert colours(4.9, 4.9) == 1
