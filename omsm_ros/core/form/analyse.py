@@ -218,9 +218,8 @@ def analyse_form(
     portions: reads the points;  asked: pose parameters of the fit, or "auto"
     sources: names of the systematic errors;  bounds: those of which only an upper bound is known
     aperture: of the part; None: the disc about the part's origin that holds all points
-    even: the points form an evenly spaced grid
     filters: wavelengths of the S- and the L-filter [m], None for the defaults
-    dust: which points far from the smooth form are left out
+    even: the points form an even grid;  dust: which points far from the form are left out
 
     Raises DataError for points that are too few, do not fit, or do not determine the pose.
     """
@@ -230,9 +229,8 @@ def analyse_form(
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
-    bounded = [n for n, name in enumerate(sources) if name in bounds]
-    # A held pose parameter has an upper bound of its offset only.
-    map_ = gathered.map(found, even, [*bounded, *range(len(sources), found.moved.shape[1])])
+    held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
+    map_ = gathered.map(found, even, [*[n for n, s in enumerate(sources) if s in bounds], *held])
     zernike = _terms(map_, found)
     uncovered, outline = _uncovered(map_, found, aperture)
     cells = GridCells.of(map_)
