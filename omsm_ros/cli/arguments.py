@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.errors import ConfigurationError, FileError, one_line, shortened
 from omsm_ros.io import json_and_yaml
+from omsm_ros.io.files import read_text
 from omsm_ros.io.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, Quantity, shown
 from omsm_ros.units import LengthUnits, units_of
@@ -59,11 +60,17 @@ def number(quantity: Quantity) -> Callable[[str], Any]:
     return read
 
 
+_MAX_YAML_BYTES = 65_536
+
+
 def json_object(text: str) -> dict[str, object]:
-    """Parse an argument as a JSON object."""
+    """Parse an argument as a JSON object, or read it from a file of YAML."""
     try:
+        if text.endswith((".yaml", ".yml")):
+            content = read_text(text, _MAX_YAML_BYTES, FileError, "description")
+            return json_and_yaml.mapping_of(content, FileError, f"description {text!r}")
         return json_and_yaml.object_of(text, ConfigurationError, shown(text))
-    except ConfigurationError as err:
+    except (ConfigurationError, FileError) as err:
         raise argparse.ArgumentTypeError(str(err)) from err
 
 

@@ -127,9 +127,9 @@ def _declare_use(add: Arguments) -> None:
         "--origin",
         json_object,
         "entries of the certificate: machine, probe, probe_serial_number, target, "
-        "temperature_c, operator, laboratory, method",
+        "temperature_c, operator, laboratory, customer, method",
         default={},
-        metavar="JSON",
+        metavar="JSON|FILE.yaml",
     )
 
 

@@ -56,6 +56,7 @@ class Origin:
     temperature_c: float | None = None
     operator: str | None = None
     laboratory: str | None = None
+    customer: str | None = None
     method: str | None = None
     software: str | None = None
     input: str | None = None

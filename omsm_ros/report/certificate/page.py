@@ -440,6 +440,7 @@ def render_dcc(calibration: Calibration, version: str) -> str:
         probe=_word(origin.probe),
         serial=_word(origin.probe_serial_number),
         laboratory=_word(origin.laboratory),
+        customer=_word(origin.customer),
         operator=_word(origin.operator),
         method=_word(origin.method or "step test on a fixed target"),
         verdict=_word(verdict_text(calibration) or "no certificate"),

@@ -258,6 +258,7 @@ _ORIGINS = {
     "target": "target",
     "operator": "operator",
     "laboratory": "laboratory",
+    "customer": "customer",
     "method": "method",
     "software": "software",
     "made_from": "made from",

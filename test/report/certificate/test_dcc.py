@@ -55,8 +55,12 @@ def test_values_and_uncertainties_are_those_of_the_calibration(certified, text):
 
 def test_texts_from_outside_are_escaped(certified):
     settings = {**certified.settings, "machine": "<a> & b"}
-    parsed = ET.fromstring(render_dcc(replace(certified, settings=settings), "0.1.0"))
+    origin = replace(certified.certificate.origin, customer="Optics & Co")
+    certificate = replace(certified.certificate, origin=origin)
+    made = replace(certified, settings=settings, certificate=certificate)
+    parsed = ET.fromstring(render_dcc(made, "0.1.0"))
     assert any("<a> & b" in (e.text or "") for e in parsed.iter("{https://ptb.de/dcc}content"))
+    assert parsed.findtext(".//{*}customer/{*}name/{*}content") == "Optics & Co"
 
 
 def test_the_schema_of_ptb_accepts_it(text):
