@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +20,7 @@ from omsm_ros.io import json_and_yaml
 from omsm_ros.io.files import atomic_file, open_regular, read_text
 from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import MAP_POINTS
-from omsm_ros.units import LengthUnits, metres_in, name_and_unit, needed, refuse_other
+from omsm_ros.units import NOT_USED, LengthUnits, metres_in, name_and_unit, needed, refuse_other
 
 # The greatest number of points of a map, in lines of sixty characters.
 MAX_TEXT_BYTES = 60 * int(MAP_POINTS.high)
@@ -52,6 +52,11 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
             raise FileError(f"{what} has {size} bytes, at most {MAX_TEXT_BYTES} are read; thin it")
         stream.seek(0)
         header, first = _beginning(stream, what)
+        if sizes := _sizes_of_matrix(header):
+            stream.seek(0)
+            body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
+            found = _matrix(body, header, first, sizes, what)
+            return replace(found, notes=(NOT_USED,) if units else ())
         names, scales, cells = _columns(header, first, units, what)
         stream.seek(0)
         body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
@@ -67,6 +72,27 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         (*_notes(names, cells), *(["a profile along x"] if profile else [])),
         sample=column.get("sample"),
     )
+
+
+def _sizes_of_matrix(header: list[str]) -> list[float]:
+    """Return width, height and unit of the values [m] of a matrix of Gwyddion; none of another."""
+    pattern = r"[#\s]*(width|height|value units):\s*((?:\d+\.?\d*(?:e[-+]?\d+)?)?)\s*(\S+)\s*"
+    lines = [one for line in header if (one := re.fullmatch(pattern, line, re.IGNORECASE))]
+    sizes = {f[1].lower(): float(f[2] or 1) * (metres_in(f[3]) or 0.0) for f in lines}
+    found = [sizes.get(name, 0.0) for name in ("width", "height", "value units")]
+    return found if all(found) else []
+
+
+def _matrix(
+    body: io.TextIOBase, header: list[str], first: str, sizes: list[float], what: str
+) -> MeasuredPoints:
+    """Read a matrix of heights, the first row at the greatest y."""
+    remedy = "write as many heights on every line, a missing one as nan"
+    layout: dict[str, Any] = {"comments": list(_COMMENTS), "delimiter": _delimiter(first)}
+    table = rows_in(islice(body, len(header), None), what, remedy, above=len(header), **layout)
+    row, column = ((index.ravel() + 0.5) for index in np.indices(table.shape))
+    x, y = column / table.shape[1] * sizes[0], (1 - row / table.shape[0]) * sizes[1]
+    return measured(x, y, table.ravel() * sizes[2])
 
 
 def _beginning(stream: IO[bytes], what: str) -> tuple[list[str], str]:

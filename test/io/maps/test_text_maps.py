@@ -269,3 +269,17 @@ def test_by_place_sees_a_transposed_map():
     made = grid(hole=False).points()
     other = type(made)(x=made.y, y=made.x, height=made.height)
     assert not np.allclose(by_place(made), by_place(other))
+
+
+def test_a_matrix_of_heights_has_the_sizes_and_units_of_its_header(tmp_path):
+    """Gwyddion exports the first row at the top: a height of x + 2 y comes back."""
+    x, y = np.meshgrid((np.arange(20) + 0.5) * 1e-6, (np.arange(10) + 0.5)[::-1] * 2e-6)
+    path, height = tmp_path / "matrix.txt", x + 2 * y
+    height[3, 4] = np.nan
+    head = "Channel: Z\nWidth: 20.0 µm\nHeight: 0.02 mm\nValue units: nm"
+    np.savetxt(path, height * 1e9, header=head, encoding="utf-8")
+    found = read_points(path)
+    assert len(found) == 199
+    assert found.missing == 1
+    assert found.height == pytest.approx(found.x + 2 * found.y, rel=1e-12)
+    assert (np.ptp(found.x), np.ptp(found.y)) == pytest.approx((19e-6, 18e-6))
