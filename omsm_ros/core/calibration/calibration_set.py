@@ -70,9 +70,7 @@ class CalibrationSet(Calibration):
 
 
 def calibration_set(
-    along: str,
-    placed: Sequence[tuple[float, Calibration]],
-    certificate: Certificate | None = None,
+    along: str, placed: Sequence[tuple[float, Calibration]], certificate: Certificate | None = None
 ) -> CalibrationSet:
     """Return the set of calibrations at their places [m], of b [rad].
 
@@ -148,8 +146,7 @@ def _certificate(middle: Calibration, members: Sequence[Calibration]) -> Certifi
         findings=tuple(f for i, f in enumerate(reasons) if f not in reasons[:i]) + tuple(kept),
         residual=replace(own.residual, noise_m=_largest(c.residual.noise_m for c in every)),
         model_errors=replace(
-            own.model_errors,
-            motion_error_m=_largest(c.model_errors.motion_error_m for c in every),
+            own.model_errors, motion_error_m=_largest(c.model_errors.motion_error_m for c in every)
         ),
         validity=replace(own.validity, from_hz=_largest(c.validity.from_hz for c in every)),
         static_gain=replace(

@@ -10,13 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from omsm_ros.core.calibration.finding import (
-    REJECTS,
-    RESERVATION,
-    WARNING,
-    Finding,
-    of_severity,
-)
+from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, WARNING, Finding, of_severity
 from omsm_ros.core.calibration.intended_use import IntendedUse
 from omsm_ros.core.calibration.latency import Latency
 from omsm_ros.core.calibration.typed_json import from_json, to_json

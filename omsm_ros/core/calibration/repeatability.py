@@ -180,8 +180,7 @@ def repeatability(calibrations: Sequence[Calibration]) -> Repeatability:
         [c.low_frequency_delay_noise for c in calibrations],
     )
     static_gain = _spread(
-        [c.static_gain for c in calibrations],
-        [c.static_gain_uncertainty for c in calibrations],
+        [c.static_gain for c in calibrations], [c.static_gain_uncertainty for c in calibrations]
     )
     p_value = _chance(off, covariance, static_gain)
     k = len(lines)

@@ -211,10 +211,7 @@ class LocalQuadratic:
         )
         if len(self._cells.x) < _LEAST_NEIGHBOURS:
             raise DataError(
-                "comparison.few_cells",
-                count=len(self._cells.x),
-                cell=cell,
-                least=_LEAST_NEIGHBOURS,
+                "comparison.few_cells", count=len(self._cells.x), cell=cell, least=_LEAST_NEIGHBOURS
             )
         self._tree = cKDTree(np.column_stack([self._cells.x, self._cells.y]))
         some = slice(None, None, max(len(points) // _PROBED, 1))

@@ -99,10 +99,7 @@ class SampledModel:
         if len(valid) != sections.inputs or len(point) != sections.inputs + 1:
             raise CalibrationError("estimation.model_sizes", inputs=sections.inputs)
         return cls(
-            sections=sections,
-            valid=valid,
-            working_point=point,
-            certificate=content["certificate"],
+            sections=sections, valid=valid, working_point=point, certificate=content["certificate"]
         )
 
 

@@ -302,10 +302,7 @@ def _entries(
         "independence_p": independence(residual, drive),
         "poles": _poles(sections, valid),
         "continuous_error": _continuous_error(sections, valid[0]),
-        "samples": {
-            "received": sum(len(r) for r in problem.records),
-            "compared": len(residual),
-        },
+        "samples": {"received": sum(len(r) for r in problem.records), "compared": len(residual)},
     }
 
 

@@ -154,10 +154,7 @@ def _reserved(
         ring = abs(np.diff(turn.values[::_STRIDE]))[along > 0] / along[along > 0]
         most, least = float(np.max(ring)), float(np.min(ring))
         found[PATH] = [
-            (
-                order * (most + least) / 2,
-                bins + order * (most - least) / 2 / path.resolution,
-            )
+            (order * (most + least) / 2, bins + order * (most - least) / 2 / path.resolution)
             for order, bins in reserved_orders
         ]
     return found

@@ -22,10 +22,7 @@ from omsm_ros.core.identification.fitted_record import (
     autocorrelation,
     mean_at_edges,
 )
-from omsm_ros.core.lti.frequency_response import (
-    COVERAGE_FACTOR,
-    FrequencyResponse,
-)
+from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, FrequencyResponse
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import quantity
 from omsm_ros.report import style
