@@ -297,7 +297,11 @@ def certificate_of_version_1(entries: Mapping[str, Any]) -> Certificate:
             continue
         *group, field = _PLACES_1[name]
         (content.setdefault(group[0], {}) if group else content)[field] = value
-    _add_limits(content, entries.get("limits"))
+    limits = entries.get("limits")
+    if isinstance(limits, Mapping):
+        content["limits"] = dict(limits)
+        band = {name: limits[name] for name in ("gain", "phase_rad") if name in limits}
+        content["validity"] = content.get("validity", {}) | band
     _add_candidates(content, entries.get("candidates"))
     for name, gain in (entries.get("static_gains") or {}).items():
         content.setdefault("static_gain", {})[name] = gain
@@ -336,15 +340,7 @@ def _findings(entries: Mapping[str, Any]) -> list[dict[str, Any]]:
     return found
 
 
-def _add_limits(content: dict[str, Any], limits: object) -> None:
-    if isinstance(limits, Mapping):
-        content["limits"] = dict(limits)
-        band = {name: limits[name] for name in ("gain", "phase_rad") if name in limits}
-        content["validity"] = content.get("validity", {}) | band
-
-
 def _add_candidates(content: dict[str, Any], candidates: object) -> None:
-    """Add the structures that were tried; one without its numbers is left out."""
     known = (
         [c for c in candidates if isinstance(c, Mapping)] if isinstance(candidates, list) else []
     )

@@ -92,7 +92,8 @@ def calibration_set(
     if len(set(positions)) < len(positions):
         raise CalibrationError("calibration.set_places", axis=along, positions=repr(positions))
     _check_alike(members)
-    middle = members[_nearest_to_middle(positions)]
+    half = (positions[0] + positions[-1]) / 2
+    middle = members[int(np.argmin([abs(position - half) for position in positions]))]
     return CalibrationSet(
         dynamics=middle.dynamics,
         static_gain=float(np.mean([c.static_gain for c in members])),
@@ -105,11 +106,6 @@ def calibration_set(
         positions=positions,
         members=members,
     )
-
-
-def _nearest_to_middle(positions: Sequence[float]) -> int:
-    middle = (positions[0] + positions[-1]) / 2
-    return int(np.argmin([abs(position - middle) for position in positions]))
 
 
 def _check_alike(members: Sequence[Calibration]) -> None:
@@ -131,7 +127,6 @@ def _check_alike(members: Sequence[Calibration]) -> None:
 
 
 def _certificate(middle: Calibration, members: Sequence[Calibration]) -> Certificate:
-    """Return what holds for all: the worst verdict, the largest uncertainties."""
     every = [c.certificate for c in members]
     own = middle.certificate
     rejected = any(c.verdict == REJECTED for c in every)
@@ -161,7 +156,6 @@ def _largest(values: Iterable[float | None]) -> float | None:
 
 
 def _latency(members: Sequence[Calibration]) -> Latency:
-    """Return the latency of the probe, which is one wherever the slides stand."""
     each = [c.latency for c in members]
     lag = max((c.dynamics.low_frequency_delay for c in members), key=abs)
     if not all(latency.resolved for latency in each):

@@ -207,7 +207,6 @@ def _spread(values: Sequence[float], uncertainties: Sequence[float]) -> Spread:
 
 
 def _chance(off: FloatArray, covariance: FloatArray, static_gain: Spread) -> float:
-    """Return p-value of deviations from the mean, of the response ``off`` (n, 2k) and the gain."""
     free = len(off) - 1
     found = [mahalanobis(row, covariance) for row in off]
     statistic, known = sum(value for value, _ in found), found[0][1] * free

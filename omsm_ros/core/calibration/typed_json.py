@@ -81,7 +81,6 @@ def _read_fields(kind: Any, content: Any, name: str) -> Any:
 
 @lru_cache
 def _form(kind: Any) -> tuple[Mapping[str, Any], frozenset[str]]:
-    """Return the types of the fields of ``kind``, and which of them have no default."""
     required = (
         f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING
     )

@@ -270,7 +270,6 @@ def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]
 
 
 def _rows(matched: Matched, values: FloatArray) -> tuple[list[ZernikeIndex], FloatArray]:
-    """Return the terms that are separable from the fitted pose, and their weights (t, m)."""
     free = matched.without_fit(values)
     own = np.linalg.norm(free, axis=1) / np.linalg.norm(values, axis=1)
     kept = np.flatnonzero(own > _LEAST_OWN_SHARE)

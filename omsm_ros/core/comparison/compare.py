@@ -101,7 +101,6 @@ def verdict_of(
 
 
 def _least_certain(found: ComparisonAgreement) -> tuple[Notice, ...]:
-    """Return the three terms with the largest uncertainty."""
     terms = sorted(found.terms, key=lambda term: -term.expanded)[:3]
     return tuple(
         Notice("comparison.expanded_of_term", expanded=t.expanded, term=(t.n, t.m)) for t in terms
@@ -250,7 +249,6 @@ def compare_measurements_of_part(
 
 
 def _places(a: MeasuredPoints, b: MeasuredPoints, side: float) -> HeightGrid:
-    """Return a grid over the rectangle that both cover."""
     low = [max(float(v.min()), float(w.min())) for v, w in ((a.x, b.x), (a.y, b.y))]
     high = [min(float(v.max()), float(w.max())) for v, w in ((a.x, b.x), (a.y, b.y))]
     if low[0] >= high[0] or low[1] >= high[1]:
@@ -322,7 +320,6 @@ def _lateral_shift(matched: Matched) -> tuple[Notice, ...]:
 
 
 def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:
-    """Return the share of the smaller area that both cover [1]."""
     both = float(np.sum(matched.filled)) * side**2
     return min(both / min(_area(points, side) for points in (a, b)), 1.0)
 

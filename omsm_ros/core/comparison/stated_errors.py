@@ -215,7 +215,6 @@ def _shared(
     halves: tuple[ComparisonSide, ComparisonSide],
     errors: tuple[MeasurementErrors, MeasurementErrors],
 ) -> tuple[str, ...]:
-    """Return the sources of a common error: those of a calibration that both used."""
     ids = {half.measurement.calibration for half in halves}
     if len(ids) > 1 or not all(ids):
         return ()
@@ -270,7 +269,6 @@ def _drifts(
     known: tuple[MeasurementErrors, MeasurementErrors],
     shared: tuple[str, ...],
 ) -> list[dict[str, FloatArray]]:
-    """Return the shapes of both drifts, estimated from the difference where not stated."""
     found: list[dict[str, FloatArray]] = [{}, {}]
     longest = max(half.measurement.duration for half in halves)
     unit: dict[int, FloatArray] = {}

@@ -127,7 +127,6 @@ def gain_uncertainty_alone(problem: Problem, fitted: Fit) -> float:
 
 
 def _motion_noise_spectrum(problem: Problem, passed: TransferFunction, length: int) -> FloatArray:
-    """Return the spectrum of the noise of the motion after ``passed``, where there is motion."""
     frequency = fft.rfftfreq(length, problem.period)
     moves = 2 * np.pi * frequency <= problem.rate * np.max(np.abs(problem.s))
     power = np.abs(passed.response(frequency)) ** 2 * problem.noise**2

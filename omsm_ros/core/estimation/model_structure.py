@@ -73,15 +73,12 @@ class ScaledStructure:
 
     def sections(self, nonlinear: FloatArray) -> list[FloatArray]:
         """Return the ascending factors of the denominator, [1, d1, d2] for a pair or [1, d1]."""
-        alpha, beta = self._logs(nonlinear)
+        singles = self.structure.poles - self.structure.pairs
+        alpha, beta = nonlinear[:singles], nonlinear[singles : self.structure.poles]
         return [
             np.exp(np.concatenate([np.zeros(1), alpha[i : i + 1], beta[i : i + 1]]))
             for i in range(len(alpha))
         ]
-
-    def _logs(self, nonlinear: FloatArray) -> tuple[FloatArray, FloatArray]:
-        singles = self.structure.poles - self.structure.pairs
-        return nonlinear[:singles], nonlinear[singles : self.structure.poles]
 
     def _delay(self, nonlinear: FloatArray) -> float:
         return float(nonlinear[-1]) if self.structure.delay else 0.0

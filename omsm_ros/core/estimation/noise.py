@@ -128,7 +128,6 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
 
 
 def _persists(on_grid: FloatArray, rate: FloatArray) -> bool:
-    """Return True if neighbours in ``on_grid`` correlate where the axis moves."""
     moving = rate**2 > _STILL * np.max(rate**2)
     value = np.where(moving & np.isfinite(on_grid), on_grid, 0.0)
     product = value[1:] * value[:-1]

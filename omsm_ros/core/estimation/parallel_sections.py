@@ -127,11 +127,8 @@ class ParallelSections:
         """Return the poles in s [rad/s], (n,); of a held input log z / T."""
         if self.hold == BAND_LIMITED:
             return self.roots()
-        return np.asarray(np.log(self._in_z()) / self.period, np.complex128)
-
-    def _in_z(self) -> ComplexArray:
         half = 0.5 * self.period * self.roots()
-        return np.asarray((1 + half) / (1 - half), np.complex128)
+        return np.asarray(np.log((1 + half) / (1 - half)) / self.period, np.complex128)
 
     def driven(self, inputs: FloatArray) -> FloatArray:
         """Return the output (n,) for ``inputs`` (n, m), as if they repeated for ever.
@@ -147,11 +144,9 @@ class ParallelSections:
         """Return the responses (states, samples) to any past and to the first samples."""
         late = int(np.ceil(np.max(self.delays, initial=0.0) / self.period - 1e-6))
         pulses = np.eye(min(late + (self.hold != BAND_LIMITED), samples), samples)
-        rows = [row for down in self._recursions() for row in decays_of(down, samples, late=late)]
+        down = [recursion(d1, d2, self.hold, self.period) for d1, d2 in self.denominators]
+        rows = [row for each in down for row in decays_of(each, samples, late=late)]
         return np.asarray(np.concatenate([np.reshape(rows, (-1, samples)), pulses]))
-
-    def _recursions(self) -> list[FloatArray]:
-        return [recursion(d1, d2, self.hold, self.period) for d1, d2 in self.denominators]
 
     def equivalent(self) -> ParallelSections | None:
         """Return G(s) of which this is the sampled form; None where there is no such G.

@@ -84,7 +84,6 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
 
 
 def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
-    """Return the problem with the variances of rounding errors of both readings."""
     plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
     shared = plateau_variance(output, plateau[problem.used], reading_step(output))
     step = reading_step(problem.input)
@@ -92,7 +91,6 @@ def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:
-    """Return the motion (n,) that is the input, finite everywhere."""
     if source == "encoder":
         return record.z
     if source != "reference":
@@ -185,7 +183,6 @@ def _affected_by_loss(record: MotionRecord) -> BoolArray:
 
 
 def _complete_edges(steps: Steps, record: MotionRecord) -> Steps:
-    """Return the steps without the edges that are partly lost."""
     if record.z_lost is None:
         return steps
     lost = record.z_lost
@@ -288,7 +285,6 @@ def check_axis_steps(prepared: Prepared) -> None:
 
 
 def _moves_unevenly(positions: FloatArray, step: float) -> bool:
-    """Return True if the speed changes at many of the samples where the axis moves."""
     advance = np.diff(positions)
     moves = (np.abs(advance[:-1]) > step / 2) | (np.abs(advance[1:]) > step / 2)
     changes = np.abs(np.diff(advance)) > step / 2

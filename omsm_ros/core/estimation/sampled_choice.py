@@ -26,7 +26,6 @@ from omsm_ros.core.estimation.sampled_fit import (
     SectionsProblem,
     grown_starts,
 )
-from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 from omsm_ros.linear_algebra import least_squares
@@ -137,15 +136,10 @@ def choose_sampled(
     comparison = _against_impulse_response(explored, fits[orders.index(chosen.order)])
     finished = _finished(whole, chosen, every)
     other = finished if chosen is free else _finished(whole, free, every)
-    larger = [c.fit.model(float(every)) for c in _alternatives(judged, chosen)]
-    return SampledChoice(finished, other, larger, orders, by_order, *comparison)
-
-
-def _alternatives(
-    judged: Sequence[SampledCandidate], chosen: SampledCandidate
-) -> list[SampledCandidate]:
     most = _ALIKE * float(np.mean(chosen.hidden))
-    return [c for c in judged if c.order > chosen.order and float(np.mean(c.hidden)) <= most]
+    alike = [c for c in judged if c.order > chosen.order and float(np.mean(c.hidden)) <= most]
+    larger = [c.fit.model(float(every)) for c in alike]
+    return SampledChoice(finished, other, larger, orders, by_order, *comparison)
 
 
 def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsProblem, int, int]:
@@ -258,7 +252,6 @@ def _early(record: SampledRecord) -> SampledRecord:
 
 
 def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, SectionsFit]:
-    """Return the problem with the delays of its inputs, and a small fit with them."""
     start = problem.spread_poles(_DELAY_ORDER)
 
     def fitted(tried: SectionsProblem, late: FloatArray) -> SectionsFit:
@@ -313,7 +306,6 @@ def _explore(
 def _next_fit(
     problem: SectionsProblem, smaller: Sequence[SectionsFit], order: int, late: FloatArray
 ) -> SectionsFit:
-    """Return the best fit of ``order`` from vector fitting and from the ``smaller`` fits."""
     if order == 0:
         return problem.fit(0, [problem.nonlinear_of(np.empty(0, np.complex128), late)])
     own = smaller[-1].problem.late(smaller[-1].nonlinear, smaller[-1].order)
@@ -352,7 +344,6 @@ def _relative(residuals: Sequence[FloatArray]) -> FloatArray:
 
 
 def _finalists(orders: Sequence[int], explained: FloatArray, asked: int) -> list[int]:
-    """Return the orders to compare: the best, the lowest of similar error, 0, 1 and ``asked``."""
     missed = 1 - explained
     best = np.argsort(missed, kind="stable")[:_FINALISTS]
     alike = np.flatnonzero(missed <= _EQUIVALENT * np.min(missed))[:_FINALISTS]
@@ -405,18 +396,14 @@ def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -
         turned = roots * RATE / every
         held = whole.hold != BAND_LIMITED
         roots = np.asarray((2 * np.tanh(turned / 2) if held else turned) / RATE)
-    starts = [whole.nonlinear_of(_paired(roots), late)]
+    roots = np.where(abs(roots.imag) < 1e-12 * abs(roots), roots.real + 0j, roots)
+    starts = [whole.nonlinear_of(roots, late)]
     found = whole.fit(candidate.order, starts, _FINAL)
     if every == 1:
         return replace(candidate, fit=found)
     part = replace(whole, records=[_early(record) for record in whole.records])
     rest = part.fit(candidate.order, [found.nonlinear], _HIDDEN)
     return SampledCandidate(found, np.array([np.mean(_relative(hidden_residual(rest, whole)))]))
-
-
-def _paired(roots: ComplexArray) -> ComplexArray:
-    """Return ``roots`` without imaginary parts by rounding."""
-    return np.where(abs(roots.imag) < 1e-12 * abs(roots), roots.real + 0j, roots)
 
 
 def _against_impulse_response(

@@ -218,7 +218,6 @@ class SectionsProblem:
         )
 
     def _drives(self, one: _Spectra, nonlinear: FloatArray, order: int) -> ComplexArray:
-        """Return the delayed spectra of the inputs, (m, k)."""
         late = self.late(nonlinear, order)[:, np.newaxis]
         return one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
 

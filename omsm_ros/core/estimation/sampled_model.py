@@ -266,7 +266,6 @@ def _check_runs(sections: ParallelSections) -> None:
 
 
 def _square(values: Sequence[float], size: int) -> FloatArray:
-    """Return a covariance (size, size) from its rows in sequence."""
     if len(values) != size**2:
         raise CalibrationError("estimation.covariance_size", count=len(values), expected=size**2)
     covariance = SIGNAL.checked_all(np.asarray(values, np.float64), CalibrationError)

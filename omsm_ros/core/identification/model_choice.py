@@ -218,7 +218,6 @@ def _chosen_on_subset(
 
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
-    """Return the candidates whose poles are identifiable."""
     duration = len(problem.input) * problem.period
     return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
 

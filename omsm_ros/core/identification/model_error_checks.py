@@ -125,7 +125,6 @@ def model_errors(searched: SearchResult) -> Iterator[Finding]:
 
 
 def _finding(searched: SearchResult, modelled: ModelledTerm, values: dict[str, object]) -> Finding:
-    """Return the reservation for a nuisance term, which names all causes that look alike."""
     family = modelled.term.family
     alike = _alike(searched, modelled) if family in _MAY_LOOK_ALIKE else []
     if not alike:
@@ -135,7 +134,6 @@ def _finding(searched: SearchResult, modelled: ModelledTerm, values: dict[str, o
 
 
 def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:
-    """Return the other families that explain about as much as ``modelled``, fitted without it."""
     problem, fitted = searched.prepared.problem, searched.model.chosen.fit
     kept = np.ones(problem.background.shape[1], np.bool_)
     kept[modelled.columns] = False

@@ -186,7 +186,6 @@ class _Search:
 def _initial_model(
     prepared: Prepared, choose: Choose, budget: EvaluationBudget
 ) -> tuple[Prepared, list[ModelledTerm], ChosenModel, EvaluationBudget]:
-    """Return the problem, its first nuisance terms and its model, and the remaining budget."""
     prepared, nuisance_terms = _with_columns(prepared, _drift(prepared, budget))
     prepared, model = choose(prepared, budget)
     prepared, model, budget = _with_errors_in_variables(prepared, model, choose, budget)
@@ -201,7 +200,6 @@ def _initial_model(
 def _rechoose(
     prepared: Prepared, model: ChosenModel, choose: Choose, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel]:
-    """Return the problem and a model chosen anew, after it has changed since ``model``."""
     prepared, found = choose(prepared, budget)
     return prepared, keep_better(prepared.problem, found, model.chosen.fit, budget)
 
@@ -263,7 +261,6 @@ def _modelled_as_poles(
 def _improving_terms(
     prepared: Prepared, diagnostics: ResidualDiagnostics, chosen: Fit, budget: EvaluationBudget
 ) -> list[ScoreTest]:
-    """Return nuisance terms with which the fit of ``diagnostics`` is better than ``chosen``."""
     columns = _select_nuisance_terms(diagnostics, diagnostics.significant())
     if not columns:
         return []
@@ -332,7 +329,6 @@ def _recomputed_columns(
     nuisance_terms: Sequence[ModelledTerm],
     families: set[str],
 ) -> tuple[Prepared, list[ModelledTerm]]:
-    """Return the problem with the columns of ``families`` for the fit of ``diagnostics``."""
     background, renewed = prepared.problem.background.copy(), []
     for modelled in nuisance_terms:
         term = modelled.term
@@ -346,7 +342,6 @@ def _recomputed_columns(
 def _grown(
     prepared: Prepared, model: ChosenModel, term: ModelErrorTerm, budget: EvaluationBudget
 ) -> tuple[Prepared, ChosenModel] | None:
-    """Return the model with the poles of ``term``, or None where that is no improvement."""
     if term.family not in (CREEP, MODE):
         return None
     problem, new = prepared.problem, poles_of(term)
@@ -385,7 +380,6 @@ def _bases(model: ChosenModel) -> list[Fit]:
 
 
 def _best_plain(model: ChosenModel) -> Fit | None:
-    """Return the best simple fit, if one was tried."""
     plain = _plain_candidates(model)
     return min(plain, key=lambda candidate: candidate.bic).fit if plain else None
 
@@ -395,6 +389,5 @@ def _plain_candidates(model: ChosenModel) -> list[Candidate]:
 
 
 def _decays(found: Fit, problem: Problem) -> bool:
-    """Return True if the response of every pole of ``found`` decays within the record."""
     slowest = float(np.min(-found.dynamics.poles().real))
     return slowest * len(problem.input) * problem.period > _LEAST_DECAYS

@@ -146,7 +146,6 @@ def _frequencies(problem: Problem) -> FloatArray:
 
 
 def _disagreement(model: ChosenModel, band: Band) -> Band:
-    """Return the largest difference from a candidate that describes the data about as well."""
     chosen = model.chosen.fit.dynamics.response(band.frequency)
     gain, phase = np.zeros(len(chosen)), np.zeros(len(chosen))
     best = min(c.bic for c in model.candidates)

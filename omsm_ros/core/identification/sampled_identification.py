@@ -115,7 +115,6 @@ def identify_samples(
 
 
 def _checked(record: SampledRecord) -> SampledRecord:
-    """Return the record with finite outputs used; raise IdentificationError for a useless one."""
     used = record.used & np.isfinite(record.output)
     samples = int(np.sum(used))
     if samples < LEAST_SAMPLES:
@@ -135,7 +134,6 @@ def _sections(candidate: SampledCandidate, period: float) -> ParallelSections:
 def _inflated_to_free_choice(
     sections: ParallelSections, choice: SampledChoice, period: float
 ) -> tuple[ParallelSections, float]:
-    """Return ``sections`` with uncertainties that include the free choice, and their factor."""
     if choice.chosen is choice.free:
         return sections, 1.0
     free, factor = _sections(choice.free, period), 1.0

@@ -103,7 +103,6 @@ def _with_exact_ones(found: ComplexArray, count: int) -> ComplexArray:
 
 
 def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
-    """Return the series of sections as a state space with arbitrary gain."""
     whole = _StateSpace(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
     for numerator, denominator in _ratios(zeros, poles):
         part = _section(numerator, denominator)
@@ -118,8 +117,9 @@ def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
 
 
 def _ratios(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
-    """Return proper ratios of real, monic, ascending polynomials of second or first order."""
-    denominators = [*_quadratics(_pairs(poles)), *_by_two(_reals(poles))]
+    real = _reals(poles)
+    by_two = [_expanded(real[i : i + 2]) for i in range(0, len(real), 2)]
+    denominators = [*_quadratics(_pairs(poles)), *by_two]
     pairs, reals = _quadratics(_pairs(zeros)), _reals(zeros)
     numerators = []
     for denominator in denominators:
@@ -144,10 +144,6 @@ def _reals(roots: ComplexArray) -> FloatArray:
 
 def _quadratics(upper: ComplexArray) -> list[FloatArray]:
     return [np.array([abs(r) ** 2, -2 * r.real, 1.0]) for r in upper]
-
-
-def _by_two(reals: FloatArray) -> list[FloatArray]:
-    return [_expanded(reals[i : i + 2]) for i in range(0, len(reals), 2)]
 
 
 def _expanded(roots: FloatArray) -> FloatArray:
@@ -215,7 +211,9 @@ def second_order_sections(zeros: ComplexArray, poles: ComplexArray, gain: float)
     padded = [np.append(r, np.zeros(count - len(r))) for r in (zeros, poles)]
     remaining = list(padded[0])
     sections = []
-    for pair in sorted(_root_pairs(padded[1]), key=_amplification, reverse=True):
+    for pair in sorted(
+        _root_pairs(padded[1]), key=lambda pair: max(abs(pair[0]), abs(pair[1])), reverse=True
+    ):
         sections.append([*_monic(_nearest(pair[0], remaining)), *_monic(pair)])
     ordered = np.array(sections[::-1], np.float64)
     ordered[0, :3] *= gain
@@ -237,10 +235,6 @@ def _root_pairs(roots: ComplexArray) -> list[tuple[complex, complex]]:
     real = sorted((r for r in roots if r.imag == 0), key=abs, reverse=True)
     conjugate = [(r, np.conj(r)) for r in roots if r.imag > 0]
     return conjugate + list(zip(real[::2], real[1::2], strict=True))
-
-
-def _amplification(pair: tuple[complex, complex]) -> float:
-    return float(max(abs(pair[0]), abs(pair[1])))
 
 
 def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
@@ -345,7 +339,6 @@ def _gain(
     poles: ComplexArray,
     late: int,
 ) -> float:
-    """Return the gain that makes H equal to G at 0 Hz, or near it if G(0) = 0."""
     angle = 0.0 if dynamics.dc_gain != 0 else _MATCHED_RAD
     z = np.exp(1j * angle)
     monic = np.prod(1 - zeros / z) / np.prod(1 - poles / z) * z**-late
@@ -354,7 +347,6 @@ def _gain(
 
 
 def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) -> FloatArray:
-    """Return the sections of z^-late Π(1 - z_i/z) / Π(1 - p_i/z), scaled by ``gain``."""
     pairs, single = divmod(late, 2)
     delays = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]] * pairs + [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * single
     rational = second_order_sections(zeros, poles, gain)

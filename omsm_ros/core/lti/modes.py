@@ -262,7 +262,7 @@ def fit_two_mass(
     if len(oscillating) < 2:
         raise IdentificationError("lti.few_modes", modes=len(oscillating))
     target = np.log(dynamics.response(lines))
-    jacobian = _stacked_jacobian(dynamics, lines)
+    jacobian = relative_response_jacobian(dynamics, lines).reshape(2 * len(lines), -1)
     whiten = _whitener(jacobian, covariance)
 
     def model(logs: FloatArray) -> TwoMass:
@@ -298,10 +298,6 @@ def _least(
     return descend(min(raced, key=lambda found: float(found.cost)).x, None)
 
 
-def _stacked_jacobian(dynamics: TransferFunction, lines: FloatArray) -> FloatArray:
-    return relative_response_jacobian(dynamics, lines).reshape(2 * len(lines), -1)
-
-
 def _whitener(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return W (k, k) with Wᵀ W the inverse covariance of the response at all lines.
 
@@ -326,7 +322,6 @@ def oscillations(dynamics: TransferFunction) -> tuple[float, ...]:
 
 
 def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArray]:
-    """Return start values of uncoupled oscillators with either mode at the second mass."""
     low, high = (2 * np.pi * frequency for frequency in oscillating[:2])
     starts = []
     for ratio in (0.05, 0.2, 0.8):
@@ -380,6 +375,5 @@ def finite_values(read: ResponseFeatures) -> dict[str, float | None]:
 
 
 def _highest_peak(values: FloatArray) -> int | None:
-    """Return the index of the highest peak, not at an end; None without one."""
     peaks, _ = signal.find_peaks(values, prominence=_LEAST_PROMINENCE)
     return int(peaks[np.argmax(values[peaks])]) if len(peaks) else None

@@ -161,7 +161,6 @@ def _inverse_series(polynomial: FloatArray) -> FloatArray:
 
 
 def _shifted(series: FloatArray, powers: int) -> FloatArray:
-    """Return the series times s to the ``powers``, to s²."""
     return np.asarray(np.append(np.zeros(powers), series)[:3], np.float64)
 
 

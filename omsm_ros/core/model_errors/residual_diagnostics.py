@@ -108,7 +108,6 @@ class ResidualSpace:
         return np.flatnonzero(self.problem.used)
 
     def _free(self, rows: FloatArray) -> None:
-        """Project ``rows`` (c, n) orthogonally to the fit, with 0 where nothing is compared."""
         rows[:, ~self.problem.used] = 0.0
         parts = [slice(i, i + BLOCK_ROWS) for i in range(0, len(self._places), BLOCK_ROWS)]
         collinear = np.zeros((len(rows), self._basis.shape[1]))
@@ -192,7 +191,6 @@ def _lengths(rows: FloatArray) -> FloatArray:
 
 
 def _pseudo_inverse(gram: FloatArray, tolerance: float) -> tuple[FloatArray, int]:
-    """Return the pseudo-inverse (c, c) of ``gram``, and its rank."""
     values, directions = np.linalg.eigh(gram)
     kept = values > tolerance * values[-1]
     strong = directions[:, kept]
@@ -448,8 +446,4 @@ def _contrast_of(diagnostics: ResidualDiagnostics, name: str, weight: FloatArray
     score = diagnostics.space.score(np.column_stack([by_gain, by_lag]))
     gain, lag = 2 * score.size
     gain_uncertainty, lag_uncertainty = 2 * np.sqrt(np.diag(score.covariance))
-    return Contrast(name, gain, gain_uncertainty, lag, lag_uncertainty, _p_value(score))
-
-
-def _p_value(score: Score) -> float:
-    return float(np.exp(score.log_p))
+    return Contrast(name, gain, gain_uncertainty, lag, lag_uncertainty, float(np.exp(score.log_p)))

@@ -112,7 +112,8 @@ def undetected_terms(
     # Only the relaxations are tested again, up to slower ones.
     slow = with_slow_creep(diagnostics.thinned or diagnostics)
     relaxations = [_undetected_terms(slow, judged, use) for judged in slow.creep]
-    for gone in _drift_models(drift):
+    steady = [_STEADY_DRIFT]
+    for gone in [steady, drift, [*steady, *drift]] if drift else [steady]:
         other = with_drift_as_noise(slow, gone).creep
         relaxations = [_better_relaxation(*pair) for pair in zip(relaxations, other, strict=True)]
     known = [term for term in relaxations if np.isfinite(term.uncertainty)]
@@ -125,15 +126,11 @@ def undetected_terms(
         judged = diagnostics.best.get(name)
         if judged is None or not np.isfinite(judged.score.uncertainty):
             continue
-        if _excited(diagnostics, judged) or _hinted_by_data(judged):
+        # Steps hardly excite a mode slower than their interval.
+        slow = judged.term.family == MODE and judged.term.parameter * diagnostics.plateau < 1
+        if not slow or _hinted_by_data(judged):
             found.append(_undetected_terms(diagnostics, judged, use))
     return found
-
-
-def _drift_models(drift: Sequence[slice]) -> list[Sequence[slice]]:
-    """Return which drifts to treat as noise: the linear one, the nonlinear ones, and both."""
-    steady = [_STEADY_DRIFT]
-    return [steady, drift, [*steady, *drift]] if drift else [steady]
 
 
 def with_slow_creep(diagnostics: ResidualDiagnostics) -> ResidualDiagnostics:
@@ -166,7 +163,6 @@ def with_drift_as_noise(
 
 
 def _better_relaxation(term: UndetectedTerm, other: ScoreTest) -> UndetectedTerm:
-    """Return the relaxation ``term`` as ``other`` has it, where its bound is smaller."""
     size, uncertainty = float(other.score.size[0]), other.score.uncertainty
     if not np.hypot(size, uncertainty) < term.carried:
         return term
@@ -224,13 +220,7 @@ def fitted_relaxation(dynamics: TransferFunction) -> float:
     return found
 
 
-def _excited(diagnostics: ResidualDiagnostics, judged: ScoreTest) -> bool:
-    """Return False for a mode slower than the interval of the steps, which hardly excite it."""
-    return judged.term.family != MODE or judged.term.parameter * diagnostics.plateau >= 1
-
-
 def _hinted_by_data(judged: ScoreTest) -> bool:
-    """Return True for a mode whose p-value is below _HINT."""
     return judged.term.family == MODE and judged.log_p < np.log(_HINT)
 
 

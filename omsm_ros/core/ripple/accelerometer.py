@@ -286,7 +286,6 @@ def _by_band(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple[f
 
 
 def _strongest(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Return frequency and amplitude of the strongest line within the bands."""
     inside = (spectrum.frequency >= bands[0][0]) & (spectrum.frequency <= bands[-1][1])
     at = float(spectrum.frequency[np.argmax(np.where(inside, spectrum.density, 0.0))])
     near = spectrum.power(at - _LOBE * spectrum.step, at + _LOBE * spectrum.step)

@@ -50,7 +50,7 @@ def fourier_sum(
     transform of the kernel (Greengard and Lee, SIAM Review 46, 2004; kernel of Fessler and Sutton,
     IEEE Trans. Signal Process. 51, 2003).
     """
-    grid = _even(_OVERSAMPLING * 2 * count)
+    grid = 1 << (_OVERSAMPLING * 2 * count - 1).bit_length()  # a power of two is fast
     position = (place - place[0]) * spacing * grid
     first = np.floor(position).astype(np.int64) - _WIDTH // 2 + 1
     total = np.zeros(grid)
@@ -74,11 +74,6 @@ def _kernel_transform(frequency: FloatArray) -> FloatArray:
     """Return the transform of the kernel over grid cells, at ``frequency`` [1/cell]."""
     inside = np.sqrt(_BETA**2 - (np.pi * _WIDTH * frequency) ** 2)
     return np.asarray(_WIDTH * np.sinh(inside) / inside)
-
-
-def _even(count: int) -> int:
-    """Return the next power of two, for a fast transform."""
-    return 1 << (count - 1).bit_length()
 
 
 @dataclass(frozen=True, eq=False)

@@ -120,7 +120,6 @@ class FormFit:
         return degree
 
     def _selected(self) -> np.ndarray:
-        """Return a random selection of samples, which has no aliases, to test a degree."""
         drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
         return np.asarray(self._chosen[np.sort(drawn)])
 
@@ -236,7 +235,6 @@ class _Basis:
 
 
 def _radial(degree: int, harmonic: int, rho: FloatArray) -> FloatArray:
-    """Return the radial part of a Zernike polynomial, by its sum (Noll 1976, Eq. 2)."""
     half = (degree - harmonic) // 2
     terms = [
         (-1) ** s * comb(degree - s, s) * comb(degree - 2 * s, half - s) for s in range(half + 1)

@@ -116,7 +116,6 @@ def _strongest(
     known: Sequence[SpectralLine],
     taken: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[SpectralLine]:
-    """Return the strongest lines of the ``residual``, all in one coordinate."""
     best: tuple[float, list[SpectralLine]] = (0.0, [])
     for coordinate in searched:
         power, spacing = power_over(signal, residual, coordinate)
@@ -184,7 +183,6 @@ def _outside_reserved(
     coordinates: dict[str, Coordinate],
     reserved: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[SpectralLine]:
-    """Return ``lines`` without those that have moved to frequencies of form and orders."""
     return [
         line
         for line in lines
@@ -196,7 +194,6 @@ def _outside_reserved(
 
 
 def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
-    """Return the indices of local maxima above ``least``, largest first."""
     inner = ratio[1:-1]
     top = (inner >= ratio[:-2]) & (inner > ratio[2:]) & (inner > least)
     places = np.flatnonzero(top) + 1
@@ -206,7 +203,6 @@ def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
 
 
 def _spaced(places: np.ndarray, most: int) -> list[int]:
-    """Return the first ``most`` of ``places`` with a distance from those before."""
     kept: list[int] = []
     for place in places:
         if len(kept) >= most:
@@ -222,7 +218,6 @@ def _judged(
     coordinates: dict[str, Coordinate],
     residual: FloatArray,
 ) -> LineSpectrum:
-    """Return the lines that are significant in the final residual, with their uncertainties."""
     floors = {}
     for name in {TIME, *(line.coordinate for line in lines)}:
         power, spacing = power_over(signal, residual, coordinates[name])
@@ -261,7 +256,6 @@ def _judged(
 def _possible(
     line: SpectralLine, ratio: float, coordinates: dict[str, Coordinate]
 ) -> dict[str, float]:
-    """Return the frequency of the line in each coordinate in which the data allow it."""
     own = coordinates[line.coordinate]
     found = {line.coordinate: line.frequency}
     for name, other in coordinates.items():

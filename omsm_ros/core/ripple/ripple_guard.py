@@ -73,7 +73,6 @@ def missing_evidence(
 
 
 def _other_pace(scan: StudiedScan, other: StudiedScan, line: SpectralLine) -> bool:
-    """Return True if a coordinate of the line has another pace in ``other``."""
     for name in line.possible:
         if name != TIME and name in other.coordinates:
             here, there = scan.coordinates[name].pace, other.coordinates[name].pace
@@ -161,7 +160,6 @@ def _finer_textures(one: StudiedScan, studied: Sequence[StudiedScan]) -> list[tu
 def _separated(
     signal: ScanSignal, textures: Sequence[tuple[float, float]]
 ) -> tuple[FormRemoved, LineSpectrum]:
-    """Return form and lines, fitted together because a line near an order leaks into it."""
     form = FormFit(signal)
     formless = form.without()
     known = [texture(signal, formless.residual, wave, spread) for wave, spread in textures]
@@ -178,7 +176,6 @@ def _separated(
 
 
 def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[SpectralLine]:
-    """Return the significant orders as lines over turns and proportional coordinates."""
     coordinates = spectrum.coordinates
     for found in formless.orders:
         ratio = np.array(found.amplitude**2 / (2 * found.uncertainty**2))
@@ -204,7 +201,6 @@ def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[Spec
 
 
 def _near_stronger_line(order: SpindleOrder, spectrum: LineSpectrum, turn: Coordinate) -> bool:
-    """Return True if the order may be leakage of a stronger line."""
     return any(
         abs(line.possible[TURN] - order.order) < _LEAKS_BINS * turn.resolution
         and line.amplitude > order.amplitude
@@ -298,7 +294,6 @@ def _or_alias(line: SpectralLine, rate: float) -> Notice:
 
 
 def _matching_acceleration_line(scan: StudiedScan, line: SpectralLine) -> AccelerationLine | None:
-    """Return the acceleration line that matches in frequency and amplitude, or None."""
     if scan.acceleration_lines is None or TIME not in line.possible:
         return None
     seen, rate = line.possible[TIME], scan.signal.rate
@@ -335,7 +330,6 @@ def _by_acceleration(scan: StudiedScan, line: SpectralLine, one: AccelerationLin
 
 
 def _by_single_scan(done: Attribution, key: Key, evidence: LineEvidence) -> NamedLine:
-    """Return the source from one scan whose pace changed, if the line fits one kind only."""
     scan, line = done.scans[key[0]], evidence.line
     kinds = {t.kind for t in evidence.tested if t.alive}
     if set(line.possible) == {PATH}:
@@ -366,7 +360,6 @@ def _by_single_scan(done: Attribution, key: Key, evidence: LineEvidence) -> Name
 def _with_true_frequency(
     scans: Sequence[StudiedScan], named: dict[Key, NamedLine], key: Key
 ) -> NamedLine:
-    """Return a vibration with its true frequency, where another scan shows it."""
     own = named[key]
     if own.kind != VIBRATION or own.frequency is not None:
         return own

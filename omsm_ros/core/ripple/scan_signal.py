@@ -169,7 +169,6 @@ def _slopes(over: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 def _longest_run(count: IntArray, *columns: FloatArray) -> tuple[IntArray, ...]:
-    """Return the longest part with a rising trigger count."""
     cuts = np.r_[0, np.flatnonzero(np.diff(count) <= 0) + 1, len(count)]
     longest = int(np.argmax(np.diff(cuts)))
     part = slice(cuts[longest], cuts[longest + 1])

@@ -138,7 +138,6 @@ def spread_of(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
 
 
 def _own_uncertainty(scan: StudiedScan, line: SpectralLine, coordinate: str) -> float:
-    """Return the standard uncertainty of its frequency over ``coordinate``."""
     share = scan.resolution(coordinate) / scan.resolution(line.coordinate)
     return line.frequency_uncertainty * share
 
@@ -204,7 +203,6 @@ def is_detected(scan: StudiedScan, hypothesis: Hypothesis, amplitude: float) -> 
 def _may_be_masked(
     scan: StudiedScan, hypothesis: Hypothesis, place: ExpectedLine, amplitude: float
 ) -> bool:
-    """Return True if the line could be present without being found."""
     if hypothesis.kind == VIBRATION:
         return False  # a vibration may stop, so that its absence is never used as evidence
     if place.coordinate == TIME:
@@ -219,7 +217,6 @@ def _may_be_masked(
 
 
 def _near_form(scan: StudiedScan, place: ExpectedLine) -> bool:
-    """Return True where the removal of the form removes a line as well."""
     turn = scan.coordinates.get(TURN)
     if turn is None:
         return False
@@ -308,19 +305,16 @@ def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[TestedHypothesis]
             shown = is_detected(scan, hypothesis, line.amplitude)
             if shown:
                 place = place_in(scan, hypothesis)
-                present += [_key_at(other, scan, place)] if place is not None else []
+                if place is not None:
+                    line_there = lines_at(scan, place)
+                    key = next(k for k, one in enumerate(scan.lines) if one is line_there)
+                    present.append((other, key))
             elif shown is not None:
                 absent.append(other)
         yield TestedHypothesis(hypothesis, tuple(present), tuple(absent))
 
 
-def _key_at(own: int, scan: StudiedScan, place: ExpectedLine) -> Key:
-    found = lines_at(scan, place)
-    return own, next(k for k, line in enumerate(scan.lines) if line is found)
-
-
 def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
-    """Return True if the scans have rings of the part in common."""
     a, b = one.signal.radius, other.signal.radius
     low, high = max(a.min(), b.min()), min(a.max(), b.max())
     return bool(high - low >= -0.02 * max(a.max(), b.max()))
@@ -334,7 +328,12 @@ def _sources(
     found = []
     for one in alive:
         rivals = [t for t in alive if _is_rival(one, t)]
-        decisive = tuple(key for key in one.present if _decides(scans[key[0]], one, rivals))
+        decisive = tuple(
+            key
+            for key in one.present
+            for place in [place_in(scans[key[0]], one.hypothesis)]
+            if all(apart(place, place_in(scans[key[0]], r.hypothesis)) for r in rivals)
+        )
         if decisive:
             found.append(SourceHypothesis(one.kind, one.hypothesis, decisive))
     return tuple(_least_aliased(found))
@@ -345,11 +344,6 @@ def _is_rival(one: TestedHypothesis, other: TestedHypothesis) -> bool:
     if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
         return False  # on circles of one radius form of the part repeats in the same way
     return one.kind != other.kind and not other.hypothesis.alias_count
-
-
-def _decides(scan: StudiedScan, one: TestedHypothesis, rivals: Sequence[TestedHypothesis]) -> bool:
-    place = place_in(scan, one.hypothesis)
-    return all(apart(place, place_in(scan, rival.hypothesis)) for rival in rivals)
 
 
 def _least_aliased(found: list[SourceHypothesis]) -> list[SourceHypothesis]:
@@ -412,7 +406,6 @@ class Attribution:
                 self._note_secondary_sources(partner, theirs)
 
     def _note_secondary_sources(self, key: Key, source: SourceHypothesis) -> None:
-        """Record a second source of a line whose partners were selected before."""
         for other in self.evidence[key].sources:
             if _family(other.kind) != _family(source.kind) and any(
                 partner in self.selected

@@ -144,7 +144,6 @@ def waves_of(
 
 
 def _apart(lines: list[SpectralLine], coordinates: dict[str, Coordinate]) -> list[SpectralLine]:
-    """Return ``lines`` without the weaker of any two that are too close to separate."""
     kept: list[SpectralLine] = []
     for line in sorted(lines, key=lambda one: -one.amplitude):
         bin_ = coordinates[line.coordinate].resolution

@@ -121,7 +121,6 @@ def _sections(page: ModelPage) -> list[Section]:
 
 
 def _poles(certificate: Mapping[str, Any]) -> Table:
-    """Return the poles that the data resolve, and bounds of the others."""
     rows = []
     for pole in certificate.get("poles", ()):
         if "frequency_hz" in pole:

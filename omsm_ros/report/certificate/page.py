@@ -53,7 +53,6 @@ def mode_table(calibration: Calibration) -> Table:
 
 
 def _oscillation(mode: KnownMode) -> tuple[str, str]:
-    """Return the damping and residue."""
     if mode.residue is None or mode.residue_uncertainty is None:
         return "1, by definition", "none"
     residue, spread = (v * MILLISECOND_S**2 for v in (mode.residue, mode.residue_uncertainty))
@@ -113,14 +112,12 @@ def shape_table(calibration: Calibration) -> Table:
 
 
 def _size(term: UndetectedEntry) -> str:
-    """Return the largest size that was missed, in the unit of its family."""
     if term.missed is None or term.family not in (CREEP, MODE):
         return quantity(term.missed, "m")
     return f"{percent(term.missed)} of the motion"
 
 
 def _family(term: UndetectedEntry) -> str:
-    """Return the name of a model error, with its time constant or frequency."""
     if term.family == CREEP:
         return f"{term.family} over {quantity(term.parameter, 's', 2)}"
     if term.family == MODE:
@@ -253,7 +250,6 @@ def _verdict_reasons(calibration: Calibration) -> list[str]:
 
 
 def _band_text(calibration: Calibration) -> str:
-    """Return the greatest half-width of the 95 % band below ``valid_up_to``."""
     at = np.geomspace(1e-3, 1.0, 200) * calibration.valid_up_to
     band = response_band(calibration.dynamics, calibration.covariance, at)
     gain, phase = (COVERAGE_FACTOR * float(np.max(part)) for part in (band.gain, band.phase))
@@ -286,7 +282,7 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
             quantity(residual.noise_m, "m"),
             f"residual, rms: {quantity(residual.rms_m, 'm')}",
         ),
-        _order_headline(calibration),
+        Headline("Structure", tables.structure_text(tables.structure_of(calibration)), ""),
     ]
 
 
@@ -311,10 +307,6 @@ def _range_headline(calibration: Calibration) -> Headline:
             ends = "the band exceeds its limits" if known else "the motion excites too little"
             details.insert(0, f"beyond it {ends}")
     return Headline(name, quantity(calibration.valid_up_to, "Hz"), "; ".join(details))
-
-
-def _order_headline(calibration: Calibration) -> Headline:
-    return Headline("Structure", tables.structure_text(tables.structure_of(calibration)), "")
 
 
 def _model_errors(certificate: Certificate) -> Section:

@@ -15,8 +15,8 @@ from omsm_ros.core.calibration.certificate import (
 from omsm_ros.core.calibration.finding import NOTE, REJECTS, RESERVATION, WARNING, Finding
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.estimation.preparation import prepare
-from omsm_ros.core.identification.certify import certificate_of
 from omsm_ros.core.identification.evidence import IdentificationEvidence
+from omsm_ros.core.identification.identify import certificate_of
 from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.model_error_search import SearchResult
 from omsm_ros.core.identification.response_uncertainty import response_uncertainty

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.identification.certify import static_gains
+from omsm_ros.core.identification.identify import static_gains
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.identification.certify import two_mass_model
-from omsm_ros.core.identification.identify import identify, table_mass
+from omsm_ros.core.identification.identify import identify, table_mass, two_mass_model
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass
 from omsm_ros.core.lti.transfer_function import TransferFunction
