@@ -88,7 +88,6 @@ class Structure:
 
     @property
     def parameters(self) -> int:
-        """Number of parameters of the dynamics."""
         return self.poles + self.zeros + self.delay
 
 
@@ -340,7 +339,6 @@ class Certificate:
 
     @property
     def reasons(self) -> tuple[Finding, ...]:
-        """Findings that reject."""
         return of_severity(self.findings, REJECTS)
 
     @property

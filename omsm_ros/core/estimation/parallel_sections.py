@@ -66,7 +66,6 @@ class ParallelSections:
 
     @property
     def inputs(self) -> int:
-        """Return the number of inputs."""
         return len(self.direct)
 
     @property

@@ -80,7 +80,6 @@ class SampledCandidate:
 
     @property
     def order(self) -> int:
-        """Return the number of poles."""
         return self.fit.order
 
 
@@ -136,8 +135,8 @@ def choose_sampled(
     comparison = _against_impulse_response(explored, fits[orders.index(chosen.order)])
     finished = _finished(whole, chosen, every)
     other = finished if chosen is free else _finished(whole, free, every)
-    most = _ALIKE * float(np.mean(chosen.hidden))
-    alike = [c for c in judged if c.order > chosen.order and float(np.mean(c.hidden)) <= most]
+    bound = _ALIKE * float(np.mean(chosen.hidden))
+    alike = [c for c in judged if c.order > chosen.order and float(np.mean(c.hidden)) <= bound]
     larger = [c.fit.model(float(every)) for c in alike]
     return SampledChoice(finished, other, larger, orders, by_order, *comparison)
 

@@ -49,7 +49,6 @@ class IdentificationEvidence:
 
     @property
     def fit(self) -> Fit:
-        """The fit that is certified."""
         return self.model.chosen.fit
 
     @property
@@ -59,7 +58,6 @@ class IdentificationEvidence:
 
     @cached_property
     def residual(self) -> ResidualTests:
-        """Tests of the residual."""
         return residual_tests(self.prepared.problem, self.fit, self.prepared.steps)
 
     @cached_property

@@ -127,8 +127,8 @@ def undetected_terms(
         if judged is None or not np.isfinite(judged.score.uncertainty):
             continue
         # Steps hardly excite a mode slower than their interval.
-        slow = judged.term.family == MODE and judged.term.parameter * diagnostics.plateau < 1
-        if not slow or _hinted_by_data(judged):
+        sluggish = judged.term.family == MODE and judged.term.parameter * diagnostics.plateau < 1
+        if not sluggish or _hinted_by_data(judged):
             found.append(_undetected_terms(diagnostics, judged, use))
     return found
 

@@ -261,7 +261,6 @@ class TestedHypothesis:
 
     @property
     def kind(self) -> str:
-        """Kind of the hypothesis."""
         return self.hypothesis.kind
 
     @property
@@ -280,7 +279,6 @@ class LineEvidence:
 
 
 def attribution_evidence(scans: Sequence[StudiedScan]) -> dict[Key, LineEvidence]:
-    """Return the evidence for every line of every scan."""
     keys = [(own, k) for own, scan in enumerate(scans) for k in range(len(scan.lines))]
     tested = {key: tuple(_tests(scans, key)) for key in keys}
     sources = {key: _sources(scans, tested[key]) for key in keys}
@@ -306,9 +304,9 @@ def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[TestedHypothesis]
             if shown:
                 place = place_in(scan, hypothesis)
                 if place is not None:
-                    line_there = lines_at(scan, place)
-                    key = next(k for k, one in enumerate(scan.lines) if one is line_there)
-                    present.append((other, key))
+                    found = lines_at(scan, place)
+                    index = next(k for k, one in enumerate(scan.lines) if one is found)
+                    present.append((other, index))
             elif shown is not None:
                 absent.append(other)
         yield TestedHypothesis(hypothesis, tuple(present), tuple(absent))
