@@ -308,6 +308,7 @@ def measure(
     )  # fmt: skip
     judgement = Judgement(used, stated, accuracy, out)
     summary = summarise(bag, done, calibration, judgement)
+    summary["settings"] |= (admission and admission.settings) or {}
     if done.statistics:
         if register is not None and nominal is not None:
             add_form(out, summary, nominal, register)
@@ -341,7 +342,8 @@ def _publish(
     view = view_of(done.points, done.sample_period)
     figures = figures_of(view, calibration, nominal, done.sample_period)
     surface = map_of(view, nominal, out)
-    publish(out, f"Surface of {bag.name}", summary, calibration, figures, surface)
+    title = str(summary["settings"].get("title", f"Surface of {bag.name}"))
+    publish(out, title, summary, calibration, figures, surface)
 
 
 # Of the registration in the summary.
