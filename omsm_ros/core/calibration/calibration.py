@@ -211,6 +211,7 @@ def excess_latency_text(
 
 
 def with_latency(calibration: Calibration, latency: Latency) -> Calibration:
+    """Return ``calibration`` with a certificate that states ``latency``."""
     return replace(calibration, certificate=replace(calibration.certificate, latency=latency))
 
 

@@ -88,6 +88,7 @@ class Structure:
 
     @property
     def parameters(self) -> int:
+        """Number of parameters of the dynamics."""
         return self.poles + self.zeros + self.delay
 
 
@@ -339,6 +340,7 @@ class Certificate:
 
     @property
     def reasons(self) -> tuple[Finding, ...]:
+        """Findings that reject."""
         return of_severity(self.findings, REJECTS)
 
     @property

@@ -123,6 +123,7 @@ class _Seen:
     v: FloatArray
 
     def step(self) -> dict[str, float]:
+        """Return the least-squares step of each pose parameter."""
         design = np.stack(list(self.columns.values()), axis=1)
         scale = np.linalg.norm(design, axis=0)
         solved = np.linalg.lstsq(design / scale, self.a - self.b, rcond=1e-10)[0] / scale

@@ -195,6 +195,7 @@ class Problem:
         return found
 
     def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
+        """Return the residual at one ψ after the linear parameters are eliminated."""
         structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
         moved = self._moved(structure, lag)
         # In the memory order of LAPACK: in that of numpy it takes five times as long.
@@ -313,6 +314,7 @@ class Fit:
 
     @property
     def structure(self) -> Structure:
+        """Poles, zeros and delay that were fitted."""
         return self.scaled.structure
 
     @property
@@ -332,6 +334,7 @@ class Fit:
 
     @property
     def samples(self) -> int:
+        """Number of samples compared."""
         return len(self.residual)
 
     @property

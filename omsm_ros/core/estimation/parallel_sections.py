@@ -66,6 +66,7 @@ class ParallelSections:
 
     @property
     def inputs(self) -> int:
+        """Return the number of inputs."""
         return len(self.direct)
 
     @property

@@ -80,6 +80,7 @@ class SampledCandidate:
 
     @property
     def order(self) -> int:
+        """Return the number of poles."""
         return self.fit.order
 
 

@@ -62,6 +62,7 @@ class SampledRecord:
         return len(self.output)
 
     def part(self, part: slice) -> SampledRecord:
+        """Return the samples of ``part``."""
         return SampledRecord(self.inputs[part], self.output[part], self.used[part])
 
 
@@ -155,6 +156,7 @@ class SectionsFit:
         return self.model().roots() / RATE
 
     def model(self, period: float = 1.0, covariance: FloatArray | None = None) -> ParallelSections:
+        """Return the fit as a model in seconds."""
         unit = RATE / period
         pairs = self.sections[:, 1] > 0
         ups = np.zeros((len(self.linear), len(pairs), 2))
@@ -192,6 +194,7 @@ class SectionsProblem:
 
     @property
     def inputs(self) -> int:
+        """Return the number of inputs."""
         return int(self.records[0].inputs.shape[1])
 
     @property
@@ -205,6 +208,7 @@ class SectionsProblem:
         return np.asarray(self.delays, np.float64)
 
     def box(self, order: int) -> tuple[FloatArray, FloatArray]:
+        """Return the bounds of the nonlinear parameters."""
         ends = ScaledStructure(Structure(order, order, False), RATE).bounds()
         count = self.inputs if self._free_delays else 0
         longest = max(len(record) for record in self.records) / 4 * RATE

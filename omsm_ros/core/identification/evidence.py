@@ -49,6 +49,7 @@ class IdentificationEvidence:
 
     @property
     def fit(self) -> Fit:
+        """The fit that is certified."""
         return self.model.chosen.fit
 
     @property
@@ -58,6 +59,7 @@ class IdentificationEvidence:
 
     @cached_property
     def residual(self) -> ResidualTests:
+        """Tests of the residual."""
         return residual_tests(self.prepared.problem, self.fit, self.prepared.steps)
 
     @cached_property

@@ -146,6 +146,7 @@ class _Search:
     without: list[ResidualDiagnostics] = field(default_factory=list)
 
     def diagnostics(self) -> ResidualDiagnostics:
+        """Return the diagnostics of the model."""
         return ResidualDiagnostics(
             self.prepared.problem, self.model.chosen.fit, self.prepared.steps
         )

@@ -137,6 +137,7 @@ class ModelErrorFamily:
         return self.part(0, len(self.parameters))
 
     def term(self, index: int) -> ModelErrorTerm:
+        """Return the term at ``index``."""
         damping = 0.0 if self.dampings is None else float(self.dampings[index])
         parameter = float(self.parameters[index])
         columns = self.part(index, index + 1)

@@ -200,6 +200,7 @@ class RunningSpectrum:
     _windows: int = 0
 
     def push(self, block: AccelerationBlock) -> None:
+        """Add a block."""
         self.received += len(block)
         if block.first_sample != self._next or block.sample_period != self._period:
             self.restarts += self._next >= 0

@@ -198,6 +198,7 @@ class _Basis:
         return cls(tuple(names), on_circle, largest)
 
     def up_to(self, degree: int) -> _Basis:
+        """Return the columns of a fit of ``degree``."""
         kept = tuple(name for name in self.names if self.degree(name) <= degree)
         return replace(self, names=kept)
 

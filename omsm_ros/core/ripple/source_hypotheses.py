@@ -261,6 +261,7 @@ class TestedHypothesis:
 
     @property
     def kind(self) -> str:
+        """Kind of the hypothesis."""
         return self.hypothesis.kind
 
     @property
@@ -279,6 +280,7 @@ class LineEvidence:
 
 
 def attribution_evidence(scans: Sequence[StudiedScan]) -> dict[Key, LineEvidence]:
+    """Return the evidence for every line of every scan."""
     keys = [(own, k) for own, scan in enumerate(scans) for k in range(len(scan.lines))]
     tested = {key: tuple(_tests(scans, key)) for key in keys}
     sources = {key: _sources(scans, tested[key]) for key in keys}

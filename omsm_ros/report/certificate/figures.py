@@ -248,6 +248,7 @@ def _draw(axes: Axes, time: FloatArray, value: FloatArray, colour: str, label: s
 
 
 def correlation(run: FreeRun) -> Figure:
+    """Draw the autocorrelation of the residual."""
     made, axes = style.figure(7.4, 2.6)
     draw_correlation(axes[0, 0], run.residual)
     return made

@@ -44,6 +44,7 @@ class ModelPage(IssuedPage):
 def model_figures_of(
     model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
 ) -> dict[str, bytes]:
+    """Return PNG files for the page."""
     made = {
         BAND: drawn.response(model),
         RECORD: drawn.record(model, inputs, output, run),

@@ -181,6 +181,7 @@ class CertificatePage(IssuedPage):
 
 
 def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
+    """Return PNG files for the page."""
     certificate = calibration.certificate
     made = {
         BAND: certificate_figures.response_with_band(calibration, fitted.measured),

@@ -32,6 +32,7 @@ _ALL_DIGITS = 10
 
 
 def texts(content: Mapping[str, Any], name: str) -> list[str]:
+    """Return the texts of a list of a model's certificate."""
     entries = content.get(name)
     return [str(entry) for entry in entries] if isinstance(entries, list) else []
 
@@ -52,6 +53,7 @@ def structure_of(calibration: Calibration) -> Structure:
 
 
 def residual_table(certificate: Certificate) -> Table:
+    """Return the tests of the residual."""
     found = certificate.residual
     rows = [
         ("χ² where the axis moves", plain(found.chi_square), "1 if only noise is left"),
@@ -91,6 +93,7 @@ def _in_words(p: float | None, good: str, bad: str) -> str:
 
 
 def order_table(certificate: Certificate) -> Table:
+    """Return every structure that was tried."""
     candidates = sorted(certificate.candidates, key=lambda c: structure_text(c.structure))
     least = min((c.bic for c in candidates), default=0.0)
     rows = [
@@ -215,6 +218,7 @@ def _power(letter: str, k: int) -> str:
 
 
 def sample_account(certificate: Certificate) -> Table:
+    """Return the number of samples by what became of them."""
     rows = [
         (reason.replace("_", " "), count(number))
         for reason, number in certificate.residual.samples.items()
@@ -233,6 +237,7 @@ _LIMITS = (
 
 
 def limit_table(certificate: Certificate) -> Table:
+    """Return what the verdict was measured against."""
     limits, use = certificate.limits, certificate.validity.use
     rows = [
         (name, quantity(limits.get(key), unit) if unit else plain(limits.get(key)))
@@ -261,6 +266,7 @@ _ORIGINS = {
 
 
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:
+    """Return what the certificate is about."""
     origin = calibration.certificate.origin
     rows = [
         ("identity", calibration.id),
@@ -285,4 +291,5 @@ def further_table(certificate: Certificate) -> Table:
 
 
 def known_rows(rows: Iterable[tuple[str, ...]], column: int) -> Sequence[tuple[str, ...]]:
+    """Return the rows that have something in ``column``."""
     return [row for row in rows if row[column] != NOTHING]
