@@ -238,12 +238,14 @@ def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
     """Bit for bit, whatever was between: messages, DDS, blocks."""
     from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
     from omsm_ros.core.correction.surface_points import join_points, pack_points
-    from omsm_ros.core.correction.uncertainty import ErrorSources
+    from omsm_ros.core.correction.machine_sources import NOTHING_STATED
+    from omsm_ros.pipelines.measure import with_sources
 
     cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))
     feed = Feed(cell)
     pairs = blocks_of(small_scan)[:30]
-    options = CorrectionOptions(sources=ErrorSources.of(true_calibration))
+    # Sources that nobody stated are assumed, live as offline.
+    options = with_sources(CorrectionOptions(), true_calibration, NOTHING_STATED, None)
     corrector = Corrector(true_calibration, options)
     parts = []
     for axes, distance in pairs:
