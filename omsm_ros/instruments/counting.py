@@ -114,7 +114,7 @@ class SequenceTracker:
             count = 0 if broken or self._anew else self._in_order(samples)
             if count:
                 yield self._accept(samples[:count], self._counter + 1, False)
-            elif self._must_wait(samples):
+            elif len(samples) == 1 and self._counter_jumps(samples[0]):
                 self._held = samples.copy()
                 return
             else:
@@ -147,10 +147,6 @@ class SequenceTracker:
         self._recent[samples["counter"] % _RECENT_SAMPLES] = samples
         return CountedRun(samples, first, restarted)
 
-    def _must_wait(self, samples: Samples) -> bool:
-        """Return whether the only sample left jumps ahead, so that the next one must decide."""
-        return len(samples) == 1 and self._counter_jumps(samples[0])
-
     def _counter_jumps(self, sample: np.void) -> bool:
         if self._counting.checked or not self._begun or self._anew:
             return False
@@ -167,7 +163,6 @@ class SequenceTracker:
         return (raw - self._raw) % self._counting.modulus
 
     def _one(self, samples: Samples, pause: _StreamBreak) -> Iterator[CountedRun]:
-        """Classify the first of ``samples``, whose counter is not the next one."""
         sample, alone = samples[0], samples[:1]
         raw = int(sample["counter"])
         if not self._begun:
@@ -223,8 +218,6 @@ class SequenceTracker:
 
 @dataclass(frozen=True, slots=True)
 class _StreamBreak:
-    """The silence before a sample."""
-
     elapsed: float = 0.0
     broken: bool = False
 

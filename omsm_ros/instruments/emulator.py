@@ -111,10 +111,6 @@ class InstrumentLink(Protocol):
     """The instrument's end of a line: a ``Pty`` or a ``TcpServer``."""
 
     @property
-    def has_reader(self) -> bool:
-        """Return whether a client is connected."""
-
-    @property
     def sessions(self) -> int:
         """Return how many clients have connected so far."""
         ...
@@ -258,7 +254,12 @@ class Instrument:
             self.greet()
         if data:
             self.receive(data)
-        self._send_answers(now, stop)
+        while self._later and self._later[0][0] <= now:
+            # Samples measured before the answer are sent first, so that no telegram is split.
+            if self._kept:
+                self._line.write(self._kept, stop)
+                self._kept = b""
+            self._line.write(self._later.pop(0)[1], stop)
         self._send(self._measure(now), now, stop)
 
     def serve(self, stop: threading.Event) -> None:
@@ -354,7 +355,6 @@ class Instrument:
         return ticks + self._clock_offset
 
     def _disturb(self, measured: Measured) -> Measured:
-        """Return the samples, the first of them saturated or without target."""
         status, distance = measured.status.copy(), measured.distance.copy()
         intensity = measured.intensity.copy()
         saturated = _use(self.faults, "saturate", len(measured))
@@ -366,7 +366,6 @@ class Instrument:
         return replace(measured, status=status, distance=distance, intensity=intensity)
 
     def _spoil(self, packed: list[bytes], first: int, counters: np.ndarray) -> list[bytes]:
-        """Return the bytes, some of them lost, repeated or damaged."""
         pieces: list[bytes] = []
         dropped, noisy, flipped = (
             self._struck(rate, len(packed))
@@ -378,7 +377,9 @@ class Instrument:
             if self.keep_truth:
                 self.truth.append((first + i, int(counters[i])))
             if piece and flipped[i]:
-                piece = self._with_a_flipped_bit(piece)
+                damaged = bytearray(piece)
+                damaged[self._random.integers(len(piece))] ^= 1 << int(self._random.integers(8))
+                piece = bytes(damaged)
             if piece and noisy[i]:
                 piece = self._random.bytes(_NOISE_BYTES) + piece
             pieces += [piece] * (1 + _use(self.faults, "duplicate", 1))
@@ -390,11 +391,6 @@ class Instrument:
         if rate:
             struck |= self._random.random(count) < rate
         return struck
-
-    def _with_a_flipped_bit(self, piece: bytes) -> bytes:
-        damaged = bytearray(piece)
-        damaged[self._random.integers(len(piece))] ^= 1 << int(self._random.integers(8))
-        return bytes(damaged)
 
     def _send(self, pieces: Iterable[bytes], now: float, stop: threading.Event | None) -> None:
         wire = b"".join(pieces)
@@ -421,17 +417,8 @@ class Instrument:
             wire = self._random.bytes(len(wire))
         self._later.append((self._clock() + self.faults.slow_answers, wire))
 
-    def _send_answers(self, now: float, stop: threading.Event | None) -> None:
-        while self._later and self._later[0][0] <= now:
-            # Samples measured before the answer are sent first, so that no telegram is split.
-            if self._kept:
-                self._line.write(self._kept, stop)
-                self._kept = b""
-            self._line.write(self._later.pop(0)[1], stop)
-
 
 def _use(faults: InstrumentFaults, name: str, most: int) -> int:
-    """Use up to ``most`` of a counted fault."""
     used: int = min(getattr(faults, name), most)
     setattr(faults, name, getattr(faults, name) - used)
     return used

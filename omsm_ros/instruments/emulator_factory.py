@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.errors import ConfigurationError
@@ -98,90 +97,48 @@ def line_for(link: str) -> Pty | TcpServer:
     return TcpServer(TCP_PORT.checked(int(port), ConfigurationError, f"port of link {link!r}"))
 
 
-class Player(Protocol):
-    """Plays motions on emulated devices, one at a time."""
+class Player:
+    """Plays motions on emulated devices of one trigger, on each its own part.
+
+    Each instrument runs in a thread: it always answers, and measures while a motion is played.
+    """
+
+    def __init__(self, *devices: tuple[Instrument, Callable[[Recording], Recording]]) -> None:
+        self._devices, self._stop = devices, threading.Event()
+        self._threads = [
+            threading.Thread(target=one.serve, args=(self._stop,), daemon=True)
+            for one, _ in devices
+        ]
+        for thread in self._threads:
+            thread.start()
 
     @property
     def playing(self) -> bool:
         """Return whether a motion has samples left."""
+        return any(one.playing for one, _ in self._devices)
 
     @property
     def played(self) -> int:
         """Return the number of samples of the motion so far."""
+        return min(one.played for one, _ in self._devices)
 
     def start(self, recording: Recording, time_lapse: float) -> None:
         """Begin a motion; its trigger counts from zero."""
+        parts = [(one, part(recording)) for one, part in self._devices]
+        for one, measured in parts:
+            one.play(RecordingSource(measured), time_lapse)
 
     def halt(self) -> None:
         """End the motion."""
+        for one, _ in self._devices:
+            one.halt()
 
     def close(self) -> None:
-        """End the motion and the device."""
-
-
-class InstrumentPlayer:
-    """Runs an instrument in a thread: it always answers, and measures while a motion is played."""
-
-    def __init__(
-        self,
-        make: Callable[..., Instrument],
-        line: InstrumentLink,
-        faults: InstrumentFaults | None = None,
-        seed: int = 1,
-    ) -> None:
-        self._instrument = make(line, triggered=True, seed=seed)
-        self._instrument.faults = faults or InstrumentFaults()
-        self._stop = threading.Event()
-        serve, stop = self._instrument.serve, self._stop
-        self._thread = threading.Thread(target=serve, args=(stop,), daemon=True)
-        self._thread.start()
-
-    @property
-    def playing(self) -> bool:
-        return self._instrument.playing
-
-    @property
-    def played(self) -> int:
-        return self._instrument.played
-
-    def start(self, recording: Recording, time_lapse: float) -> None:
-        self._instrument.play(RecordingSource(recording), time_lapse)
-
-    def halt(self) -> None:
-        self._instrument.halt()
-
-    def close(self) -> None:
+        """End the motion and the devices."""
         self.halt()
         self._stop.set()
-        self._thread.join(timeout=_END_S)
-
-
-class PlayerGroup:
-    """Plays a motion on several devices of one trigger, on each its own part."""
-
-    def __init__(self, *players: tuple[Player, Callable[[Recording], Recording]]) -> None:
-        self._players = players
-
-    @property
-    def playing(self) -> bool:
-        return any(player.playing for player, _ in self._players)
-
-    @property
-    def played(self) -> int:
-        return min(player.played for player, _ in self._players)
-
-    def start(self, recording: Recording, time_lapse: float) -> None:
-        parts = [(player, part(recording)) for player, part in self._players]
-        for player, measured in parts:
-            player.start(measured, time_lapse)
-
-    def halt(self) -> None:
-        for player, _ in self._players:
-            player.halt()
-
-    def close(self) -> None:
-        for player, _ in self._players:
-            player.close()
+        for thread in self._threads:
+            thread.join(timeout=_END_S)
 
 
 def player_for(
@@ -192,13 +149,13 @@ def player_for(
     seed: int = 1,
 ) -> Player:
     """Return what plays motions on ``line``, and on the line of the ``second`` device, if any."""
-    known = emulated(device)
-    first = InstrumentPlayer(known.make, line, faults, seed)
-    if known.second is None or second is None:
-        return first
-    own = replace(faults) if faults else None  # their counts are used up
-    other = InstrumentPlayer(known.second.make, second, own, seed)
-    return PlayerGroup((first, lambda recording: recording), (other, known.second.part))
+    known, faults = emulated(device), faults or InstrumentFaults()
+    devices = [(known.make(line, triggered=True, seed=seed), lambda recording: recording)]
+    if known.second is not None and second is not None:
+        devices.append((known.second.make(second, triggered=True), known.second.part))
+    for one, _ in devices:
+        one.faults = replace(faults)  # their counts are used up
+    return Player(*devices)
 
 
 class AccelerationFeed:

@@ -64,12 +64,6 @@ class TcpServer:
             self._listening.close()
             self._listening = None
 
-    @property
-    def has_reader(self) -> bool:
-        """Return whether a client is connected."""
-        self._accept()
-        return self._client is not None
-
     def read(self) -> bytes:
         """Return the bytes that the client sent; b"" if none."""
         self._accept()
@@ -116,7 +110,6 @@ class TcpServer:
             self.sessions += 1
 
     def _gone(self) -> bool:
-        """Return whether the client has closed its end."""
         if (client := self._client) is None:
             return True
         try:
@@ -197,11 +190,6 @@ class Pty:
     def path(self) -> str:
         """Return what a driver opens: the link, or the terminal's own name without one."""
         return str(self._link or self._slave_name)
-
-    @property
-    def has_reader(self) -> bool:
-        """Return whether a driver has the port open."""
-        return not self._events(0.0) & select.POLLHUP
 
     def read(self) -> bytes:
         """Return what the driver sent; b"" if nothing."""

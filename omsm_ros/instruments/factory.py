@@ -99,10 +99,7 @@ class TracedTransport:
 
 
 def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """Return the probe that ``values``, each of PARAMETERS by name, describe.
-
-    Raises ConfigurationError.
-    """
+    """Return the probe that ``values`` of PARAMETERS describe; raises ConfigurationError."""
     make = _maker(PROBES, values["device"])
     transport = transport_for(values["port"], values["baud_rate"])
     if values["trace"]:
@@ -112,28 +109,19 @@ def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
 
 
 def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """Return the stream of axes that ``values``, each of AXIS_PARAMETERS, describe.
-
-    Raises ConfigurationError.
-    """
+    """Return the stream of axes that ``values`` of AXIS_PARAMETERS describe; raises ConfigurationError."""
     if values["device"] not in STREAMS:
         raise ConfigurationError(f"device {values['device']!r}, expected one of {STREAMS}")
     return make_device(defaults() | dict(values), now_ns)
 
 
 def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> Any:
-    """Return the reference sensor that ``values``, each of REFERENCE_PARAMETERS, describe.
-
-    Raises ConfigurationError.
-    """
+    """Return the reference sensor that ``values`` of REFERENCE_PARAMETERS describe; raises ConfigurationError."""
     return _maker(REFERENCES, values["device"])(values, now_ns)
 
 
 def make_accelerometer(values: Values, now_ns: NowNs = time.time_ns) -> Any:
-    """Return the accelerometer that ``values``, each of ACCELEROMETER_PARAMETERS, describe.
-
-    Raises ConfigurationError.
-    """
+    """Return the accelerometer that ``values`` of ACCELEROMETER_PARAMETERS describe; raises ConfigurationError."""
     return _maker(ACCELEROMETERS, values["device"])(values, now_ns)
 
 

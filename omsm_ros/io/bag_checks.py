@@ -253,8 +253,6 @@ def _bounded(decompress: Callable[..., bytes], data: bytes, size: int, exactly: 
 
 
 class _Unpacked:
-    """Reads a compressed file of a folder, up to a bound."""
-
     def __init__(self, packed: IO[bytes], mode: str) -> None:
         self._path, self._size = Path(packed.name), fstat(packed.fileno()).st_size
         self._stream, self._read = storage_mcap.zstd.open(packed, mode), 0
@@ -342,7 +340,6 @@ class ChunkReader(McapReader):  # type: ignore[misc]
     def _within(
         self, chunk: Any, wanted: Mapping[int, Connection], first: int, last: int
     ) -> Iterator[_Waiting]:
-        """Yield the messages of the ``wanted`` channels from ``first`` to before ``last``."""
         records, place, at = self._records(chunk), chunk.chunk_start_offset, 0
         while at < len(records):
             kind, length = _RECORD.unpack_from(records, at)

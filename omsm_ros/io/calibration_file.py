@@ -182,7 +182,6 @@ class CalibrationFolder:
         return self.link.with_name(name)
 
     def _rename_file(self) -> None:
-        """Rename a calibration file that has the name of the link."""
         if self.link.is_symlink() or not self.link.is_file():
             return
         old, since_ns = load_calibration(self.link), self.link.stat().st_mtime_ns

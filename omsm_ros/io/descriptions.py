@@ -62,7 +62,6 @@ def save_geometry(path: Path | str, geometry: Geometry) -> None:
 
 
 def _made(kind: Callable[..., _T], values: Mapping[str, Any], what: str) -> _T:
-    """Return a record of numbers made of ``values``, which must have its fields' names."""
     parameters = fields(kind)  # type: ignore[arg-type]
     required = [field.name for field in parameters if field.default is MISSING]
     check_form(values, form({p.name: NUMBER for p in parameters}, required), FileError, what)
@@ -196,7 +195,6 @@ def load_surface(path: Path | str) -> Surface:
 
 
 def _extent(content: Any) -> tuple[int, int]:
-    """Return the number of shapes in a description, and the depth of nested turned frames."""
     named = content if isinstance(content, dict) else {}
     inside = named.values() if named else content if isinstance(content, list) else ()
     known = [_extent(part) for part in inside]
@@ -225,7 +223,6 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
 
 
 def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
-    """Return the surface of a map in a file of any known format."""
     # Imported here, because readers of maps take longer to load than a scan takes to correct.
     from omsm_ros.io.maps.read_map import read_points
     from omsm_ros.units import units_of
@@ -246,7 +243,6 @@ def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
 
 
 def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None) -> Any:
-    """Return a record of ``kind`` made of ``values`` under the names of its fields."""
     known = [each for each in fields(kind) if each.init]
     hints = get_type_hints(kind)
     required = [each.name for each in known if each.default is MISSING]
@@ -260,7 +256,6 @@ def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None
 
 
 def _schema(hint: Any) -> Mapping[str, Any]:
-    """Return the JSON schema of a value of this type."""
     if _choices(hint):
         return {"enum": list(_choices(hint))}
     if get_origin(hint) is tuple:
@@ -269,7 +264,6 @@ def _schema(hint: Any) -> Mapping[str, Any]:
 
 
 def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
-    """Return ``value`` of a description as one of the type ``hint``."""
     if value is None and _present(hint) is not hint:
         return None
     kind = _present(hint)
@@ -290,7 +284,6 @@ def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
 
 
 def _present(hint: Any) -> Any:
-    """Return the type of a value that may also be absent."""
     if get_origin(hint) in (types.UnionType, Union):
         return next(kind for kind in get_args(hint) if kind is not types.NoneType)
     return hint

@@ -54,7 +54,6 @@ def _schema_of(kind: Any) -> dict[str, Any]:
 
 
 def _made(kind: Any, content: Any) -> Any:
-    """Return a record, row or number of ``content``, which follows the schema of ``kind``."""
     kind = _without_none(kind)
     if is_dataclass(kind):
         hints = typing.get_type_hints(kind)
@@ -70,7 +69,6 @@ def _names(kind: Any) -> Mapping[str, None]:
 
 
 def _without_none(kind: Any) -> Any:
-    """Return the type of a field that may also be None, by leaving it out of the file."""
     if typing.get_origin(kind) in (types.UnionType, typing.Union):
         (kind,) = (k for k in typing.get_args(kind) if k is not types.NoneType)
     return kind

@@ -229,11 +229,6 @@ def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) 
     )
 
 
-def _all_finite(packed: NDArray[np.void]) -> bool:
-    # Without reported intensity the field is NaN, which PCL must know.
-    return all(bool(np.isfinite(packed[name]).all()) for name, kind in CLOUD_FIELDS if "f" in kind)
-
-
 def cloud_message(
     messages: Messages, packed: NDArray[np.void], stamp_ns: int, frame: str = "workpiece"
 ) -> Any:
@@ -252,7 +247,9 @@ def cloud_message(
         point_step=POINT_DTYPE.itemsize,
         row_step=POINT_DTYPE.itemsize * len(packed),
         data=messages.sequence(packed.view(np.uint8), np.uint8),
-        is_dense=_all_finite(packed),
+        is_dense=all(
+            bool(np.isfinite(packed[name]).all()) for name, kind in CLOUD_FIELDS if "f" in kind
+        ),
     )
 
 

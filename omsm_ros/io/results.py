@@ -77,7 +77,6 @@ class PlyWriter:
 
 
 def _header_lines(points: int) -> list[bytes]:
-    """Return the header of our clouds without comments."""
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {points}"]
     lines += [f"property {_PLY_TYPES[kind]} {name}" for name, kind in CLOUD_FIELDS]
     return [line.encode("ascii") for line in lines]

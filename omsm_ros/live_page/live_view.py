@@ -126,7 +126,6 @@ class RunningMap:
         self._changed[row, column] = self._version
 
     def _lay_out(self) -> None:
-        """Lay the grid around all points so far, and enter them."""
         assert self._early is not None
         x, y, values = (np.concatenate(parts) for parts in zip(*self._early, strict=True))
         span = max(float(np.ptp(x)), float(np.ptp(y)), _LEAST_SPAN_M) * _MARGIN
@@ -394,7 +393,6 @@ def _traffic_light_entry(
 
 
 def _is_rejected(calibration: Mapping[str, Any]) -> bool:
-    """Return whether the calibration in force was rejected."""
     return bool(calibration.get("verdict") == REJECTED)
 
 

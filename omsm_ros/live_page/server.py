@@ -166,7 +166,6 @@ class LiveServer:
             self._server = None
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the page, a refusal, or None where the socket may be opened."""
         if (place := _split(request.path)) is None:
             return _text(http.HTTPStatus.BAD_REQUEST, "the address cannot be read\n")
         # Before websockets 17 a request has no method but GET.

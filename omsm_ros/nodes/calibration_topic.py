@@ -89,17 +89,13 @@ class CalibrationTopic:
             self._node.get_logger().error(
                 f"calibration refused: {self.refused}", throttle_duration_sec=_COMPLAINT_PERIOD_S
             )
-            self._republish()
+            now = self.decided()
+            if self.calibration is not None and now - self._repeated_ns > _REPEAT_NS:
+                self._repeated_ns, refused = now, self.refused
+                self.announce(self.calibration, now)
+                self.refused = refused
             return
         self.announce(heard, since_ns)
-
-    def _republish(self) -> None:
-        """Publish the calibration in force again, as the newest one."""
-        now = self.decided()
-        if self.calibration is not None and now - self._repeated_ns > _REPEAT_NS:
-            self._repeated_ns, refused = now, self.refused
-            self.announce(self.calibration, now)
-            self.refused = refused
 
     def _plausible(self, stamp_ns: int) -> int:
         """Return the stamp; now for a message without one, or with one ahead of this clock."""

@@ -76,7 +76,11 @@ class CalibratorNode(ManagedNode):
         self._refused = dict.fromkeys(_STREAMS, 0)
         self._recent = RecentIncrease()
         self._last, self._trouble = "nothing identified yet", ""
-        self._claim(undo)
+        try:
+            undo.enter_context(exclusive_lock(self._folder.link))
+        except FileError as err:  # it is published nevertheless
+            self._trouble = str(err)
+            self.get_logger().error(self._trouble)
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
         self._worker = BackgroundWorker(self, undo)
         self._worker.serve(undo, Identify, "~/identify", self._on_identify)
@@ -111,16 +115,7 @@ class CalibratorNode(ManagedNode):
                 buffer.forget()
         self._probe = reported
 
-    def _claim(self, undo: ExitStack) -> None:
-        """Lock the calibrations of this cell against a second calibrator."""
-        try:
-            undo.enter_context(exclusive_lock(self._folder.link))
-        except FileError as err:  # it is published nevertheless
-            self._trouble = str(err)
-            self.get_logger().error(self._trouble)
-
     def _publish_stored(self) -> None:
-        """Publish the calibration that was in force before this start."""
         try:
             known = self._folder.in_force()
         except OmsmError as err:
@@ -181,7 +176,6 @@ class CalibratorNode(ManagedNode):
         return True, f"{verdict_text(calibration)}; {calibration.id[:12]} {kept}"
 
     def _bag(self, given: str) -> Path | None:
-        """Return the bag that a request names, None for the live recording."""
         if not given:
             return None
         return resolved_within(Path(given), self.values["bag_folders"], BagError, "bag")

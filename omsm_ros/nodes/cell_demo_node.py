@@ -247,7 +247,6 @@ def perform(
 
 
 def _record(node: DemoNode, processes: NodeProcesses, plan: Demonstration, bag: Path) -> None:
-    """Start a recorder, and wait until it is connected to all topics."""
     node.forget("recorder")
     processes.start("recorder", path=str(bag))
     node.wait_until(
@@ -291,7 +290,6 @@ def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> Non
 
 
 def _axes_of(plan: Demonstration) -> str:
-    """Return the node that publishes the axes."""
     companion = plan.companion_parameters()
     return "axis_driver" if companion and companion[0] == "axis_driver" else "confocal_driver"
 
@@ -303,7 +301,6 @@ def _scan(
     samples: int,
     progress: Callable[[int], None],
 ) -> None:
-    """Scan by the emulator's service ``motion``, and wait until all is corrected and recorded."""
     drivers = {"/omsm/axes": _axes_of(plan), "/omsm/confocal": "confocal_driver"}
     earlier = {topic: node.value(driver, "blocks") for topic, driver in drivers.items()}
     received = ("axes_received", "distance_received")

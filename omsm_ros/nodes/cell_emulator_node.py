@@ -116,7 +116,6 @@ class CellEmulatorNode(ManagedNode):
         self.get_logger().info(f"cell at {self._link}, time lapse {values['time_lapse']:g}")
 
     def _second_line(self, undo: ExitStack) -> InstrumentLink | None:
-        """Return the port of the second device, None where the cell has one device."""
         device = self.values["device"]
         if (second := emulated(device).second) is None:
             return None

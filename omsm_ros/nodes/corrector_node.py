@@ -336,7 +336,6 @@ class CorrectorNode(ManagedNode):
             self.get_logger().info(f"samples so far: {account.as_dict()}")
 
     def _end_correction(self) -> None:
-        """Publish what the correction so far still holds, and keep its counts."""
         self._publish_rest()
         if self._corrector is not None:
             self._state.keep(self._corrector.account)

@@ -66,7 +66,9 @@ class Diagnostics:
     def publish(self) -> None:
         """Publish now."""
         report = self._report()
-        _add_clock(self._node, report)
+        clock = self._node.get_clock()
+        if clock.ros_time_is_active and clock.now().nanoseconds == 0:
+            report.add(WARN, "use_sim_time is set, but no node publishes /clock: stamps are 0")
         count, last = _defects.get(self._node.get_fully_qualified_name(), (0, ""))
         if count:
             report.values["defects"] = count
@@ -81,12 +83,6 @@ class Diagnostics:
         array = DiagnosticArray(status=[status])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
-
-
-def _add_clock(node: Node, report: StateReport) -> None:
-    clock = node.get_clock()
-    if clock.ros_time_is_active and clock.now().nanoseconds == 0:
-        report.add(WARN, "use_sim_time is set, but no node publishes /clock: stamps are 0")
 
 
 def log_internal_error(node: Node, err: Exception) -> str:

@@ -216,22 +216,6 @@ class ConfocalDriverNode(DriverNode):
         response.success, response.message = True, f"dark reference taken{stray}; identify again"
 
 
-class AxisDriverNode(DriverNode):
-    """Reads the axes where the probe does not carry them, and publishes them."""
-
-    def __init__(self) -> None:
-        super().__init__("axis_driver", AXIS_PARAMETERS, make_axes, axes="axes")
-
-
-class ReferenceDriverNode(DriverNode):
-    """Reads the reference sensor and publishes its distance."""
-
-    def __init__(self) -> None:
-        super().__init__(
-            "reference_driver", REFERENCE_PARAMETERS, make_reference, distance="reference"
-        )
-
-
 class AccelerometerDriverNode(DriverNode):
     """Samples a three-axis accelerometer and publishes its blocks."""
 
@@ -259,6 +243,9 @@ class AccelerometerDriverNode(DriverNode):
 
 
 confocal_driver = partial(run, ConfocalDriverNode)
-axis_driver = partial(run, AxisDriverNode)
-reference_driver = partial(run, ReferenceDriverNode)
+axis_driver = partial(
+    run, partial(DriverNode, "axis_driver", AXIS_PARAMETERS, make_axes, axes="axes")
+)
+_reference = ("reference_driver", REFERENCE_PARAMETERS, make_reference)
+reference_driver = partial(run, partial(DriverNode, *_reference, distance="reference"))
 accelerometer_driver = partial(run, AccelerometerDriverNode)

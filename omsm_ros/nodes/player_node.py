@@ -121,7 +121,6 @@ class Listeners:
         return sorted(n for n, each in self._listeners.items() if any(self._open(each).values()))
 
     def _open(self, listener: _Listener) -> dict[str, int]:
-        """Return the number of messages not processed, by topic."""
         if not listener.taken:
             return {}
         return {
@@ -188,7 +187,11 @@ class Listeners:
             listener.asked = None
             with suppress(DataError):
                 self._enter(listener, _counts(future.result().message), now)
-                self._find_again(name, listener)
+                for topic, count in listener.taken.items():
+                    surplus = count - listener.before[topic] - self._published[topic]
+                    if surplus > 0:
+                        listener.before[topic] += surplus
+                        self.lost[name] -= min(surplus, self.lost[name])
         elif now - since > _RETRY_S:
             listener.client.remove_pending_request(future)
             listener.asked = None
@@ -202,14 +205,6 @@ class Listeners:
         if taken != listener.taken:
             listener.last_progress = now
         listener.taken = taken
-
-    def _find_again(self, name: str, listener: _Listener) -> None:
-        """Reduce the lost messages by those that arrived late."""
-        for topic, count in listener.taken.items():
-            surplus = count - listener.before[topic] - self._published[topic]
-            if surplus > 0:
-                listener.before[topic] += surplus
-                self.lost[name] -= min(surplus, self.lost[name])
 
     def _give_up(self, name: str) -> None:
         self._node.destroy_client(self._listeners.pop(name).client)
@@ -399,7 +394,6 @@ class PlayerNode(ManagedNode):
         return ""
 
     def _missing(self, name: str) -> list[str]:
-        """Return the nodes of ``wait_for`` that do not subscribe to the topic ``name``."""
         found = {info.node_name for info in self.get_subscriptions_info_by_topic(name)}
         return [node for node in self.values["wait_for"].split() if node not in found]
 

@@ -152,7 +152,6 @@ class VibrationMonitorNode(ManagedNode):
 
 
 def _figures(levels: Any) -> dict[str, object]:
-    """Return every level by its name, in SI."""
     found: dict[str, object] = {"windows": levels.windows}
     for place, (low, high) in enumerate(levels.bands):
         band = f"{low:g}_{high:g}_hz"

@@ -248,7 +248,10 @@ def write_adjustment(
 ) -> None:
     """Write adjustment.json, the adjusted points of all scans, and report.html into ``out``."""
     out.mkdir(parents=True, exist_ok=True)
-    _save_cloud(out / ADJUSTED_CLOUD, found, scans)
+    with PlyWriter(out / ADJUSTED_CLOUD) as cloud:
+        for index, scan in enumerate(scans):
+            height = corrected_heights(found, scan.data, index)
+            cloud.write(replace(scan.points, height=height))
     facts["files"] = {"adjustment": ADJUSTMENT, "cloud": ADJUSTED_CLOUD}
     if report:
         facts["files"]["report"] = REPORT
@@ -258,14 +261,6 @@ def write_adjustment(
         from omsm_ros.report.adjustment import render
 
         save_text(out / REPORT, render(title, facts, found))
-
-
-def _save_cloud(path: Path, found: Adjustment, scans: Sequence[AdjustedScan]) -> None:
-    """Write the points of all scans, heights less what the adjustment found of the machine."""
-    with PlyWriter(path) as cloud:
-        for index, scan in enumerate(scans):
-            height = corrected_heights(found, scan.data, index)
-            cloud.write(replace(scan.points, height=height))
 
 
 def adjustment_facts(

@@ -402,7 +402,6 @@ def sample_rows(summary: dict[str, Any]) -> Iterable[tuple[str, str]]:
 
 
 def _live_text(summary: dict[str, Any]) -> str:
-    """Return whether live and offline points are equal, with a remedy if not."""
     if summary["live_equals_offline"]:
         return "to the last bit"
     left_out = summary["samples"]["distance"]["corrected"] - summary["live_points"]

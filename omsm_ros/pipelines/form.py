@@ -252,7 +252,6 @@ def _mismatch_text(form: FormResult, nominal: Surface) -> list[str]:
 
 
 def _counts(form: FormResult, missing: int) -> dict[str, int]:
-    """Return the number of points by their use, with those that had no height."""
     added = {name: form.counts[name] + missing for name in ("read", "not_finite")}
     return form.counts | added
 

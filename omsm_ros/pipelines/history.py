@@ -22,6 +22,7 @@ from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.files import SUMMARY, exception_text, read_text
 from omsm_ros.io.folders import MAX_RESULT_BYTES
 from omsm_ros.quantities import COUNTER, SIGNAL, shown
+from omsm_ros.report.tables import part
 from omsm_ros.report.verdict import verdict_text
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -158,7 +159,6 @@ class Catalogue:
         return " ".join(text.split())[:200]
 
     def _shown_address(self) -> str:
-        """Return the address without its password."""
         try:
             url = self._sql.engine.make_url(self.address)
         except (ValueError, self._sql.exc.ArgumentError):
@@ -284,7 +284,8 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
     path = folder / SUMMARY
     text = read_text(path, MAX_RESULT_BYTES, FileError, "summary")
     summary = json_and_yaml.object_of(text, FileError, f"summary {str(path)!r}")
-    settings = _object(_part(summary, "settings"))
+    settings = part(summary, "settings")
+    settings = settings if isinstance(settings, Mapping) else {}
     source = bag if bag is not None else Path(str(summary.get("bag", "")))
     place = str(folder.absolute())
     row = {
@@ -293,15 +294,15 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
         "machine": _machine(settings),
         "bag": str(source.absolute()),
         "folder": place,
-        "version": str(_part(summary, "versions", "omsm_ros") or ""),
+        "version": str(part(summary, "versions", "omsm_ros") or ""),
         "settings": json_and_yaml.text_of(settings),
         "calibration": str(summary.get("calibration", "")),
-        "received": _count(_part(summary, "samples", "distance", "received")),
-        "corrected": _count(_part(summary, "samples", "distance", "corrected")),
-        "deviation_rms": _number(_part(summary, "figures", "rms", "value")),
-        "deviation_peak_to_valley": _number(_part(summary, "figures", "peak_to_valley", "value")),
-        "dynamic_error_rms": _number(_part(summary, "dynamic_error_before", "rms")),
-        "uncertainty_median": _number(_part(summary, "uncertainty", "median")),
+        "received": _count(part(summary, "samples", "distance", "received")),
+        "corrected": _count(part(summary, "samples", "distance", "corrected")),
+        "deviation_rms": _number(part(summary, "figures", "rms", "value")),
+        "deviation_peak_to_valley": _number(part(summary, "figures", "peak_to_valley", "value")),
+        "dynamic_error_rms": _number(part(summary, "dynamic_error_before", "rms")),
+        "uncertainty_median": _number(part(summary, "uncertainty", "median")),
     }
     with Catalogue(address) as catalogue:
         return catalogue.add("measurements", row)
@@ -389,17 +390,6 @@ def _number(value: object) -> float | None:
 
 def _count(value: object) -> int | None:
     return value if isinstance(value, int) and 0 <= value <= COUNTER.high else None
-
-
-def _object(value: object) -> Mapping[str, object]:
-    return value if isinstance(value, Mapping) else {}
-
-
-def _part(content: Mapping[str, Any], *names: str) -> Any:
-    found: Any = content
-    for name in names:
-        found = found.get(name) if isinstance(found, Mapping) else None
-    return found
 
 
 def _recorded(bag: Path | None) -> int | None:

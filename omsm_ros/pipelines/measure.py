@@ -439,7 +439,6 @@ def _implausible(temperatures: FloatArray) -> list[str]:
 
 
 def _places(calibration: Calibration) -> dict[str, Any]:
-    """Return the positions of the members of a calibration set."""
     if not isinstance(calibration, CalibrationSet):
         return {}
     places = {"along": calibration.along, "positions": list(calibration.positions)}

@@ -158,7 +158,6 @@ def publish_spectra(
 
 
 def _clouds_before(out: Path) -> list[str]:
-    """Return the clouds of an earlier run, which may have had more scans."""
     earlier = out.glob("band_stopped_*.ply") if (out / SPECTRUM).is_file() else ()
     return [path.name for path in earlier]
 

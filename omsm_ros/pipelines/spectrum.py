@@ -122,7 +122,6 @@ def spectra_of(
 
 
 def _names(paths: Sequence[AnyBag]) -> list[str]:
-    """Return the names of the files, numbered if several have the same name."""
     stems = [Path(str(path)).stem for path in paths]
     return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 

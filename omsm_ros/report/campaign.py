@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
@@ -136,9 +136,9 @@ def remarks(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
         for i in np.flatnonzero(one.outlying):
             usual = one.series.formatted(float(np.nanmedian(one.values)))
             value = one.series.formatted(float(one.values[i]))
+            name = one.series.name[0].lower() + one.series.name[1:]
             found.append(
-                f"{measurements[i].name} is an outlier: {_low(one.series.name)} is {value}, the "
-                f"median is {usual}"
+                f"{measurements[i].name} is an outlier: {name} is {value}, the median is {usual}"
             )
         if one.drift is not None and one.drift.significant:
             unit = "K" if one.series is TEMPERATURE else one.series.unit
@@ -151,7 +151,6 @@ def remarks(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
 
 
 def _temperature_correlation(judged: Sequence[JudgedSeries]) -> list[str]:
-    """Return correlations with the temperature, each as a sentence."""
     warm = [one.values for one in judged if one.series is TEMPERATURE]
     found = []
     for one in judged:
@@ -164,10 +163,6 @@ def _temperature_correlation(judged: Sequence[JudgedSeries]) -> list[str]:
                 f"{one.series.name} depends on the temperature, {low} to {high} per kelvin (95 %)"
             )
     return found
-
-
-def _low(name: str) -> str:
-    return name[0].lower() + name[1:]
 
 
 def _value(measurement: CampaignEntry, series: Series) -> float:
@@ -247,18 +242,10 @@ def _figure(measurements: Sequence[CampaignEntry], judged: Sequence[JudgedSeries
 _COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
-class HistoryLike(Protocol):
-    """A machine with its calibrations and measurements in the catalogue."""
-
-    machine: str
-    calibrations: list[dict[str, Any]]
-    measurements: list[dict[str, Any]]
-
-
-def draw(machines: Sequence[HistoryLike]) -> bytes:
+def draw(machines: Sequence[Any]) -> bytes:
     """Draw lag, static gain and form over time (PNG), one colour per machine.
 
-    Rejected calibrations are crosses.
+    machines: as of ``CatalogueHistory``;  rejected calibrations are crosses
     """
     made, axes = style.figure(10.0, 7.0, rows=3, sharex=True)
     lag, gain, form = axes[:, 0]

@@ -78,7 +78,6 @@ def _profile(cuts: Sequence[Profile], band: Profile | None, title: str, position
 
 
 def _unit(cuts: Sequence[Profile]) -> tuple[float, str]:
-    """Return the unit in which the heights have at most four digits, and its name."""
     largest = max(float(np.nanmax(np.abs(cut.value), initial=0.0)) for cut in cuts)
     units = ((NANOMETRE_M, "nm"), (MICROMETRE_M, "µm"), (MILLIMETRE_M, "mm"))
     return next((u for u in units if largest < _LARGEST_NUMBER * u[0]), units[-1])

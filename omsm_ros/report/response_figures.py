@@ -171,7 +171,11 @@ def step_response(
     lengths = {len(part) for part in given}
     if len(lengths) != 1 or len(time) < 3:
         raise DataError(f"step response of {sorted(lengths)!r} samples, expected one length of 3+")
-    window = _steepest(time, encoder)
+    speed = np.abs(np.diff(encoder))
+    middle = int(np.argmax(speed > 0.9 * speed.max()))
+    period = float(np.median(np.diff(time)))
+    before, after = round(30 * MILLISECOND_S / period), round(60 * MILLISECOND_S / period)
+    window = slice(max(middle - before, 0), middle + after)
     made, axes = style.figure(6.1, 5.6, rows=2, sharex=True, height_ratios=(1.25, 1))
     upper, lower = axes[:, 0]
     edge = encoder[window]
@@ -193,14 +197,6 @@ def step_response(
     style.legend_above(upper)
     style.legend_above(lower)
     return made
-
-
-def _steepest(time: FloatArray, encoder: FloatArray) -> slice:
-    speed = np.abs(np.diff(encoder))
-    middle = int(np.argmax(speed > 0.9 * speed.max()))
-    period = float(np.median(np.diff(time)))
-    before, after = round(30 * MILLISECOND_S / period), round(60 * MILLISECOND_S / period)
-    return slice(max(middle - before, 0), middle + after)
 
 
 def _start(edge: FloatArray) -> int:

@@ -117,7 +117,11 @@ class Scene:
     def look(self, time: FloatArray, about: FloatArray | float = 0.0) -> ProbeTarget:
         """Return the situation at ``time`` (n,) [s]; ``about``: start for the distance [m]."""
         slides = self.positions(time)
-        x, y, raised = self._shift(time, slides)
+        total = Shift(np.zeros(1), np.zeros(1), np.zeros(1))
+        for shifting in self.shifting:
+            part = shifting(time, slides)
+            total = Shift(*(a + b for a, b in zip(total, part, strict=True)))
+        x, y, raised = total
         shifted = slides._replace(x=slides.x - x, y=slides.y - y)
         probe, mount = self.probe.at(time), self.disturbances.machine.mount
         if is_default(mount) and not slides.b.any():
@@ -126,14 +130,6 @@ class Scene:
             distance = height + raised - probe - self.stand_off
             return ProbeTarget(probe, height, on_x, on_y, distance)
         return self._along_the_beam(mount, shifted, probe, raised, about)
-
-    def _shift(self, time: FloatArray, slides: AxisPositions) -> Shift:
-        """Return the total shift of the workpiece relative to the probe."""
-        total = Shift(np.zeros(1), np.zeros(1), np.zeros(1))
-        for shifting in self.shifting:
-            part = shifting(time, slides)
-            total = Shift(*(a + b for a, b in zip(total, part, strict=True)))
-        return total
 
     def _along_the_beam(
         self,
@@ -326,9 +322,10 @@ def record(
         ``scale · (surface - probe motion - stand_off)``, rounded, with no target out of range
     substeps: simulated steps in a sample period; None takes enough for 0.1 nm
     """
-    random = _random_streams(cell.seed)
+    children = np.random.SeedSequence(cell.seed).spawn(len(_STREAMS))
+    random = {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
     errors = cell.disturbances
-    steps = substeps or _enough_substeps(cell.sample_period)
+    steps = substeps or max(_LEAST_SUBSTEPS, int(np.ceil(cell.sample_period / _LONGEST_STEP_S)))
     timing = Timing(round(motion.duration / cell.sample_period), cell.sample_period, steps)
     scene = scene_of(cell.plant, errors, motion, surface, stand_off, timing, random)
     nominal = np.arange(timing.samples, dtype=np.float64) * cell.sample_period
@@ -350,16 +347,6 @@ def record(
             response=TrueResponse(cell.plant.dynamics, errors, cell.probe),
         ),
     )
-
-
-def _enough_substeps(sample_period: float) -> int:
-    return max(_LEAST_SUBSTEPS, int(np.ceil(sample_period / _LONGEST_STEP_S)))
-
-
-def _random_streams(seed: int) -> dict[str, np.random.Generator]:
-    """Return an independent generator for each use."""
-    children = np.random.SeedSequence(seed).spawn(len(_STREAMS))
-    return {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
 
 
 def _axes(cell: Cell, scene: Scene, when: Instants, random: np.random.Generator) -> AxisBlock:
@@ -396,7 +383,6 @@ def _distance(
 def _further_channels(
     scene: Scene, when: Instants, timing: Timing, random: Mapping[str, np.random.Generator]
 ) -> dict[str, Any]:
-    """Return the channels of reference sensor and accelerometer, if present."""
     channels: dict[str, Any] = {}
     if reference := scene.disturbances.reference:
         channels["reference"] = reference.read(

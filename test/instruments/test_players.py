@@ -15,7 +15,6 @@ from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.emulator_factory import (
     EMULATED,
-    InstrumentPlayer,
     emulated,
     line_for,
     player_for,
@@ -35,7 +34,7 @@ def play(name: str, link: str, recording: Recording, lapse: float = 20.0) -> lis
     got: list[BlockPair] = []
     stop = threading.Event()
     with line_for(link) as line:
-        player = InstrumentPlayer(emulated(name).make, line)
+        player = player_for(name, line)
         values = defaults() | {"device": name, "port": line.path} | emulated(name).driver
         device = make_device(values)
         reader = DeviceReader(device, got.extend)

@@ -237,8 +237,8 @@ def test_a_slip_of_the_counters_is_an_error_and_ends_the_points(cell, true_calib
 def test_live_points_are_those_of_the_core(cell, true_calibration, small_scan):
     """Bit for bit, whatever was between: messages, DDS, blocks."""
     from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-    from omsm_ros.core.correction.surface_points import join_points, pack_points
     from omsm_ros.core.correction.machine_sources import NOTHING_STATED
+    from omsm_ros.core.correction.surface_points import join_points, pack_points
     from omsm_ros.pipelines.measure import with_sources
 
     cell.processes.start("corrector", calibration=saved(cell, "cal.json", true_calibration))

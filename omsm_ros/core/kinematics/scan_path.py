@@ -113,7 +113,6 @@ class ScanPathReader:
 
 
 def _known(block: AxisBlock) -> Iterator[AxisBlock]:
-    """Yield the runs of a block in which Z is known."""
     known = np.isfinite(block.z)
     if np.all(known):
         yield block
@@ -172,7 +171,6 @@ def _content_without(slow: FloatArray, velocity: FloatArray, sample_period: floa
 
 
 def _with_small_factors(number: int) -> int:
-    """Return the largest number up to ``number`` that has only ``_SMALL_FACTORS``."""
     for found in range(number, 1, -1):
         rest = found
         for factor in _SMALL_FACTORS:

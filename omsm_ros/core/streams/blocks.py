@@ -77,7 +77,6 @@ class Block:
     parts: IntArray = field(default_factory=lambda: np.empty((0, 2), np.int64))
 
     def __len__(self) -> int:
-        """Return the number of samples."""
         raise NotImplementedError
 
     @property
@@ -335,7 +334,6 @@ def _continues(first: B, length: int, block: B) -> bool:
 
 
 def _nonempty_channels(block: B) -> tuple[str, ...]:
-    """Return the names of the channels that are not empty."""
     return tuple(name for name in _channels(block) if len(getattr(block, name)))
 
 

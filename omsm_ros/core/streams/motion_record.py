@@ -143,7 +143,6 @@ def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]
 
 
 def _ordered(blocks: Iterable[B]) -> list[B]:
-    """Return the blocks in the order of their stamps."""
     return sorted(blocks, key=lambda block: (block.stamp_ns, block.first_sample))
 
 
@@ -357,7 +356,6 @@ _MANY = 100
 
 
 def _follows(before: Block, block: Block) -> bool:
-    """Return whether the count of ``block`` goes on from that of ``before``, at its time."""
     begun = before.newest
     return block.first_sample >= begun[0] and not is_ahead_of_time(begun, block)
 
@@ -432,7 +430,6 @@ class BlockBuffer(Generic[Probed]):
         self._apart = min(self._apart, len(self._blocks))
 
     def __len__(self) -> int:
-        """Return the number of samples held."""
         return self._samples
 
     def recent(self, duration: float = 0.0) -> list[Probed]:

@@ -310,28 +310,22 @@ class Pairing:
         """Return -1 if the head of the axes has no partner, 1 for the distance, 0 for a pair."""
         if not self._linked(a, d):
             if _apart(a, d):
-                return self._earlier_session(a, d)
+                if a.session == self._link[0]:
+                    return -1
+                if d.session == self._link[1]:
+                    return 1
+                return _sign(a.stamp_ns - d.stamp_ns) or -1
             if max(a.first, d.first) < min(a.end, d.end):
                 self._link = (a.session, d.session)
         return _sign(a.first - d.first)
 
-    def _earlier_session(self, a: SampleRun, d: SampleRun) -> int:
-        """Return -1 or 1 if the head of the axes or of the distance is of an older session."""
-        if a.session == self._link[0]:
-            return -1
-        if d.session == self._link[1]:
-            return 1
-        return _sign(a.stamp_ns - d.stamp_ns) or -1
-
 
 def _apart(a: SampleRun, d: SampleRun) -> bool:
-    """Return True if the same trigger count has two different times."""
     count = max(a.first, d.first)
     return abs(a.stamp_of(count) - d.stamp_of(count)) > STAMP_TOLERANCE_S * NANOSECONDS_PER_S
 
 
 def _missing(run: SampleRun, other: RunQueue) -> RejectionReason:
-    """Return the reason why the first sample of ``run`` has no partner."""
     lost = other.given_up
     overdue = lost is not None and run.first < lost.end and not _apart(run, lost)
     return RejectionReason.OVERDUE if overdue else RejectionReason.UNMATCHED

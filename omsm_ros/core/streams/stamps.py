@@ -188,7 +188,6 @@ class StampLine:
         self._head = 0
 
     def __len__(self) -> int:
-        """Return the number of blocks to come."""
         return len(self._counts) - self._head
 
     def advance(self, session: int, count: int) -> bool:

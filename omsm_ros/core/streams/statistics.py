@@ -130,7 +130,6 @@ class EvenSelection:
         self._room: NDArray[Any] = np.empty(0)
 
     def __len__(self) -> int:
-        """Return the number of rows kept."""
         return -(-self._seen // self._every)
 
     @property
@@ -145,7 +144,9 @@ class EvenSelection:
     def chosen(self, rows: int) -> slice:
         """Return which of the next ``rows`` will be kept, so that only those need be computed."""
         while -(-(self._seen + rows) // self._every) > self._most:
-            self._halve()
+            held = len(self)
+            self._room[: -(-held // 2)] = self._room[:held:2].copy()
+            self._every *= 2
         return slice(-self._seen % self._every, rows, self._every)
 
     def add_chosen(self, part: NDArray[Any], rows: int) -> None:
@@ -163,12 +164,6 @@ class EvenSelection:
             if held:
                 room[:held] = self._room[:held]
             self._room = room
-
-    def _halve(self) -> None:
-        """Drop every other row."""
-        held = len(self)
-        self._room[: -(-held // 2)] = self._room[:held:2].copy()
-        self._every *= 2
 
     def rows(self) -> NDArray[Any]:
         """Return the rows kept so far, in order; a view that is valid until the next are added."""

@@ -372,7 +372,6 @@ class TriggerSlipDetector:
 
     @staticmethod
     def _stride(period_ns: float) -> float:
-        """Return the samples from one verdict to the next."""
         return max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0)
 
     def _judge(self, count: int) -> None:

@@ -229,7 +229,10 @@ class Chrocodile(StreamDevice):
         for name, value in (("LAI", wanted.lamp), ("THR", wanted.threshold)):
             if value is not None:
                 self._set(name, value)
-        self._read_scale()
+        found = self._try("SCA", QUERY).numbers
+        if found and found[0] > 0:
+            self._probe = replace(self._wanted.probe, full_scale=found[0] * MICROMETRE_M)
+            self._identity["SCA"] = f"{found[0]:g}"
         for name in ("SEN", "LAI"):
             self._read(name)
         if not intact:
@@ -263,7 +266,6 @@ class Chrocodile(StreamDevice):
         return True
 
     def _measure_distance(self) -> None:
-        """Choose the chromatic mode; DeviceError if the device stays in the interferometric one."""
         self._try("MMD", 0)
         self._read("MMD")
         if self._identity.get("MMD", "0") != "0":
@@ -273,7 +275,6 @@ class Chrocodile(StreamDevice):
             )
 
     def _read(self, name: str) -> None:
-        """Enter a setting of the device, if the model reports it."""
         if name not in self._identity and (found := self._try(name, QUERY).numbers):
             self._identity[name] = " ".join(f"{number:g}" for number in found)
 
@@ -326,12 +327,6 @@ class Chrocodile(StreamDevice):
 
     def _transport_is_serial(self) -> bool:
         return getattr(self._transport, "baud_rate", None) is not None
-
-    def _read_scale(self) -> None:
-        found = self._try("SCA", QUERY).numbers
-        if found and found[0] > 0:
-            self._probe = replace(self._wanted.probe, full_scale=found[0] * MICROMETRE_M)
-            self._identity["SCA"] = f"{found[0]:g}"
 
     def _unanswered(self, name: str, said: bytes) -> DeviceTimeoutError:
         if said:
@@ -389,7 +384,6 @@ def _version(text: str) -> str:
 
 
 def _value(text: str) -> object:
-    """Return the number in a text, or the text."""
     try:
         return float(text)
     except ValueError:

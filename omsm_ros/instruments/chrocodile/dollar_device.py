@@ -82,7 +82,6 @@ class ChrocodileDevice(Chrocodile):
         self._try("STA")
 
     def _layout(self) -> Layout:
-        """Return the layout that the device describes, or that of the table if it does not."""
         answer = self._try("DTF")
         try:
             layout = Layout.described(answer.text, self._wanted.sync)

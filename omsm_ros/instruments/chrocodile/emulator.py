@@ -284,7 +284,6 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
             self.say(encode_format(self._format))
 
     def _describe(self) -> None:
-        """Make a new data format, with the signals in the device's order."""
         self._format_counter += 1
         numbers = sorted(self._layout.signals)
         signals = tuple((n, SIGNALS[n].type, 1) for n in numbers)

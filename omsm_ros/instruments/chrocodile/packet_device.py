@@ -57,7 +57,6 @@ class ChrocodilePacketDevice(Chrocodile):
         return super().counts() | vars(self._decoder.statistics)
 
     def _begin(self) -> None:
-        """Wait until the device has reported its whole configuration."""
         self._decoder.reset()
         self._early.clear()
         self._commands.clear()

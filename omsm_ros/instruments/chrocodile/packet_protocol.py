@@ -323,7 +323,6 @@ class PacketDecoder:
         waiting.append((payload[: count * form.dtype.itemsize], time_ns, stream))
 
     def _flush(self, found: list[Message], waiting: list[tuple[bytes, int, int]]) -> None:
-        """Join the waiting samples into one message."""
         if not waiting:
             return
         form = self._formats[waiting[0][2]]

@@ -337,7 +337,8 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         return confocal_dtype(kind)
 
     def _set_up(self, port: CommandPort) -> dict[str, str]:
-        identity = _info(port.ask("GETINFO", "\n", _INFORMATION))
+        pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", port.ask("GETINFO", "\n", _INFORMATION))
+        identity = {key.strip().lower(): value.strip() for key, value in pairs}
         self._set_rate(port)
         return identity | {"rate": f"{1 / self._wanted.sample_period:g}"}  # as read back
 
@@ -388,7 +389,6 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
     def _peak(
         self, frames: np.ndarray[tuple[int], np.dtype[np.void]]
     ) -> tuple[IntArray, IntArray | None]:
-        """Return distance and intensity of the first peak, in either order of the words."""
         distance: IntArray = frames["distance 1"].astype(np.int64)
         if "intensity 1" not in (frames.dtype.names or ()):
             return distance, None
@@ -419,12 +419,6 @@ def _check_not_silent(name: str, settings: ConfocalDtSettings, silent: float) ->
             f"{name} sent no readable data for {silent:.1f} s; check power, output "
             "interface and (RS-422) baud rate"
         )
-
-
-def _info(said: str) -> dict[str, str]:
-    """Return the ``Name: value`` lines of an answer."""
-    pairs = re.findall(r"(\w[\w ]*):([^\r\n]+)", said)
-    return {key.strip().lower(): value.strip() for key, value in pairs}
 
 
 def make_serial(values: Values, transport: Transport, now_ns: NowNs) -> ConfocalDtDevice:

@@ -96,7 +96,6 @@ def _matrix(
 
 
 def _beginning(stream: IO[bytes], what: str) -> tuple[list[str], str]:
-    """Return the lines before the first line of numbers, and that line."""
     header: list[str] = []
     # Text also ends lines at CR, as old Macs write; detached, it leaves the stream open.
     text = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="surrogateescape")
@@ -134,7 +133,6 @@ def _delimiter(line: str) -> str | None:
 
 
 def _cells(line: str) -> tuple[int, int]:
-    """Return the number of cells of a line, without and with empty ones at its end."""
     mark = _delimiter(line)
     full = line.rstrip(f" {mark}") if mark else line
     return len(full.split(mark)), len(line.split(mark))
@@ -213,7 +211,6 @@ def _names(line: str) -> list[str]:
 
 
 def _named(names: list[str]) -> dict[str, tuple[int, float | None]]:
-    """Return place and unit of the columns with a role."""
     found: dict[str, tuple[int, float | None]] = {}
     for place, (name, unit) in enumerate(map(name_and_unit, names)):
         role = _ROLES.get(name)
@@ -226,7 +223,6 @@ def _named(names: list[str]) -> dict[str, tuple[int, float | None]]:
 def _with_units(
     found: dict[str, tuple[int, float | None]], below: list[str], what: str
 ) -> dict[str, tuple[int, float | None]]:
-    """Return ``found`` with the units of a line of units below the names, if any."""
     for line in below:
         units = [metres_in(name.strip("[]() ")) for name in _names(line)]
         for role, (place, own) in found.items():
@@ -265,7 +261,6 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv
 
 
 def _formats(columns: Mapping[str, NDArray[np.generic]]) -> list[str]:
-    """Return formats with as many digits as each kind of number holds."""
     return [
         "%d" if part.dtype.kind in "iu" else "%.9g" if part.dtype.itemsize <= 4 else "%.17g"
         for part in columns.values()

@@ -187,7 +187,6 @@ def _points(head: bytes, phase: FloatArray, what: str) -> MeasuredPoints:
 
 
 def _at(form: str, head: bytes, place: int) -> Any:
-    """Return the entry at ``place`` of the header."""
     return struct.unpack_from(form, head, place)[0]
 
 

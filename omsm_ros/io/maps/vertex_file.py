@@ -67,7 +67,6 @@ def read_pcd(path: Path, units: LengthUnits | None) -> MeasuredPoints:
 
 
 def _header(stream: IO[bytes], last: str, what: str) -> list[str]:
-    """Return the lines up to the one that begins with ``last``, which is the last."""
     lines: list[str] = []
     for raw in islice(iter(lambda: stream.readline(_LONGEST_LINE), b""), _MOST_LINES):
         lines.append(raw.decode("ascii", "replace").strip())

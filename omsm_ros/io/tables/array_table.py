@@ -222,7 +222,6 @@ def _unpacked_matlab(stream: IO[bytes]) -> int:
 
 
 def _flat(name: str, found: Any) -> Iterator[tuple[str, Any]]:
-    """Yield each array in ``found`` with its name, which begins with that of its structure."""
     if isinstance(found, Mapping):
         parts = list(found.items())
     elif fields := getattr(getattr(found, "dtype", None), "names", None):
@@ -280,7 +279,9 @@ class TdmsTable(ForeignTable):
             raise ValueError("it was cut short")
         for group in file.groups():
             for known_properties in (file, group, *group.channels()):
-                _check_scales(known_properties.properties)
+                scales = known_properties.properties.get(_SCALES, 0)
+                if isinstance(scales, int | float | np.number) and not scales <= _MOST_SCALES:
+                    raise ValueError(f"{_SCALES} is {scales}, expected at most {_MOST_SCALES}")
         self._channels = {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
         self.names = [n for n, c in self._channels.items() if _kind(c) in "fiuM"]
         properties = {name: self._channels[name].properties for name in self.names}
@@ -334,13 +335,6 @@ class TdmsTable(ForeignTable):
             return np.asarray(since / NANOSECONDS_PER_S)
         with np.errstate(invalid="ignore"):  # damaged singles; NaN is reported later
             return np.asarray(values, np.float64)
-
-
-def _check_scales(properties: Mapping[str, object]) -> None:
-    """Raise ValueError for more scales than a file needs: the library would create them all."""
-    scales = properties.get(_SCALES, 0)
-    if isinstance(scales, int | float | np.number) and not scales <= _MOST_SCALES:
-        raise ValueError(f"{_SCALES} is {scales}, expected at most {_MOST_SCALES}")
 
 
 def _kind(channel: Any) -> str:

@@ -204,7 +204,6 @@ def _column(channel: str, given: Mapping[str, Any]) -> Column:
 
 
 def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:
-    """Return the SI value of a column's unit, which must be stated."""
     units = UNITS[channel]
     if channel == "trigger":
         return 1.0

@@ -148,7 +148,6 @@ class TextTable(ForeignTable):
         return "utf-8-sig"
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield the pieces of lines, each with the number of its first, from 1."""
         number, rest = 1, ""
         raw = open_regular(self.path, FileError, "table")
         with io.TextIOWrapper(raw, self._encoding, "replace", newline=None) as stream:
@@ -171,7 +170,6 @@ class TextTable(ForeignTable):
         return line.split() if mark == " " else line.split(mark)
 
     def _named_cells(self, line: str) -> list[str]:
-        """Return the cells of the line of names, which may have delimiters in quotes."""
         if len(line) > _MAX_LINE_CHARACTERS:
             raise FileError(
                 f"{self} has {len(line)} characters in a line; give a table of numbers, one row a "
@@ -230,7 +228,6 @@ class TextTable(ForeignTable):
                     )
 
     def _culprit(self, lines: list[tuple[int, str]], rows: _Rows) -> FileError:
-        """Return the error of the first line that is no row of numbers."""
         good, bad = 0, len(lines)  # lines[:good] are rows, lines[:bad] are not all
         while bad - good > 1:
             middle = (good + bad) // 2

@@ -161,7 +161,6 @@ class TopicTable(ForeignTable):
 
     @staticmethod
     def _is_foreign_message(found: Sequence[float | None], fields: Sequence[str]) -> bool:
-        """Return whether a message has none of the columns but its time."""
         pairs = zip(found, fields, strict=True)
         return not any(v is not None for v, f in pairs if f != LOG_TIME and not f.endswith("stamp"))
 
@@ -172,7 +171,6 @@ def _columns(names: Sequence[str], rows: list[list[float]]) -> dict[str, FloatAr
 
 
 def _leaves(message: Any, way: str = "", deep: int = 0) -> Iterator[str]:
-    """Yield the paths to the numbers of a message."""
     if deep > _DEEPEST:
         return
     labels = getattr(message, "name", None)
