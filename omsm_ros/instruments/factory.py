@@ -25,10 +25,7 @@ class TracedTransport:
     """
 
     def __init__(
-        self,
-        transport: Transport,
-        path: Path,
-        monotonic: Callable[[], float] = time.monotonic,
+        self, transport: Transport, path: Path, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
         self._transport = transport
         self._path = path
@@ -99,7 +96,7 @@ class TracedTransport:
 
 
 def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """Return the probe that ``values`` of PARAMETERS describe; raises ConfigurationError."""
+    """Return the probe of ``values`` (PARAMETERS); raises ConfigurationError."""
     make = _maker(PROBES, values["device"])
     transport = transport_for(values["port"], values["baud_rate"])
     if values["trace"]:
@@ -109,19 +106,19 @@ def make_device(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
 
 
 def make_axes(values: Values, now_ns: NowNs = time.time_ns) -> StreamDevice:
-    """Return the stream of axes that ``values`` of AXIS_PARAMETERS describe; raises ConfigurationError."""
+    """Return the stream of axes of ``values`` (AXIS_PARAMETERS); raises ConfigurationError."""
     if values["device"] not in STREAMS:
         raise ConfigurationError(f"device {values['device']!r}, expected one of {STREAMS}")
     return make_device(defaults() | dict(values), now_ns)
 
 
 def make_reference(values: Values, now_ns: NowNs = time.time_ns) -> Any:
-    """Return the reference sensor that ``values`` of REFERENCE_PARAMETERS describe; raises ConfigurationError."""
+    """Return the sensor of ``values`` (REFERENCE_PARAMETERS); raises ConfigurationError."""
     return _maker(REFERENCES, values["device"])(values, now_ns)
 
 
 def make_accelerometer(values: Values, now_ns: NowNs = time.time_ns) -> Any:
-    """Return the accelerometer that ``values`` of ACCELEROMETER_PARAMETERS describe; raises ConfigurationError."""
+    """Return the sensor of ``values`` (ACCELEROMETER_PARAMETERS); raises ConfigurationError."""
     return _maker(ACCELEROMETERS, values["device"])(values, now_ns)
 
 

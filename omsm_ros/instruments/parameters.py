@@ -65,10 +65,7 @@ PORT = Parameter(
     "port", "", "serial:///dev/ttyUSB0?baud=921600, tcp://host:port, or a path", required=True
 )
 DEVICE = Parameter(
-    "device",
-    "six_channel",
-    "what is connected: see docs/devices.md",
-    choices=tuple(PROBES),
+    "device", "six_channel", "what is connected: see docs/devices.md", choices=tuple(PROBES)
 )
 RENEW = Parameter(
     "renew",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -82,6 +83,8 @@ class StreamDevice:
     ) -> None:
         """now_ns: the host clock that stamps refer to [ns];  monotonic: for time-outs [s]."""
         self.channels = channels
+        self._decoder: Any = None  # of the protocol, with ``statistics`` and ``reset``
+        self._unread = 0  # bytes that came since the last sample, an idle line's left out
         self._transport = transport
         self._settings = settings
         self._now_ns = now_ns
@@ -194,10 +197,14 @@ class StreamDevice:
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return asdict(self.statistics)
+        decoder = self._decoder
+        return asdict(self.statistics) | (vars(decoder.statistics) if decoder is not None else {})
 
     def _prepare(self) -> None:
         """Set the device up; raises DeviceError."""
+        if self._decoder is not None:
+            self._decoder.reset()
+        self._unread = 0
 
     def _decode(self, data: bytes) -> Samples:
         """Return the samples that ``data`` completes, shape (n,); n may be 0."""
@@ -212,13 +219,8 @@ class StreamDevice:
         return 0.0
 
     def _listen_in(self, silent: float) -> None:
-        """Raise DeviceError if the device is gone, after ``silent`` [s] without a byte."""
-
-    def _check_understood(self, silent: float, unread: int) -> None:
-        """Raise NoSamplesError if bytes keep coming, but for ``silent`` [s] no sample in them.
-
-        unread: bytes that came since the last sample, an idle line's left out
-        """
+        """Raise DeviceError if the device is gone or not understood, after ``silent`` [s]."""
+        unread = self._unread
         if silent > UNREADABLE_S and unread:
             described = f"{self.described_by}, " if self.described_by else ""
             raise NoSamplesError(

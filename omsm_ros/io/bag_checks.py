@@ -309,10 +309,7 @@ class ChunkReader(McapReader):  # type: ignore[misc]
     """Reads an MCAP file chunk by chunk; one without index as rosbags does."""
 
     def messages(
-        self,
-        connections: Collection[Connection],
-        start: int | None = None,
-        stop: int | None = None,
+        self, connections: Collection[Connection], start: int | None = None, stop: int | None = None
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield ``(connection, time of recording [ns], message)`` by time, then by place.
 

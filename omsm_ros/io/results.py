@@ -153,14 +153,7 @@ _ANY = {"type": "object"}
 _COUNT, _NUMBER = ranged(COUNTER), ranged(SIGNAL)
 _ERROR = group({"rms": NUMBER_OR_NULL, "peak_to_valley": NUMBER_OR_NULL})
 _DEVIATION = group({"peak_to_valley": NUMBER_OR_NULL, "rms_area_weighted": NUMBER_OR_NULL})
-_STREAM = group(
-    {
-        "received": _COUNT,
-        "corrected": _COUNT,
-        "counted": each(_COUNT),
-    },
-    pending=_COUNT,
-)
+_STREAM = group({"received": _COUNT, "corrected": _COUNT, "counted": each(_COUNT)}, pending=_COUNT)
 _SOURCE = {
     "source": TEXT, "says": TEXT, "kind": TEXT, "status": TEXT, "unit": TEXT,
     "reason": TEXT, "standard_uncertainty": NUMBER_OR_NULL, "height": NUMBER_OR_NULL,
@@ -194,12 +187,7 @@ _FORM = group(
         temperature=or_none(_ANY),
     ),
     prediction=or_none(
-        group(
-            {},
-            limits=rows(_LIMIT),
-            not_evaluated=TEXTS,
-            speed_factor=NUMBER_OR_NULL,
-        )
+        group({}, limits=rows(_LIMIT), not_evaluated=TEXTS, speed_factor=NUMBER_OR_NULL)
     ),
     dynamic_error_before=or_none(_ERROR),
     dynamic_error_after=or_none(_ERROR),

@@ -94,11 +94,7 @@ class BackgroundWorker:
             self.waiting -= 1
 
     def serve(
-        self,
-        undo: ExitStack,
-        kind: Any,
-        name: str,
-        answer: Callable[[Any, Any], Awaitable[None]],
+        self, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], Awaitable[None]]
     ) -> None:
         """Offer the service ``name``, as ``running.serve``, with an asynchronous ``answer``."""
 

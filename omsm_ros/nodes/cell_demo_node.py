@@ -295,11 +295,7 @@ def _axes_of(plan: Demonstration) -> str:
 
 
 def _scan(
-    node: DemoNode,
-    plan: Demonstration,
-    motion: str,
-    samples: int,
-    progress: Callable[[int], None],
+    node: DemoNode, plan: Demonstration, motion: str, samples: int, progress: Callable[[int], None]
 ) -> None:
     drivers = {"/omsm/axes": _axes_of(plan), "/omsm/confocal": "confocal_driver"}
     earlier = {topic: node.value(driver, "blocks") for topic, driver in drivers.items()}
@@ -323,11 +319,7 @@ def _scan(
 
 
 def _follow(
-    node: DemoNode,
-    who: str,
-    before: Mapping[str, int],
-    total: int,
-    progress: Callable[[int], None],
+    node: DemoNode, who: str, before: Mapping[str, int], total: int, progress: Callable[[int], None]
 ) -> None:
     """Wait until each of the counts has grown by ``total`` from what it was ``before``."""
 

@@ -112,11 +112,7 @@ class CorrectionState:
         self._oldest_ns = 0
 
     def report(
-        self,
-        corrector: Corrector | None,
-        now: float,
-        cpu: float,
-        motion: LiveOffset | None = None,
+        self, corrector: Corrector | None, now: float, cpu: float, motion: LiveOffset | None = None
     ) -> StateReport:
         """Return the report; ``corrector`` is None without a calibration.
 

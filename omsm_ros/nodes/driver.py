@@ -21,12 +21,7 @@ from omsm_ros.core.calibration.calibration import PROBE
 from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.blocks import BlockPair
-from omsm_ros.instruments.factory import (
-    make_accelerometer,
-    make_axes,
-    make_device,
-    make_reference,
-)
+from omsm_ros.instruments.factory import make_accelerometer, make_axes, make_device, make_reference
 from omsm_ros.instruments.parameters import (
     ACCELEROMETER_PARAMETERS,
     AXIS_PARAMETERS,

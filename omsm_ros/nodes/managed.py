@@ -126,9 +126,7 @@ class DeclaredParameters:
         return SetParametersResult(successful=True)
 
 
-def _rejecting_untyped(
-    set_them: Callable[[Any, Any], Any],
-) -> Callable[[Any, Any], Any]:
+def _rejecting_untyped(set_them: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
     """Return a callback that refuses a value of unknown type, which rclpy does not answer."""
 
     def answer(request: Any, response: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -71,9 +72,13 @@ class ViewerNode(ManagedNode):
         self._server.start()
         undo.callback(self._server.stop)
         self.get_logger().info(f"look at {self._shown}")
-        listen(self, undo, PointCloud2, "points", self._on_points)
-        listen(self, undo, AccelerationBlock, "acceleration", self._on_acceleration)
-        listen(self, undo, Calibration, "calibration", self._on_calibration, LATCHED_QOS)
+        view, convert = self._view, message_mapping
+        shows = partial(self._show, convert.cloud_array, view.add_points)
+        listen(self, undo, PointCloud2, "points", shows)
+        shows = partial(self._show, convert.acceleration_block, view.add_acceleration)
+        listen(self, undo, AccelerationBlock, "acceleration", shows)
+        shows = partial(self._show, convert.calibration, view.set_calibration)
+        listen(self, undo, Calibration, "calibration", shows, LATCHED_QOS)
         heard = self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 100)
         undo.callback(self.destroy_subscription, heard)
 
@@ -87,21 +92,11 @@ class ViewerNode(ManagedNode):
         """Return the address of the page, and the number of messages refused."""
         return StateReport(f"look at {self._shown}", {"refused_messages": self._refused})
 
-    def _on_points(self, message: Any, info: MessageInfo) -> None:
+    def _show(
+        self, convert: Callable[..., Any], show: Callable[..., Any], message: Any, _: MessageInfo
+    ) -> None:
         try:
-            self._view.add_points(message_mapping.cloud_array(message))
-        except OmsmError as err:
-            self._warn(str(err))
-
-    def _on_acceleration(self, message: Any, info: MessageInfo) -> None:
-        try:
-            self._view.add_acceleration(message_mapping.acceleration_block(message))
-        except OmsmError as err:
-            self._warn(str(err))
-
-    def _on_calibration(self, message: Any, info: MessageInfo) -> None:
-        try:
-            self._view.set_calibration(message_mapping.calibration(message))
+            show(convert(message))
         except OmsmError as err:
             self._warn(str(err))
 

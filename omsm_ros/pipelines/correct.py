@@ -42,12 +42,7 @@ from omsm_ros.errors import BagError, ConfigurationError, DataError, Notice
 from omsm_ros.io.results import PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import (
-    MAX_PATH_SAMPLES,
-    SCAN_TOPICS,
-    Recording,
-    scan_data,
-)
+from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording, scan_data
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import quantity
 

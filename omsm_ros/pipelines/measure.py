@@ -43,12 +43,7 @@ from omsm_ros.errors import DataError, Notice
 from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.results import save_fields
 from omsm_ros.io.topics import AnyBag
-from omsm_ros.pipelines.adjust import (
-    conformity_entry,
-    figures_entry,
-    priors_of,
-    verdict_entry,
-)
+from omsm_ros.pipelines.adjust import conformity_entry, figures_entry, priors_of, verdict_entry
 from omsm_ros.pipelines.correct import Admission, Correction, StampJoining, correct_bag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
@@ -212,10 +207,7 @@ def _registered_figures(form: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def live_verdict(
-    corrector: Corrector,
-    calibration: Calibration,
-    stated: MachineSources,
-    accuracy: float | None,
+    corrector: Corrector, calibration: Calibration, stated: MachineSources, accuracy: float | None
 ) -> dict[str, Any]:
     """Return the verdict on the points so far, and their uncertainty (k = 2, rms) [m]."""
     shared = [size for name, size in corrector.budget.items() if name not in RANDOM]

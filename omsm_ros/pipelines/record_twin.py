@@ -17,13 +17,7 @@ from omsm_ros.io.files import save_text
 from omsm_ros.readable import count, quantity
 from omsm_ros.twin.cell import Recording, blocks_of, pieces
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import (
-    Scenario,
-    planned_test_of,
-    scan_of,
-    source_recording,
-    spiral_of,
-)
+from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, source_recording, spiral_of
 
 _BLOCK_SAMPLES = 1000
 # Bounds memory to half a gigabyte with all disturbances.

@@ -46,13 +46,7 @@ def path_check_of(
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
     distance = _bridged(record)
     _check_follows(predicted, -distance / calibration.static_gain)
-    return check_path(
-        record.z,
-        distance,
-        predicted,
-        calibration.static_gain,
-        record.sample_period,
-    )
+    return check_path(record.z, distance, predicted, calibration.static_gain, record.sample_period)
 
 
 def _check_follows(predicted: FloatArray, seen: FloatArray) -> None:

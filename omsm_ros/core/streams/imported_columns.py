@@ -12,13 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import (
-    AxisBlock,
-    DistanceBlock,
-    FloatArray,
-    IntArray,
-    Status,
-)
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray, Status
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import COUNTER, INTENSITY_READING, SAMPLE_PERIOD, STAMP, TIME
 from omsm_ros.units import DATE, NANOSECONDS_PER_S, SINCE_1970, contradicts_unit

@@ -267,9 +267,7 @@ def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def _by_stamp(
-    axes: Sequence[AxisBlock],
-    distance: Sequence[DistanceBlock],
-    reference: Sequence[DistanceBlock],
+    axes: Sequence[AxisBlock], distance: Sequence[DistanceBlock], reference: Sequence[DistanceBlock]
 ) -> MotionRecord:
     """Interpolate the axis at the samples of the grid, and pair both by counter."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period

@@ -291,11 +291,7 @@ class AnalogAccelerometer(AnalogDevice):
     """Reads three axes; an IEPE sensor has no response at 0 Hz, and no offset is removed."""
 
     def __init__(
-        self,
-        source: Converter,
-        settings: BlockSettings,
-        sensitivity: float,
-        **clocks: Any,
+        self, source: Converter, settings: BlockSettings, sensitivity: float, **clocks: Any
     ) -> None:
         """sensitivity: [V/(m/s²)]; the paper's PCB 356A17 has 0.5 V/g."""
         super().__init__(source, settings, **clocks)

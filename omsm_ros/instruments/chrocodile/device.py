@@ -13,12 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.errors import (
-    ConfigurationError,
-    DeviceError,
-    DeviceTimeoutError,
-    NoSamplesError,
-)
+from omsm_ros.errors import ConfigurationError, DeviceError, DeviceTimeoutError, NoSamplesError
 from omsm_ros.instruments.blocks import (
     PERIOD_TOLERANCE,
     BlockPair,
@@ -26,10 +21,7 @@ from omsm_ros.instruments.blocks import (
     Channels,
     wrapping,
 )
-from omsm_ros.instruments.chrocodile.protocol import (
-    QUERY,
-    Answer,
-)
+from omsm_ros.instruments.chrocodile.protocol import QUERY, Answer
 from omsm_ros.instruments.chrocodile.telegram import (
     DISTANCE,
     ENCODER_RANGE,
@@ -47,12 +39,7 @@ from omsm_ros.instruments.chrocodile.telegram import (
     distance_of,
 )
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
-from omsm_ros.instruments.parameters import (
-    Values,
-    axes_of,
-    block_settings,
-    probe_reading_of,
-)
+from omsm_ros.instruments.parameters import Values, axes_of, block_settings, probe_reading_of
 from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Transport

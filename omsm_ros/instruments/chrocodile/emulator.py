@@ -15,10 +15,8 @@ and clients.
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -121,18 +119,16 @@ class ChrocodileEmulator(Instrument):
         line: InstrumentLink,
         source: Source | None = None,
         *,
-        triggered: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-        seed: int = 1,
         probe: ProbeReading | None = None,
         axes: tuple[AxisScaling, ...] = AXIS_SCALING,
         sync: bytes = SYNC,
+        **options: Any,
     ) -> None:
         self._probe = probe or ProbeReading()
         self._axes = axes
         self._sync = sync
         self._requests = RequestParser()
-        super().__init__(line, source, triggered=triggered, clock=clock, seed=seed)
+        super().__init__(line, source, **options)
 
     def reset(self) -> None:
         """Go back to the factory's settings: ASCII, distance and intensity, 1 kHz, free running."""

@@ -52,10 +52,6 @@ class ChrocodilePacketDevice(Chrocodile):
         self._commands: list[PacketCommand] = []
         self._said, self._answered = b"", False  # it has answered with a value of its own
 
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        return super().counts() | vars(self._decoder.statistics)
-
     def _begin(self) -> None:
         self._decoder.reset()
         self._early.clear()

@@ -90,15 +90,11 @@ class BlockStreamDevice(StreamDevice):
         super().__init__(transport, settings, channels, counting, *clocks)
         self._decoder = BlockDecoder(kind, self._frame)
         self._head_bytes, self._frame_bytes = HEADERS[kind].size, 1
-        self._unread, self._undescribed = 0, False
+        self._undescribed = False
         self._next: int | None = None  # counter of the next block
         self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
         self._commands, self._answers_within = commands, patience
         self._identity: dict[str, str] = {}
-
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        return super().counts() | vars(self._decoder.statistics)
 
     @property
     def identity(self) -> dict[str, str]:
@@ -106,9 +102,9 @@ class BlockStreamDevice(StreamDevice):
         return self._identity
 
     def _prepare(self) -> None:
-        self._decoder.reset()
+        super()._prepare()
         self._doubtful, self._next = [], None
-        self._unread, self._undescribed = 0, False
+        self._undescribed = False
         if self._commands is None:
             return
         within = self._answers_within
@@ -171,7 +167,7 @@ class BlockStreamDevice(StreamDevice):
                 f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not "
                 "describe their content; read this controller over RS-422 (device: confocaldt)"
             )
-        self._check_understood(silent, self._unread)
+        super()._listen_in(silent)
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         """Return the fields of a frame, by the flags in the block's header."""
@@ -246,17 +242,15 @@ class ConfocalDtDevice(StreamDevice):
         self._wanted = settings
         self._decoder = SerialDecoder(len(settings.values))
         self._believed = PlausibleValueFilter(len(settings.values))
-        self._counted = self._unread = 0
+        self._counted = 0
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        waited = {"unconfirmed": self._believed.unconfirmed}
-        return super().counts() | vars(self._decoder.statistics) | waited
+        return super().counts() | {"unconfirmed": self._believed.unconfirmed}
 
     def _prepare(self) -> None:
-        self._decoder.reset()
+        super()._prepare()
         self._believed.reset()
-        self._unread = 0
         if "counter" not in self._wanted.values:
             self._tracker.restart_count()
 
@@ -292,7 +286,7 @@ class ConfocalDtDevice(StreamDevice):
     def _listen_in(self, silent: float) -> None:
         if "counter" not in self._wanted.values:
             self._tracker.restart_count()
-        self._check_understood(silent, self._unread)
+        super()._listen_in(silent)
         _check_not_silent(self._transport.name, self._wanted, silent)
 
 

@@ -10,20 +10,13 @@ channels, linearisation, most commands (they are answered as unknown).
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from omsm_ros.core.streams.blocks import Status
-from omsm_ros.instruments.emulator import (
-    AXIS_SCALING,
-    Instrument,
-    InstrumentLink,
-    Measured,
-    Source,
-)
+from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument, InstrumentLink, Measured, Source
 from omsm_ros.instruments.emulator_factory import (
     OWN_ENCODERS,
     TWIN_READING,
@@ -64,16 +57,14 @@ class Controller(Instrument):
         line: InstrumentLink,
         source: Source | None = None,
         *,
-        triggered: bool = False,
-        clock: Callable[[], float] = time.monotonic,
-        seed: int = 1,
         probe: ProbeReading | None = None,
         commands: InstrumentLink | None = None,
+        **options: Any,
     ) -> None:
         self._probe = probe or ProbeReading()
         self._commands = commands
         self._typed = b""
-        super().__init__(line, source, triggered=triggered, clock=clock, seed=seed)
+        super().__init__(line, source, **options)
 
     def reset(self) -> None:
         """Go back to the settings after switching on."""
@@ -207,11 +198,7 @@ def _blocks(
 
 SERIAL = Emulated(
     partial(ConfocalDtSerialEmulator, probe=TWIN_READING, width=3),
-    {
-        "signals": "distance intensity counter",
-        "trigger": "each",
-        "probe.zero": TWIN_READING.zero,
-    },
+    {"signals": "distance intensity counter", "trigger": "each", "probe.zero": TWIN_READING.zero},
     # RS-422 carries the distance alone, so the axes come from a device of their own.
     second=SecondDevice("axis_driver", SixChannelEmulator, {"device": "six_channel"} | SCALES),
     baud_rate=691_200,

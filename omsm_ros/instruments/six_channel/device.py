@@ -63,19 +63,10 @@ class GenericStreamDevice(StreamDevice):
         self.unknown_status = 0
         self._scaling = settings.scaling
         self._decoder = FrameDecoder()
-        self._unread = 0
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""
-        return (
-            super().counts()
-            | vars(self._decoder.statistics)
-            | {"unknown_status": self.unknown_status}
-        )
-
-    def _prepare(self) -> None:
-        self._decoder.reset()
-        self._unread = 0
+        return super().counts() | {"unknown_status": self.unknown_status}
 
     def _decode(self, data: bytes) -> Samples:
         frames = self._decoder.feed(data)
@@ -83,9 +74,6 @@ class GenericStreamDevice(StreamDevice):
         self._unread = 0 if len(frames) else self._unread + len(data) - data.count(0)
         self.unknown_status += int(np.sum(~known_status(frames)))
         return samples_of(frames, self._scaling)
-
-    def _listen_in(self, silent: float) -> None:
-        self._check_understood(silent, self._unread)
 
 
 def samples_of(frames: FrameArray, scaling: StreamScaling) -> Samples:
@@ -129,8 +117,6 @@ class CsvStreamDevice(StreamDevice):
         self, transport: Transport, settings: CsvSettings | None = None, *clocks: Any
     ) -> None:
         settings = settings or CsvSettings()
-        self._decoder = CsvDecoder(settings.columns, _MOST_PARTS // settings.parts)
-        self._unread = 0
         self._columns, self._probe = settings.columns, settings.scaling.probe
         self._parts = settings.parts
         timed = "device_time" in settings.columns or settings.clocked
@@ -141,14 +127,7 @@ class CsvStreamDevice(StreamDevice):
         channels = Channels("distance" in settings.columns, axes, timed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
         super().__init__(transport, settings, channels, counting, *clocks)
-
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        return super().counts() | vars(self._decoder.statistics)
-
-    def _prepare(self) -> None:
-        self._decoder.reset()
-        self._unread = 0
+        self._decoder = CsvDecoder(settings.columns, _MOST_PARTS // settings.parts)
 
     def _decode(self, data: bytes) -> Samples:
         rows = self._decoder.feed(data)
@@ -175,9 +154,6 @@ class CsvStreamDevice(StreamDevice):
             if name in self._columns:
                 samples["counts"][:, index] = np.rint(rows[name] * self._parts).astype(np.int64)
         return samples
-
-    def _listen_in(self, silent: float) -> None:
-        self._check_understood(silent, self._unread)
 
 
 def _in_parts(axis: AxisScaling, parts: int) -> AxisScaling:

@@ -222,9 +222,5 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
     scale = LengthUnits(metres, metres) if metres else needed(units, what)
     dx, dy = (size / count for size, count in zip(found.physical_sizes, height.shape, strict=True))
     return HeightGrid(
-        height=height.T * scale.height,
-        x0=0.0,
-        y0=0.0,
-        dx=dx * scale.lateral,
-        dy=dy * scale.lateral,
+        height=height.T * scale.height, x0=0.0, y0=0.0, dx=dx * scale.lateral, dy=dy * scale.lateral
     ).points((f"read by SurfaceTopography as {type(reader).__name__}",))

@@ -154,14 +154,8 @@ def draw_correlation(axes: Axes, left: FloatArray) -> None:
 
 def order(candidates: Sequence[CandidateFit], chosen: Structure | None) -> Figure:
     """Draw the residual of each candidate over its number of parameters."""
-    made, axes = style.figure(6.1, 2.7)
-    _draw_candidates(axes[0, 0], candidates, chosen)
-    return made
-
-
-def _draw_candidates(
-    axes: Axes, candidates: Sequence[CandidateFit], chosen: Structure | None
-) -> None:
+    made, grid = style.figure(6.1, 2.7)
+    axes = grid[0, 0]
     size = np.asarray([c.structure.parameters for c in candidates])
     rms = np.asarray([c.rms_m for c in candidates]) / NANOMETRE_M
     if rms.max() > 3 * rms.min() > 0:
@@ -179,6 +173,7 @@ def _draw_candidates(
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.legend_above(axes)
     style.label(axes, x="parameters of the dynamics", y="residual rms [nm]", title="Candidates")
+    return made
 
 
 # Figures of a model between any two sampled quantities, in the units of the record.
