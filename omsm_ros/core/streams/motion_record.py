@@ -283,7 +283,15 @@ def _by_stamp(
         carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)
         second = [replace(g, distance=c.z) for g, c in zip(grid, carried, strict=True)]
     record = _covered(_by_counter(moved, grid, second, probe_period / finer))
-    counts = _unfilled(record.counts, distance, finer)
+    received = sum(map(len, distance))
+    duplicates, unmatched = (record.counts[name] // finer for name in ("duplicates", "unmatched"))
+    paired = record.counts["paired"]
+    counts = dict(record.counts) | {
+        "received": received,
+        "duplicates": duplicates,
+        "unmatched": unmatched,
+        "not_ok": received - duplicates - unmatched - paired,
+    }
     return replace(record, counts=counts, by_stamps=True)
 
 
@@ -331,21 +339,6 @@ def _covered(record: MotionRecord) -> MotionRecord:
         reference=None if record.reference is None else record.reference[part],
         z_lost=None if np.all(known[part]) else ~known[part],
     )
-
-
-def _unfilled(
-    counts: Mapping[str, int], distance: Sequence[DistanceBlock], finer: int
-) -> dict[str, int]:
-    """Return the counts of the readings, without the grid samples between them."""
-    received = sum(map(len, distance))
-    duplicates, unmatched = (counts[name] // finer for name in ("duplicates", "unmatched"))
-    paired = counts["paired"]
-    return dict(counts) | {
-        "received": received,
-        "duplicates": duplicates,
-        "unmatched": unmatched,
-        "not_ok": received - duplicates - unmatched - paired,
-    }
 
 
 # A block needs 2 kB besides its samples, which is much for a short block: that many blocks are
