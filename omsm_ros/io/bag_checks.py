@@ -57,10 +57,7 @@ DAMAGED = "it is damaged; save what is whole with 'omsm inspect --repair', or re
 
 @contextmanager
 def bag_errors(path: Path, remedy: str) -> Iterator[None]:
-    """Raise BagError for any exception that the libraries raise on a bag's bytes.
-
-    These are many: struct.error, ZstdError, RuntimeError, AssertionError, …
-    """
+    """Raise BagError for any of the many exceptions that the libraries raise on a bag's bytes."""
     try:
         yield
     except BagError:

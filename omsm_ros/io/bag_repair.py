@@ -147,10 +147,7 @@ class _Copy:
             yield place, kind, body
 
     def _within(self, kind: int, body: bytes) -> list[McapRecord]:
-        """Return the definitions, channels and messages of a record.
-
-        Raises an exception if it is damaged.
-        """
+        """Return definitions, channels and messages of a record; any exception if it is damaged."""
         stream = ReadDataStream(BytesIO(body))
         if kind == Opcode.SCHEMA:
             return [Schema.read(stream)]

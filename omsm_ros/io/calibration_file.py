@@ -66,10 +66,7 @@ def load_calibration(path: Path | str) -> Calibration:
 
 
 def load_for_others(path: Path | str) -> Calibration:
-    """Read ``CAL.json`` for a caller that may not see the file: errors show none of its content.
-
-    Raises CalibrationError.
-    """
+    """Read ``CAL.json`` for a caller that may not see it; a CalibrationError shows no content."""
     text = _text_of(path)
     try:
         return _calibration_in(text, path)
@@ -202,10 +199,7 @@ class CalibrationFolder:
 
 
 def since(path: Path) -> int:
-    """Return since when the calibration at ``path``, a file or a link, is in force [ns].
-
-    Raises CalibrationError if there is none.
-    """
+    """Return since when the calibration at ``path`` is in force [ns]; CalibrationError without."""
     try:
         return os.lstat(path).st_mtime_ns
     except (OSError, ValueError) as err:

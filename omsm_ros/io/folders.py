@@ -130,10 +130,7 @@ def _refuse_foreign(target: Path, names: Sequence[str]) -> None:
 
 
 def read_result(path: Path, what: str) -> dict[str, Any]:
-    """Return the object in a JSON file of results, such as ``summary.json``, called ``what``.
-
-    Raises FileError if it is missing, too large, or no JSON object.
-    """
+    """Return the object of a JSON file, ``what``; FileError if missing, too large or no object."""
     text = read_text(path, MAX_RESULT_BYTES, FileError, what)
     return json_and_yaml.object_of(text, FileError, f"{what} {str(path)!r}")
 

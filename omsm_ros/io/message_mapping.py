@@ -160,10 +160,7 @@ def _json_object(name: str, text: str) -> dict[str, object]:
 
 
 def cloud_array(message: Any) -> NDArray[np.void]:
-    """Return the points of our own PointCloud2 as a structured array (n,) of ``POINT_DTYPE``.
-
-    Raises DataError for a cloud of another layout.
-    """
+    """Return our PointCloud2 as a structured array (n,) of ``POINT_DTYPE``; or DataError."""
     if message.point_step != POINT_DTYPE.itemsize or message.is_bigendian:
         raise DataError(
             f"cloud with point_step {message.point_step!r}, expected {POINT_DTYPE.itemsize}; give "
@@ -279,10 +276,7 @@ _SCHEMA = form({**_SHAPE, "height_line": _LINE_OF_HEIGHT}, tuple(_SHAPE))
 
 
 def vibration_levels(message: Any) -> dict[str, Any]:
-    """Return the levels of the vibration monitor, see ``VibrationLevels.entry``, alarm and limit.
-
-    Raises BagError for a text with another content.
-    """
+    """Return ``VibrationLevels.entry``, alarm and limit; BagError for another content."""
     text = message.data
     if len(text) > MAX_CHARACTERS:
         raise BagError(

@@ -273,10 +273,7 @@ def read_form(path: Path) -> dict[str, Any]:
 
 
 def read_curves(path: Path) -> dict[str, Any]:
-    """Return the content of ``curves.json``: profiles [m], densities [m⁴].
-
-    Raises FileError as :func:`read_form`, and for columns of a curve with different lengths.
-    """
+    """Return ``curves.json``: profiles [m], densities [m⁴]; FileError as :func:`read_form`."""
     curves, what = read_result(path, "curves"), f"curves {str(path)!r}"
     check_form(curves, _CURVES, FileError, what)
     density = curves.get("psd") or {}

@@ -90,10 +90,7 @@ class RunningMap:
         self._next_generation = generation
 
     def add(self, x: FloatArray, y: FloatArray, values: FloatArray) -> int:
-        """Add points at ``x``, ``y`` (n,) [m] with ``values`` (n, k); return their number.
-
-        Points with values that are not finite are left out.
-        """
+        """Add ``values`` (n, k) at ``x``, ``y`` (n,) [m]; return the number of finite ones."""
         good = np.isfinite(x) & np.isfinite(y) & np.all(np.isfinite(values), axis=1)
         x, y, values = x[good], y[good], values[good]
         if not len(x):
@@ -253,10 +250,7 @@ class LiveView:
         self._bin, self._bin_start = [], now
 
     def add_state(self, name: str, level: str, message: str, values: Mapping[str, str]) -> None:
-        """Enter the state of a node; level "OK", "WARN", "STALE" or "ERROR".
-
-        Raises DataError for more nodes than a cell has.
-        """
+        """Enter a node's state: "OK", "WARN", "STALE" or "ERROR"; DataError for too many nodes."""
         name = name[:_MOST_NAME]
         kept = {key[:_MOST_NAME]: value[:_MOST_VALUE] for key, value in values.items()}
         message = message[:_MOST_MESSAGE]

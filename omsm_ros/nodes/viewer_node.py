@@ -117,10 +117,7 @@ class ViewerNode(ManagedNode):
 
 
 def load_token(path: str) -> str:
-    """Return the token in a file of one line.
-
-    Raises ConfigurationError for a file that others may read, or that holds no token.
-    """
+    """Return the token in a file of one line that others may not read; or ConfigurationError."""
     text = read_text(path, _MAX_TOKEN_BYTES, FileError, "token file").strip()
     if os.stat(path).st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise ConfigurationError(

@@ -214,10 +214,7 @@ class Demonstration:
         return self.out / NOMINAL
 
     def prepare(self) -> None:
-        """Make the folder, and remove the results of an earlier demonstration.
-
-        Raises OmsmError if it holds files and is not the folder of a demonstration.
-        """
+        """Make the folder without earlier results; OmsmError if it is not of a demonstration."""
         _ = self.disturbances  # report an unreadable file before removing anything
         mark = self.out / _MARK
         # Scan and calibration of a real machine have the same file names.

@@ -222,10 +222,7 @@ def save_model(path: Path | str, model: SampledModel) -> None:
 
 
 def load_model(path: Path | str) -> SampledModel:
-    """Read ``MODEL.json``, of schema 1 too.
-
-    Raises CalibrationError if it is malformed or cannot be computed with.
-    """
+    """Read ``MODEL.json``; CalibrationError if malformed or not to be computed with."""
     what = f"model {str(path)!r}"
     text = read_text(path, _MAX_BYTES, CalibrationError, "model")
     content = json_and_yaml.object_of(text, CalibrationError, what)

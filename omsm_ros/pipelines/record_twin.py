@@ -71,10 +71,7 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
 def record_sources(
     out: Path, scenario: Scenario, kinds: Sequence[str], disturbance_file: Path | None = None
 ) -> dict[str, int]:
-    """Write one bag for each of ``kinds`` into ``out``, for ``omsm sources``; return its samples.
-
-    Raises BagError if a bag of that name exists.
-    """
+    """Write a bag for each of ``kinds``; return its samples. BagError if one exists."""
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
     bags_of = {kind: out / f"{kind}.mcap" for kind in kinds}
     return {

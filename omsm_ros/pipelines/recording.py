@@ -79,10 +79,7 @@ class Recording:
         )
 
     def scan_path(self) -> ScanPath:
-        """Return the start of the path, with the probe's readings if there are any.
-
-        Raises BagError without a position of Z.
-        """
+        """Return the start of the path, with readings if any; BagError without a position of Z."""
         reader = ScanPathReader(MAX_PATH_SAMPLES)
         for _, block in self.stream(*filter(self.holds, SCAN_TOPICS)):
             reader.add(block)

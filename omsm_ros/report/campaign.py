@@ -243,10 +243,7 @@ _COLOURS = (style.AFTER, style.BEFORE, "#009E73", "#CC79A7", "#E69F00", "#56B4E9
 
 
 def draw(machines: Sequence[Any]) -> bytes:
-    """Draw lag, static gain and form over time (PNG), one colour per machine.
-
-    machines: as of ``CatalogueHistory``;  rejected calibrations are crosses
-    """
+    """Draw lag, gain and form over time (PNG), a colour per machine; crosses are rejected."""
     made, axes = style.figure(10.0, 7.0, rows=3, sharex=True)
     lag, gain, form = axes[:, 0]
     for i, machine in enumerate(machines):

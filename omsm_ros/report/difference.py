@@ -121,10 +121,7 @@ CAPTIONS = {
 
 
 def render(title: str, date: str, facts: Mapping[str, Any], found: Comparison) -> str:
-    """Return the page as HTML; all text from outside is escaped.
-
-    facts: the content of ``difference.json``
-    """
+    """Return the page of ``difference.json`` (``facts``) as HTML; all text is escaped."""
     drawn = profiles(found)
     if found.agreement is not None:
         drawn["terms"] = terms(found.agreement.terms)

@@ -66,10 +66,7 @@ class PlannedPath:
 
 
 def averaged(at: FloatArray, time: FloatArray, values: FloatArray, ramp: float) -> FloatArray:
-    """Return the polygon through ``values`` (n,) at ``time`` (n,), averaged over ``ramp`` [s].
-
-    In closed form, from the integral of the polygon.
-    """
+    """Return the polygon through ``values`` (n,) at ``time`` (n,), averaged over ``ramp`` [s]."""
     step = time[1] - time[0]
     if ramp <= 0:
         return np.asarray(np.interp(at, time, values))

@@ -291,10 +291,7 @@ def plan_steps(
 
 
 def plan_csv(plan: StepPlan, period: float) -> str:
-    """Return ``time_s,z_m`` lines every ``period`` [s], a header first.
-
-    Raises ConfigurationError for more than a million lines.
-    """
+    """Return ``time_s,z_m`` lines every ``period`` [s]; ConfigurationError beyond a million."""
     if plan.duration > _MOST_LINES * period:
         raise ConfigurationError(
             "kinematics.lines",

@@ -322,10 +322,7 @@ def _as_axis(block: DistanceBlock) -> AxisBlock:
 
 
 def _covered(record: MotionRecord) -> MotionRecord:
-    """Return the record from the first to the last sample at which the axis is known.
-
-    Raises DataError if there is none.
-    """
+    """Return the record from the first to the last known sample of the axis; or DataError."""
     known = np.ones(len(record), np.bool_) if record.z_lost is None else ~record.z_lost
     places = np.flatnonzero(known)
     if not len(places):

@@ -82,10 +82,7 @@ def stamps_of(blocks: Sequence[Block]) -> IntArray:
 
 
 def fit_clock(blocks: Sequence[Block]) -> StampClock:
-    """Return the line through the stamps of the blocks of one session.
-
-    Raises DataError if the stamps contradict the blocks' sample period.
-    """
+    """Return the line through the stamps of a session; DataError if they contradict the period."""
     nominal = blocks[0].sample_period * NANOSECONDS_PER_S
     stamps = stamps_of(blocks)
     clock = StampClock.through(stamps, nominal)

@@ -101,10 +101,7 @@ class Layout:
 
     @classmethod
     def of(cls, signals: Sequence[int], sync: bytes = SYNC) -> Layout:
-        """Return the layout of a selection by `$SODX`, after the table ``SIGNALS``.
-
-        Raises ConfigurationError for a signal that is not in the table.
-        """
+        """Return the layout of a selection by `$SODX`; ConfigurationError for an unknown signal."""
         if unknown := [number for number in signals if number not in SIGNALS]:
             raise ConfigurationError(
                 f"signals {unknown!r} are not in the table; the device must describe them ($DTF)"

@@ -34,10 +34,7 @@ _PCD_KINDS = {"F": "f", "I": "i", "U": "u"}
 
 
 def read_ply(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read the vertices of a PLY file; metres if it is one of ours, else ``units``.
-
-    Raises FileError for another or an incomplete file, or one without any unit.
-    """
+    """Read the vertices of a PLY file; metres if ours, else ``units``. FileError if incomplete."""
     what = f"cloud {str(path)!r}"
     with open_regular(path, FileError, "cloud") as stream:
         lines = _header(stream, "end_header", what)
@@ -50,10 +47,7 @@ def read_ply(path: Path, units: LengthUnits | None) -> MeasuredPoints:
 
 
 def read_pcd(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read the points of a PCD file; metres if it is one of ours, else ``units``.
-
-    Raises FileError for another or an incomplete file, or one without any unit.
-    """
+    """Read the points of a PCD file; metres if ours, else ``units``. FileError if incomplete."""
     what = f"cloud {str(path)!r}"
     with open_regular(path, FileError, "cloud") as stream:
         lines = _header(stream, "DATA ", what)
