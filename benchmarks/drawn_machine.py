@@ -15,13 +15,7 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.model_errors.families import CREEP, MODE
 from omsm_ros.core.surface.nominal import PAPER_MIRROR_RADIUS_M
 from omsm_ros.twin.disturbances import Disturbances, VibrationLine
-from omsm_ros.twin.machine_errors import (
-    Drift,
-    Harmonic,
-    MachineErrors,
-    SpindleError,
-    Straightness,
-)
+from omsm_ros.twin.machine_errors import Drift, Harmonic, MachineErrors, SpindleError, Straightness
 from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.sensors import ClockErrors, EncoderErrors, Pitch
@@ -161,9 +155,7 @@ def _of_both(draw: _Draw) -> Disturbances:
             creep=(Creep(fraction=draw.normal(PRIORS[CREEP]), time_constant_s=5.0),),
             soft_modes=(
                 SoftMode(
-                    frequency_hz=8.0,
-                    damping_ratio=0.05,
-                    participation=draw.normal(PRIORS[MODE]),
+                    frequency_hz=8.0, damping_ratio=0.05, participation=draw.normal(PRIORS[MODE])
                 ),
             ),
             backlash_m=abs(draw.normal(1e-9)),

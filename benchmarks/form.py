@@ -234,10 +234,7 @@ def _map() -> list[Row]:
     portion = PointBatch(points.x, points.y, points.height, np.empty((0, len(points))))
     found = analyse_form(Flat(), lambda: [portion], ("piston", "tip", "tilt"), even=True)
     table = []
-    for figure, value, bar in (
-        ("peak to valley", 8.95, 0.01),
-        ("rms", 1.52, 0.01),
-    ):
+    for figure, value, bar in (("peak to valley", 8.95, 0.01), ("rms", 1.52, 0.01)):
         rest = without_second_order(found.map).deviation
         mine = float(np.ptp(rest) if figure == "peak to valley" else np.std(rest))
         off = abs(mine / NANOMETRE_M - value)

@@ -11,11 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from benchmarks.against_truth import (
-    band_held,
-    coverage,
-    rejected,
-)
+from benchmarks.against_truth import band_held, coverage, rejected
 from benchmarks.cramer_rao import response_bounds
 from benchmarks.row import Row, at_least, at_most, shown
 from benchmarks.twin_motions import respond

@@ -90,11 +90,7 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
         start = time.monotonic()
         sent = _publish(node, publishers, turn, rate, round(duration * rate / size))
         spent = time.monotonic() - start
-        node.wait_until(
-            "the last block",
-            lambda: _received(node) >= sent,
-            lambda: _received(node),
-        )
+        node.wait_until("the last block", lambda: _received(node) >= sent, lambda: _received(node))
         used = _processor_time(processes.pid("corrector")) - used
         found = _account(node, sent)
         node.destroy_node()

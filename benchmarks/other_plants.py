@@ -9,14 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from benchmarks.against_truth import (
-    band_held,
-    inside,
-    mass_errors,
-    mode_errors,
-    over_stated,
-    worst,
-)
+from benchmarks.against_truth import band_held, inside, mass_errors, mode_errors, over_stated, worst
 from benchmarks.identification import record_once, rms, seeds
 from benchmarks.row import Row, at_least, at_most, between
 from omsm_ros.core.calibration.calibration import Calibration

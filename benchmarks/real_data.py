@@ -293,13 +293,7 @@ def _against_peers(same: list[dict[str, object]]) -> Row:
 
 
 def _row(record: str, order: int, method: str, value: float, seconds: float) -> dict[str, object]:
-    return {
-        "record": record,
-        "order": order,
-        "method": method,
-        "score": value,
-        "seconds": seconds,
-    }
+    return {"record": record, "order": order, "method": method, "score": value, "seconds": seconds}
 
 
 def _cell(score: float, seconds: float) -> str:

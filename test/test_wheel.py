@@ -87,10 +87,7 @@ def test_it_installs_every_command(wheel):
     with zipfile.ZipFile(wheel) as archive:
         (points,) = [n for n in archive.namelist() if n.endswith("entry_points.txt")]
         reported = archive.read(points).decode()
-    assert set(re.findall(r"^(\w+) = ", reported, re.MULTILINE)) == {
-        "omsm",
-        *start.NODES,
-    }
+    assert set(re.findall(r"^(\w+) = ", reported, re.MULTILINE)) == {"omsm", *start.NODES}
 
 
 @pytest.mark.parametrize("absent", ["rclpy", "omsm_msgs"])

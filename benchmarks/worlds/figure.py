@@ -74,12 +74,7 @@ class Figure:
 
     @classmethod
     def draw(
-        cls,
-        seed: int,
-        radius: float,
-        low: float = 35e-9,
-        rings: float = 3e-9,
-        marks: float = 1e-9,
+        cls, seed: int, radius: float, low: float = 35e-9, rings: float = 3e-9, marks: float = 1e-9
     ) -> Figure:
         """Draw a figure of given rms [m] of terms 4 to 36, of its rings and of its tool marks."""
         rng = np.random.default_rng([seed, 4201])

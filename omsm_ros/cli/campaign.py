@@ -19,14 +19,7 @@ from urllib.parse import quote, urlsplit
 
 from omsm_ros import __version__
 from omsm_ros.cli.arguments import ADDRESS, Arguments
-from omsm_ros.cli.command import (
-    CliCommand,
-    Facts,
-    progress_bar,
-    say,
-    table,
-    written,
-)
+from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, json_and_yaml
 from omsm_ros.io.calibration_file import load_calibration

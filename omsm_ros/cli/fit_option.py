@@ -78,11 +78,7 @@ def declare_tolerance(add: Arguments) -> None:
         "clusters of N points and less; default: isolated ones, which count against the tolerance",
         metavar="none|isolated|N",
     )
-    add(
-        "--tolerance",
-        TOLERANCE,
-        "tolerance of the peak to valley of the part [m]; needs --fit",
-    )
+    add("--tolerance", TOLERANCE, "tolerance of the peak to valley of the part [m]; needs --fit")
 
 
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}

@@ -53,8 +53,7 @@ TASKS: dict[str, dict[str, Word]] = {
     },
     "latency": {
         "selfcal": Word(
-            "latency",
-            "estimate dynamics from scans of one part at different speeds or directions",
+            "latency", "estimate dynamics from scans of one part at different speeds or directions"
         ),
         "reversal": Word(
             "latency", "estimate the probe latency from two scans with opposite spindle directions"
@@ -108,7 +107,7 @@ TASKS: dict[str, dict[str, Word]] = {
     "models of other systems": {
         "validate": Word(
             "identify", "simulate a model on another record and compare with its output"
-        ),
+        )
     },
 }
 

@@ -16,10 +16,7 @@ _NAMES = {
     "creep": ("slow relaxation (creep) with a time constant of {time_constant_s:s/2}", _CREEP),
     "mode": ("a lightly damped mode at {frequency_hz:Hz/4}", _MODE),
     "backlash": ("backlash of ±{size_m:m}", _BACKLASH),
-    "friction": (
-        "friction of ±{size_m:m} that slides after {travel_m:m} of travel",
-        _FRICTION,
-    ),
+    "friction": ("friction of ±{size_m:m} that slides after {travel_m:m} of travel", _FRICTION),
     "linearity": (
         "a nonlinear scale of the probe, {size_m:m} at the ends of its range",
         _LINEARITY,
@@ -29,10 +26,7 @@ _NAMES = {
         "vibration of {size_m:m} at {frequency_hz:Hz/4}, or at its alias {alias_hz:Hz/4}",
         _VIBRATION,
     ),
-    "drift": (
-        "drift of {size_m:m} rms during the test, or the beginning of a relaxation",
-        _DRIFT,
-    ),
+    "drift": ("drift of {size_m:m} rms during the test, or the beginning of a relaxation", _DRIFT),
     "stiffening": (
         "a stiffness that grows with the deflection",
         "make smaller steps, as large as the deflections of a scan",

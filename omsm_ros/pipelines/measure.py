@@ -350,12 +350,7 @@ def add_form(
     from omsm_ros.pipelines.form import judge_form, open_measurement
 
     facts = judge_form(
-        open_measurement(out),
-        nominal,
-        out,
-        register.dofs,
-        register.aperture,
-        dust=register.dust,
+        open_measurement(out), nominal, out, register.dofs, register.aperture, dust=register.dust
     )
     summary["form"] = {name: facts[name] for name in _OF_FORM}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}

@@ -30,11 +30,7 @@ def second(tmp_path_factory, small_scan_blocks):
 
 @pytest.mark.parametrize(
     "options",
-    [
-        [],
-        ["--namespace", "/cell2"],
-        ["--topics", "axes=/cell2/axes,confocal=/cell2/confocal"],
-    ],
+    [[], ["--namespace", "/cell2"], ["--topics", "axes=/cell2/axes,confocal=/cell2/confocal"]],
 )
 def test_a_second_cell_is_inspected_and_corrected(
     capsys, tmp_path, second, true_calibration, options

@@ -69,7 +69,7 @@ def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     assert summary["deviation"]["corrected"]["rms"] < 15e-9
     assert "<html" in (tmp_path / "report.html").read_text()
     assert {p.name for p in tmp_path.iterdir()} == {
-        *("cloud.ply", "summary.json", "report.html", "systematic.npz"),
+        *("cloud.ply", "summary.json", "report.html", "systematic.npz")
     }
 
 

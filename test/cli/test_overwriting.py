@@ -30,34 +30,16 @@ def shop(tmp_path, monkeypatch):
         ("identify steps.mcap --out steps.mcap", "is an input"),
         ("identify steps.mcap --out ./link.mcap", "is an input"),
         ("identify steps.mcap --out older.mcap", "is a recording"),
-        (
-            "identify run.csv --input u --output y --period 1 --out run.csv",
-            "is an input",
-        ),
-        (
-            "validate cal.json run.csv --input u --output y --out run.csv",
-            "is an input",
-        ),
-        (
-            "validate cal.json run.csv --input u --output y --out cal.json",
-            "is an input",
-        ),
+        ("identify run.csv --input u --output y --period 1 --out run.csv", "is an input"),
+        ("validate cal.json run.csv --input u --output y --out run.csv", "is an input"),
+        ("validate cal.json run.csv --input u --output y --out cal.json", "is an input"),
         ("export points.xyz --out points.xyz", "is an input"),
         ("selfcal steps.mcap older.mcap --out older.mcap", "is an input"),
         ("calset cal.json@x=0 cal.json@x=1 --out cal.json", "is an input"),
-        (
-            "align steps.mcap --calibration cal.json --radius 1 --out cal.json",
-            "is an input",
-        ),
-        (
-            "history --catalogue h.sqlite --add cal.json --plot cal.json",
-            "is an input",
-        ),
+        ("align steps.mcap --calibration cal.json --radius 1 --out cal.json", "is an input"),
+        ("history --catalogue h.sqlite --add cal.json --plot cal.json", "is an input"),
         ("correct bag --calibration cal.json --out bag", "is an input"),
-        (
-            "form points.xyz --nominal geo.yaml --out points.xyz",
-            "is an input",
-        ),
+        ("form points.xyz --nominal geo.yaml --out points.xyz", "is an input"),
     ],
 )
 def test_what_is_read_is_not_written(shop, capsys, words, said):

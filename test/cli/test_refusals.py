@@ -107,10 +107,7 @@ def test_doctor_names_the_limit_of_open_files(capsys, monkeypatch, tmp_path):
     with open_files_at_most(0) as most:
         status = cli.main(["doctor"])
     out, err = capsys.readouterr()
-    assert (status, err.strip()) == (
-        2,
-        "omsm: not ready: open files; see the remedies above",
-    )
+    assert (status, err.strip()) == (2, "omsm: not ready: open files; see the remedies above")
     assert f"NO  open files         a process may open {most} files" in out
     assert "→ give it more with 'ulimit -n 1024'" in out
 

@@ -137,10 +137,7 @@ def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
 
 
 def test_two_campaigns_do_not_share_a_folder(shop, tmp_path):
-    with (
-        campaign._locked(tmp_path),
-        pytest.raises(FileError, match="another campaign writes"),
-    ):
+    with campaign._locked(tmp_path), pytest.raises(FileError, match="another campaign writes"):
         run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
 
 

@@ -37,10 +37,7 @@ def test_doctor_ends_with_a_refusal_where_something_must_be_mended(capsys, monke
 
 @pytest.mark.parametrize(
     ("option", "says"),
-    [
-        ("--radius=2", "that of the twin's mirror"),
-        ("--feed=1e-7", "40 000 000 samples"),
-    ],
+    [("--radius=2", "that of the twin's mirror"), ("--feed=1e-7", "40 000 000 samples")],
 )
 def test_a_scan_of_the_twin_that_no_memory_holds_is_refused(capsys, tmp_path, option, says):
     assert cli.main(["twin", "--out", str(tmp_path / "shop"), option]) == 2

@@ -101,8 +101,7 @@ NOTEBOOKS = sorted(path.stem for path in (ROOT / "docs/notebooks").glob("*.md"))
 
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize(
-    "name",
-    [n if n in QUICK else pytest.param(n, marks=pytest.mark.soak) for n in NOTEBOOKS],
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.soak) for n in NOTEBOOKS]
 )
 def test_a_notebook_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -33,7 +33,7 @@ NOT_RUN = {
 }
 NEEDS_LAUNCH = {
     r"ros2 launch omsm_ros replay\.launch\.py": "the stand-in for launch has no events; the node "
-    "that it starts is run, and the whole where there is a real ros2",
+    "that it starts is run, and the whole where there is a real ros2"
 }
 NOT_RUN |= {} if REAL_ROS2 else NEEDS_LAUNCH
 

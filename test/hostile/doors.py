@@ -47,10 +47,7 @@ def through_arguments(place: Path, blocks: Any) -> Cases:
 def through_calibrations(place: Path, blocks: Any) -> Cases:
     content = json.loads((place / "cal.json").read_text())
     content["covariance"] = [1e-30 if k % 8 == 0 else 0.0 for k in range(49)]
-    content["certificate"] |= {
-        "residual": {"noise_m": 1e-8},
-        "static_gain": {"polarity": 1},
-    }
+    content["certificate"] |= {"residual": {"noise_m": 1e-8}, "static_gain": {"polarity": 1}}
     correct = ("correct", "scan.mcap", "--calibration", "{}", "--out", "out", "--no-report")
     commands = [
         ("predict", "motion.csv", "--calibration", "{}"),

@@ -126,12 +126,7 @@ CASES: dict[str, tuple[Callable[[], Any], list[bytes], Callable[[Any], Found], b
         list,
         b"\x00\x40",
     ),
-    "text": (
-        CsvDecoder,
-        encode_lines(counted(row_dtype(COLUMNS), "sequence")),
-        each,
-        b" " * 1020,
-    ),
+    "text": (CsvDecoder, encode_lines(counted(row_dtype(COLUMNS), "sequence")), each, b" " * 1020),
     "six channels": (
         FrameDecoder,
         [encode_six_channels(frame[np.newaxis]) for frame in counted(FRAME, "sequence")],

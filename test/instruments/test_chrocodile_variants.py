@@ -14,10 +14,7 @@ from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
 from omsm_ros.instruments.emulator import AXIS_SCALING
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
-BOTH = [
-    (ChrocodileEmulator, ChrocodileDevice),
-    (ChrocodilePacketEmulator, ChrocodilePacketDevice),
-]
+BOTH = [(ChrocodileEmulator, ChrocodileDevice), (ChrocodilePacketEmulator, ChrocodilePacketDevice)]
 
 
 @pytest.mark.parametrize(("emulator", "device"), BOTH)

@@ -72,11 +72,7 @@ CASES: dict[str, tuple[Callable[[], Any], Callable[[], bytes], int]] = {
         lambda: encode_frames(np.arange(1000)[:, np.newaxis]),
         3,
     ),
-    "text": (
-        CsvDecoder,
-        lambda: b"".join(encode_lines(np.zeros(50, row_dtype(COLUMNS)))),
-        1100,
-    ),
+    "text": (CsvDecoder, lambda: b"".join(encode_lines(np.zeros(50, row_dtype(COLUMNS)))), 1100),
     "six channels": (FrameDecoder, lambda: encode_six_channels(np.zeros(50, FRAME)), 100),
 }
 

@@ -13,12 +13,7 @@ from omsm_ros.instruments import parameters
 from omsm_ros.instruments.chrocodile import device as chrocodile
 from omsm_ros.instruments.chrocodile.telegram import LATCHES
 from omsm_ros.instruments.emulator_factory import EMULATED, emulated
-from omsm_ros.instruments.factory import (
-    make_accelerometer,
-    make_axes,
-    make_device,
-    make_reference,
-)
+from omsm_ros.instruments.factory import make_accelerometer, make_axes, make_device, make_reference
 from omsm_ros.instruments.parameters import (
     ACCELEROMETER_PARAMETERS,
     AXIS_PARAMETERS,

@@ -13,12 +13,7 @@ import pytest
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockPair
-from omsm_ros.instruments.emulator_factory import (
-    EMULATED,
-    emulated,
-    line_for,
-    player_for,
-)
+from omsm_ros.instruments.emulator_factory import EMULATED, emulated, line_for, player_for
 from omsm_ros.instruments.factory import make_axes, make_device, make_reference
 from omsm_ros.instruments.parameters import AXIS_PARAMETERS, REFERENCE_PARAMETERS, defaults
 from omsm_ros.instruments.reader import DeviceReader

@@ -78,11 +78,7 @@ KINDS = {
         modulus=2**18,
     ),
     "capaNCDT": Kind(
-        CapaNcdtEmulator,
-        CapaNcdtDevice,
-        CapaNcdtSettings(probe=MICRO),
-        checked=True,
-        modulus=2**32,
+        CapaNcdtEmulator, CapaNcdtDevice, CapaNcdtSettings(probe=MICRO), checked=True, modulus=2**32
     ),
     "text": Kind(CsvStreamEmulator, CsvStreamDevice, CsvSettings(), modulus=2**32),
 }

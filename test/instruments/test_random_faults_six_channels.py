@@ -15,11 +15,7 @@ from omsm_ros.instruments.emulator import Instrument, Measured
 from omsm_ros.instruments.scaling import AXES
 from omsm_ros.instruments.six_channel.device import AdsRing, GenericStreamDevice, StreamSettings
 from omsm_ros.instruments.six_channel.emulator import SixChannelEmulator
-from omsm_ros.instruments.six_channel.protocol import (
-    FRAME,
-    FrameArray,
-    StreamScaling,
-)
+from omsm_ros.instruments.six_channel.protocol import FRAME, FrameArray, StreamScaling
 
 from .conftest import Bench
 from .test_random_faults import (

@@ -33,12 +33,7 @@ def test_unknown_verdicts_are_counted_and_lost() -> None:
     frames = frames_of(np.arange(4))
     frames["status"] = [0, 9, 1, 200]
     ((_, distance),), device = run(encode_frames(frames))
-    assert distance.status.tolist() == [
-        Status.OK,
-        Status.LOST,
-        Status.NO_TARGET,
-        Status.LOST,
-    ]
+    assert distance.status.tolist() == [Status.OK, Status.LOST, Status.NO_TARGET, Status.LOST]
     assert device.unknown_status == 2
 
 

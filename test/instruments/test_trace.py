@@ -23,10 +23,7 @@ SIX = ChrocodileSettings(axes=AXIS_SCALING)
 
 @pytest.mark.parametrize(
     ("device", "emulator"),
-    [
-        (ChrocodileDevice, ChrocodileEmulator),
-        (ChrocodilePacketDevice, ChrocodilePacketEmulator),
-    ],
+    [(ChrocodileDevice, ChrocodileEmulator), (ChrocodilePacketDevice, ChrocodilePacketEmulator)],
 )
 def test_a_replayed_trace_gives_the_same_blocks(device: Any, emulator: Any, tmp_path: Path) -> None:
     loop = Loopback()
@@ -89,9 +86,7 @@ def test_every_connection_is_in_the_trace(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("place", ["/dev/full", "/dev/null/wire.trace", "/", "wire\0trace"])
-def test_an_unwritable_trace_is_reported_with_the_remedy_and_the_port_is_closed(
-    place: str,
-) -> None:
+def test_an_unwritable_trace_is_reported_with_the_remedy_and_the_port_is_closed(place: str) -> None:
     loop = Loopback()
     traced = TracedTransport(loop, Path(place), loop.clock)
     for _ in range(2):

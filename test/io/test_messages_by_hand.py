@@ -263,8 +263,7 @@ def more_points(message):
 
 
 @pytest.mark.parametrize(
-    "spoil",
-    [others_fields, moved_field, doubled_field, half_of_the_bytes, odd_bytes, more_points],
+    "spoil", [others_fields, moved_field, doubled_field, half_of_the_bytes, odd_bytes, more_points]
 )
 def test_a_cloud_of_another_layout_is_refused_and_never_misread(spoil):
     message = message_mapping.cloud_message(bag_messages(), pack_points(cloud(2)), 0)

@@ -18,10 +18,7 @@ NAMES = ("cloud", "form", "report", "summary")
 
 
 def run(path, text, step=None):
-    with (
-        pytest.MonkeyPatch.context() as patched,
-        result_folder(path, NAMES) as folder,
-    ):
+    with pytest.MonkeyPatch.context() as patched, result_folder(path, NAMES) as folder:
         for name in NAMES:
             save_text(folder / name, text)
         if step is not None:

@@ -11,13 +11,7 @@ pytest.importorskip("omsm_msgs", reason="the messages are not built")
 
 from omsm_msgs import msg
 
-from omsm_ros.core.ripple.accelerometer import (
-    PROBE,
-    SLIDE,
-    Alarm,
-    MonitorOptions,
-    RunningSpectrum,
-)
+from omsm_ros.core.ripple.accelerometer import PROBE, SLIDE, Alarm, MonitorOptions, RunningSpectrum
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError

@@ -185,10 +185,7 @@ def test_other_databases_are_refused(name):
 def test_a_password_is_never_shown(monkeypatch):
     monkeypatch.setattr("omsm_ros.pipelines.history.WAIT_S", 1)
     pytest.importorskip("psycopg", reason="psycopg is an optional package")
-    with (
-        pytest.raises(FileError) as refused,
-        Catalogue("postgresql://me:sesame@127.0.0.1:1/base"),
-    ):
+    with pytest.raises(FileError) as refused, Catalogue("postgresql://me:sesame@127.0.0.1:1/base"):
         pass
     assert "sesame" not in str(refused.value)
     assert "127.0.0.1" in str(refused.value)

@@ -84,11 +84,7 @@ def summary():
             "code": "not_verified",
             "text": "not verified",
             "reasons": [{"code": "not_redundant", "text": "one speed cannot show a lag"}],
-            "add": {
-                "code": "other_speed",
-                "text": "scan again faster",
-                "reached": 4e-9,
-            },
+            "add": {"code": "other_speed", "text": "scan again faster", "reached": 4e-9},
         },
         "settings": {"probe": "exposure 1 ms", "spindle_speed": 30},
         "versions": {"omsm_ros": "0.1.0"},

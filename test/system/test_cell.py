@@ -34,8 +34,7 @@ OTHERS = ("chrocodile", "chrocodile_packet", "confocaldt", "confocaldt_ethernet"
 
 
 @pytest.mark.parametrize(
-    "device",
-    ["six_channel", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS)],
+    "device", ["six_channel", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS)]
 )
 def test_calibrate_scan_correct_and_replay(cell, device):
     plan = demonstration.Demonstration(

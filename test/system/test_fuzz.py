@@ -15,8 +15,7 @@ from omsm_ros.nodes.topics import LATCHED_QOS
 pytestmark = pytest.mark.timeout(0)
 
 NUMBERS = st.one_of(
-    st.sampled_from([0.0, -0.0, 1e-3, 1.0, -1.0, 1e300, -1e300, 5e-324, float("inf")]),
-    st.floats(),
+    st.sampled_from([0.0, -0.0, 1e-3, 1.0, -1.0, 1e300, -1e300, 5e-324, float("inf")]), st.floats()
 )
 COUNTS = st.one_of(st.sampled_from([0, 1, 2**32, 2**53, 2**63, 2**64 - 1]), st.integers(0, 5000))
 PERIODS = st.one_of(st.just(1e-3), st.just(1e-3), NUMBERS)
@@ -85,11 +84,7 @@ CALIBRATIONS = st.fixed_dictionaries(
         **dict.fromkeys(("settings", "certificate", "id"), TEXTS),
     },
 )
-FUZZ = {
-    "database": None,
-    "suppress_health_check": list(HealthCheck),
-    "derandomize": True,
-}
+FUZZ = {"database": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(20_000, marks=pytest.mark.soak)])

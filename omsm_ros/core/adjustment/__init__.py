@@ -5,12 +5,7 @@ how far the scans agree, and a verdict. ``plan_scans`` and ``posterior_uncertain
 covariance before anything is scanned.
 """
 
-from omsm_ros.core.adjustment.adjust import (
-    Adjustment,
-    SourceFinding,
-    adjust,
-    corrected_heights,
-)
+from omsm_ros.core.adjustment.adjust import Adjustment, SourceFinding, adjust, corrected_heights
 from omsm_ros.core.adjustment.figures import Figure, FormMap
 from omsm_ros.core.adjustment.planning import (
     PlannedSet,

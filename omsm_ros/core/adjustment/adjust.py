@@ -29,12 +29,7 @@ from omsm_ros.core.adjustment.refutation import (
     settled,
     start_scales,
 )
-from omsm_ros.core.adjustment.scan_data import (
-    ScanData,
-    ScanView,
-    fitted_surface,
-    view_of,
-)
+from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, fitted_surface, view_of
 from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes
 from omsm_ros.core.adjustment.verdict import (
     Verdict,

@@ -79,8 +79,7 @@ class Network:
         hats, knots, steps = _hats_of(blocks, end)
         number = len(blocks)
         member = sparse.csr_array(
-            (np.ones(number), (self.part.cell, np.arange(number))),
-            shape=(self.part.cells, number),
+            (np.ones(number), (self.part.cell, np.arange(number))), shape=(self.part.cells, number)
         )
         for name, value in {
             "place": place,

@@ -12,13 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
-from omsm_ros.core.adjustment.network import (
-    Network,
-    Scales,
-    Solution,
-    estimate_scales,
-    solve,
-)
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, estimate_scales, solve
 from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, HIGHEST_DEGREE, RINGS, SYMMETRIC
 from omsm_ros.core.adjustment.sources import FREE, base_name
 from omsm_ros.core.streams.blocks import FloatArray

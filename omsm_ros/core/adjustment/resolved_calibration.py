@@ -123,10 +123,7 @@ def resolved(calibration: Calibration, found: SelfCalibration) -> Calibration:
 
 
 def from_scans_alone(
-    found: SelfCalibration,
-    sample_period: float,
-    static_gain: float,
-    settings: Mapping[str, object],
+    found: SelfCalibration, sample_period: float, static_gain: float, settings: Mapping[str, object]
 ) -> Calibration:
     """Return a calibration of low order from scans corrected with :func:`unit_calibration`.
 
@@ -256,10 +253,7 @@ def undetermined(found: SelfCalibration) -> list[Notice]:
 def _findings(found: SelfCalibration) -> Iterator[Finding]:
     """Yield the reasons against the calibration that the scans give."""
     if not found.agreement.holds:
-        values = {
-            "disagreement": found.agreement.disagreement,
-            "ratio": found.agreement.ratio,
-        }
+        values = {"disagreement": found.agreement.disagreement, "ratio": found.agreement.ratio}
         yield Finding("adjustment.scans_disagree", REJECTS, values)
     if stats.chi2.sf(found.prior_conflict, GAIN) < _PRIOR_CONFLICT_P:
         values = {"shift": float(found.values[LAG]), "chi2": found.prior_conflict}

@@ -290,16 +290,10 @@ def scan_budget(
     """
     acting = whole_scan_sources(calibration, sources, geometry, stated)
     fields = standard_fields(acting, trace) if len(trace) else {}
-    rows = [
-        *_random_rows(calibration, sources, random, stated),
-        *_systematic_rows(acting, fields),
-    ]
+    rows = [*_random_rows(calibration, sources, random, stated), *_systematic_rows(acting, fields)]
     noise = float(np.sqrt(sum(random.get(name, 0.0) ** 2 for name in RANDOM)))
     return ScanBudget(
-        rows=tuple(rows),
-        fields=fields,
-        random=noise,
-        bounds=upper_bounds(calibration, stated),
+        rows=tuple(rows), fields=fields, random=noise, bounds=upper_bounds(calibration, stated)
     )
 
 

@@ -351,11 +351,7 @@ KINDS: dict[str, SourceKind] = {
     "squareness": SourceKind(_RADIANS, squareness),
     "parallelism": SourceKind(_RADIANS, parallelism, needs_slope=True),
     "straightness_x": SourceKind(
-        _METRES,
-        straightness_x,
-        _CORRELATED,
-        _LENGTH_OPTIONAL,
-        squares=curve_variance,
+        _METRES, straightness_x, _CORRELATED, _LENGTH_OPTIONAL, squares=curve_variance
     ),
     "straightness_z": SourceKind(
         _METRES,
@@ -373,38 +369,18 @@ KINDS: dict[str, SourceKind] = {
         squares=pitch_variance,
     ),
     "spindle_axial": SourceKind(_METRES, spindle_axial, _PER_TURN),
-    "spindle_radial": SourceKind(
-        _METRES,
-        spindle_radial,
-        _PER_TURN,
-        needs_slope=True,
-    ),
+    "spindle_radial": SourceKind(_METRES, spindle_radial, _PER_TURN, needs_slope=True),
     "spindle_tilt": SourceKind(_RADIANS, spindle_tilt, _PER_TURN),
     "encoder_scale": SourceKind(_SHARE, encoder_scale),
     "encoder_interpolation": SourceKind(_METRES, encoder_interpolation, _PERIOD),
-    "probe_linearity": SourceKind(
-        _METRES,
-        linearity,
-        {"half_range": quantities.PERIOD},
-    ),
+    "probe_linearity": SourceKind(_METRES, linearity, {"half_range": quantities.PERIOD}),
     "probe_periodic": SourceKind(_METRES, linearity_periodic, _PERIOD),
-    "probe_slope": SourceKind(
-        quantities.SLOPE_ERROR,
-        slope,
-        needs_slope=True,
-    ),
-    "probe_slope_square": SourceKind(
-        quantities.SLOPE_ERROR,
-        slope_square,
-        needs_slope=True,
-    ),
+    "probe_slope": SourceKind(quantities.SLOPE_ERROR, slope, needs_slope=True),
+    "probe_slope_square": SourceKind(quantities.SLOPE_ERROR, slope_square, needs_slope=True),
     "drift_rate": SourceKind(quantities.RATE_UNCERTAINTY, drift_rate),
     "drift_walk": SourceKind(quantities.WALK_UNCERTAINTY, drift_walk, squares=random_walk_variance),
     "drift": SourceKind(
-        _METRES,
-        drift,
-        {"correlation_time": quantities.CORRELATION_TIME},
-        squares=curve_variance,
+        _METRES, drift, {"correlation_time": quantities.CORRELATION_TIME}, squares=curve_variance
     ),
 }
 """Kinds of systematic error by their names."""

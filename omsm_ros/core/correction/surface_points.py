@@ -44,8 +44,7 @@ class SurfacePoints:
 _COLUMNS = tuple(field.name for field in fields(SurfacePoints) if field.name != "stamp_ns")
 _KINDS = {"sample": np.int64, "intensity": np.float32}
 _NO_POINTS = SurfacePoints(
-    **{name: np.empty(0, _KINDS.get(name, np.float64)) for name in _COLUMNS},
-    stamp_ns=0,
+    **{name: np.empty(0, _KINDS.get(name, np.float64)) for name in _COLUMNS}, stamp_ns=0
 )
 
 

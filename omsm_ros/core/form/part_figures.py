@@ -24,11 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.form.deviation_map import (
-    DeviationMap,
-    UncertainValue,
-    weighted_quantiles,
-)
+from omsm_ros.core.form.deviation_map import DeviationMap, UncertainValue, weighted_quantiles
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray

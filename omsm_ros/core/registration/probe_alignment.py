@@ -209,9 +209,7 @@ def _with(geometry: Geometry, unknown: FloatArray) -> Geometry:
     if len(unknown) == 5:
         return centred
     return replace(
-        centred,
-        beam_x=float(unknown[5]) * _SLOPE_UNIT,
-        beam_y=float(unknown[6]) * _SLOPE_UNIT,
+        centred, beam_x=float(unknown[5]) * _SLOPE_UNIT, beam_y=float(unknown[6]) * _SLOPE_UNIT
     )
 
 

@@ -128,10 +128,7 @@ class ZernikeSurface:
         most = MOST_FRINGE if self.indexing == "fringe" else MOST_ZERNIKES
         if len(self.coefficients) > most:
             raise SurfaceError(
-                "surface.zernikes",
-                terms=len(self.coefficients),
-                most=most,
-                indexing=self.indexing,
+                "surface.zernikes", terms=len(self.coefficients), most=most, indexing=self.indexing
             )
         for place, value in enumerate(self.coefficients):
             TERM_SIZE.checked(value, SurfaceError, f"coefficients[{place}]")

@@ -7,9 +7,7 @@ import pytest
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 
-from .corrected_runs import (
-    SPIRAL,
-)
+from .corrected_runs import SPIRAL
 
 
 @pytest.fixture(scope="module")

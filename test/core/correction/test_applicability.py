@@ -45,10 +45,7 @@ PROBE = {"probe.averaging": 4.0, "probe.model": "A"}
         ([{"probe.averaging": 4}], ()),
         ([{"probe.lamp": 50.0}], ()),
         ([PROBE | {"probe.averaging": 8.0}], ("probe.averaging is 8.0, calibrated with 4.0",)),
-        (
-            [PROBE, PROBE | {"probe.model": "B"}] * 2,
-            ("probe.model is 'B', calibrated with 'A'",),
-        ),
+        ([PROBE, PROBE | {"probe.model": "B"}] * 2, ("probe.model is 'B', calibrated with 'A'",)),
     ],
 )
 def test_what_the_probe_tells_is_compared_where_both_know(reported, reasons):

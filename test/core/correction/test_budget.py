@@ -100,9 +100,7 @@ def test_noise_at_rest_holds_what_it_is_made_of(true_calibration: Calibration) -
     assert "encoder_noise" in not_evaluated(said)
 
 
-def test_what_a_step_test_could_not_show_is_a_row_of_its_own(
-    true_calibration: Calibration,
-) -> None:
+def test_what_a_step_test_could_not_show_is_a_row_of_its_own(true_calibration: Calibration) -> None:
     p = len(true_calibration.covariance)
     known = replace(true_calibration, covariance=np.diag([1.0] + [0.0] * (p - 1)) * 1e-8)
     certificate = certified_by({"noise_covariance": [0.0] * p**2}, known.certificate)

@@ -110,11 +110,7 @@ def test_geometry_moves_the_points(quiet_scan: Recording) -> None:
     takes=st.integers(1, 40),
 )
 def test_cuts_and_interleaving_do_not_change_a_bit(
-    scan: Recording,
-    axis_cuts: list[int],
-    probe_cuts: list[int],
-    turns: list[bool],
-    takes: int,
+    scan: Recording, axis_cuts: list[int], probe_cuts: list[int], turns: list[bool], takes: int
 ) -> None:
     axes, distance = part(scan.axes, 0, 4000), part(scan.distance, 0, 4000)
     holes = np.r_[500:520, 1990:2010]

@@ -15,15 +15,7 @@ from omsm_ros.core.streams.blocks import Account, Status
 from omsm_ros.errors import DataError
 from omsm_ros.twin.cell import Recording
 
-from .corrected_runs import (
-    CALIBRATION,
-    balanced,
-    cut,
-    part,
-    run,
-    same_points,
-    shifted,
-)
+from .corrected_runs import CALIBRATION, balanced, cut, part, run, same_points, shifted
 
 # Every sample is accounted for.
 

@@ -15,11 +15,7 @@ from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.twin.cell import Recording
 
-from .corrected_runs import (
-    CALIBRATION,
-    calibration,
-    run,
-)
+from .corrected_runs import CALIBRATION, calibration, run
 
 # Refusals.
 

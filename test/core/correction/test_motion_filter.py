@@ -22,11 +22,7 @@ from omsm_ros.twin.plant import Plant
 
 G = Plant().dynamics
 CALIBRATION = Calibration(
-    dynamics=G,
-    static_gain=1.0,
-    sample_period=1e-3,
-    valid_up_to=100.0,
-    covariance=np.zeros((7, 7)),
+    dynamics=G, static_gain=1.0, sample_period=1e-3, valid_up_to=100.0, covariance=np.zeros((7, 7))
 )
 X, Y, B, C, ERROR, MOVED, RATE, SENSITIVITIES = range(8)
 SPEED = np.array([2e-3, -1e-3, 3e-3, 0.01, 3.0])

@@ -9,12 +9,7 @@ import pytest
 from scipy import interpolate, signal
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.predict import (
-    Prediction,
-    Residual,
-    dynamic_error,
-    predict_error,
-)
+from omsm_ros.core.correction.predict import Prediction, Residual, dynamic_error, predict_error
 from omsm_ros.core.kinematics.limits import FASTEST, MachineLimits
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.kinematics.trajectories import Chirp, Spiral

@@ -91,10 +91,7 @@ def monte_carlo(known: Calibration, sources: ErrorSources, runs: int) -> np.ndar
 
 
 SOURCES = ErrorSources(
-    probe_noise=4e-9,
-    probe_resolution=6e-9,
-    encoder_noise=2e-9,
-    static_gain=2e-4,
+    probe_noise=4e-9, probe_resolution=6e-9, encoder_noise=2e-9, static_gain=2e-4
 )
 
 

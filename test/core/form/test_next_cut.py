@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.form.compensation import (
-    Compensation,
-    CutSurface,
-    check_last_cut,
-    cut_path,
-)
+from omsm_ros.core.form.compensation import Compensation, CutSurface, check_last_cut, cut_path
 from omsm_ros.core.kinematics.planner import plan_path
 from omsm_ros.errors import ConfigurationError, DataError
 

@@ -5,13 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.calibration.certificate import (
-    ACCEPTED,
-    REJECTED,
-    RESERVED,
-    Certificate,
-    Origin,
-)
+from omsm_ros.core.calibration.certificate import ACCEPTED, REJECTED, RESERVED, Certificate, Origin
 from omsm_ros.core.calibration.finding import NOTE, REJECTS, RESERVATION, WARNING, Finding
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.estimation.preparation import prepare

@@ -11,11 +11,7 @@ from scipy import signal
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.steps import find_steps
-from omsm_ros.core.identification.fitted_record import (
-    autocorrelation,
-    fitted_record,
-    mean_at_edges,
-)
+from omsm_ros.core.identification.fitted_record import autocorrelation, fitted_record, mean_at_edges
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction

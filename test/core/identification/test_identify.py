@@ -17,15 +17,7 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, blocks_of, record
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
-from .recorded_motions import (
-    TRUTH,
-    errors,
-    from_noise,
-    identified,
-    record_of,
-    recorded,
-    resonance,
-)
+from .recorded_motions import TRUTH, errors, from_noise, identified, record_of, recorded, resonance
 
 
 class TestStepTest:

@@ -8,12 +8,7 @@ from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.streams.motion_record import MotionRecord
-from omsm_ros.errors import (
-    ConfigurationError,
-    DataError,
-    IdentificationError,
-    StepTestError,
-)
+from omsm_ros.errors import ConfigurationError, DataError, IdentificationError, StepTestError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 from .recorded_motions import TRUTH, errors, identified, record_of, recorded, resonance

@@ -42,11 +42,7 @@ def points(geometry: Geometry, **motion: float) -> WorkpiecePoints:
     """One point, of axes that rest at zero but for those named."""
     values = {name: np.array([motion.get(name, 0.0)]) for name in ("x", "y", "z", "b", "c", "d")}
     return workpiece_points(
-        geometry,
-        (values["x"], values["y"], values["z"]),
-        values["b"],
-        values["c"],
-        values["d"],
+        geometry, (values["x"], values["y"], values["z"]), values["b"], values["c"], values["d"]
     )
 
 

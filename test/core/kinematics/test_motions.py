@@ -89,8 +89,7 @@ def test_a_sharp_edge_is_there_from_its_first_moment_on():
 @pytest.mark.parametrize("speed", [30.0, -45.0])
 @pytest.mark.parametrize("surface", [PAPER_MIRROR, Toroid(0.05, -0.04)])
 @pytest.mark.parametrize(
-    "make",
-    [lambda s, v: Spiral(s, 5e-3, 1e-3, v), lambda s, v: Circle(s, 4e-3, v, turns=2.5)],
+    "make", [lambda s, v: Spiral(s, 5e-3, 1e-3, v), lambda s, v: Circle(s, 4e-3, v, turns=2.5)]
 )
 def test_a_probe_on_the_axis_of_its_spindle_sees_the_surface_all_the_way(make, surface, speed):
     """Through the kinematics that turn positions of axes into points."""

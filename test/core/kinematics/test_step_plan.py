@@ -81,11 +81,7 @@ def test_gcode_moves_add_up_to_nothing_and_last_as_planned():
 
 @pytest.mark.parametrize(
     ("options", "match"),
-    [
-        ({"rise": 5e-3}, "too short"),
-        ({"count": 11}, "range"),
-        ({"dwell": 0.05}, "no rest"),
-    ],
+    [({"rise": 5e-3}, "too short"), ({"count": 11}, "range"), ({"dwell": 0.05}, "no rest")],
 )
 def test_a_plan_that_cannot_work_is_refused(options, match):
     with pytest.raises(ConfigurationError, match=match):

@@ -2,13 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.free_path import Multisine
-from omsm_ros.core.kinematics.trajectories import (
-    Chirp,
-    Circle,
-    Spiral,
-    StepTest,
-    s_curve,
-)
+from omsm_ros.core.kinematics.trajectories import Chirp, Circle, Spiral, StepTest, s_curve
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import ConfigurationError
 

@@ -140,8 +140,7 @@ def test_an_uncertain_delay_is_an_uncertain_phase_only():
 
 
 @pytest.mark.parametrize(
-    "dynamics",
-    [G, TransferFunction([1.0], [1.0, 1e-3]), TransferFunction([1.0], [1.0], 3e-4)],
+    "dynamics", [G, TransferFunction([1.0], [1.0, 1e-3]), TransferFunction([1.0], [1.0], 3e-4)]
 )
 def test_inter_sample_motion_is_a_delay_at_low_frequency(dynamics):
     covariance = inter_sample_motion_covariance(dynamics, 3e-6, 1e-3)
@@ -279,10 +278,7 @@ def test_a_pole_and_a_delay_that_do_the_same_leave_no_frequency_without_uncertai
     frequency = np.geomspace(0.1, 50.0, 500)
     band, least = (
         response_band(dynamics, covariance, frequency)
-        for covariance in (
-            np.outer(alike, alike) + np.outer(apart, apart),
-            np.outer(apart, apart),
-        )
+        for covariance in (np.outer(alike, alike) + np.outer(apart, apart), np.outer(apart, apart))
     )
     assert np.all(band.gain >= 0.9 * least.gain)
     assert np.all(band.phase >= 0.9 * least.phase)

@@ -177,11 +177,7 @@ class TestOfOneScan:
 
     def test_what_is_sharp_in_one_coordinate_alone_is_known_by_that(self):
         one = scan(path_like=PATH)
-        one.lines = (
-            line(2500.0, coordinate=PATH),
-            line(123.4),
-            line(7.0, coordinate=TURN),
-        )
+        one.lines = (line(2500.0, coordinate=PATH), line(123.4), line(7.0, coordinate=TURN))
         assert kinds(one)[0] == [PART, VIBRATION, SYNCHRONOUS]
 
     def test_a_line_that_another_scan_would_have_to_show_is_not_on_the_part(self):

@@ -27,11 +27,7 @@ FIVE = np.zeros(5)
 def test_a_block_that_no_device_sends_is_refused_by_name(
     wrong: dict[str, object], named: str
 ) -> None:
-    good = dict.fromkeys("xyzbc", FIVE) | {
-        "stamp_ns": 0,
-        "first_sample": 0,
-        "sample_period": 1e-3,
-    }
+    good = dict.fromkeys("xyzbc", FIVE) | {"stamp_ns": 0, "first_sample": 0, "sample_period": 1e-3}
     AxisBlock(**good)  # type: ignore[arg-type]
     with pytest.raises(DataError, match=named):
         AxisBlock(**good | wrong)  # type: ignore[arg-type]

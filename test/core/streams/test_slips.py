@@ -183,10 +183,7 @@ def test_the_remedy_names_the_offset_that_would_do() -> None:
 @pytest.mark.parametrize("who", [0, 1])
 def test_a_device_that_begins_anew_alone_is_never_paired_wrongly_for_long(who: int) -> None:
     whole = Device(ALL).blocks()
-    restarted = [
-        *Device(ALL[:2000]).blocks(),
-        *Device(ALL[2500:]).blocks(),
-    ]
+    restarted = [*Device(ALL[:2000]).blocks(), *Device(ALL[2500:]).blocks()]
     done = join(restarted if who == 0 else whole, whole if who == 0 else restarted)
     assert len(done.wrong) == 0
     assert done.axes[:2000] == list(range(2000))

@@ -1,12 +1,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.surface.nominal import (
-    PAPER_MIRROR,
-    Flat,
-    OffAxisParaboloid,
-    Sphere,
-)
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, OffAxisParaboloid, Sphere
 from omsm_ros.errors import SurfaceError
 
 RNG = np.random.default_rng(0)

@@ -39,9 +39,7 @@ SHAPES = {
     "q_bfs": QBfs(0.01, (1e-6, 2e-6, -1e-6, 3e-6), 0.05),
     "q_con": QCon(0.01, (1e-6, 2e-6, -1e-6), 0.05, -1.2),
     "q_freeform": QFreeform(
-        0.01,
-        (QTerm(0, 2, 2e-6), QTerm(3, -1, 1e-6), QTerm(2, 0, 5e-7), QTerm(4, 7, -1e-6)),
-        0.05,
+        0.01, (QTerm(0, 2, 2e-6), QTerm(3, -1, 1e-6), QTerm(2, 0, 5e-7), QTerm(4, 7, -1e-6)), 0.05
     ),
     "section": OffAxisSection(Asphere(0.08, -0.6, (0.0, 50.0)), 0.03, 0.7),
     "posed": PosedSurface(PAPER_MIRROR, POSE),

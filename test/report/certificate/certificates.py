@@ -6,10 +6,7 @@ from dataclasses import replace
 
 from certified import certified_by
 
-from omsm_ros.report.certificate.page import (
-    CertificatePage,
-    headlines,
-)
+from omsm_ros.report.certificate.page import CertificatePage, headlines
 
 ATTACK = "<script>alert('x')</script>\"><img src=x onerror=alert(1)>"
 

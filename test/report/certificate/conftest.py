@@ -8,11 +8,7 @@ from parsed_page import Page
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import assemble
-from omsm_ros.report.certificate.page import (
-    CertificatePage,
-    certificate_figures_of,
-    render,
-)
+from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
 
 
 @pytest.fixture(scope="module")

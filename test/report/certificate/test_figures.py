@@ -22,9 +22,7 @@ class TestFigures:
 
     def test_a_phase_beyond_half_a_turn_lies_on_the_curve(self, calibration):
         late = replace(
-            calibration,
-            dynamics=TransferFunction([1.0], [1.0], 10e-3),
-            covariance=np.zeros((2, 2)),
+            calibration, dynamics=TransferFunction([1.0], [1.0], 10e-3), covariance=np.zeros((2, 2))
         )
         frequency = np.array([5.0, 60.0, 130.0, 210.0])
         exact = np.full(4, 1e-4)

@@ -51,13 +51,7 @@ def page_of(model, record, **parts):
 @pytest.mark.parametrize("model", [HELD, SMOOTH])
 def test_all_parts_are_there(model, record):
     page = render_model(page_of(model, record, source="<b>.csv", version="1.2"))
-    for text in (
-        "Accepted from",
-        "91.00",
-        "Poles",
-        "Working point".lower(),
-        "&lt;b&gt;.csv",
-    ):
+    for text in ("Accepted from", "91.00", "Poles", "Working point".lower(), "&lt;b&gt;.csv"):
         assert text in page, text
     assert "<b>.csv" not in page
     assert page.count("<figure>") == 3
