@@ -279,3 +279,6 @@ def _origin(recorded_ns: int | None) -> Origin:
 
 
 main = partial(run, CalibratorNode)
+
+if __name__ == "__main__":
+    main()

@@ -164,3 +164,6 @@ class CellEmulatorNode(ManagedNode):
 
 
 main = partial(run, CellEmulatorNode)
+
+if __name__ == "__main__":
+    main()

@@ -463,3 +463,6 @@ def _prediction(*motion: Any) -> Prediction:
 
 
 main = partial(run, CorrectorNode)
+
+if __name__ == "__main__":
+    main()

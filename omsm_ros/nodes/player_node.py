@@ -470,3 +470,6 @@ class PlayerNode(ManagedNode):
 
 
 main = partial(run, PlayerNode)
+
+if __name__ == "__main__":
+    main()

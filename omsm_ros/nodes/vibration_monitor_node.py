@@ -178,3 +178,6 @@ def _edges(text: str) -> tuple[float, ...]:
 
 
 main = partial(run, VibrationMonitorNode)
+
+if __name__ == "__main__":
+    main()

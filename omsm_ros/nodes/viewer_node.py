@@ -132,3 +132,6 @@ def load_token(path: str) -> str:
 
 
 main = partial(run, ViewerNode)
+
+if __name__ == "__main__":
+    main()

@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros import cli
 
-RADIUS, POINTS = 10e-3, 22_000
+RADIUS, POINTS = 10e-3, 30_000
 COARSE_M, FINE_M = 2e-3, 0.5e-3
 
 

@@ -27,7 +27,7 @@ import demo
 import start
 
 REAL = pytest.mark.skipif(bool(start.missing()), reason=start.missing())
-pytestmark = pytest.mark.xdist_group("linuxcnc")
+pytestmark = [pytest.mark.xdist_group("linuxcnc"), pytest.mark.timeout(180)]
 
 
 def counters(bag):

@@ -162,7 +162,7 @@ def test_as_many_points_as_the_fit_needs_are_enough(count):
 
 
 @pytest.mark.parametrize(
-    ("size", "said"), [(0.0, "0 m"), (1e-304, "m"), (4e-10, "0.790 nm|0.80. nm|0.79. nm")]
+    ("size", "said"), [(0.0, "0 nm"), (1e-304, "m"), (4e-10, "0.790 nm|0.80. nm|0.79. nm")]
 )
 def test_points_closer_than_atoms_are_refused(size, said):
     """A cloud in a unit that it does not have; squares of the least vanish, and no form is left."""

@@ -324,7 +324,7 @@ def test_the_aperture_leaves_out_what_lies_beyond():
         (PointBatch(*np.zeros((3, 0)), np.empty((0, 0))), "0 points"),
         (PointBatch(*np.zeros((3, 50)), np.empty((0, 50))), "50 points"),
         (PointBatch(*np.full((3, 500), np.nan), np.empty((0, 500))), r"0 points lie"),
-        (PointBatch(*np.zeros((3, 500)), np.empty((0, 500))), "within 0 m .*measure across"),
+        (PointBatch(*np.zeros((3, 500)), np.empty((0, 500))), "within 0 nm .*measure across"),
         (
             scan(Sphere(0.1))._replace(x=spiral()[0] * 100, y=spiral()[1] * 100),
             "not converge|lie on the nominal",
