@@ -92,9 +92,10 @@ LOAD += "_filter_loop(), _pencil_solver()"
 
 
 def test_correcting_loads_neither_ros_nor_the_heavy_parts_of_scipy() -> None:
+    """The command adjusts the scan afterwards, so it alone may load more of scipy."""
     heavy = ["scipy.signal", "scipy.linalg", "scipy.stats", "scipy.optimize", "scipy.interpolate"]
     heavy += ["scipy.fft", "rclpy", "omsm_msgs", "matplotlib", "control", "tqdm"]
-    code = f"import sys, omsm_ros.cli.correct; {LOAD}; "
+    code = f"import sys, omsm_ros.core.correction.correct; {LOAD}; "
     assert run(code + f"print([m for m in {heavy} if m in sys.modules])") == "[]"
 
 

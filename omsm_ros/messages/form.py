@@ -33,7 +33,7 @@ TEMPLATES: dict[str, str] = {
         "and that the program was cut; no further cut is computed"
     ),
     "form.tool_too_blunt": (
-        "a nose of {tool_radius:m} does not fit into the surface; take a sharper tool"
+        "a nose of {tool_radius:m} does not fit into the surface; choose a sharper tool"
     ),
     "form.spiral_below_one_turn": (
         "spiral of {feed:m} a turn from a rim of {rim:m} makes less than one turn; take a narrower "

@@ -41,7 +41,7 @@ def in_child(work: Callable[[], T], seconds: float = _BAG_S, most_bytes: int = _
     sender.close()
     try:
         if not receiver.poll(seconds):
-            raise OmsmError(f"the bag was not read in {seconds:g} s; try omsm inspect")
+            raise OmsmError(f"the bag was not read in {seconds:g} s; check it with omsm inspect")
         failed, result = receiver.recv()
     except EOFError as err:
         raise OmsmError(

@@ -37,7 +37,7 @@ def record_device(
     Returns all counts. Raises ConfigurationError for a parameter, DeviceError if no sample came.
     """
     if unknown := set(given) - set(defaults()):
-        raise ConfigurationError(f"no parameters {sorted(unknown)!r}; docs/nodes.md lists them")
+        raise ConfigurationError(f"no parameters {sorted(unknown)!r}; see docs/nodes.md")
     values = defaults() | {p.name: p.checked(given[p.name]) for p in PARAMETERS if p.name in given}
     device = make_device(values)
     axes, distance = device.channels.axes is not None, device.channels.distance

@@ -65,7 +65,6 @@ HARMFUL: dict[str, Text] = {
     "averages at the end": lambda rows: written([*rows, ["mean", *rows[-1][1:]]]),
     "names once more": lambda rows: written([*rows, *rows]),
     "cut short": lambda rows: written([*rows[:-1], [""] * len(rows[0])]).rstrip() + b"-",
-    "UTF-16": lambda rows: written(rows).decode().encode("utf-16"),
     "zeros behind it": lambda rows: written(rows) + bytes(512),
     "a page of the web": lambda rows: b"<html><body>404</body></html>\n",
 }
