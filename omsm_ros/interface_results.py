@@ -36,7 +36,7 @@ _ORIGIN = "omsm_ros result"
 
 
 class Result:
-    """What all results share: text, tables, axes and files."""
+    """Base of all results: text, tables, axes and files."""
 
     _along = "sample"
 

@@ -1,4 +1,4 @@
-"""What is behind LinuxCNC in the demonstration: the twin; and a recording against its plan.
+"""The twin behind LinuxCNC in the demonstration, and a comparison of a recording with its plan.
 
     python behind.py COMMAND.mcap OUT.mcap [flat|mirror]    encoders and probe of a commanded motion
     python behind.py --judge scan_N.csv COMMAND.mcap        distance of the motion from the plan
@@ -40,7 +40,7 @@ class CommandedMotion:
         return len(self.axes) * self.axes.sample_period
 
     def positions(self, time):
-        """Return the commanded axes at ``time`` [s]; at rest before and after the record."""
+        """Return the commanded axes at ``time`` [s]; still before and after the record."""
         period = self.axes.sample_period
         within = np.clip(time, 0.0, (len(self.axes) - 1) * period)
         x, z, c = (Trajectory(0.0, period, getattr(self.axes, n)).at(within) for n in "xzc")

@@ -40,7 +40,7 @@ def nose(u):
 
 
 class CutPart:
-    """What a cut leaves: deviation from the nominal on circles, linear between them."""
+    """Surface after a cut: deviation from the nominal on circles, linear between them."""
 
     def __init__(self, axes, tip):
         turn = axes.c / (2 * np.pi)

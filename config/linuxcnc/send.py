@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """Send HAL's sampler over TCP, a line a servo cycle: python3 send.py PORT CFG (cfg of the sampler).
 
-What no client takes stays in the sampler's FIFO, so a client that comes back in time loses nothing.
+Samples wait in the sampler's FIFO without a client; one that returns in time loses nothing.
 """
 
 import socket

@@ -31,7 +31,7 @@ from omsm_ros.readable import date_text, date_text_of_stamp, plain, quantity
 _SPHERE = "sphere"
 _HOW = """\
 still: probe before a fixed place for a minute: noise, drift
-passes: X over the same line ten times, spindle at rest: drift
+passes: X over the same line ten times, spindle stopped: drift
 turned: spiral over a turned flat, or a turned part (--nominal): spindle
 stand_offs: one ring, Z further by some micrometres in each turn: gain and linearity of the probe
 sphere: spiral over a sphere (--radius) mounted a millimetre off the axis: centre, beam

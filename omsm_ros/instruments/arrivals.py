@@ -1,4 +1,4 @@
-"""What the arrivals of samples show: the host's time of a device's clock, and missed triggers.
+"""Arrivals of samples: they give the host's time of a device's clock, and show missed triggers.
 
 Host time is fitted as ``offset + (1 + drift) · device time`` over the arrivals of half a minute:
 robustly, since some arrivals are very late, and over a window, since crystals change with

@@ -338,7 +338,7 @@ def _publish(
     publish(out, title, summary, calibration, figures, surface)
 
 
-# Of the registration in the summary.
+# Entries of the registration that the summary keeps.
 _OF_FORM = ("pose", "deviation", "removed", "points", "open")
 
 

@@ -20,7 +20,7 @@ from omsm_ros.pipelines.progress import Progress, no_progress
 
 # How often the end of the recording is looked for [s].
 _LOOK_S = 0.05
-# What a killed recording loses at most [s].
+# Interval of writing to the disk; a killed recording loses no more than this [s].
 _FLUSH_S = 0.5
 
 

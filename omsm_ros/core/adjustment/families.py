@@ -132,7 +132,7 @@ def _one(
     return Family(name, unit, 1, lambda v: column(v)[np.newaxis], wide, shown_by, default)
 
 
-# Of the mean speed: a spindle holds its speed better.
+# Share of the mean speed; a spindle holds its speed better than this.
 _SAME_SPEED = 0.01
 
 

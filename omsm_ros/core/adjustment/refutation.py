@@ -27,7 +27,7 @@ _LEAST_GAIN = 10.0
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
-# Of a value: a family that changes by less is a cause of its own.
+# A family whose value changes by less than this share is a cause of its own.
 _UNCHANGED = 0.3
 # A lag that depends on something has an unknown mean, which is no further cause.
 _OFFSET = "lag_change"
@@ -120,7 +120,7 @@ def fit_and_refute(
 
 
 def _grouped(found: Sequence[Refutation], before: Mapping[str, FloatArray]) -> list[Refutation]:
-    """Return causes: what was released because of an earlier one belongs to it.
+    """Return causes; a family released because of an earlier one belongs to that one.
 
     A family that was found as large before anything was released is a cause of its own, as is the
     same cause in another scan. What

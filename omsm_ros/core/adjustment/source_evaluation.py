@@ -37,14 +37,14 @@ KINDS = tuple(_SOURCES)
 # Means of consecutive points: enough for twelve waves a turn, few enough for dense algebra.
 _BLOCKS, _BLOCKS_PER_TURN, _MOST_BLOCKS = 600, 32, 1600
 _GROUPS = 8
-# Of a ring: what a turned part may hold; and of a disc.
+# Highest harmonic of a ring and Zernike degree of a disc that the form of a turned part may have.
 _RING_HARMONICS, _ZERNIKE_DEGREE = 12, 10
 _HATS = 24
 # A source is shown if its uncertainty is below half of what a machine in need of repair has.
 _SHOWN_SHARE = 0.5
 # An uncertainty that a dial gauge at the spindle reaches as well.
 _SHOWN_CENTRE_M = 1e-5
-# Of the walk's variance per second over that of the noise of a block.
+# Limits of the ratio: variance of the walk in a second over the variance of a block's noise.
 _LEAST_RATIO, _LARGEST_RATIO = 1e-8, 1e6
 
 

@@ -24,7 +24,7 @@ UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redund
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
 UNIDENTIFIED = "unidentified"
 
-# Of the normal distribution: drift that is rarer than this is not the declared one.
+# Standard deviations; drift beyond them is not the declared drift (probability 1e-4, one-sided).
 _RARE_WALK = 3.7
 # Speeds nearer to each other than a tenth leave a lag as open as one scan does.
 _OTHER_SPEED = 0.1

@@ -139,7 +139,7 @@ class MachineSources:
 
 
 NOTHING_STATED = MachineSources()
-# What one scan cannot show, in the size that the adjustment of scans assumes by default.
+# Sources that one scan cannot show, with the size that the adjustment of scans assumes.
 ASSUMED_SIZES = {"lag_change": 1e-4, "drift_rate": 1e-9}
 
 

@@ -4,9 +4,9 @@ All records share the sections; each has its own initial state and offset. Those
 enter linearly and are eliminated (variable projection, Golub and Pereyra 1973), the states of each
 record first. Model and data are compared in time, so missing samples of the output do not count.
 
-Starting points are poles by vector fitting of the spectra of input and output (Gustavsen and
-Semlyen 1999), with the transients of the record as further residues, and the poles of a smaller fit
-with pairs added at the lines at which its residual is largest.
+Starting points are of two kinds. One is poles by vector fitting of the spectra of input and output
+(Gustavsen and Semlyen 1999), with the transients of the record as further residues. The other is
+the poles of a smaller fit, with pairs added at the lines at which its residual is largest.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ _LEAST_PREDICTED = 0.5
 _LEAST_INDEPENDENCE_P = 1e-4
 # Frequencies over three decades: neighbours are 2 % apart.
 _FREQUENCIES = 400
-# Lines of a block: these, and so many for each input; most ratio of its frequencies.
+# Number of lines in a block, added number for each input, largest ratio of its frequencies.
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
 # Power of a line over the largest nearby, and over the largest of all, below which it is left out.
 _NEARBY, _LEAST_POWER = 1e-3, 1e-8

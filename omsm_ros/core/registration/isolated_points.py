@@ -40,7 +40,7 @@ _NEARBY = 5.0
 _BY_CHANCE = 0.01
 # A cluster of more events than this is always form.
 _MOST_BY_CHANCE = 30
-# A step longer than so many usual ones is a jump to another line, no part of the path.
+# A step longer than this multiple of the usual one is a jump to another line.
 _JUMP = 10.0
 # Points narrower than this share of their length lie on a line.
 _LINE = 1e-3

@@ -55,7 +55,7 @@ _INFORMATION = rb"Serial|E\d\d"
 _KILOHERTZ = 1000.0
 
 
-# So many distances in a portion are not all before the range by chance.
+# With this number of distances in a portion, chance does not put all of them before the range.
 _MANY_VALUES = 5
 COUNTER_RANGE = 2**32
 # The beginning of blocks whose header does not describe the frames.

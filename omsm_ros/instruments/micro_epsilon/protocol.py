@@ -61,7 +61,7 @@ INTENSITY_MASK, INTENSITY_FULL = 0x7FF, 1024
 _NO_INTENSITY = 0xC000F800
 # Distances from this value on are error codes.
 FIRST_ERROR = 0x7FFFFF00
-# Of them: a peak before, and one behind the measuring range.
+# Codes of a peak before, and of one behind the measuring range.
 BEFORE_RANGE_NM, BEHIND_RANGE_NM = 0x7FFFFF05, 0x7FFFFF06
 _SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
 
