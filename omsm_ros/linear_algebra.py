@@ -3,8 +3,6 @@
 Columns may have any units: each is scaled to unit length first.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import threading

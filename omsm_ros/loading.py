@@ -4,8 +4,6 @@ A signal while the program only loads ends it at once, without a traceback. This
 nothing that takes time, because signals are not handled before.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -6,8 +6,6 @@ that all results stay finite and fit into memory. A number outside has a wrong u
 damaged or forged file.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -6,8 +6,6 @@ pages replace them by typographic ones (:mod:`omsm_ros.report.page_parts`). A nu
 has to type is given in the unit of its field instead.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from datetime import datetime, timezone

@@ -3,8 +3,6 @@
 Multiply to enter SI (``5 * MICROMETRE_M``), divide to leave it (``height / NANOMETRE_M``).
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ removes unfinished files and ends by the signal. With ``--json`` standard output
 object and nothing else.
 """
 
-from __future__ import annotations
-
 import gc
 import signal
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The command that adjusts scans of one part together: adjust."""
 
-from __future__ import annotations
-
 import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of

@@ -1,7 +1,5 @@
 """Commands for calibrations: verify, compare, calset."""
 
-from __future__ import annotations
-
 import argparse
 import re
 from dataclasses import asdict, replace

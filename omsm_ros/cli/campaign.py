@@ -1,7 +1,5 @@
 """The command batch: correct a folder of recordings."""
 
-from __future__ import annotations
-
 import argparse
 import fcntl
 import hashlib

@@ -1,7 +1,5 @@
 """The parts of a command: arguments, an action that returns facts, and how they are printed."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator

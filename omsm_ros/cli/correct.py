@@ -1,7 +1,5 @@
 """Commands for a scan: predict, correct, align, report."""
 
-from __future__ import annotations
-
 import argparse
 from argparse import SUPPRESS
 from collections.abc import Mapping

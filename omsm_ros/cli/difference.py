@@ -1,7 +1,5 @@
 """The command difference: compare two measurements of one part, also of another instrument."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The command doctor: check whether this computer can run a cell, with remedies."""
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import math

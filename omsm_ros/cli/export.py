@@ -1,7 +1,5 @@
 """The command export: write a cloud or map in the format of another program."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

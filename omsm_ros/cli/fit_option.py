@@ -1,7 +1,5 @@
 """Options of a registration and rows of its result, for form, correct and difference."""
 
-from __future__ import annotations
-
 import argparse
 
 from omsm_ros.cli.arguments import Arguments

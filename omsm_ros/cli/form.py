@@ -1,7 +1,5 @@
 """Commands for the form of a part: form, compensate, surface."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

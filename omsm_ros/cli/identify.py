@@ -1,7 +1,5 @@
 """Commands to identify a calibration or a sampled model, and to validate a model."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """Commands that split a lag into structural dynamics and latency: selfcal, reversal, latency."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The command that plans a step test, or scans of a part: plan."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Commands for recordings: record a device; inspect or repair a bag; import other recordings."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The command sources: evaluate error sources of a machine from recordings made for it."""
 
-from __future__ import annotations
-
 import argparse
 from datetime import datetime, timezone
 from pathlib import Path

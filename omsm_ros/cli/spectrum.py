@@ -1,7 +1,5 @@
 """The command spectrum: lines in scans of one part, and their sources."""
 
-from __future__ import annotations
-
 import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object

@@ -1,7 +1,5 @@
 """Commands to begin with: twin, completion."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import asdict
 

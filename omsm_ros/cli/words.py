@@ -3,8 +3,6 @@
 They are listed here so that ``omsm --help`` need not load their modules, which takes seconds.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 

@@ -5,8 +5,6 @@ robustly, since some arrivals are very late, and over a window, since crystals c
 temperature.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

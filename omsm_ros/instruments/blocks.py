@@ -1,7 +1,5 @@
 """Cuts runs of samples into blocks, stamped by the host's clock."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple

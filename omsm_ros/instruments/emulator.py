@@ -6,8 +6,6 @@ client is connected or not: samples that are not sent are lost, and its counter 
 Not imitated: latency of the link, baud rate and UART overrun, jitter of the trigger.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Emulated devices by name: their ports, and how motions are played on them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Makes the devices that parameters describe, not yet connected, and traces their traffic."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

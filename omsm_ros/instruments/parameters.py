@@ -1,7 +1,5 @@
 """The parameters of the drivers, and the settings that all devices take from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any, TypeAlias

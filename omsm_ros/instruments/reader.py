@@ -1,7 +1,5 @@
 """Reads a device continuously and connects again after each fault of its line."""
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable, Sequence

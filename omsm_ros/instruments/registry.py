@@ -3,8 +3,6 @@
 Nothing is imported before it is asked for: most processes use one device.
 """
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Counts of encoders and readings of probes, to and from metres and radians."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -4,8 +4,6 @@
 never came are ``lost``; bytes that hold none are counted by the decoder of the protocol.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields

@@ -4,8 +4,6 @@ Each complete chunk with a valid checksum is copied message by message; messages
 can read are left out. The new bag has an index.
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """``CAL.json``: a calibration as a file, its schema and its id checked."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone

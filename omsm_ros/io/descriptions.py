@@ -1,7 +1,5 @@
 """Reads descriptions of machine and part: geometry, limits, pitch, motion, sources, surface."""
 
-from __future__ import annotations
-
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, fields, is_dataclass

@@ -4,8 +4,6 @@ Its names are those of :class:`~omsm_ros.twin.disturbances.Disturbances` and of 
 and its schema is derived from them; a record that is left out is switched off.
 """
 
-from __future__ import annotations
-
 import types
 import typing
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Reads regular files up to a bound, and writes files that appear only when they are complete."""
 
-from __future__ import annotations
-
 import os
 import secrets
 import stat

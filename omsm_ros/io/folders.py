@@ -1,7 +1,5 @@
 """Writes and reads folders of results, and keeps private folders and exclusive files."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

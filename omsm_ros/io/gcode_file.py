@@ -4,8 +4,6 @@ Only ``linuxcnc`` has run on its controller. The others follow the programming m
 dry first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 On a damaged file the HDF5 library may loop for ever, which this process could not interrupt.
 """
 
-from __future__ import annotations
-
 import importlib
 import math
 import resource

@@ -3,8 +3,6 @@
 Several cells may be on one network and in one bag; each has its own namespace.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Collects what a browser shows of a running scan: map, errors, states, calibration."""
 
-from __future__ import annotations
-
 import struct
 import threading
 import time

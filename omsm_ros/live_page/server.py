@@ -1,7 +1,5 @@
 """Serves the live page and its socket on one port, read-only."""
 
-from __future__ import annotations
-
 import contextlib
 import hmac
 import http

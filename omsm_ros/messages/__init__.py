@@ -24,8 +24,6 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 To add a message, add its code and template to the dictionary of its room in this package.
 """
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 import string

@@ -1,7 +1,5 @@
 """Sentences of :mod:`omsm_ros.core.calibration`."""
 
-from __future__ import annotations
-
 TEMPLATES: dict[str, str] = {
     "calibration.text": "{text}",
     # Content of a calibration file or message.

@@ -1,7 +1,5 @@
 """Sentences about the correction: uncertainty budget, prediction, counter offset."""
 
-from __future__ import annotations
-
 from omsm_ros.messages.verdict import SOURCE_NAMES
 
 TEMPLATES: dict[str, str] = {

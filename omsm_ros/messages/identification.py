@@ -1,7 +1,5 @@
 """Sentences of :mod:`omsm_ros.core.identification`."""
 
-from __future__ import annotations
-
 # Remedies at the machine for each model error.
 _CREEP = "let the joints of probe and target settle, and rest longer on each plateau"
 _MODE = "look for a loose part, and for what the machine stands on"

@@ -1,7 +1,5 @@
 """Sentences about motions: paths, trajectories, step tests."""
 
-from __future__ import annotations
-
 TEMPLATES: dict[str, str] = {
     "kinematics.pitch": "positions of the pitch do not increase; sort them, each once, two or more",
     # Path of a scan

@@ -1,7 +1,5 @@
 """Sentences about transfer functions and their discretisation."""
 
-from __future__ import annotations
-
 TEMPLATES: dict[str, str] = {
     "lti.coefficients": "{name} {values!r} must be a row of finite numbers",
     "lti.denominator": "denominator[0] is {value:g}, expected 1; divide all by it",

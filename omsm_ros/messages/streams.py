@@ -1,7 +1,5 @@
 """Sentences about streams of samples: pairing, stamps, counters, imported columns."""
 
-from __future__ import annotations
-
 _RISING = (
     "import the parts before and after it separately, or, if time is rounded too coarsely, leave "
     "it out and state sample_period"

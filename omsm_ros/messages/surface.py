@@ -1,7 +1,5 @@
 """Sentences about nominal surfaces, measured points and deviations."""
 
-from __future__ import annotations
-
 TEMPLATES: dict[str, str] = {
     # Nominal surfaces
     "surface.terms": (

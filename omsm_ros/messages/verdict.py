@@ -1,7 +1,5 @@
 """Sentences about an adjustment of scans: its verdict, its reasons, and names of sources."""
 
-from __future__ import annotations
-
 TEMPLATES = {
     "verdict.verified": "verified by {scans:count} scans",
     "verdict.except": "{text}, except for {number} sources as declared or assumed",

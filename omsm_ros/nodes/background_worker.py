@@ -1,7 +1,5 @@
 """Does work that takes seconds in a thread, while the node continues to take samples."""
 
-from __future__ import annotations
-
 import multiprocessing
 import queue
 import resource

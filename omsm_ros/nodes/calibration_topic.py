@@ -5,8 +5,6 @@ publishes a newer one again. So every latched message holds the newest calibrati
 be restarted without losing it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any

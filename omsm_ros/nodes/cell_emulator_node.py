@@ -1,7 +1,5 @@
 """``cell_emulator``: emulates probe and encoders of a cell on a port, with data of the twin."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """The parameters of the corrector, and the options of the correction made of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any

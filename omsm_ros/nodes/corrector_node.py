@@ -1,7 +1,5 @@
 """``corrector``: computes corrected surface points from axes and distance, continuously."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence

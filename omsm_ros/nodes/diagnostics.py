@@ -4,8 +4,6 @@ OK: it works.  WARN: it works, but should be checked.  STALE: no input arrives. 
 work. Faults that are over are only counted.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field

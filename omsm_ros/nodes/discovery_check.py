@@ -1,7 +1,5 @@
 """Checks that two ROS contexts of this computer exchange a message; for ``omsm doctor``."""
 
-from __future__ import annotations
-
 import sys
 import time
 

@@ -3,8 +3,6 @@
 A thread reads the device, and its blocks are published; no fault of the line ends the node.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Sequence

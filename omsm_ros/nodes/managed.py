@@ -9,8 +9,6 @@ node implements the steps, and puts on the stack ``undo`` how each is undone:
     report():        return its state while it is configured
 """
 
-from __future__ import annotations
-
 import difflib
 import time
 from collections.abc import Callable, Sequence

@@ -3,8 +3,6 @@
 The module has no slow imports, since it is needed before the others load.
 """
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os

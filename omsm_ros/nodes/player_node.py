@@ -6,8 +6,6 @@ subscribers how many messages they have processed (``~/taken``, a service of all
 package), and never sends more than a small part of a queue.
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence

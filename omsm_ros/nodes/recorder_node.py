@@ -1,7 +1,5 @@
 """``recorder``: writes the cell's topics to an ``.mcap`` file until it is ended."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial

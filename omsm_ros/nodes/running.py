@@ -4,8 +4,6 @@ No message, request or parameter ends a node: an invalid one is refused with the
 internal error is logged and counted in the diagnostics.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

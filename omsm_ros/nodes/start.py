@@ -4,8 +4,6 @@ The module has no slow imports, so that Ctrl-C while the others load is an order
 ``python -m omsm_ros.nodes.start corrector …`` is the same as the command ``corrector``.
 """
 
-from __future__ import annotations
-
 import ctypes
 import importlib
 import os

@@ -1,7 +1,5 @@
 """Publishers and subscriptions of the nodes, and their quality of service."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence

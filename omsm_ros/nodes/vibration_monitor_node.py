@@ -1,7 +1,5 @@
 """``vibration_monitor``: measures vibration and its effect on heights."""
 
-from __future__ import annotations
-
 import time
 from contextlib import ExitStack
 from functools import partial

@@ -1,7 +1,5 @@
 """``viewer``: shows the running scan in a browser."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Adjust scans of one part together: from bags to form, sources and verdict in one folder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

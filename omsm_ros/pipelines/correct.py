@@ -1,7 +1,5 @@
 """Correct a recorded bag in one pass: blocks → core → cloud.ply and the figures of its summary."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain

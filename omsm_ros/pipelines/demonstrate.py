@@ -1,7 +1,5 @@
 """Run the demonstration on the digital twin and compare its results with the true values."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field

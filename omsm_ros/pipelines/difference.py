@@ -1,7 +1,5 @@
 """Compare two measurements of one part, also of another instrument: task and files."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timezone

@@ -1,7 +1,5 @@
 """From a cloud and a nominal surface to ``form.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

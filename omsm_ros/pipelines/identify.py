@@ -1,7 +1,5 @@
 """Identify sampled models from tables and bags; write certificates and pages of models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone

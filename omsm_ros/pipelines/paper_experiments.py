@@ -1,7 +1,5 @@
 """Repeat the paper's experiments on the twin: Fig. 6 to 11 and Table 1, each with its report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Repeat the paper's measurement of its mirror on the twin: Fig. 7 and 8."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Plan the scans of a part: which set reaches an accuracy, and the programs to run."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial

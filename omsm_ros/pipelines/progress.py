@@ -1,7 +1,5 @@
 """Report the progress of a task."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread

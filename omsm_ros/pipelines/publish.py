@@ -1,7 +1,5 @@
 """Write the report of a measurement, of a registered part, or of spectra."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Record a device to a bag without ROS."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """Write bags of the digital twin: a step test and a scan."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

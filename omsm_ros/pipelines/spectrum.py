@@ -1,7 +1,5 @@
 """Compute spectra of scans and classify their lines: from bags to ``spectrum.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Determine dynamics, latency and probe position from whole scans."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Verify a calibration on a free path, find counter offsets, and predict errors of a motion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The page of an adjustment: verdict and figures, the map, sources declared and found."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The page of a campaign: outliers, drift, and a table of all measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

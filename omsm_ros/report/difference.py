@@ -1,7 +1,5 @@
 """The report of a comparison of two measurements: one self-contained HTML file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

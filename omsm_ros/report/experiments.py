@@ -1,7 +1,5 @@
 """Report of one of the paper's experiments: results of the paper and of the twin, with figures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 

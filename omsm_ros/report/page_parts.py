@@ -1,7 +1,5 @@
 """Parts of a page: headlines, sections of figures and tables, and the line of issue."""
 
-from __future__ import annotations
-
 import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence

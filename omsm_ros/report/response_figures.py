@@ -1,7 +1,5 @@
 """Figures of the identified dynamics: Bode plot and step response."""
 
-from __future__ import annotations
-
 from typing import Any, Protocol
 
 import numpy as np

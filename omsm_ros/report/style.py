@@ -1,7 +1,5 @@
 """Common style of all figures, with colours for all colour vision, without global state."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Sequence

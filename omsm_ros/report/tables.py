@@ -1,7 +1,5 @@
 """Tables of a report: numbers as text, with their units."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The verdict on a measurement, with every reason against it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any

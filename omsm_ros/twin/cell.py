@@ -5,8 +5,6 @@ the noise of the encoder, and all ``Disturbances``. The file of each family stat
 :func:`compare_with_truth` compares a correction with the true values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple, TypeVar

@@ -4,8 +4,6 @@ Each is a shift of the workpiece relative to the probe; positive z brings it nea
 errors of Y and of the angle of C, roll of the slides, thermal deformation of the part.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import NamedTuple
 

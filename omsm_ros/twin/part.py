@@ -1,7 +1,5 @@
 """The part on the chuck: its pose, its figure error and azimuthal ripple."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

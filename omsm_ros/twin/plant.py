@@ -3,8 +3,6 @@
 ``command → servo → X_d (encoder) → G(s) → true motion of the probe``
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulate a chromatic confocal probe: exposure, linearity, light and noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Check the numbers of disturbances, and whether a disturbance is switched on."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any

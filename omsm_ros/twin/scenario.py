@@ -1,7 +1,5 @@
 """Simulate the measurement of the paper: step test and scan, with the true values."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ computer. Not imitated for encoders: errors of X, Y, B and C, count loss, bendin
 of a counter are faults of the emulators.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

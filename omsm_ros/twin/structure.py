@@ -7,8 +7,6 @@ imitated: backlash and friction within the servo loop, stiffness that changes th
 mode (it scales the whole deflection), temperature.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Simulated signal that can be evaluated between its computed values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

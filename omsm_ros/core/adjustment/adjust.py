@@ -1,7 +1,5 @@
 """Adjust scans of one part together: form, errors of the machine, and what is contradicted."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 

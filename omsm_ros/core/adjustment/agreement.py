@@ -6,8 +6,6 @@ difference with its full uncertainty. PV and rms are those of each scan alone, c
 was found of the machine together.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

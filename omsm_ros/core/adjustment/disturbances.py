@@ -4,8 +4,6 @@ They are looked for in the residuals of a first fit. Each finding becomes a fami
 columns, and is tested as all others are.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

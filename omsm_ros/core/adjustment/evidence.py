@@ -6,8 +6,6 @@ part it is the score test: with s what its columns find in the residual, I their
 all others are fitted, ``χ² = sᵀ I⁻¹ s`` (Rao 1948).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ have one cause and one declared size. Names are those of the declared sources
 (:mod:`omsm_ros.core.correction.source_kinds`); ``/n`` behind a name is the number per turn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 

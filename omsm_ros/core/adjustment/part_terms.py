@@ -8,8 +8,6 @@ drift or a bend of a slide. Cells are random effects of one variance, common to 
 eliminated cell by cell.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

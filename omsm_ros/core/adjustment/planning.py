@@ -4,8 +4,6 @@ A design becomes a scan with few points a turn, each of which stands for many re
 equations are those of the adjustment (:mod:`network`), without heights.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ The family that explains most is released first; those that explain as much as i
 together with it, are one group whose members these scans do not separate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

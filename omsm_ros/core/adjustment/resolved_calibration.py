@@ -6,8 +6,6 @@ side; a mechanical lag of Z does not. On a surface that Z follows, an error of t
 calibration has the same effect, so the result is not better than that delay.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 

@@ -4,8 +4,6 @@ Velocities follow from the axes by a local polynomial (Savitzky-Golay). A missin
 point, a missing axis sample its neighbours too.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise

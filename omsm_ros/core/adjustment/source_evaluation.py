@@ -7,8 +7,6 @@ its covariance. A jackknife over parts of the recording shows what that model le
 larger of both uncertainties counts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Sources of error: columns with one cause, and what is declared of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

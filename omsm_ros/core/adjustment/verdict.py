@@ -3,8 +3,6 @@
 Codes and values only; sentences are made elsewhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ that it was made with. Each difference is an objection; a user who corrects anyw
 recorded with the result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

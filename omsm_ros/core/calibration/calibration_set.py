@@ -4,8 +4,6 @@ A set may be used wherever a calibration may. Where one response is needed (a pr
 it is that of the member nearest to the middle; a correction interpolates between members.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Findings: what a check says of a calibration, as a code with values."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 

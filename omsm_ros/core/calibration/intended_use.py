@@ -1,7 +1,5 @@
 """Intended use of a calibration: Z motion of the scans to be corrected, and their accuracy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar

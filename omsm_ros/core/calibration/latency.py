@@ -5,8 +5,6 @@ the other axes must be delayed too. A step test measures the sum of both and can
 scans of one part at several speeds or in both directions can.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from math import sqrt
 

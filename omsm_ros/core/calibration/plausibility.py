@@ -4,8 +4,6 @@ A calibration comes from a file or over the network. Numbers that no machine has
 minutes, a pole in a million years) are not only wrong: filters made of them take all memory.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction

@@ -4,8 +4,6 @@ Two identified responses are compared over their common valid band with both cov
 result is the change and its significance in standard deviations.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Dataclasses to JSON values and back, each value checked against the type of its field."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass

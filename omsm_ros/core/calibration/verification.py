@@ -1,7 +1,5 @@
 """Difference between probe and model on a free path, as in the paper's Fig. 9."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

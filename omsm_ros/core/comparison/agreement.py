@@ -6,8 +6,6 @@ all of them at once with 95 % (Šidák). In addition ``χ² = cᵀ C⁻¹ c`` te
 covariance C.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Compare two measurements of one part: match, subtract, test the agreement."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Piston, tip, tilt and power are linear; shift and clocking, on request, are foun
 with the slopes of the local fits. All places have the same area.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ fitted to the surrounding cells, weighted by distance (tricube; Cleveland 1979).
 shorter than the radius are averaged out. Places that the cells do not surround get no value.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

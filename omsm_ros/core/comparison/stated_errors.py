@@ -9,8 +9,6 @@ A systematic error is a sum of shapes over the surface, each with an independent
 standard deviation one (Karhunen-Loève expansion): a shape is its effect on every height [m].
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Protocol
 

@@ -6,8 +6,6 @@ not depend on how the streams are cut into blocks and interleaved, to the last b
 and offline agree.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field

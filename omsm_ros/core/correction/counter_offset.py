@@ -9,8 +9,6 @@ Stamps show a slip only beyond half a sample and the delay of the links, and a c
 link looks like a slip. The motion distinguishes both, see :class:`LiveOffset`.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass

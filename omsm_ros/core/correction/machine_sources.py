@@ -7,8 +7,6 @@ In the budget of a scan a source is *evaluated* from data, *declared*, *assumed*
 the adjustment assumes, or *not evaluated*; then its contribution is unknown, not zero.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields

@@ -8,8 +8,6 @@ The residual consists of the calibration's covariance below that frequency, the 
 above it, and non-linear errors everywhere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -7,8 +7,6 @@ Each field function returns the change of the heights [m] of n points per unit o
 for its k independent components or (n,) for one. Fields of lateral shifts need the slopes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 

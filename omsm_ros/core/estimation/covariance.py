@@ -1,7 +1,5 @@
 """Covariance of fitted parameters in coloured noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import fft
 

@@ -4,8 +4,6 @@ The prior is the TC kernel, c · α^max(i, j), of Chen, Ohlsson and Ljung (2012)
 that is smooth and decays. Its parameters maximise the marginal likelihood (Pillonetto et al. 2014).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy import linalg, signal
 

@@ -14,8 +14,6 @@ of a mode, or fits backlash and scale errors to that noise. Where the axis is st
 of many samples has little noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from math import comb

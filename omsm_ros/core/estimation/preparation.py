@@ -9,8 +9,6 @@ axis moves, with the mean of |G|² over all frequencies. A search for other erro
 would be in vain.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -9,8 +9,6 @@ A few thousand samples determine the order as well as all, except for dynamics s
 last; so the orders of a long record are explored on its most exciting part.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ No number, size, direction or rate of steps is assumed. A motion without plateau
 has no edges; it can be used for identification too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -4,8 +4,6 @@ Where the part is too high by d along its normal the tool goes ``d √(1 + |∇z
 Shorter wavelengths are noise, texture, or too fast for the axes, and are not compensated.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -16,8 +16,6 @@ to the figure. Upper bounds of errors, as of an unknown latency, are not subtrac
 the square by an error of that size belongs to the uncertainty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

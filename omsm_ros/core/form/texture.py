@@ -7,8 +7,6 @@ the area of the ring: ``Σ 2π f S(f) Δf`` is the mean square in the band of th
 density is the mean square per radian of half a turn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ equilibrated Gram matrix of condition 10⁶ leaves ten digits. Where the points 
 the disc to separate the terms, the highest orders are left out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import comb

@@ -5,8 +5,6 @@ write a function and append a call of it to :data:`CHECKS`, and the sentence of 
 :mod:`omsm_ros.messages.identification`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np

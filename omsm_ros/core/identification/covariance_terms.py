@@ -13,8 +13,6 @@ as N(estimate, uncertainty²), so its mean square is estimate² + uncertainty²:
 size is added to the covariance, unless the user declares a smaller prior.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Everything that the checks of an identification use."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

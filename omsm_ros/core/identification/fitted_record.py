@@ -1,7 +1,5 @@
 """The recording with the certified fit, as a certificate draws it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -16,8 +16,6 @@ The static gains are regressions on the plateaus. With a reference sensor on the
 are three, and two of them show whether the scale of the probe or that of the encoder is wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps

@@ -6,8 +6,6 @@ where the final fit still shows it: what was modelled before a better explanatio
 have taken a part of that explanation.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ of the background. Two slow families that explain the residual about equally wel
 together, because one alone would also explain a part of the other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

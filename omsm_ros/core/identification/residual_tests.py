@@ -5,8 +5,6 @@ that is independent of the motion says that the dynamics are. The second matters
 covariance allows for coloured noise, but nothing allows for a missing mode.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How well is the response of a chosen model known, and up to which frequency is it trusted?"""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

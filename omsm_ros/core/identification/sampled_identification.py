@@ -14,8 +14,6 @@ neighbouring lines, the residual is fitted by the inputs and the transient of th
 polynomial method, Pintelon et al. 2010). Where that finds a difference, the model is not valid.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

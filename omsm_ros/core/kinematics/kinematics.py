@@ -4,8 +4,6 @@ Chain: workpiece → C → Y → X → base → Z → B → probe. The workpiece
 the spindle, which is parallel to Z; x and y are slide positions relative to the spindle axis.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 

@@ -5,8 +5,6 @@ which both are equal; velocities grow with k, accelerations with k² and jerks w
 are not declared are reported as not evaluated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 

@@ -7,8 +7,6 @@ segments take whole cycles, and C reaches its speed within one. The vertices are
 that the path, not the vertices, is on the surface. Tried on LinuxCNC 2.9.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

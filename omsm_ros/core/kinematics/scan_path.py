@@ -1,7 +1,5 @@
 """Path of a scan, with the bandwidth and the derivatives of its Z motion."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise

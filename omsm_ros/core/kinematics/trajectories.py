@@ -3,8 +3,6 @@
 Each motion gives the commanded axes at any time, also before its start.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 

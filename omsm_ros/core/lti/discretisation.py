@@ -13,8 +13,6 @@ delay is a Lagrange interpolator of the same order. At 0 Hz
 the gain is G(0).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial

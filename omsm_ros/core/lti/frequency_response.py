@@ -1,7 +1,5 @@
 """Frequency responses: estimates without a model, uncertainty of a model, and valid band."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

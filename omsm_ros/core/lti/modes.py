@@ -10,8 +10,6 @@ of motion and is unstable for ordinary machines; correct is ``a1 = k1 c2 + k2 c1
 not determine the common scale of masses and stiffnesses, so ``m1`` must be known, or is the unit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 

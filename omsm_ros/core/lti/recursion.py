@@ -5,8 +5,6 @@ samples. The remaining error is the response to the difference between the true 
 polynomial.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from math import comb
 

@@ -11,8 +11,6 @@ about equally well. The covariance of one of them does not include the others: t
 weighted by likelihood, is added.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

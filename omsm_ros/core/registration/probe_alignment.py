@@ -5,8 +5,6 @@ offset across the feed as a flat centre. A beam inclined by β measures d β to 
 distance d. Offset and inclination are fitted so that the corrected points lie on the sphere.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Lines and levels of measured acceleration, and the height error that they may cause."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

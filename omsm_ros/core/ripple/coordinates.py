@@ -4,8 +4,6 @@ In a scan at constant pace the coordinates are proportional and cannot be distin
 pace changes, a line is sharp in its own coordinate only.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

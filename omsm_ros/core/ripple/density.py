@@ -1,7 +1,5 @@
 """One-sided power spectral density, its noise floor, band-stop filter and alias frequencies."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ Gauss-Newton), and the search continues in the residual. This separates lines cl
 lobe of a window, and weak lines from the side lobes of strong ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ measures it; or if the pace of the scan changed and the line is sharp in one coo
 Otherwise it is undecided.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 

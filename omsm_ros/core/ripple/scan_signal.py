@@ -1,7 +1,5 @@
 """Heights of a scan over time, path, radius and turns of the spindle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

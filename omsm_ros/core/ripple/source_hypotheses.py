@@ -7,8 +7,6 @@ are selected one after the other, those with most partners first; a line that is
 source is no evidence for another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 

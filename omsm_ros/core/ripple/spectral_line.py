@@ -1,7 +1,5 @@
 """Spectral lines and their joint fit of frequency, cosine and sine by Gauss-Newton."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -7,8 +7,6 @@ For each stream ``received == corrected + pending + sum(counted.values())`` at a
 that never came are ``missing`` and not part of this sum.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace

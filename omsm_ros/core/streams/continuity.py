@@ -5,8 +5,6 @@ counts from the start again. A counter that wraps is unwrapped by its driver. In
 is played in time lapse, stamps advance more slowly than the count times the sample period.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ A number outside the plausible range, a time that falls and a unit that contradi
 DataError instead of being interpreted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

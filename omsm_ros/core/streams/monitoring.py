@@ -3,8 +3,6 @@
 All times come from the caller and must not decrease.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Robust scatter of readings, and an even selection from a stream of unknown length."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ readings in succession were repeated by a driver, and equal readings at the end 
 clipped or mean "no reading".
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

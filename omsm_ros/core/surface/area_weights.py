@@ -10,8 +10,6 @@ It depends on the path of the scan.
   other point.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray

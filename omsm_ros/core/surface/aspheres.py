@@ -10,8 +10,6 @@ methods for axially symmetric optical aspheres", Opt. Express 18, 19700 (2010), 
 the shape of freeform optics", Opt. Express 20, 2483 (2012).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -3,8 +3,6 @@
 Points may come in any order and need no grid. They are not filtered or thinned.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Height maps on an even grid, as points and as nominal surfaces; slopes of surfaces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias, runtime_checkable
 

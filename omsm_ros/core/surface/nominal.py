@@ -4,8 +4,6 @@ A surface is described in the workpiece frame of the scan: x, y in the plane of 
 along the spindle axis, all in metres.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Heights stay along the machine's z. A point q of the machine is ``p = Ráµ€ (q âˆ
 the part; the height over x, y solves ``p_z = h(p_x, p_y)`` by Newton's method.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields
 
 import numpy as np

@@ -9,8 +9,6 @@ of x + i y. The Jacobi polynomials P follow from their three-term recurrence. No
 factorial is computed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 

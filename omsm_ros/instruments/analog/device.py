@@ -1,7 +1,5 @@
 """Reads analog sensors through a converter: an accelerometer, a capacitive probe."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from types import MappingProxyType

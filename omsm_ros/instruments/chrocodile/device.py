@@ -4,8 +4,6 @@ Not tested on hardware. Details that the public documents leave open are setting
 forms are accepted.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

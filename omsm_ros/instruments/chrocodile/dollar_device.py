@@ -1,7 +1,5 @@
 """A CHRocodile in the dollar protocol, over a serial line or TCP."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import Any

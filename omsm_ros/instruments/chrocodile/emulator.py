@@ -12,8 +12,6 @@ of tables, spectra, changes of the baud rate, samples during an answer, several 
 and clients.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from typing import Any, NamedTuple

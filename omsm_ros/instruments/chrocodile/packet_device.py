@@ -1,7 +1,5 @@
 """Reads a CHRocodile 2 in the packet protocol, over TCP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any

@@ -5,8 +5,6 @@ answers and updates carry arguments; a data format describes the samples of the 
 the same counter. Signal numbers are those of the dollar protocol.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias

@@ -10,8 +10,6 @@ accepted once sync and counter of the next one have arrived: bytes lost inside i
 flipped in a value cannot be detected in this protocol.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import re

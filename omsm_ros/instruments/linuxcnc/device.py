@@ -5,8 +5,6 @@ gap and a restart of LinuxCNC is a fall to one. ``overrun`` on a line of its own
 samples that it reports are missing numbers, too.
 """
 
-from __future__ import annotations
-
 from omsm_ros.instruments.parameters import USUAL_COLUMNS, NowNs, Values
 from omsm_ros.instruments.scaling import AXES
 from omsm_ros.instruments.six_channel.device import CsvStreamDevice, make_text

@@ -4,8 +4,6 @@ Not tested on hardware. A controller that is switched off and on leaves its old 
 and silent, so the driver connects again after a silence.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field, replace
 from typing import Any

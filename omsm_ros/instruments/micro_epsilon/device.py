@@ -5,8 +5,6 @@ setting. Over Ethernet the blocks state their content, and the rate is set and r
 command port is given.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from dataclasses import dataclass, field, replace

@@ -8,8 +8,6 @@ Not imitated: exposure control, several peaks, video signals, statistics, mathem
 channels, linearisation, most commands (they are answered as unknown).
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

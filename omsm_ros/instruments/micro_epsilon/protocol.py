@@ -10,8 +10,6 @@ above mark them: 00 low, 01 middle, 10 high in the first value of a frame, 11 hi
 So a missing byte always shows.
 """
 
-from __future__ import annotations
-
 import itertools
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Reads the generic six-channel stream, binary or text, from a line or a TwinCAT PLC."""
 
-from __future__ import annotations
-
 import ctypes
 import time
 from dataclasses import dataclass, field, replace

@@ -6,8 +6,6 @@ the sender's own clock, and the faults of ``Instrument``.
 Not imitated: resolution of the sender's clock, overruns as ``halsampler`` reports them, commands.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from omsm_ros.instruments.emulator import Instrument, Measured

@@ -11,8 +11,6 @@ counts, which may have decimals; distance is in nanometres, time in nanoseconds.
 CR or both. A line with another content or number of columns is malformed.
 """
 
-from __future__ import annotations
-
 import re
 import zlib
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Reads and writes text with columns for x, y and height, and profiles of DABAM."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Iterator, Mapping

@@ -5,8 +5,6 @@ Then a line for each point: height, its three derivatives, and a flag, nonzero f
 The first point is at the least x and the greatest y; x runs first, then y falls.
 """
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

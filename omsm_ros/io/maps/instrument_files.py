@@ -1,7 +1,5 @@
 """Reads maps of instruments: HDF5 (ours and Zygo ``.datx``), MetroPro, and others by a library."""
 
-from __future__ import annotations
-
 import io
 import math
 import struct

@@ -1,7 +1,5 @@
 """Reads a map of any known format as points in metres."""
 
-from __future__ import annotations
-
 import codecs
 from dataclasses import replace
 from pathlib import Path

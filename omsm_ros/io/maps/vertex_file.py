@@ -1,7 +1,5 @@
 """Reads and writes point clouds: PLY (Stanford), PCD (Point Cloud Library, version 0.7)."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from itertools import islice

@@ -3,8 +3,6 @@
 Files are written in the revision ``ISO5436 - 2000``, which all readers accept.
 """
 
-from __future__ import annotations
-
 import re
 import zipfile
 from io import BytesIO

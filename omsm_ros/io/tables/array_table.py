@@ -5,8 +5,6 @@ A column of a table is named ``dataset[3]``, counted from 0; columns of a single
 channels of TDMS ``group/channel``.
 """
 
-from __future__ import annotations
-
 import contextlib
 import faulthandler
 import io

@@ -1,7 +1,5 @@
 """The base of tables of other programs, and the map of their columns."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence

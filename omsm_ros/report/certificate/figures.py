@@ -3,8 +3,6 @@
 Every function returns a matplotlib Figure that belongs to the caller; all arguments are SI.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

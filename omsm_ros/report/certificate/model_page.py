@@ -1,7 +1,5 @@
 """The page of a model between any two sampled quantities, with a record that it is run over."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any

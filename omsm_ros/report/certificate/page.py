@@ -1,7 +1,5 @@
 """The certificate of a calibration as a page to file: HTML in one piece."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import NamedTuple

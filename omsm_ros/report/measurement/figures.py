@@ -3,8 +3,6 @@
 Every function returns a matplotlib Figure; arguments are in SI units, labels state the unit drawn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

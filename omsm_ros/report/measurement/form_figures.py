@@ -1,7 +1,5 @@
 """Figures of a registered part, from the contents of ``form.json`` and ``curves.json``."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The report of a measurement: one self-contained HTML file."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Convert a cloud of any size to an image, the mean of each pixel with narrow gaps closed."""
 
-from __future__ import annotations
-
 import io
 import json
 from base64 import b64encode
