@@ -5,11 +5,13 @@
 
 Each servo cycle is sent to PORT, for `omsm record` and `axis_driver`. LinuxCNC refuses to run as
 root; started by root it runs as the user nobody. The largest acceleration of C is that which the
-program states in its comment. Only one LinuxCNC runs on a computer.
+program states in its comment. Only one LinuxCNC runs on a computer; processes and shared memory
+that a killed run of this script left behind are removed at the next start.
 """
 
 import argparse
 import contextlib
+import fcntl
 import math
 import os
 import pwd
@@ -19,12 +21,20 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 INSTALL = "apt-get install -y --no-install-recommends linuxcnc-uspace"
 HERE = Path(__file__).resolve().parent
 OTHER_USER = "nobody"
 END_S = 10.0
+# Marks the processes of this script; LinuxCNC hands its environment on to all of them.
+MARK = "OMSM_PROGRAM"
+# Processes of any LinuxCNC: realtime, and the owner of its shared memory.
+PROCESSES = ("rtapi_app", "linuxcncsvr")
+# Keys of that shared memory: messages, motion, RTAPI, HAL, sampler.
+SEGMENTS = (1001, 1002, 1003, 1004, 1005, 100, 0x48484C34, 0x48414C32, 0x48534130)
+LOCK = Path("/tmp/linuxcnc.lock")
 
 
 def missing():
@@ -52,15 +62,70 @@ def configure(folder, program, port, cycle, servo):
     hal.write_text(text.replace("7010", str(port)))
 
 
+def processes():
+    """Return the processes of this script's LinuxCNC, and those of another one."""
+    own, other = [], []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            name, marked = (folder / "comm").read_text().strip(), False
+            if "Z" in (folder / "stat").read_text().rpartition(")")[2].split()[0]:
+                continue
+            with contextlib.suppress(PermissionError):
+                marked = f"{MARK}=".encode() in (folder / "environ").read_bytes()
+            if marked:
+                own.append(int(folder.name))
+            elif name in PROCESSES:
+                other.append(int(folder.name))
+    return own, other
+
+
+def clear():
+    """Kill what an earlier run left, remove its shared memory; RuntimeError if another one runs."""
+    end = time.monotonic() + END_S
+    while found := processes():
+        own, other = found
+        if other:
+            numbers = " ".join(map(str, other))
+            raise RuntimeError(f"another LinuxCNC is running; end it first (kill -9 {numbers})")
+        if not own:
+            break
+        if time.monotonic() > end:
+            raise RuntimeError(f"processes {own} of an earlier LinuxCNC do not end")
+        for number in own:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
+        time.sleep(0.05)
+    lines = Path("/proc/sysvipc/shm").read_text().splitlines()[1:]
+    left = [words for line in lines if int((words := line.split())[0]) % 2**32 in SEGMENTS]
+    for words in left:
+        subprocess.run(["ipcrm", "-m", words[1]], check=False)
+    LOCK.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def alone():
+    """Lock LinuxCNC for this process; RuntimeError if another run of this script holds it."""
+    with Path(shutil.which("linuxcnc")).open() as locked:
+        try:
+            fcntl.flock(locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as err:
+            raise RuntimeError("this script runs LinuxCNC already; wait until it has ended") from err
+        clear()
+        try:
+            yield
+        finally:
+            clear()
+
+
 @contextlib.contextmanager
 def running(program, port, cycle=1e-3, servo=200.0):
     """Start LinuxCNC with the text of a program; yield its process, and end it."""
     if reason := missing():
         raise RuntimeError(reason)
-    with tempfile.TemporaryDirectory(prefix="linuxcnc_") as name:
+    with alone(), tempfile.TemporaryDirectory(prefix="linuxcnc_") as name:
         folder = Path(name)
         configure(folder, program, port, cycle, servo)
-        environment = os.environ | {"HOME": name, "OMSM_PROGRAM": str(folder / "program.nc")}
+        environment = os.environ | {"HOME": name, MARK: str(folder / "program.nc")}
         environment.pop("PYTHONPATH", None)  # its Python is that of the system
         other = {}
         if os.geteuid() == 0:
@@ -80,18 +145,14 @@ def running(program, port, cycle=1e-3, servo=200.0):
         try:
             yield process
         finally:
-            end(process)
-
-
-def end(process):
-    """End LinuxCNC; it ends its own processes when it is asked to."""
-    for number in (signal.SIGTERM, signal.SIGKILL):
-        with contextlib.suppress(ProcessLookupError):
-            if process.poll() is None:
-                os.killpg(process.pid, number)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(END_S)
-            return
+            # Asked to end, LinuxCNC ends its own processes; what then remains is cleared.
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGTERM)
+            try:
+                process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 if __name__ == "__main__":

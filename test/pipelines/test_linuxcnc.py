@@ -1,5 +1,9 @@
 """Programs on the real LinuxCNC of this machine, where it is installed."""
 
+import contextlib
+import json
+import os
+import signal
 import socket
 import subprocess
 import sys
@@ -55,36 +59,80 @@ def test_a_program_is_executed_as_planned_and_no_cycle_is_lost(tmp_path):
     assert np.std((found.distance.distance - truth)[ok]) < 12e-9
 
 
-# A killed program may leave LinuxCNC's processes behind, which keep the next start waiting.
+def numbers(bag):
+    return np.concatenate([np.array(r) for r in counters(bag)])
+
+
+def free_port():
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return free.getsockname()[1]
+
+
+def wait_until(reached, patience=30.0):
+    end = time.monotonic() + patience
+    while not reached():
+        assert time.monotonic() < end, "nothing came in time"
+        time.sleep(0.1)
+
+
+@contextlib.contextmanager
+def recorder(port, bag):
+    """Run ``omsm record`` and yield its process after a second of samples."""
+    command = ["omsm", "record", "--port", f"tcp://127.0.0.1:{port}", "--out", str(bag), "--json"]
+    with subprocess.Popen([*command, "--silence", "30"], stdout=subprocess.PIPE) as process:
+        try:
+            wait_until(lambda: bag.exists() and bag.stat().st_size > 20_000)
+            yield process
+        finally:
+            process.kill()
+
+
 @pytest.mark.soak
 @REAL
-@pytest.mark.parametrize("victim", ["reader", "LinuxCNC"])
-def test_killed_in_mid_program_every_cycle_is_accounted_for(tmp_path, victim):
-    steps = plan_steps(sample_period=1e-3, count=1, dwell=2.0)
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
+def test_a_killed_reader_leaves_the_rest_to_the_next(tmp_path):
+    port = free_port()
     given = {"device": "linuxcnc", "port": f"tcp://127.0.0.1:{port}"}
-    with start.running(steps_gcode(steps), port) as process:
-        command = ["omsm", "record", "--port", given["port"], "--out", str(tmp_path / "1.mcap")]
-        reader = subprocess.Popen([*command, "--silence", "2"])
-        time.sleep(7.0)
-        if victim == "reader":
-            reader.kill()
-            reader.wait()
-            more = record_device(given, tmp_path / "2.mcap", lambda n, _: n > 1000)
-        else:
-            subprocess.run(["pkill", "-9", "-g", str(process.pid)], check=False)
-            assert reader.wait(20.0) == 0
-    first = counters(tmp_path / "1.mcap")
-    seen = np.concatenate([np.array(r) for r in first])
-    assert len(seen) > 1000
-    assert np.all(np.diff(seen) == 1)
-    if victim == "reader":
-        then = np.concatenate([np.array(r) for r in counters(tmp_path / "2.mcap")])
-        # What the dead reader had taken is a gap of the count; the rest waited in HAL's FIFO.
-        assert 0 < then[0] - seen[-1] < 2000
-        assert np.all(np.diff(then) == 1)
-        assert more.get("lost", 0) == 0
+    program = steps_gcode(plan_steps(sample_period=1e-3, count=3, dwell=2.0))
+    with start.running(program, port):
+        with recorder(port, tmp_path / "1.mcap"):
+            time.sleep(2.0)
+        more = record_device(
+            given, tmp_path / "2.mcap", lambda n, silent: n > 1000 or silent > 20.0
+        )
+    first, then = numbers(tmp_path / "1.mcap"), numbers(tmp_path / "2.mcap")
+    assert len(first) > 1000
+    assert len(then) > 1000
+    assert np.all(np.diff(first) == 1)
+    assert np.all(np.diff(then) == 1)
+    # What the dead reader had taken and not written is a gap of the count.
+    assert 0 < then[0] - first[-1] < 2000
+    assert more.get("lost", 0) == more.get("restarts", 0) == 0
+
+
+@pytest.mark.soak
+@REAL
+def test_a_killed_linuxcnc_is_a_restart_of_the_count(tmp_path):
+    port, bag = free_port(), tmp_path / "1.mcap"
+    program = steps_gcode(plan_steps(sample_period=1e-3, count=3, dwell=2.0))
+    with contextlib.ExitStack() as stack:
+        with start.running(program, port):
+            reader = stack.enter_context(recorder(port, bag))
+            time.sleep(2.0)
+            for number in start.processes()[0]:
+                os.kill(number, signal.SIGKILL)
+        with start.running(program, port):
+            size = bag.stat().st_size
+            wait_until(lambda: bag.stat().st_size > size + 50_000)
+            reader.send_signal(signal.SIGINT)
+            found = json.loads(reader.communicate(timeout=20.0)[0])
+    assert found["restarts"] == 1
+    assert found.get("lost", 0) == found.get("overruns", 0) == 0
+    blocks = counters(bag)
+    assert sum(map(len, blocks)) == found["samples"] == found["decoded"]
+    # Each run is counted from its first cycle on, without a gap and without a repetition.
+    steps = np.diff(numbers(bag))
+    assert np.sum(steps != 1) == 1
+    assert numbers(bag)[np.flatnonzero(steps != 1)[0] + 1] == 1
 
 
 class Wave:
