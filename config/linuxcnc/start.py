@@ -109,7 +109,9 @@ def alone():
         try:
             fcntl.flock(locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as err:
-            raise RuntimeError("this script runs LinuxCNC already; wait until it has ended") from err
+            raise RuntimeError(
+                "this script runs LinuxCNC already; wait until it has ended"
+            ) from err
         clear()
         try:
             yield
