@@ -28,6 +28,6 @@ while True:
                 overruns = stream.num_overruns
                 lines.append("overrun\n")
             client.sendall("".join(lines).encode())
-            time.sleep(0.01)
+            time.sleep(0.02)
     except OSError:
         client.close()

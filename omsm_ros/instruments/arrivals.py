@@ -18,6 +18,8 @@ from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 WINDOW_S = 30.0
 # Arrivals closer than this count as one, their mean: it bounds the fit to 1500 points [s].
 _BIN_S = 0.02
+# The line is fitted anew after this time [s], and after this part of its span [1].
+_FIT_S, _FIT_PART = 0.1, 0.02
 # Crystals differ by some tens of ppm: the standard uncertainty of the drift before any arrival.
 _DRIFT_SIGMA = 100 * PPM
 # A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
@@ -83,7 +85,8 @@ class DeviceClock:
             return
         self._newest = (device_ns, arrival_ns)
         self._keep(device, late)
-        if len(self._bins) < 50 or device - self._fitted_at > 0.1 or device < self._fitted_at:
+        patience = max(_FIT_S, _FIT_PART * self._span)
+        if len(self._bins) < 50 or not 0 <= device - self._fitted_at < patience:
             self._fit()
             self._fitted_at = device
 

@@ -181,9 +181,10 @@ OVERRUN = b"overrun"
 _WHOLE = ("sequence", "device_time", "status")
 # Bounds the memory of a line without end.
 MAX_LINE_BYTES = 1024
-_INTEGER = re.compile(rb"[-+]?\d{1,19}")
-_NUMBER = re.compile(rb"[-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?")
-_SEPARATOR = re.compile(rb"[,;\s]+")
+_SEPARATORS = b",; \t\v\f"
+_INTEGER = rb"([-+]?\d{1,19})"
+_NUMBER = rb"([-+]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d+)?)"
+_ANY = rb"[^,;\s]+"
 
 
 # Numbers beyond these ranges are damage: counts that no counter reaches, times of centuries,
@@ -227,8 +228,14 @@ class CsvDecoder:
     def __init__(self, columns: Sequence[str] = COLUMNS, most_counts: int = MOST_COUNTS) -> None:
         """Raise ConfigurationError for columns that are not valid."""
         check_columns(columns)
-        self._ranges = _RANGES | dict.fromkeys(AXES, (-most_counts, most_counts))
-        self._columns = tuple(columns)
+        words = [_ANY if n == SKIPPED else _INTEGER if n in _WHOLE else _NUMBER for n in columns]
+        self._line = re.compile(rb"[,;\s]*" + rb"[,;\s]+".join(words) + rb"[,;\s]*")
+        ranges = _RANGES | dict.fromkeys(AXES, (-most_counts, most_counts))
+        self._read = [
+            (int if name in _WHOLE else float, *ranges.get(name, _OTHER_RANGE))
+            for name in columns
+            if name != SKIPPED
+        ]
         self._dtype = row_dtype(columns)
         self._tail = b""
         self._received = self._lines = self._malformed = self._overruns = 0
@@ -259,27 +266,17 @@ class CsvDecoder:
         return WireCounts(self._received, kept, len(self._tail), **counts)
 
     def _row(self, line: bytes) -> tuple[float, ...] | None:
-        words = [word for word in _SEPARATOR.split(line) if word]
-        if not words:
-            return None
-        self._overruns += words == [OVERRUN]
-        row = self._values(words) if len(line) <= MAX_LINE_BYTES else None
-        self._malformed += row is None
-        return row
-
-    def _values(self, words: list[bytes]) -> tuple[float, ...] | None:
-        if len(words) != len(self._columns):
-            return None
-        row: list[float] = []
-        for name, word in zip(self._columns, words, strict=True):
-            if name == SKIPPED:
-                continue
-            whole = name in _WHOLE
-            if not (_INTEGER if whole else _NUMBER).fullmatch(word):
-                return None
-            value = int(word) if whole else float(word)
-            least, most = self._ranges.get(name, _OTHER_RANGE)
-            if not least <= value <= most:
-                return None
-            row.append(value)
-        return tuple(row)
+        found = self._line.fullmatch(line) if len(line) <= MAX_LINE_BYTES else None
+        if found is not None:
+            words = zip(self._read, found.groups(), strict=True)
+            row = tuple(
+                value
+                for (number, least, most), word in words
+                if least <= (value := number(word)) <= most
+            )
+            if len(row) == len(self._read):
+                return row
+        text = line.strip(_SEPARATORS)
+        self._overruns += text == OVERRUN
+        self._malformed += bool(text)
+        return None
