@@ -25,8 +25,9 @@ from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.part_figures import without_second_order
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.registration.placement import Aperture, PointBatch
+from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,

@@ -30,7 +30,7 @@ from omsm_ros.interface_results import (
 
 if TYPE_CHECKING:
     from omsm_ros.core.kinematics.kinematics import Surface
-    from omsm_ros.core.registration.placement import Aperture
+    from omsm_ros.core.surface.aperture import Aperture
 
 
 def read(path: Path | str, columns: Path | str | None = None) -> Recording:

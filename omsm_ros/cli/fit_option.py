@@ -5,10 +5,10 @@ import argparse
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.isolated_points import DustRule
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import parse_dofs
-from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import COUNTER, LENGTH, TOLERANCE, shown
+from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.errors import ConfigurationError, SurfaceError
+from omsm_ros.quantities import COUNTER, TOLERANCE, shown
 from omsm_ros.readable import count, measured
 
 
@@ -33,21 +33,11 @@ def dust_rule(text: str) -> DustRule:
 
 
 def aperture(text: str) -> Aperture:
-    """Parse an aperture R or R,X,Y [m]."""
+    """Parse an aperture such as R[,X,Y] or ellipse:A,B[,X,Y] [m]."""
     try:
-        parts = [
-            LENGTH.checked(float(part), ConfigurationError, name)
-            for part, name in zip(text.split(","), ("radius", "x", "y"), strict=False)
-        ]
-        if len(parts) != len(text.split(",")) or len(parts) == 2 or parts[0] <= 0:
-            raise ValueError
-        return Aperture(*parts)
-    except ConfigurationError as err:
+        return Aperture.parse(text)
+    except SurfaceError as err:
         raise argparse.ArgumentTypeError(str(err)) from err
-    except ValueError as err:
-        raise argparse.ArgumentTypeError(
-            f"aperture is {shown(text)}, expected R or R,X,Y in metres"
-        ) from err
 
 
 def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
@@ -62,8 +52,10 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     add(
         "--aperture",
         aperture,
-        "disc of the part to evaluate [m]; default: all points",
-        metavar="R[,X,Y]",
+        "area of the part to evaluate [m]: R, annulus:R,INNER, ellipse:A,B or rectangle:A,B (half "
+        "lengths along x and y), each with ,X,Y of its middle if that is not the origin, or "
+        "polygon:X,Y,X,Y…; default: that of the nominal surface, else around all points",
+        metavar="APERTURE",
     )
 
 

@@ -25,9 +25,9 @@ from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
 from omsm_ros.core.kinematics.planner import plan_path
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.kinematics.trajectories import Spiral
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import AUTO
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import ConfigurationError, DataError, FileError
 from omsm_ros.io.calibration_file import load_calibration

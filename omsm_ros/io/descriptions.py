@@ -15,6 +15,7 @@ from omsm_ros.core.correction.source_kinds import FORMER_NAMES, KINDS
 from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import Aperture, BoundedSurface
 from omsm_ros.core.surface.height_grid import GridSurface, as_grid
 from omsm_ros.core.surface.nominal import SHAPES
 from omsm_ros.core.surface.posed import Pose, PosedSurface
@@ -208,6 +209,7 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
     """
     values = dict(description)
     shape, pose = values.pop("shape", None), values.pop("pose", None)
+    aperture = values.pop("aperture", None)
     named = {"shape": shape} if shape is not None else {}
     known = sorted([*SHAPES, *([_GRID] if folder is not None else [])])
     check_form(named, form({"shape": {"enum": known}}, ("shape",)), SurfaceError, what)
@@ -215,9 +217,11 @@ def surface_of(description: Mapping[str, Any], what: str, folder: Path | None = 
         surface = _grid(values, f"{what}: {shape}", folder or Path())
     else:
         surface = _record(SHAPES[shape], values, f"{what}: {shape}", folder)
-    if pose is None:
+    if pose is not None:
+        surface = PosedSurface(surface, _value(Pose, pose, f"{what}: pose", folder))
+    if aperture is None:
         return surface
-    return PosedSurface(surface, _value(Pose, pose, f"{what}: pose", folder))
+    return BoundedSurface(surface, Aperture.parse(str(aperture)))
 
 
 def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
@@ -276,6 +280,8 @@ def _value(hint: Any, value: Any, what: str, folder: Path | None) -> Any:
         if not isinstance(value, dict):
             raise SurfaceError(f"{what} is {shown(value)}, expected names and values")
         if kind is Surface:
+            if "aperture" in value:
+                raise SurfaceError("surface.nested_aperture")
             return surface_of(value, what, folder)
         return _record(kind, value, what, folder)
     return value

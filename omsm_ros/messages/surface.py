@@ -6,6 +6,14 @@ TEMPLATES: dict[str, str] = {
         "{name} has {terms} coefficients, expected {most} at most; leave out the others, or "
         "describe the surface by a grid"
     ),
+    "surface.aperture": (
+        "aperture is {text!r}, expected R, annulus:R,INNER, ellipse:A,B, rectangle:A,B with half "
+        "lengths, each also with ,X,Y of its middle, or polygon:X,Y,X,Y,X,Y with three corners or "
+        "more, in metres"
+    ),
+    "surface.nested_aperture": (
+        "a part of a surface has an aperture; state it beside the outermost shape"
+    ),
     "surface.indexing": "indexing is {indexing!r}, expected one of {known:list}",
     "surface.norm": "norm is {norm!r}, expected 'peak' or 'rms'",
     "surface.zernikes": (

@@ -15,7 +15,6 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import (
     POSE_PARAMETERS,
-    Aperture,
     Placed,
     PointBatch,
     PointBatches,
@@ -24,6 +23,7 @@ from omsm_ros.core.registration.placement import (
 from omsm_ros.core.registration.pose_parameters import MOVES, Registration
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, without_duplicates
@@ -226,11 +226,12 @@ def form_facts(
             ],
         },
         "aperture": {
-            "radius": form.aperture.radius,
+            "radius": found.disc.radius,
+            "x": found.disc.x,
+            "y": found.disc.y,
+            "outline": form.aperture.outline,
+            "rim": form.aperture.rim().tolist(),
             "uncovered": form.uncovered,
-            "outline": form.outline,
-            "x": form.aperture.x,
-            "y": form.aperture.y,
             "s_filter": form.bands.s_filter,
             "l_filter": form.bands.l_filter,
             "bands": {name: list(ends) for name, ends in form.bands.rms_bands.items()},

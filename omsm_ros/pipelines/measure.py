@@ -35,8 +35,8 @@ from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
 from omsm_ros.core.registration.isolated_points import DustRule
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import Aperture, within_aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.errors import DataError, Notice
@@ -133,8 +133,11 @@ def add_verdict(
     """
     scan, form = done.scan, summary.get("form")
     tolerance = None if register is None else register.tolerance
-    if scan is not None and register is not None and register.aperture is not None:
-        scan = _within(scan, register.aperture)
+    area = None
+    if register is not None and judgement.options.surface is not None:
+        _, area = within_aperture(judgement.options.surface, register.aperture)
+    if scan is not None and area is not None:
+        scan = _within(scan, area)
     doubts = [*done.faults, *map(str, _losses(done))]
     if scan is None or scan.turns < _LEAST_TURNS:
         systematic = summary["budget"]["systematic"]

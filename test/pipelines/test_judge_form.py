@@ -10,7 +10,8 @@ from omsm_ros.cli import main
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import Aperture, PointBatch
+from omsm_ros.core.registration.placement import PointBatch
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, ZernikeSurface
 from omsm_ros.io.files import CLOUD, SYSTEMATIC
 from omsm_ros.io.maps.read_map import read_points
@@ -183,8 +184,8 @@ def test_people_read_the_figures_too(folder, tmp_path, capsys):
     [
         (["--fit", "roll"], "roll"),
         (["--fit", "piston,clocking", "--nominal", "{}/sphere.yaml"], "clocking cannot be fitted"),
-        (["--aperture", "1,2"], "expected R or R,X,Y"),
-        (["--aperture", "-1"], "expected R or R,X,Y"),
+        (["--aperture", "1,2"], "expected R, annulus"),
+        (["--aperture", "-1"], "expected R, annulus"),
         (["--aperture", "0.001,0.05,0"], "0 points lie on"),
         (["--nominal", "{}/dust"], "dust"),
     ],

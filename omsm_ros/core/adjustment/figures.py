@@ -17,8 +17,8 @@ from scipy import linalg, sparse
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 POSE = ("piston", "tip", "tilt")

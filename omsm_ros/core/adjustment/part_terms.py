@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.adjustment.blocks import Blocks
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 # Free up to degree 10 (tried: what a turned freeform has beyond is below 2 nm); the variance of

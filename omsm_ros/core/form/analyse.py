@@ -41,11 +41,12 @@ from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
-from omsm_ros.core.registration.placement import Aperture, Placed, PointBatch, PointBatches, placed
+from omsm_ros.core.registration.placement import Placed, PointBatch, PointBatches, placed
 from omsm_ros.core.registration.pose_parameters import Registration
 from omsm_ros.core.registration.register import CHUNK, register
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
+from omsm_ros.core.surface.aperture import Aperture, best_covered, within_aperture
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.zernike_terms import (
     ZernikeIndex,
@@ -56,9 +57,8 @@ from omsm_ros.core.surface.zernike_terms import (
 from omsm_ros.errors import DataError, Notice
 
 ZERNIKES = first_terms(37, "fringe")
-# A larger share of the aperture without points keeps a tolerance open. Cells are this many tracks
-# wide, or this share of the radius.
-_COVERED_WELL, _TRACKS_PER_CELL, _CELLS_PER_RADIUS = 0.02, 2.5, 64
+# A larger share of the aperture without points keeps a tolerance open.
+_COVERED_WELL = 0.02
 # Points with all their effects take 50 MB. Extremes and counts are of all points.
 MOST_WEIGHED = 2**19
 # A hundred points for each Zernike term.
@@ -165,14 +165,14 @@ def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
 class FormResult:
     """Form of a part.
 
-    registration: pose;  aperture: the disc of the part that is evaluated
+    registration: pose, and the disc of the terms;  aperture: of the part; unless it is known, the
+        disc, rectangle or ellipse around the points that they cover best
     map: deviations of all points, or of an even selection of half a million
     deviation: figures by name;  zernike: terms of the deviation, one at the rim
     bands: wavelengths of the filters;  profiles, density: curves of the map
     counts: of the points by outcome; they add up to "read"
     dust: x, y and deviation of the points left out as dust (3, d) [m]
-    uncovered, outline: share of the aperture without points, and its shape: the "disc"; without an
-        aperture asked for, also the "rectangle" or "ellipse" around the points that is best covered
+    uncovered: share of the aperture without points
     """
 
     registration: Registration
@@ -186,7 +186,6 @@ class FormResult:
     counts: dict[str, int]
     dust: FloatArray
     uncovered: float
-    outline: str
 
     def doubts(self, *, decided: bool = False) -> list[Doubt]:
         """Return what the figures do not contain.  decided: that points left out are no defects."""
@@ -223,6 +222,7 @@ def analyse_form(
 
     Raises DataError for points that are too few, do not fit, or do not determine the pose.
     """
+    surface, aperture = within_aperture(surface, aperture)
     how = {"sources": sources, "aperture": aperture, "even": even, "dust": dust}
     found = register(surface, portions, asked, **how)  # type: ignore[arg-type]
     gathered = _Gathered(surface, found, aperture)
@@ -232,12 +232,14 @@ def analyse_form(
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
     map_ = gathered.map(found, even, [*[n for n, s in enumerate(sources) if s in bounds], *held])
     zernike = _terms(map_, found)
-    uncovered, outline = _uncovered(map_, found, aperture)
+    uncovered, covered = best_covered(
+        map_.x, map_.y, found.spacing, aperture or found.disc, aperture is None
+    )
     cells = GridCells.of(map_)
     bands = bands_of(cells, *filters)
     return FormResult(
         registration=found,
-        aperture=found.disc,
+        aperture=covered,
         map=map_,
         deviation=_figures(map_, gathered, found)
         | optical_terms(map_, zernike)
@@ -249,33 +251,6 @@ def analyse_form(
         counts=gathered.counts,
         dust=gathered.dust,
         uncovered=uncovered,
-        outline=outline,
-    )
-
-
-def _uncovered(
-    map_: DeviationMap, found: Registration, aperture: Aperture | None
-) -> tuple[float, str]:
-    """Return the share of the aperture that has no points, and its shape."""
-    disc = found.disc
-    pitch = max(_TRACKS_PER_CELL * found.spacing, disc.radius / _CELLS_PER_RADIUS)
-    pitch = min(pitch, disc.radius / 2)
-    count = int(np.ceil(2 * disc.radius / pitch))
-    if min(np.ptp(map_.x), np.ptp(map_.y)) < pitch:
-        return 0.0, "disc"  # a profile
-    edges = [np.linspace(c - disc.radius, c + disc.radius, count + 1) for c in (disc.x, disc.y)]
-    filled = np.histogram2d(map_.x, map_.y, edges)[0] > 0
-    u, v = np.meshgrid(*[(e[1:] + e[:-1]) / 2 for e in edges], indexing="ij")
-    # Cells at the rim, which lie within the aperture in part, count only if they have points.
-    shapes = {"disc": filled | (np.hypot(u - disc.x, v - disc.y) < disc.radius - pitch)}
-    if aperture is None:
-        away = [
-            np.abs(2 * cells - p.max() - p.min()) / (np.ptp(p) - pitch)
-            for cells, p in ((u, map_.x), (v, map_.y))
-        ]
-        shapes |= {"rectangle": np.maximum(*away) < 1, "ellipse": np.hypot(*away) < 1}
-    return min(
-        (float(1 - np.mean(filled[cells])), shape) for shape, cells in shapes.items() if cells.any()
     )
 
 

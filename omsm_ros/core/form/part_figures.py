@@ -24,8 +24,8 @@ import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, UncertainValue, weighted_quantiles
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
 # 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
 from omsm_ros.errors import DataError
 

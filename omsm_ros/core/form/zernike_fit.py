@@ -11,8 +11,8 @@ from math import comb
 
 import numpy as np
 
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 from omsm_ros.errors import DataError
 

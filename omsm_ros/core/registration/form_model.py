@@ -20,9 +20,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, rms_of, terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 

@@ -15,6 +15,7 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.statistics import EvenSelection
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.posed import Pose
 from omsm_ros.errors import DataError, SurfaceError
@@ -45,25 +46,6 @@ class PointBatch(NamedTuple):
 
 PointBatches: TypeAlias = Callable[[], Iterable[PointBatch]]
 """Function that reads all points from the start, portion by portion; called once per pass."""
-
-
-@dataclass(frozen=True, slots=True)
-class Aperture:
-    """A disc of the part's x and y: ``radius`` about (``x``, ``y``) [m]."""
-
-    radius: float
-    x: float = 0.0
-    y: float = 0.0
-
-    def holds(self, x: FloatArray, y: FloatArray) -> BoolArray:
-        """Return which points lie within the aperture, of their shape."""
-        square = (x - self.x) ** 2 + (y - self.y) ** 2
-        # Points on the rim are inside although float32 rounds them.
-        return np.asarray(square <= (self.radius * (1 + 1e-6)) ** 2)
-
-    def scaled(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return x and y on the unit disc."""
-        return (x - self.x) / self.radius, (y - self.y) / self.radius
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,11 +160,3 @@ def inside_aperture(points: Placed, aperture: Aperture | None) -> Placed:
     if extent < _LEAST_EXTENT_M:
         raise DataError("registration.small_extent", extent=extent)
     return points.part(good)
-
-
-def centred_aperture(points: Placed) -> Aperture:
-    """Return the disc that holds all points, about the origin or else their middle."""
-    ends = [(float(v.min()), float(v.max())) for v in (points.x, points.y)]
-    inside = all(low < 0 < high for low, high in ends)
-    x, y = (0.0, 0.0) if inside else ((low + high) / 2 for low, high in ends)
-    return Aperture(float(np.hypot(points.x - x, points.y - y).max()) or 1.0, x, y)

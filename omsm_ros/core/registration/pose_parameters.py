@@ -16,7 +16,6 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.form_model import FormBasis
 from omsm_ros.core.registration.placement import (
     POSE_PARAMETERS,
-    Aperture,
     Placed,
     Placement,
     PointBatch,
@@ -24,6 +23,7 @@ from omsm_ros.core.registration.placement import (
     placed,
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 

@@ -30,11 +30,9 @@ from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule, FarPo
 from omsm_ros.core.registration.placement import (
     LEAST_POINTS,
     POSE_PARAMETERS,
-    Aperture,
     Placement,
     PointBatch,
     PointBatches,
-    centred_aperture,
     dof_columns,
     inside_aperture,
     placed,
@@ -55,6 +53,7 @@ from omsm_ros.core.registration.pose_parameters import (
 )
 from omsm_ros.core.streams import statistics
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import Aperture, disc_of, within_aperture
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.posed import PosedSurface
 from omsm_ros.errors import DataError
@@ -150,6 +149,7 @@ def register(
     Raises DataError for too few points, a pose parameter that the surface does not determine,
     or a fit that does not converge.
     """
+    surface, aperture = within_aperture(surface, aperture)
     chosen = selection(portions, _MOST_SELECTED)
     start = Placement()
     dofs = _determined(surface, chosen, asked, aperture, start)
@@ -161,14 +161,17 @@ def register(
         dofs = _determined(surface, chosen, asked, aperture, seated)
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     points = inside_aperture(placed(surface, at, chosen), aperture)
-    disc = aperture or centred_aperture(points)
+    disc = aperture.disc if aperture else disc_of(points.x, points.y)
     basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
     fit = _PoseFit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
     open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
     if AUTO in asked:
         fit, stand, open_ = _useful(fit, stand, chosen, asked, open_)
-    return _over_all(fit, stand, portions, sources, open_, dust)
+    if aperture is None:
+        points = inside_aperture(placed(surface, stand.at, chosen), None)
+        disc = disc_of(points.x, points.y)
+    return _over_all(fit, stand, portions, sources, open_, dust, disc)
 
 
 def _determined(
@@ -365,6 +368,7 @@ def _over_all(
     sources: Sequence[str],
     open_: OpenUncertainty,
     dust: DustRule,
+    disc: Aperture,
 ) -> Registration:
     """Return the registration from one pass over all points at the converged pose.
 
@@ -402,7 +406,7 @@ def _over_all(
         limit=stand.limit,
         dust=left_out,
         spacing=far.space().spacing,
-        disc=fit.basis.disc,
+        disc=disc,
         basis=fit.basis,
         form=found.form,
         noise=float(np.sqrt(variance)),

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.image import AxesImage
-from matplotlib.patches import Ellipse, Patch, Rectangle
+from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
 
 from omsm_ros.core.kinematics.kinematics import Surface
@@ -77,21 +77,14 @@ def registered_map(
     made = style.empty(*_FULL_WIDTH)
     _draw_map(made, rasterise(x, y, deviation), "nm", "Registered deviation [nm]")
     axes = made.axes[0]
-    if "outline" in (aperture := form.get("aperture") or {}):
-        middle, size = [aperture["x"], aperture["y"]], [2 * aperture["radius"]] * 2
-        if aperture["outline"] != "disc":
-            middle = [(v.max() + v.min()) / 2 for v in (x, y)]
-            size = [float(np.ptp(v)) for v in (x, y)]
-        (u, v), (width, height) = np.array([middle, size]) / MILLIMETRE_M
-        look: dict[str, Any] = {"fc": style.MISSING, "ec": style.MUTED, "hatch": "////"}
+    if rim := (form.get("aperture") or {}).get("rim"):
+        edge = np.array(rim) / MILLIMETRE_M
         # Below the image, whose pixels without a point are transparent.
-        outline: Patch = Ellipse((u, v), width, height, zorder=-1, lw=0, **look)
-        if aperture["outline"] == "rectangle":
-            corner = (u - width / 2, v - height / 2)
-            outline = Rectangle(corner, width, height, zorder=-1, lw=0, **look)
-        axes.add_patch(outline)
-        axes.set_xlim(u - 0.51 * width, u + 0.51 * width)
-        axes.set_ylim(v - 0.51 * height, v + 0.51 * height)
+        look: dict[str, Any] = {"fc": style.MISSING, "ec": style.MUTED, "hatch": "////"}
+        axes.add_patch(Polygon(edge.T, zorder=-1, lw=0, **look))
+        low, high = edge.min(axis=1), edge.max(axis=1)
+        axes.set_xlim(low[0] - 0.01 * (high - low)[0], high[0] + 0.01 * (high - low)[0])
+        axes.set_ylim(low[1] - 0.01 * (high - low)[1], high[1] + 0.01 * (high - low)[1])
     dust = form.get("left_out") or {}
     if "x" in dust:
         at = [np.array(dust[name], np.float64) / MILLIMETRE_M for name in "xy"]

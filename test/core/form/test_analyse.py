@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import Aperture, PointBatch
+from omsm_ros.core.registration.placement import PointBatch
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import Flat, Sphere
 from omsm_ros.errors import DataError
 

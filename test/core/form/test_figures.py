@@ -10,8 +10,8 @@ from omsm_ros.core.form.deviation_map import (
     weighted_quantiles,
 )
 from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.streams.statistics import noise_of
+from omsm_ros.core.surface.aperture import Aperture
 
 DISC = Aperture(1e-2)
 POINTS = 20_000

@@ -27,7 +27,7 @@ from omsm_ros.core.form.part_figures import (
 )
 from omsm_ros.core.form.texture import UncertainCurve, profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
-from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 

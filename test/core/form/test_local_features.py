@@ -5,7 +5,7 @@ import pytest
 
 from omsm_ros.core.form.deviation_map import DeviationMap
 from omsm_ros.core.form.part_figures import extents_of_part
-from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.surface.aperture import Aperture
 
 R, NOISE = 12.7e-3, 10e-9
 X, Y = (v.ravel() for v in np.meshgrid(*[np.linspace(-R, R, 200)] * 2))

@@ -3,7 +3,8 @@
 import numpy as np
 
 from omsm_ros.core.form.analyse import analyse_form
-from omsm_ros.core.registration.placement import Aperture, PointBatch
+from omsm_ros.core.registration.placement import PointBatch
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import Sphere, ZernikeSurface
 from omsm_ros.core.surface.posed import Sum
 

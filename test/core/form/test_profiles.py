@@ -10,7 +10,7 @@ from omsm_ros.core.form.deviation_map import DeviationMap
 from omsm_ros.core.form.part_figures import without_form
 from omsm_ros.core.form.texture import profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
-from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, first_terms, zernike_values
 
 DISC = Aperture(10e-3, 1e-3, -2e-3)

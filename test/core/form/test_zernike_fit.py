@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.zernike_fit import fit_zernikes
-from omsm_ros.core.registration.placement import Aperture
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, first_terms, zernike_values
 from omsm_ros.errors import DataError
 

@@ -16,7 +16,6 @@ from omsm_ros.core.registration.form_model import (
     outlier_limit,
     relaxation_factor,
 )
-from omsm_ros.core.registration.placement import Aperture
 from omsm_ros.core.registration.pose_parameters import (
     OpenUncertainty,
     PoseParameters,
@@ -24,6 +23,7 @@ from omsm_ros.core.registration.pose_parameters import (
     shares_of,
     typical_range,
 )
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 from omsm_ros.errors import DataError
 

@@ -9,16 +9,14 @@ from scipy.spatial.transform import Rotation
 from omsm_ros.core.registration.placement import (
     LEAST_POINTS,
     POSE_PARAMETERS,
-    Aperture,
-    Placed,
     Placement,
     PointBatch,
-    centred_aperture,
     dof_columns,
     inside_aperture,
     placed,
     selection,
 )
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
@@ -123,21 +121,6 @@ def test_a_fit_that_strays_is_reported_with_what_to_check(name, step):
         Placement().moved([name], np.array([step]))
 
 
-# Apertures.
-
-
-def test_an_aperture_holds_its_rim_even_in_float32():
-    disc = Aperture(5e-3, 1e-3, -2e-3)
-    angle = np.linspace(0, 2 * np.pi, 50)
-    rim = np.stack([1e-3 + 5e-3 * np.cos(angle), -2e-3 + 5e-3 * np.sin(angle)])
-    assert np.all(disc.holds(*rim))
-    assert np.all(disc.holds(*rim.astype(np.float32).astype(float)))
-    centre = np.array([[1e-3], [-2e-3]])
-    assert not np.any(disc.holds(*(centre + 1.001 * (rim - centre))))
-    u, v = disc.scaled(*rim)
-    np.testing.assert_allclose(np.hypot(u, v), np.ones(50))
-
-
 def test_points_beyond_the_aperture_or_the_surface_do_not_count():
     x, y = RNG.uniform(-0.03, 0.03, (2, 4000))
     z = np.where(np.hypot(x, y) < 0.02, Sphere(0.02).height(x, y), 0.0)
@@ -169,30 +152,6 @@ def test_points_closer_than_atoms_are_refused(size, said):
     at = placed(Flat(), Placement(), portion(size / 6e-3 * np.stack([X, Y, 0 * X])))
     with pytest.raises(DataError, match=f"within .*{said}.*check the units of the cloud"):
         inside_aperture(at, None)
-
-
-def placed_at(x, y):
-    nothing = np.zeros((3, len(x)))
-    return Placed(x, y, 0 * x, nothing, nothing)
-
-
-def test_about_the_origin_is_the_disc_that_holds_all_points():
-    found = centred_aperture(placed_at(X, Y))
-    assert (found.x, found.y) == (0.0, 0.0)
-    assert found.radius == np.hypot(X, Y).max()
-
-
-@pytest.mark.parametrize("away", [(0.1, 0.0), (0.0, -0.2), (0.3, 0.4)])
-def test_a_part_off_the_origin_has_its_own_disc(away):
-    found = centred_aperture(placed_at(X + away[0], Y + away[1]))
-    assert abs(found.x - away[0]) < 3e-4
-    assert abs(found.y - away[1]) < 3e-4
-    assert np.all(found.holds(X + away[0], Y + away[1]))
-    assert found.radius < 9e-3
-
-
-def test_a_single_place_has_a_disc_too():
-    assert centred_aperture(placed_at(np.zeros(3), np.zeros(3))).radius == 1.0
 
 
 # Selections.

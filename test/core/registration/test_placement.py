@@ -3,13 +3,8 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.registration.placement import (
-    Aperture,
-    Placement,
-    PointBatch,
-    inside_aperture,
-    placed,
-)
+from omsm_ros.core.registration.placement import Placement, PointBatch, inside_aperture, placed
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import DataError
 

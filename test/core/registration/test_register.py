@@ -10,7 +10,6 @@ import pytest
 from omsm_ros.core.registration import register as registering
 from omsm_ros.core.registration.placement import (
     POSE_PARAMETERS,
-    Aperture,
     Placement,
     PointBatch,
     dof_columns,
@@ -18,6 +17,7 @@ from omsm_ros.core.registration.placement import (
 )
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,

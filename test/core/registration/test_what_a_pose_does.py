@@ -9,13 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from omsm_ros.core.correction.surface_points import join_points
-from omsm_ros.core.registration.placement import (
-    Aperture,
-    Placement,
-    PointBatch,
-    dof_columns,
-    placed,
-)
+from omsm_ros.core.registration.placement import Placement, PointBatch, dof_columns, placed
 from omsm_ros.core.registration.probe_alignment import (
     SphereScan,
     SphereScanReader,
@@ -24,6 +18,7 @@ from omsm_ros.core.registration.probe_alignment import (
 )
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.streams.blocks import AxisBlock
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.errors import DataError

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.surface import deviation as form
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
@@ -140,7 +141,7 @@ def test_a_registered_map_shows_points_left_out_and_what_no_point_covers():
     x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-5e-3, 5e-3, 120)] * 2))
     kept = (np.hypot(x, y) <= 5e-3) & ((x < 1e-3) | (y < 1e-3))
     form = {
-        "aperture": {"x": 0.0, "y": 0.0, "radius": 5e-3, "outline": "disc"},
+        "aperture": {"rim": Aperture(5e-3).rim().tolist()},
         "left_out": {"x": [-2e-3], "y": [-1e-3]},
     }
     figure = figures.registered_map(x[kept], y[kept], 0 * x[kept], form)

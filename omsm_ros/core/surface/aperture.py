@@ -1,0 +1,237 @@
+"""Aperture: the area of a part that counts, in its x and y."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, get_args
+
+import numpy as np
+
+from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.surface.height_grid import Gradient, gradient_of
+from omsm_ros.errors import SurfaceError
+from omsm_ros.quantities import LENGTH
+
+Outline = Literal["disc", "annulus", "ellipse", "rectangle", "polygon"]
+# Points on the rim are inside although float32 rounds them.
+_RIM = 1 + 1e-6
+# Points of a drawn rim.
+_DRAWN = 181
+# Cells that show gaps; the widest gap that is covered, in tracks, and at least in cells.
+_CELLS_ACROSS, _GAP_IN_TRACKS, _LEAST_CELLS = 512, 3.5, 3.0
+# Share of the points that an outline around them holds; of a rectangle, an ellipse holds 79 %.
+_HOLDS_ALL = 0.95
+# Directions in which the rim of a scan may lie a track within that of the aperture.
+_AROUND = np.exp(0.25j * np.pi * np.arange(8))
+# The smallest disc about the part's origin counts if its middle is off by less than this share.
+_CENTRED = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Aperture:
+    """An area within the disc of ``radius`` about (``x``, ``y``) [m], over which its terms extend.
+
+    outline: of the area, the disc itself unless stated
+    sizes: inner radius of an annulus, half lengths along x and y of an ellipse or rectangle, or
+        x, y, x, y … of the corners of a polygon [m]
+    """
+
+    radius: float
+    x: float = 0.0
+    y: float = 0.0
+    outline: Outline = "disc"
+    sizes: tuple[float, ...] = ()
+
+    @classmethod
+    def parse(cls, text: str) -> Aperture:
+        """Return the aperture of a text such as '12e-3' or 'ellipse:12e-3,17e-3,0,1e-3' [m].
+
+        Radius of a disc, radius and inner radius of an annulus, half lengths of an ellipse or
+        rectangle, each with x and y of its middle if that is not the origin; corners of a polygon.
+        Raises SurfaceError for another text.
+        """
+        outline, _, numbers = text.rpartition(":")
+        try:
+            sizes = [float(part) for part in numbers.split(",")]
+        except ValueError as err:
+            raise SurfaceError("surface.aperture", text=text) from err
+        return cls.of(outline.strip() or "disc", *sizes)
+
+    @classmethod
+    def of(cls, outline: str, *sizes: float) -> Aperture:
+        """Return the aperture of an outline and its sizes [m], in the order of :meth:`parse`."""
+        text = f"{outline}:" + ",".join(f"{size:g}" for size in sizes)
+        for size in sizes:
+            LENGTH.checked(size, SurfaceError, "aperture")
+        if outline == "polygon" and len(sizes) >= 6 and len(sizes) % 2 == 0:
+            middle, radius = smallest_disc(np.array(sizes[::2]), np.array(sizes[1::2]))
+            return cls(radius, *middle, "polygon", sizes)
+        own = 1 if outline == "disc" else 2
+        known = outline in get_args(Outline)[:-1] and len(sizes) in (own, own + 2)
+        if not known or min(sizes[:own]) <= 0 or (outline == "annulus" and sizes[1] >= sizes[0]):
+            raise SurfaceError("surface.aperture", text=text)
+        middle = (0.0, 0.0) if len(sizes) == own else (sizes[-2], sizes[-1])
+        if own == 1:
+            return cls(sizes[0], *middle)
+        if outline == "annulus":
+            return cls(sizes[0], *middle, "annulus", (sizes[1],))
+        long = max(sizes[:2]) if outline == "ellipse" else float(np.hypot(sizes[0], sizes[1]))
+        return cls(long, *middle, outline, (sizes[0], sizes[1]))  # type: ignore[arg-type]
+
+    @property
+    def disc(self) -> Aperture:
+        """The disc that holds the area."""
+        return Aperture(self.radius, self.x, self.y)
+
+    def holds(self, x: FloatArray, y: FloatArray) -> BoolArray:
+        """Return which points lie within the aperture, of their shape."""
+        u, v = np.asarray(x) - self.x, np.asarray(y) - self.y
+        if self.outline == "polygon":
+            return _within(u, v, _RIM * (self._corners() - [[self.x], [self.y]]))
+        if self.outline in ("ellipse", "rectangle"):
+            a, b = np.abs(u) / self.sizes[0], np.abs(v) / self.sizes[1]
+            size = np.maximum(a, b) if self.outline == "rectangle" else np.hypot(a, b)
+            return np.asarray(size <= _RIM)
+        square = u**2 + v**2
+        inside = square <= (self.radius * _RIM) ** 2
+        if self.outline == "annulus":
+            inside &= square >= (self.sizes[0] / _RIM) ** 2
+        return np.asarray(inside)
+
+    def scaled(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return x and y on the unit disc."""
+        return (x - self.x) / self.radius, (y - self.y) / self.radius
+
+    def rim(self) -> FloatArray:
+        """Return the closed outline (2, n) [m]; that of an annulus returns along its hole."""
+        if self.outline == "polygon":
+            corners = self._corners()
+            return np.append(corners, corners[:, :1], axis=1)
+        middle, angle = np.array([[self.x], [self.y]]), np.linspace(0, 2 * np.pi, _DRAWN)
+        turn = np.stack([np.cos(angle), np.sin(angle)])
+        if self.outline == "rectangle":
+            turn = np.array([[1, -1, -1, 1, 1], [1, 1, -1, -1, 1]], np.float64)
+        if self.outline in ("ellipse", "rectangle"):
+            return np.asarray(middle + np.array(self.sizes)[:, np.newaxis] * turn)
+        hole = self.sizes[0] * turn[:, ::-1] if self.outline == "annulus" else np.empty((2, 0))
+        return np.asarray(middle + np.concatenate([self.radius * turn, hole], axis=1))
+
+    def _corners(self) -> FloatArray:
+        return np.array(self.sizes).reshape(-1, 2).T
+
+
+def _within(x: FloatArray, y: FloatArray, corners: FloatArray) -> BoolArray:
+    """Return which points lie within the polygon of ``corners`` (2, k): an odd number of edges."""
+    inside = np.zeros(np.shape(x), bool)
+    for (ax, ay), (bx, by) in zip(corners.T, np.roll(corners, -1, axis=1).T, strict=True):
+        crossed = (ay > y) != (by > y)
+        inside ^= crossed & (x < ax + (bx - ax) * (y - ay) / ((by - ay) or 1.0))
+    return inside
+
+
+def smallest_disc(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], float]:
+    """Return middle and radius [m] of the smallest disc that holds the points x, y (n,) [m].
+
+    The farthest point joins the two or three that the disc rests on, until none lies outside.
+    """
+    places = np.asarray(x) + 1j * np.asarray(y)
+    resting, middle, radius = [places[0]], complex(places[0]), 0.0
+    while True:
+        away = np.abs(places - middle)
+        far = int(np.argmax(away))
+        if away[far] <= radius * (1 + 1e-12) or len(resting) > 3:
+            return _found(middle, away[far])
+        points = [*resting, places[far]]
+        rests = [r for k in (2, 3) for r in combinations(points, k)]
+        discs = [(c, float(np.max(np.abs(np.array(points) - c))), r) for r in rests
+                 if (c := _through(*r)) is not None]  # fmt: skip
+        middle, larger, through = min(discs, key=lambda disc: disc[1])
+        if larger <= radius:  # rounding
+            return _found(middle, away[far])
+        radius, resting = larger, list(through)
+
+
+def _found(middle: complex, radius: float) -> tuple[tuple[float, float], float]:
+    return (float(middle.real), float(middle.imag)), float(radius)
+
+
+def _through(a: complex, b: complex, c: complex | None = None) -> complex | None:
+    """Return the middle of the smallest circle through two or three points, None on a line."""
+    if c is None:
+        return (a + b) / 2
+    b, c = b - a, c - a
+    cross = 2 * (b.real * c.imag - b.imag * c.real)
+    if abs(cross) <= 1e-12 * abs(b) * abs(c):
+        return None
+    return a + 1j * (abs(c) ** 2 * b - abs(b) ** 2 * c) / cross
+
+
+def disc_of(x: FloatArray, y: FloatArray) -> Aperture:
+    """Return the disc that holds points x, y (n,) [m], about the origin if that is their middle."""
+    middle, radius = smallest_disc(x, y)
+    if np.hypot(*middle) < _CENTRED * radius:
+        middle, radius = (0.0, 0.0), float(np.hypot(x, y).max())
+    return Aperture(radius or 1.0, *middle)
+
+
+def best_covered(
+    x: FloatArray, y: FloatArray, track: float, aperture: Aperture, free: bool
+) -> tuple[float, Aperture]:
+    """Return the share of an aperture that points x, y (n,) [m] leave uncovered, and the aperture.
+
+    track: distance of neighbouring tracks [m]
+    free: the rectangle or ellipse around the points may stand for ``aperture``, if it has less
+
+    Wider gaps than holes of random points count; the rim may lie a track within the aperture's.
+    """
+    from scipy import ndimage  # takes long to load
+
+    box = [(float(np.ptp(v)) / 2, float(v.max() + v.min()) / 2) for v in (x, y)]
+    sizes = [half for half, _ in box] + [middle for _, middle in box]
+    track = max(track, 2 * float(np.sqrt(sizes[0] * sizes[1] / len(x))))
+    if min(sizes[:2]) < track:
+        return 0.0, aperture  # a profile
+    pitch = max(2 * aperture.radius / _CELLS_ACROSS, track / 2)
+    reach = max(_GAP_IN_TRACKS * track, _LEAST_CELLS * pitch) / 2 / pitch
+    half = aperture.radius + (np.ceil(reach) + 1) * pitch
+    ends = [np.arange(m - half, m + half + pitch, pitch) for m in (aperture.x, aperture.y)]
+    empty = np.histogram2d(x, y, ends)[0] == 0
+    # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
+    near = ndimage.distance_transform_edt(empty) <= reach
+    open_ = ndimage.distance_transform_edt(near) <= reach
+    shapes = [aperture]
+    if free:
+        around_points = [Aperture.of(outline, *sizes) for outline in ("rectangle", "ellipse")]
+        shapes += [s for s in around_points if np.mean(s.holds(x, y)) > _HOLDS_ALL]
+    u, v = np.meshgrid(*[(e[1:] + e[:-1]) / 2 for e in ends], indexing="ij")
+    around, shares = (track + pitch) * _AROUND, []
+    for shape in shapes:
+        inside = np.all([shape.holds(u + a.real, v + a.imag) for a in around], axis=0)
+        shares.append(float(np.mean(open_[inside])) if inside.any() else 1.0)
+    best = int(np.argmin(shares))
+    return shares[best], shapes[best]
+
+
+def within_aperture(surface: Surface, aperture: Aperture | None) -> tuple[Surface, Aperture | None]:
+    """Return surface and aperture, which is that of a :class:`BoundedSurface` unless stated."""
+    if not isinstance(surface, BoundedSurface):
+        return surface, aperture
+    return surface.surface, aperture or surface.aperture
+
+
+@dataclass(frozen=True, slots=True)
+class BoundedSurface:
+    """A nominal ``surface`` of which an ``aperture`` counts, in the frame of the surface."""
+
+    surface: Surface
+    aperture: Aperture
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m], beyond the aperture too."""
+        return self.surface.height(x, y)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        return gradient_of(self.surface, x, y)
