@@ -12,7 +12,7 @@ TEMPLATES: dict[str, str] = {
         "more, in metres"
     ),
     "surface.nested_aperture": (
-        "a part of a surface has an aperture; state it beside the outermost shape"
+        "a part of a surface has an aperture; state it with the outermost shape"
     ),
     "surface.indexing": "indexing is {indexing!r}, expected one of {known:list}",
     "surface.norm": "norm is {norm!r}, expected 'peak' or 'rms'",

@@ -214,17 +214,15 @@ def analyse_form(
 ) -> FormResult:
     """Register the points and evaluate their deviations.
 
-    portions: reads the points;  asked: pose parameters of the fit, or "auto"
-    sources: names of the systematic errors;  bounds: those of which only an upper bound is known
-    aperture: of the part; None: the disc about the part's origin that holds all points
+    As in :func:`register`, and  bounds: sources of which only an upper bound is known
     filters: wavelengths of the S- and the L-filter [m], None for the defaults
-    even: the points form an even grid;  dust: which points far from the form are left out
 
     Raises DataError for points that are too few, do not fit, or do not determine the pose.
     """
     surface, aperture = within_aperture(surface, aperture)
-    how = {"sources": sources, "aperture": aperture, "even": even, "dust": dust}
-    found = register(surface, portions, asked, **how)  # type: ignore[arg-type]
+    found = register(
+        surface, portions, asked, sources=sources, aperture=aperture, even=even, dust=dust
+    )
     gathered = _Gathered(surface, found, aperture)
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):
@@ -232,14 +230,13 @@ def analyse_form(
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
     map_ = gathered.map(found, even, [*[n for n, s in enumerate(sources) if s in bounds], *held])
     zernike = _terms(map_, found)
-    uncovered, covered = best_covered(
-        map_.x, map_.y, found.spacing, aperture or found.disc, aperture is None
-    )
+    outline = aperture or found.disc
+    uncovered, outline = best_covered(map_.x, map_.y, found.spacing, outline, aperture is None)
     cells = GridCells.of(map_)
     bands = bands_of(cells, *filters)
     return FormResult(
         registration=found,
-        aperture=covered,
+        aperture=outline,
         map=map_,
         deviation=_figures(map_, gathered, found)
         | optical_terms(map_, zernike)

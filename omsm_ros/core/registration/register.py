@@ -376,8 +376,7 @@ def _over_all(
     """
     free, held = len(fit.names), root_of(open_.held)
     sums = fit.new_sums(len(sources) + 2 * len(held))
-    square = points = 0.0
-    far, beyond = FarPoints(stand.limit), []
+    square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []
     for portion in portions():
         beyond.append(fit.sums(stand, portion, held, sums, far))
         before = placed(fit.surface, Placement(), portion).deviation
@@ -390,8 +389,8 @@ def _over_all(
     found, variance = fit.solved(stand.at, sums)
     # Each column is the step of the pose for one standard uncertainty of a source.
     moved = found.covariance[:free] / found.noise @ sums.gram[:, sums.columns + 1 :]
-    covariance = found.covariance[:free, :free]
-    by_source = open_.by_source(fit.names, covariance, (*sources, *[HELD] * 2 * len(held)), moved)
+    covariance, names = found.covariance[:free, :free], (*sources, *[HELD] * 2 * len(held))
+    by_source = open_.by_source(fit.names, covariance, names, moved)
     return Registration(
         surface=fit.surface,
         placement=stand.at.moved(fit.names, found.step),
