@@ -353,9 +353,11 @@ class TriggerSlipDetector:
 
     def _set_least_steps(self) -> None:
         """Take the least step of each stream that its scatter does not hide."""
-        rows = self._seen.rows
+        rows, early = self._seen.rows, self._seen.rows[:, 0] < self._first_judged()
         for stream in (0, 1):
-            begun = rows[rows[:, 2 + stream] > 0]
+            which = rows[:, 2 + stream] > 0
+            later = which & ~early
+            begun = rows[later if np.sum(later) > _LEAST_STAMPS else which]
             time = begun[:, 4] - stream * begun[:, 1]
             steps = np.diff(time) - np.diff(begun[:, 0]) * self._period_ns
             if len(steps) >= _LEAST_STAMPS:
@@ -405,8 +407,10 @@ class TriggerSlipDetector:
 
     def _recent(self) -> FloatArray | None:
         """Return the rows of :class:`StampHistory` to be judged; None if too few."""
-        first = self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
-        return self._seen.recent(first, self._since, _LEAST_STAMPS)
+        return self._seen.recent(self._first_judged(), self._since, _LEAST_STAMPS)
+
+    def _first_judged(self) -> float:
+        return self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
 
     def _window(self) -> FloatArray | None:
         """Return the skews to be judged [samples]; None if too few or in time lapse."""
