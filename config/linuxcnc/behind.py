@@ -43,9 +43,9 @@ class CommandedMotion:
         """Return the commanded axes at ``time`` [s]; still before and after the record."""
         period = self.axes.sample_period
         within = np.clip(time, 0.0, (len(self.axes) - 1) * period)
-        x, z, c = (Trajectory(0.0, period, getattr(self.axes, n)).at(within) for n in "xzc")
-        zero = np.zeros_like(x)
-        return AxisPositions(x, zero, z, zero, c)
+        return AxisPositions(
+            *(Trajectory(0.0, period, getattr(self.axes, n)).at(within) for n in "xyzbc")
+        )
 
 
 def commanded(bag):

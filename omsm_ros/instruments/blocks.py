@@ -153,6 +153,11 @@ class BlockCutter:
         return self._evenly_wrong
 
     @property
+    def rate_known(self) -> bool:
+        """Return whether device time or enough arrivals show the rate of the samples."""
+        return self._channels.timed or self._clock.drift is not None
+
+    @property
     def arrives_otherwise(self) -> bool:
         """Return whether samples without time arrive at another rate than stated."""
         return not self._channels.timed and abs(self.period_deviation) > ARRIVAL_TOLERANCE

@@ -171,6 +171,11 @@ class StreamDevice:
                 f"samples arrive at {self._rates()}: set sample_period to the trigger's, unless "
                 "a recording is played in time lapse"
             )
+        if self.decoded and not self._cutter.rate_known:
+            return (
+                f"{self._transport.name}: the rate of the samples is not verified yet; they carry "
+                "no time, and arrivals show the rate after 5 s"
+            )
         if self._cutter.perhaps_at_zero:
             return (
                 f"{self._transport.name}: counter and encoders are at zero after a silence; if the "

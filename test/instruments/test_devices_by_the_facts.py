@@ -24,7 +24,13 @@ from omsm_ros.instruments.micro_epsilon.device import (
     ConfocalDtEthernetDevice,
     ConfocalDtSettings,
 )
-from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
+from omsm_ros.instruments.scaling import AXES
+from omsm_ros.instruments.six_channel.device import (
+    CsvSettings,
+    CsvStreamDevice,
+    GenericStreamDevice,
+    StreamSettings,
+)
 from omsm_ros.instruments.six_channel.protocol import encode_frames
 from omsm_ros.instruments.stream import StreamDevice
 
@@ -353,6 +359,29 @@ def test_a_trigger_of_another_rate_is_not_published() -> None:
     found = [pair for _ in portions for pair in device.poll(0.0)]
     assert not found
     assert "2000 Hz" in device.trouble
+
+
+@pytest.mark.parametrize(("period", "said"), [(1e-3, ""), (1.01e-3, "set sample_period")])
+def test_axes_without_time_are_doubtful_until_arrivals_show_their_rate(
+    period: float, said: str
+) -> None:
+    portions = [b"%d 0 0 0 0 0\n" % n for n in range(8000)]
+    now, step = 0.0, 10
+    portions = [b"".join(portions[i : i + step]) for i in range(0, 8000, step)]
+    device = CsvStreamDevice(
+        Script(*portions), CsvSettings(columns=("sequence", *AXES)), lambda: round(now * 1e9)
+    )
+    device._monotonic = lambda: now
+    device.open()
+    cautions = []
+    for _ in portions:
+        now += step * period
+        device.poll(0.0)
+        cautions.append(device.caution)
+    assert all("not verified" in caution for caution in cautions[:100])
+    assert not any("not verified" in caution for caution in cautions[600:])
+    assert said in cautions[-1]
+    assert bool(cautions[-1]) == bool(said)
 
 
 def test_a_pause_of_the_trigger_is_no_other_rate() -> None:

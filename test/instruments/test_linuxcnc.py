@@ -20,7 +20,8 @@ def read(portions, **given):
 
 
 def line(cycle, x=0.0, z=0.0, c=0.0, away=0, probe=0.0):
-    return f"{cycle} {x:.17g} {z:.17g} {c:.17g} {away} {probe:.17g}\n".encode()
+    axes = f"{x:.17g} 0 {z:.17g} 0 {c:.17g}"
+    return f"{cycle} {cycle * 1_000_000} {axes} {away} {probe:.17g}\n".encode()
 
 
 def test_a_picometre_of_a_millimetre_arrives():
@@ -49,3 +50,13 @@ def test_the_probe_has_no_target_where_the_program_does_not_measure():
 def test_stated_scales_are_kept():
     (pair,), _ = read([line(1, x=1.0) + line(2, x=1.0)], **{"x.counts_per_unit": 1 / 0.0254})
     np.testing.assert_allclose(pair.axes.x, 0.0254)
+
+
+def test_another_period_than_linuxcnc_states_is_not_delivered():
+    """LinuxCNC runs at 1 kHz, ``sample_period`` states 4 kHz."""
+    blocks, counts = read(
+        [b"".join(map(line, range(1 + 50 * k, 51 + 50 * k))) for k in range(10)],
+        sample_period=2.5e-4,
+    )
+    assert not blocks
+    assert counts["withheld"] == 500

@@ -1,8 +1,9 @@
 """Reads LinuxCNC: lines of HAL's sampler over TCP, one a servo cycle.
 
 The first column is the number of the servo cycle, counted in HAL itself, so that a lost cycle is a
-gap and a restart of LinuxCNC is a fall to one. ``overrun`` on a line of its own is counted; the
-samples that it reports are missing numbers, too.
+gap and a restart of LinuxCNC is a fall to one. The time is that number times the period which
+LinuxCNC states itself. ``overrun`` on a line of its own is counted; the samples that it reports are
+missing numbers, too.
 """
 
 from omsm_ros.instruments.parameters import USUAL_COLUMNS, NowNs, Values
@@ -11,7 +12,7 @@ from omsm_ros.instruments.six_channel.device import CsvStreamDevice, make_text
 from omsm_ros.instruments.transport import Transport
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M
 
-COLUMNS = "sequence x z c status distance"
+COLUMNS = "sequence device_time x y z b c status distance"
 """Columns of ``config/linuxcnc/cell.hal``."""
 # HAL's numbers have 53 bits: a picometre of a millimetre, and 17 prad of a degree, are resolved.
 _PARTS = 10**9
@@ -26,4 +27,4 @@ def make(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice
         given["columns"] = COLUMNS
     for axis, usual in _COUNTS_PER_UNIT.items():
         given[f"{axis}.counts_per_unit"] = given[f"{axis}.counts_per_unit"] or usual
-    return make_text(given, transport, now_ns, _PARTS, clocked=True)
+    return make_text(given, transport, now_ns, _PARTS)

@@ -29,7 +29,7 @@ from omsm_ros.instruments.six_channel.protocol import (
 )
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Transport, parts_of
-from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
+from omsm_ros.units import NANOMETRE_M
 
 _SEQUENCE_RANGE = 2**32
 
@@ -95,7 +95,7 @@ class CsvSettings(BlockSettings):
     """Settings of the text stream.
 
     columns: of a line, in order;  scaling: counts ↔ SI;  modulus: of the sequence
-    parts: of a count that are resolved;  clocked: the sequence counts periods of the sender's clock
+    parts: of a count that are resolved
     An axis without a column stays at its offset.
     """
 
@@ -103,7 +103,6 @@ class CsvSettings(BlockSettings):
     scaling: StreamScaling = field(default_factory=StreamScaling)
     modulus: int = 2**32
     parts: int = PARTS
-    clocked: bool = False
 
 
 class CsvStreamDevice(StreamDevice):
@@ -117,8 +116,7 @@ class CsvStreamDevice(StreamDevice):
         settings = settings or CsvSettings()
         self._columns, self._probe = settings.columns, settings.scaling.probe
         self._parts = settings.parts
-        timed = "device_time" in settings.columns or settings.clocked
-        self._clocked = settings.clocked
+        timed = "device_time" in settings.columns
         has_axes = bool(set(AXES) & set(settings.columns))
         in_parts = (_in_parts(axis, settings.parts) for axis in settings.scaling.axes)
         axes = tuple(in_parts) if has_axes else None
@@ -133,10 +131,7 @@ class CsvStreamDevice(StreamDevice):
         samples = np.zeros(len(rows), SAMPLE)
         samples["counter"] = rows["sequence"]
         samples["intensity"] = np.nan
-        if self._clocked:
-            period_ns = self._settings.sample_period * NANOSECONDS_PER_S
-            samples["time"] = np.rint(rows["sequence"] * period_ns)
-        elif self.channels.timed:
+        if self.channels.timed:
             samples["time"] = rows["device_time"]
         if "distance" in self._columns:
             measured = rows["distance"] != self._probe.invalid
@@ -180,14 +175,14 @@ def make_binary(values: Values, transport: Transport, now_ns: NowNs) -> GenericS
 
 
 def make_text(
-    values: Values, transport: Transport, now_ns: NowNs, parts: int = PARTS, clocked: bool = False
+    values: Values, transport: Transport, now_ns: NowNs, parts: int = PARTS
 ) -> CsvStreamDevice:
     """Return the device that ``values`` describe, which resolves ``parts`` of a count."""
     columns = tuple(values["columns"].replace(",", " ").split())
     read = [axis for axis in AXES if axis in columns]
     scaling = StreamScaling(**axes_of(values, read), probe=_probe_scaling(values))
     settings = CsvSettings(
-        **_stream_settings(values), columns=columns, scaling=scaling, parts=parts, clocked=clocked
+        **_stream_settings(values), columns=columns, scaling=scaling, parts=parts
     )
     return CsvStreamDevice(transport, settings, now_ns)
 
