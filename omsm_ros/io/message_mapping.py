@@ -69,8 +69,7 @@ def ros_messages() -> Messages:
     from sensor_msgs.msg import PointCloud2, PointField
     from std_msgs.msg import Header
 
-    names = ("AxisBlock", "DistanceBlock", "AccelerationBlock", "Calibration")
-    ours = {name: getattr(msg, name) for name in names}
+    ours = {name: kind for name, kind in vars(msg).items() if name[:1].isupper()}
     others = {c.__name__: c for c in (Time, Header, PointCloud2, PointField)}
     return Messages({**ours, **others}, _ros_sequence)
 

@@ -3,12 +3,16 @@
 import multiprocessing
 import queue
 import resource
+import signal
 import threading
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from multiprocessing.connection import Connection
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar, cast
 
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 
@@ -17,6 +21,7 @@ from omsm_ros.nodes.memory import return_free_memory
 from omsm_ros.nodes.running import offer, refusing
 
 T = TypeVar("T")
+Attend: TypeAlias = Callable[..., None]
 
 # Requests that may wait; a further one is refused at once.
 _MOST_WAITING = 8
@@ -24,23 +29,51 @@ _MOST_WAITING = 8
 _BAG_S, _BAG_BYTES = 300.0, 8 << 30
 # Idle time after which free memory is returned to the system [s].
 _IDLE_S = 1.0
+# Between two looks at a process, and two messages of feedback that say nothing new [s].
+UNLIMITED = resource.RLIM_INFINITY
+_LOOK_S, _FEEDBACK_S = 0.05, 0.5
+_PROGRESS, _DONE, _FAILED = "progress", "done", "failed"
 
 
-def in_child(work: Callable[[], T], seconds: float = _BAG_S, most_bytes: int = _BAG_BYTES) -> T:
+def silent(stage: str, **numbers: object) -> None:
+    """State no progress."""
+
+
+class Cancelled(OmsmError):
+    """The client of an action, or the end of the node, has ended the work."""
+
+
+def in_child(
+    work: Callable[..., T],
+    seconds: float = _BAG_S,
+    most_bytes: int = _BAG_BYTES,
+    attend: Attend | None = None,
+) -> T:
     """Return what ``work`` returns in a process of its own, or raise what it raises.
 
     A bag from outside may be made to take memory or time without end. ``work`` and its result are
     pickled. Raises OmsmError if it takes longer, or more memory.
+
+    attend: called with the fields of the progress that ``work(progress)`` states, and without
+        fields meanwhile; what it raises ends the process
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    child = context.Process(target=_child, args=(sender, work, most_bytes), daemon=True)
+    arguments = (sender, work, most_bytes, attend is not None)
+    child = context.Process(target=_child, args=arguments, daemon=True)
     child.start()
     sender.close()
+    until = time.monotonic() + seconds
+    kind, content = _PROGRESS, cast("Any", {})
     try:
-        if not receiver.poll(seconds):
-            raise OmsmError(f"the bag was not read in {seconds:g} s; check it with omsm inspect")
-        failed, result = receiver.recv()
+        while kind == _PROGRESS:
+            if attend is not None:
+                attend(**content)
+            if time.monotonic() > until:
+                raise OmsmError(
+                    f"the bag was not read in {seconds:g} s; check it with omsm inspect"
+                )
+            kind, content = receiver.recv() if receiver.poll(_LOOK_S) else (_PROGRESS, {})
     except EOFError as err:
         raise OmsmError(
             f"the process that read the bag ended; it may have needed more than "
@@ -50,20 +83,86 @@ def in_child(work: Callable[[], T], seconds: float = _BAG_S, most_bytes: int = _
         child.kill()
         child.join()
         receiver.close()
-    if failed:
-        raise result
-    return result  # type: ignore[no-any-return]
+    if kind == _FAILED:
+        raise content
+    return content  # type: ignore[no-any-return]
 
 
-def _child(sender: Connection, work: Callable[[], Any], most_bytes: int) -> None:
+def _child(sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the node ends this process
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
+    told: tuple[object, float] = (None, 0.0)
+
+    def progress(stage: str, **numbers: object) -> None:
+        nonlocal told
+        about, now = (stage, numbers.get("order")), time.monotonic()
+        if about != told[0] or now - told[1] > _FEEDBACK_S:
+            told = about, now
+            sender.send((_PROGRESS, {"stage": stage, **numbers}))
+
     try:
-        answer = (False, work())
+        answer = (_DONE, work(progress) if tells else work())
     except MemoryError:
         return  # the parent sees that this process ended
     except OmsmError as err:
-        answer = (True, OmsmError(str(err)))
+        answer = (_FAILED, OmsmError(str(err)))
     sender.send(answer)
+
+
+class Goal:
+    """A goal of an action that is being worked on.
+
+    ended: set when the node stops serving the action
+    """
+
+    def __init__(self, handle: Any, kind: Any, ended: threading.Event) -> None:
+        self._handle, self._feedback, self._ended = handle, kind.Feedback(), ended
+        self._begun, self._told = time.monotonic(), float("-inf")
+        if hasattr(self._feedback, "stage"):
+            self._feedback.stage = "waiting"
+
+    @property
+    def cancelled(self) -> bool:
+        """Return whether it is to end."""
+        return bool(self._ended.is_set() or self._handle.is_cancel_requested)
+
+    def attend(self, **fields: object) -> None:
+        """Publish feedback with ``fields``, without them twice a second; raise Cancelled."""
+        if self.cancelled:
+            raise Cancelled("cancelled")
+        for name, value in fields.items():
+            setattr(self._feedback, name, value)
+        now = time.monotonic()
+        if fields or now - self._told > _FEEDBACK_S:
+            self._told, self._feedback.elapsed = now, now - self._begun
+            self._handle.publish_feedback(self._feedback)
+
+
+def serve_action(
+    node: Node, undo: ExitStack, kind: Any, name: str, perform: Callable[..., Awaitable[None]]
+) -> None:
+    """Offer the action ``name``; ``perform(request, result, goal)`` fills in the result.
+
+    A goal ends as cancelled if that was asked for and ``success`` is false, else as aborted if it
+    is false.
+    """
+    ended = threading.Event()
+
+    async def execute(handle: Any) -> Any:
+        result, goal = kind.Result(), Goal(handle, kind, ended)
+        with refusing(node, result):
+            await perform(handle.request, result, goal)
+        if ended.is_set():  # there is nobody to answer
+            return result
+        end = handle.canceled if goal.cancelled else handle.abort
+        (handle.succeed if result.success else end)()
+        return result
+
+    server = ActionServer(
+        node, kind, name, execute, cancel_callback=lambda _: CancelResponse.ACCEPT
+    )
+    undo.callback(server.destroy)
+    undo.callback(ended.set)
 
 
 class BackgroundWorker:
@@ -76,8 +175,8 @@ class BackgroundWorker:
         threading.Thread(target=self._run, daemon=True).start()
         undo.callback(self._work.put, None)
 
-    async def do(self, work: Callable[[], T]) -> T:
-        """Return what ``work`` returns, or raise what it raises.
+    async def do(self, work: Callable[[], T], goal: Goal | None = None) -> T:
+        """Return what ``work`` returns, or raise what it raises; Cancelled if ``goal`` is.
 
         Raises OmsmError if too many requests wait.
         """
@@ -86,10 +185,26 @@ class BackgroundWorker:
         self.waiting += 1
         done = Future()
         self._work.put((work, done))
+        timer = self._watched(done, goal) if goal else None
         try:
             return await done  # type: ignore[no-any-return]
         finally:
             self.waiting -= 1
+            if timer is not None:
+                self._node.destroy_timer(timer)
+
+    def _watched(self, done: Future, goal: Goal) -> Any:
+        """Return a timer that ends the wait of a goal for its turn, too."""
+
+        def look() -> None:
+            try:
+                goal.attend()
+            except Cancelled as err:
+                done.set_exception(err)
+
+        return self._node.create_timer(
+            _FEEDBACK_S, look, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def serve(
         self, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], Awaitable[None]]
@@ -120,6 +235,8 @@ class BackgroundWorker:
             patience = _IDLE_S
 
     def _do(self, work: Callable[[], Any], done: Future) -> None:
+        if done.done():  # cancelled while it waited
+            return
         try:
             done.set_result(work())
         except Exception as err:  # raised by ``do``

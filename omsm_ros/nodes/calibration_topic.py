@@ -10,11 +10,13 @@ from contextlib import ExitStack
 from typing import Any
 
 from omsm_msgs.msg import Calibration as CalibrationMessage
+from omsm_msgs.msg import CertificateSummary
 from rclpy.node import Node
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import OmsmError, one_line
 from omsm_ros.io import message_mapping
+from omsm_ros.io.figure_messages import certificate_message
 from omsm_ros.nodes import topics
 
 TOPIC = "calibration"
@@ -47,6 +49,9 @@ class CalibrationTopic:
         self._publisher = topics.publish_on(
             node, undo, CalibrationMessage, TOPIC, topics.LATCHED_QOS
         )
+        self._summary = topics.publish_on(
+            node, undo, CertificateSummary, "certificate", topics.LATCHED_QOS
+        )
         if listens:
             topics.listen(
                 node, undo, CalibrationMessage, TOPIC, self._on_message, topics.LATCHED_BY_MANY_QOS
@@ -67,6 +72,7 @@ class CalibrationTopic:
         self._published = calibration.id, since_ns
         message = message_mapping.calibration_message(self._messages, calibration, since_ns)
         self._publisher.publish(message)
+        self._summary.publish(certificate_message(self._messages, calibration))
 
     def _on_message(self, message: Any, _: topics.MessageInfo) -> None:
         stamp_ns = message_mapping.stamp_of(message)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from omsm_msgs import action
 from omsm_msgs.msg import AxisBlock, DistanceBlock
 from omsm_msgs.srv import Identify
 from std_msgs.msg import String
@@ -22,9 +25,17 @@ from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.errors import BagError, ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder
+from omsm_ros.io.figure_messages import certificate_message
 from omsm_ros.io.files import resolved_within
 from omsm_ros.io.folders import exclusive_lock
-from omsm_ros.nodes.background_worker import BackgroundWorker, in_child
+from omsm_ros.nodes.background_worker import (
+    UNLIMITED,
+    BackgroundWorker,
+    Goal,
+    in_child,
+    serve_action,
+    silent,
+)
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, StateReport
@@ -84,6 +95,7 @@ class CalibratorNode(ManagedNode):
         self._topic = CalibrationTopic(self, undo, self._adopt, listens=True)
         self._worker = BackgroundWorker(self, undo)
         self._worker.serve(undo, Identify, "~/identify", self._on_identify)
+        serve_action(self, undo, action.Identify, "~/identify", self._on_identify)
         self._probe: dict[str, object] = {}
         listen(self, undo, String, "probe_settings", self._on_probe, LATCHED_BY_MANY_QOS)
         self._publish_stored()
@@ -143,15 +155,20 @@ class CalibratorNode(ManagedNode):
             return self._trouble
         return f"kept as {file}"
 
-    async def _on_identify(self, request: Identify.Request, response: Identify.Response) -> None:
+    async def _on_identify(self, request: Any, response: Any, goal: Goal | None = None) -> None:
+        """Answer the service, or the action with its ``goal``."""
         try:
             bag = self._bag(request.bag)
-            identified = await self._worker.do(self._work(request, bag))
+            identified = await self._worker.do(self._work(request, bag, goal), goal)
+            if goal is not None:
+                goal.attend()  # nothing is put in force for a goal that was cancelled
             calibration = identified.calibration
             since_ns = self._topic.decided()
             response.calibration = message_mapping.calibration_message(
                 self._messages, calibration, since_ns
             )
+            if goal is not None:
+                response.certificate = certificate_message(self._messages, calibration)
             response.success, self._last = self._judge(calibration, since_ns)
             if response.success and self.values["catalogue"]:
                 self._last += await self._worker.do(partial(self._noted, bag, calibration))
@@ -204,21 +221,27 @@ class CalibratorNode(ManagedNode):
             return f"; no certificate: {err}"
         return f"; certificate in {page}"
 
-    def _work(self, request: Identify.Request, bag: Path | None):  # type: ignore[no-untyped-def]
+    def _work(self, request: Any, bag: Path | None, goal: Goal | None):  # type: ignore[no-untyped-def]
         """Return the work of a request; the samples that it needs are taken now."""
+        attend = goal.attend if goal is not None else None
         duration = quantities.DURATION.checked(request.duration)
         order = quantities.ORDER.checked(request.order)
         options = {"order": order, "input": request.input or "encoder"}
         if bag:
             lapse = self._time_lapse
             work = partial(_identify_bag, bag, duration, self._settings, lapse, self._trigger)
-            return partial(in_child, partial(work, options))
+            return partial(in_child, partial(work, options), attend=attend)
         streams = [self._buffers[topic].recent(duration) for topic in _STREAMS]
         options |= {
             "settings": settings_with(self._settings, [self._probe]),
             "origin": _origin(int(self.get_clock().now().nanoseconds)),
         }
-        return lambda: _identified(self._live_motion(*streams), **options)
+
+        def live() -> Any:
+            work = partial(_identified, self._live_motion(*streams), options)
+            return in_child(work, math.inf, UNLIMITED, attend) if attend else work()
+
+        return live
 
     def _live_motion(self, *streams: Any) -> MotionRecord:
         faster = quantities.TIME_LAPSE.checked(self._time_lapse, ConfigurationError, "time_lapse")
@@ -257,21 +280,25 @@ def _identify_bag(
     time_lapse: object,
     trigger: CommonTrigger,
     options: dict[str, Any],
+    progress: Callable[..., None] = silent,
 ) -> Identification:
+    progress("reading")
     # Loaded on demand, because reading bags takes long to import.
     from omsm_ros.pipelines.recording import Recording
 
     with Recording(bag) as recording:
         motion = recording.motion(duration=duration, time_lapse=time_lapse, trigger=trigger)
         settings = recording.settings(stated)
-    origin = _origin(recording.recorded_ns)
-    return _identified(motion, settings=settings, origin=origin, **options)
+    options = {**options, "settings": settings, "origin": _origin(recording.recorded_ns)}
+    return _identified(motion, options, progress)
 
 
-def _identified(*motion: Any, **options: Any) -> Identification:
+def _identified(
+    motion: MotionRecord, options: dict[str, Any], progress: Callable[..., None] = silent
+) -> Identification:
     from omsm_ros.core.identification.identify import identify
 
-    return identify(*motion, **options)
+    return identify(motion, progress=progress, **options)
 
 
 def _origin(recorded_ns: int | None) -> Origin:

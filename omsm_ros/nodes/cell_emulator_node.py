@@ -6,12 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from omsm_msgs.action import Scan
 from omsm_msgs.msg import AccelerationBlock
 from rclpy.clock import Clock, ClockType
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from omsm_ros import quantities
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, OmsmError, shortened
 from omsm_ros.instruments.emulator import InstrumentFaults, InstrumentLink
 from omsm_ros.instruments.emulator_factory import (
     EMULATED,
@@ -23,6 +25,7 @@ from omsm_ros.instruments.emulator_factory import (
 from omsm_ros.io import message_mapping
 from omsm_ros.io.disturbance_file import load_disturbances
 from omsm_ros.io.folders import exclusive_lock, runtime_folder
+from omsm_ros.nodes.background_worker import Cancelled, Goal, serve_action
 from omsm_ros.nodes.diagnostics import StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
@@ -39,7 +42,12 @@ _SCENARIO = (
     Parameter("step_rise", 20e-3, "edge of the step test [s]; 0 = sharp", quantities.RISE, unset=0),
     Parameter("sample_period", 1e-3, "of the trigger [s]", quantities.SAMPLE_PERIOD),
 )
-_ACCELERATION_PERIOD_S = 0.05
+_ACCELERATION_PERIOD_S, _FEEDBACK_PERIOD_S = 0.05, 0.2
+_MOTIONS: dict[str, Any] = {
+    Scan.Goal.STEP_TEST: planned_test_of,
+    Scan.Goal.SCAN: scan_of,
+    Scan.Goal.VERIFYING_SCAN: verifying_scan_of,
+}
 _FAULTS = (
     Parameter("fault_noise", 0.0, "noise burst before a frame", quantities.PROBABILITY),
     Parameter("fault_flip", 0.0, "flipped bit in a frame", quantities.PROBABILITY),
@@ -67,7 +75,7 @@ class CellEmulatorNode(ManagedNode):
 
     Services: ``~/step_test``, ``~/scan``, ``~/verifying_scan`` (std_srvs/Trigger; the last one
     scans the part outward at twice the speed) answer as soon as the motion starts; ``~/stop``
-    ends it.
+    ends it. The action ``~/scan`` ends with the motion, and stops it when it is cancelled.
     """
 
     def __init__(self) -> None:
@@ -100,14 +108,10 @@ class CellEmulatorNode(ManagedNode):
             values["seed"],
         )
         undo.callback(self._player.close)
-        motions = {
-            "step_test": planned_test_of,
-            "scan": scan_of,
-            "verifying_scan": verifying_scan_of,
-        }
-        for name, motion_of in motions.items():
-            serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, motion_of))
+        for name in _MOTIONS:
+            serve(self, undo, Trigger, f"~/{name}", partial(self._on_start, name))
         serve(self, undo, Trigger, "~/stop", self._on_stop)
+        serve_action(self, undo, Scan, "~/scan", self._on_scan)
         self._messages = message_mapping.ros_messages()
         self._acceleration_lines = self.publish_on(undo, AccelerationBlock, "acceleration")
         self._feed: AccelerationFeed | None = None
@@ -138,16 +142,46 @@ class CellEmulatorNode(ManagedNode):
         if block is not None:
             self._acceleration_lines.publish(message_mapping.block_message(self._messages, block))
 
-    def _on_start(self, motion_of: Any, request: Any, response: Any) -> None:
+    def _start(self, motion: str) -> int:
+        """Start a motion and return its number of samples; OmsmError if it is not possible."""
+        if motion not in _MOTIONS:
+            raise ConfigurationError(
+                f"motion {shortened(motion, 40)!r}, expected one of {[*_MOTIONS]}"
+            )
         if not self.active:
-            response.success, response.message = False, "inactive; activate it first"
-        elif self._player.playing:
-            response.success, response.message = False, "a motion is running; stop it first"
-        else:
-            recording = motion_of(self._scenario, self._disturbances)
-            self._feed = AccelerationFeed(recording, self.get_clock().now().nanoseconds)
-            self._player.start(recording, self.values["time_lapse"])
-            response.success, response.message = True, f"{len(recording.axes)} samples"
+            raise OmsmError("inactive; activate it first")
+        if self._player.playing:
+            raise OmsmError("a motion is running; stop it first")
+        recording = _MOTIONS[motion](self._scenario, self._disturbances)
+        self._feed = AccelerationFeed(recording, self.get_clock().now().nanoseconds)
+        self._player.start(recording, self.values["time_lapse"])
+        return len(recording.axes)
+
+    def _on_start(self, motion: str, request: Any, response: Any) -> None:
+        samples = self._start(motion)
+        response.success, response.message = True, f"{samples} samples"
+
+    async def _on_scan(self, request: Scan.Goal, result: Scan.Result, goal: Goal) -> None:
+        samples, over = self._start(request.motion), Future()
+
+        def look() -> None:
+            try:
+                goal.attend(played=self._player.played, samples=samples)
+            except Cancelled as err:
+                self._player.halt()
+                over.set_exception(err)
+            if not self._player.playing and not over.done():
+                over.set_result(None)
+
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        timer = self.create_timer(_FEEDBACK_PERIOD_S, look, clock=steady)
+        try:
+            await over
+        finally:
+            self.destroy_timer(timer)
+            result.samples = self._player.played
+        result.success = result.samples == samples
+        result.message = f"{result.samples} of {samples} samples played"
 
     def _on_stop(self, request: Any, response: Any) -> None:
         self._player.halt()

@@ -8,7 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from omsm_msgs.msg import AxisBlock, DistanceBlock
+from omsm_msgs import action
+from omsm_msgs.msg import Account as AccountMessage
+from omsm_msgs.msg import AxisBlock, DistanceBlock, Verdict
 from omsm_msgs.srv import LoadCalibration, PredictError
 from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import PointCloud2
@@ -27,9 +29,10 @@ from omsm_ros.errors import BagError, CalibrationError, Notice, OmsmError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import load_calibration, load_for_others, since
 from omsm_ros.io.descriptions import load_surface
+from omsm_ros.io.figure_messages import account_message, verdict_message
 from omsm_ros.io.files import resolved_within
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.background_worker import BackgroundWorker, in_child
+from omsm_ros.nodes.background_worker import BackgroundWorker, Goal, in_child, serve_action
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
@@ -84,9 +87,9 @@ class CorrectionState:
         """Add the account of a correction that has ended to those before it."""
         self._ended = _sum_of(self._ended, account)
 
-    def account(self, corrector: Corrector) -> Account:
+    def account(self, corrector: Corrector | None) -> Account:
         """Return the account of all corrections since the node was configured."""
-        return _sum_of(self._ended, corrector.account)
+        return _sum_of(self._ended, corrector.account) if corrector else self._ended
 
     def heard(self, stream: str, first: int, samples: int, period: float, now: float) -> None:
         """Count a block; first: its trigger number;  now: [s]."""
@@ -242,6 +245,8 @@ class CorrectorNode(ManagedNode):
         self._state = CorrectionState()
         self._waiting: dict[str, list[Any]] = {}
         self._points = self.publish_on(undo, PointCloud2, "points")
+        self._accounts = self.publish_on(undo, AccountMessage, "account")
+        self._verdicts = self.publish_on(undo, Verdict, "verdict")
         self._topic = CalibrationTopic(
             self, undo, lambda heard, _: self._use(heard), self.values["follow_calibrator"]
         )
@@ -250,6 +255,7 @@ class CorrectorNode(ManagedNode):
         self._worker = BackgroundWorker(self, undo)
         self._worker.serve(undo, LoadCalibration, "~/load_calibration", self._on_load)
         self._worker.serve(undo, PredictError, "~/predict_error", self._on_predict)
+        serve_action(self, undo, action.PredictError, "~/predict_error", self._on_predict)
         if path := self.values["calibration"]:
             self._put_in_force(load_calibration(path), since(Path(path)))
         else:
@@ -350,9 +356,7 @@ class CorrectorNode(ManagedNode):
         calibration = self._topic.calibration
         return calibration.id if calibration else ""
 
-    async def _on_predict(
-        self, request: PredictError.Request, response: PredictError.Response
-    ) -> None:
+    async def _on_predict(self, request: Any, response: Any, goal: Goal | None = None) -> None:
         # Without a prediction the error is not zero but unknown.
         response.peak_to_valley = response.rms = response.outside_band_fraction = float("nan")
         bag = request.bag
@@ -360,12 +364,18 @@ class CorrectorNode(ManagedNode):
             bag = str(resolved_within(Path(bag), self.values["bag_folders"], BagError, "bag"))
         known, period = self._topic.calibration, request.sample_period
         predict = partial(_prediction, known, bag, request.z, period)
-        prediction = await self._worker.do(partial(in_child, predict) if bag else predict)
+        if goal is not None:
+            predict = partial(in_child, predict, attend=goal.attend)
+        elif bag:
+            predict = partial(in_child, predict)
+        prediction = await self._worker.do(predict, goal)
         response.peak_to_valley = prediction.peak_to_valley
         response.rms = prediction.rms
         response.outside_band_fraction = prediction.outside_band_fraction
         response.safe = prediction.safe
         response.message = prediction.message
+        if goal is not None:
+            response.success = True
 
     def _take(self, stream: str, message: Any, info: MessageInfo) -> None:
         samples = len(message.z if stream == "axes" else message.distance)
@@ -428,7 +438,7 @@ class CorrectorNode(ManagedNode):
         self.get_logger().warning(text, throttle_duration_sec=_COMPLAINT_PERIOD_S)
 
     def report(self) -> StateReport:
-        """Return the account, and the present faults."""
+        """Return the account, and the present faults; publish account and verdict."""
         if self._motion and self._corrector and not self._corrector.slips.same_stamps:
             self._motion.judge()
         now, cpu = time.monotonic(), time.process_time()
@@ -440,6 +450,8 @@ class CorrectorNode(ManagedNode):
                 self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
             )
             report.values |= verdict_values(verdict)
+            self._publish_verdict(verdict)
+        self._publish_account()
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._worker.waiting
         if self._frame != self.values["workpiece_frame"]:
@@ -451,6 +463,21 @@ class CorrectorNode(ManagedNode):
         if self._topic.refused:
             report.add(WARN, f"a calibration was refused: {self._topic.refused}")
         return report
+
+    def _publish_verdict(self, verdict: Mapping[str, Any]) -> None:
+        used, now_ns = self._in_force_id(), self.get_clock().now().nanoseconds
+        steps, accuracy = next_steps(verdict), accuracy_of(self.values)
+        self._verdicts.publish(
+            verdict_message(self._messages, verdict, steps, used, accuracy, now_ns)
+        )
+
+    def _publish_account(self) -> None:
+        state = self._state
+        outside = {"uncalibrated": state.uncalibrated, "refused": state.refused}
+        account, now_ns = state.account(self._corrector), self.get_clock().now().nanoseconds
+        self._accounts.publish(
+            account_message(self._messages, account, outside, state.published, now_ns)
+        )
 
 
 def _prediction(*motion: Any) -> Prediction:

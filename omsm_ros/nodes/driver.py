@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from omsm_msgs.msg import AccelerationBlock, AxisBlock, DistanceBlock
+from omsm_msgs.msg import AccelerationBlock, AxisBlock, DistanceBlock, ProbeSettings
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -29,6 +29,7 @@ from omsm_ros.instruments.parameters import (
 from omsm_ros.instruments.reader import DeviceReader, State
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.io import json_and_yaml, message_mapping
+from omsm_ros.io.figure_messages import probe_message
 from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
@@ -100,9 +101,8 @@ class DriverNode(ManagedNode):
         self._recent, self._flow = RecentIncrease(), SampleFlow()
         self._reported: dict[str, object] = {}
         if self._settings_topic:
-            self._settings = publish_on(
-                undo=undo, node=self, kind=String, topic=self._settings_topic, qos=LATCHED_QOS
-            )
+            self._settings = publish_on(self, undo, String, self._settings_topic, LATCHED_QOS)
+            self._plotted = publish_on(self, undo, ProbeSettings, "probe", LATCHED_QOS)
         if self._axes_topic:
             self._axes = self.publish_on(undo, AxisBlock, self._axes_topic)
         if self._distance_topic:
@@ -136,6 +136,8 @@ class DriverNode(ManagedNode):
         if reported != self._reported:
             self._reported = reported
             self._settings.publish(String(data=json_and_yaml.text_of(reported)))
+            now_ns = self.get_clock().now().nanoseconds
+            self._plotted.publish(probe_message(self._messages, named, now_ns))
 
     def report(self) -> StateReport:
         """Return the counts of all samples, and the present faults."""

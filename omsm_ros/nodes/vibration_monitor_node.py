@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 from omsm_msgs.msg import AccelerationBlock
+from omsm_msgs.msg import VibrationLevels as LevelsMessage
 from std_msgs.msg import String
 
 from omsm_ros import quantities
@@ -22,6 +23,7 @@ from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError, OmsmError
 from omsm_ros.io import json_and_yaml, message_mapping
 from omsm_ros.io.calibration_file import load_calibration
+from omsm_ros.io.figure_messages import vibration_message
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.diagnostics import STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
@@ -62,6 +64,7 @@ class VibrationMonitorNode(ManagedNode):
                 axis=values["axis"],
             )
         )
+        self._messages = message_mapping.ros_messages()
         self._alarm = Alarm(values["alarm"], values["release"])
         self._refused, self._blocks_refused = "", 0
         self._lately = RecentIncrease()
@@ -75,6 +78,7 @@ class VibrationMonitorNode(ManagedNode):
         """Begin to receive and publish."""
         self._task_result = 0
         self._publisher = publish_on(self, undo, String, "vibration")
+        self._plotted = publish_on(self, undo, LevelsMessage, "vibration_levels")
         listen(self, undo, AccelerationBlock, "acceleration", self._take)
 
     def _use(self, calibration: Calibration, _: int) -> None:
@@ -99,6 +103,10 @@ class VibrationMonitorNode(ManagedNode):
             self._task_result = levels.windows
             content = {**levels.entry(), "alarm": self._alarm.raised, "limit": self._alarm.limit}
             self._publisher.publish(String(data=json_and_yaml.text_of(content)))
+            alarm = self._alarm
+            self._plotted.publish(
+                vibration_message(self._messages, levels, alarm.raised, alarm.limit, message.header)
+            )
 
     def _levels(self) -> Any:
         known = self._calibration

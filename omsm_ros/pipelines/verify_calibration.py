@@ -1,6 +1,6 @@
 """Verify a calibration on a free path, find counter offsets, and predict errors of a motion."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -154,14 +154,25 @@ def _column(blocks: Sequence[Block], first: int, values: Sequence[FloatArray]) -
 
 
 def predict_from(
-    calibration: Calibration | None, bag: str, z: FloatArray, sample_period: float
+    calibration: Calibration | None,
+    bag: str,
+    z: FloatArray,
+    sample_period: float,
+    progress: Callable[[str], object] = lambda stage: None,
 ) -> Prediction:
-    """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty."""
+    """Predict the dynamic error of the motion in ``bag``, or of ``z`` [m] if that is empty.
+
+    progress: called with "reading" and "predicting"
+    """
     if calibration is None:
         raise CalibrationError("no calibration in use; call identify or load one")
     if bag:
+        progress("reading")
         with Recording(bag) as recording:
-            return predict_error(calibration, recording.scan_path())
-    SAMPLE_PERIOD.checked(sample_period, name="sample_period")
-    positions = POSITION.checked_all(np.asarray(z, np.float64), name="z")
-    return predict_error(calibration, ScanPath(z=positions, sample_period=sample_period))
+            path = recording.scan_path()
+    else:
+        SAMPLE_PERIOD.checked(sample_period, name="sample_period")
+        positions = POSITION.checked_all(np.asarray(z, np.float64), name="z")
+        path = ScanPath(z=positions, sample_period=sample_period)
+    progress("predicting")
+    return predict_error(calibration, path)

@@ -37,6 +37,8 @@ class EvaluationBudget:
         longest record
     evaluations, samples, longest: used so far; longest is the most samples of one evaluation
     incomplete: a search was cut short because the budget was exhausted
+    watch: called at each evaluation with the poles of its model and ``evaluations``; what it
+        raises ends the search
     """
 
     most_evaluations: int = _MOST_EVALUATIONS
@@ -46,12 +48,14 @@ class EvaluationBudget:
     samples: int = 0
     longest: int = 0
     incomplete: bool = False
+    watch: Callable[[int, int], object] = lambda poles, evaluations: None
 
-    def count(self, samples: int) -> None:
-        """Count an evaluation of ``samples`` samples."""
+    def count(self, samples: int, poles: int = 0) -> None:
+        """Count an evaluation of ``samples`` samples of a model with ``poles``."""
         self.longest = max(self.longest, samples)
         self.samples += samples
         self.evaluations += 2 * samples > self.longest
+        self.watch(poles, self.evaluations)
 
     @property
     def exhausted(self) -> bool:
@@ -66,9 +70,8 @@ class EvaluationBudget:
 
     def renewed(self) -> EvaluationBudget:
         """Return a budget of the same limits with nothing used."""
-        return EvaluationBudget(
-            self.most_evaluations, self.most_samples, self.most_full_evaluations
-        )
+        limits = self.most_evaluations, self.most_samples, self.most_full_evaluations
+        return EvaluationBudget(*limits, watch=self.watch)
 
 
 @dataclass(frozen=True, eq=False)

@@ -371,7 +371,7 @@ def fit(
 
     def project(nonlinear: FloatArray) -> Projection:
         if budget is not None:
-            budget.count(problem.compared)
+            budget.count(problem.compared, structure.poles)
         return problem.project(scaled, nonlinear)
 
     best, least = None, np.inf

@@ -85,6 +85,9 @@ from omsm_ros.quantities import MASS
 DEFAULT_LIMITS = ResponseLimits()
 NO_ORIGIN = Origin()
 Parameters = ParamSpec("Parameters")
+Progress = Callable[..., object]
+# Stages of an identification, as the action states them.
+STEPS, ORDER, UNCERTAINTY = "steps", "order", "uncertainty"
 # The setting without which masses, springs and dampers are known only per mass of the table.
 TABLE_MASS_SETTING = "table_mass_kg"
 # valid_up_to of a calibration that is trusted nowhere, below the frequency of any motion.
@@ -139,6 +142,7 @@ def identify(
     use: IntendedUse = PAPER_USE,
     origin: Origin = NO_ORIGIN,
     budget: EvaluationBudget | None = None,
+    progress: Progress = lambda stage, **numbers: None,
 ) -> Identification:
     """Return the calibration that ``record`` supports, with the fit behind it.
 
@@ -150,6 +154,8 @@ def identify(
     use: the scans that will be corrected, and the accuracy asked for; limits follow from it
     origin: who recorded it with what and when, for the certificate
     budget: of the model search; None for the default. A search that it cuts short is reported.
+    progress: called with "steps" (steps: edges found), "order" (order, evaluations) and
+        "uncertainty"; what it raises ends the computation
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
     did not measure it, ConfigurationError for an impossible input or mass. A model that cannot be
@@ -158,9 +164,13 @@ def identify(
     mass = table_mass(settings or {})
     prepared = prepare(record, input)
     check_axis_steps(prepared)
+    progress(STEPS, steps=len(prepared.steps.edges))
+    budget = budget or EvaluationBudget()
+    budget.watch = lambda poles, done: progress(ORDER, order=poles, evaluations=done)
     searched = search_model_errors(
         prepared, partial(_chosen, order=order), budget, may_grow=not order
     )
+    progress(UNCERTAINTY)
     prepared, model = searched.prepared, searched.model
     check_gain(model.chosen.fit.gain)
     best = model.chosen.fit
