@@ -91,13 +91,13 @@ def in_child(
 def _child(sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the node ends this process
     resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
-    told: tuple[object, float] = (None, 0.0)
+    stated: tuple[object, float] = (None, 0.0)
 
     def progress(stage: str, **numbers: object) -> None:
-        nonlocal told
+        nonlocal stated
         about, now = (stage, numbers.get("order")), time.monotonic()
-        if about != told[0] or now - told[1] > _FEEDBACK_S:
-            told = about, now
+        if about != stated[0] or now - stated[1] > _FEEDBACK_S:
+            stated = about, now
             sender.send((_PROGRESS, {"stage": stage, **numbers}))
 
     try:
@@ -117,7 +117,7 @@ class Goal:
 
     def __init__(self, handle: Any, kind: Any, ended: threading.Event) -> None:
         self._handle, self._feedback, self._ended = handle, kind.Feedback(), ended
-        self._begun, self._told = time.monotonic(), float("-inf")
+        self._begun, self._stated = time.monotonic(), float("-inf")
         if hasattr(self._feedback, "stage"):
             self._feedback.stage = "waiting"
 
@@ -133,8 +133,8 @@ class Goal:
         for name, value in fields.items():
             setattr(self._feedback, name, value)
         now = time.monotonic()
-        if fields or now - self._told > _FEEDBACK_S:
-            self._told, self._feedback.elapsed = now, now - self._begun
+        if fields or now - self._stated > _FEEDBACK_S:
+            self._stated, self._feedback.elapsed = now, now - self._begun
             self._handle.publish_feedback(self._feedback)
 
 

@@ -37,14 +37,17 @@ def test_an_account_closes():
     message = figures.account_message(MESSAGES, account, outside, 12, 0)
     for stream in (message.axes, message.distance):
         assert stream.received == stream.corrected + stream.pending + sum(stream.samples)
-    assert dict(zip(message.axes.reasons, message.axes.samples)) == {"late": 2, "unmatched": 1}
+    assert dict(zip(message.axes.reasons, message.axes.samples, strict=True)) == {
+        "late": 2,
+        "unmatched": 1,
+    }
     assert (message.axes.uncalibrated, message.distance.refused, message.clouds) == (3, 8, 12)
 
 
 def test_vibration_has_a_level_for_each_band_and_nan_without_a_calibration():
     levels = VibrationLevels(
         bands=((5.0, 50.0), (50.0, 500.0)),
-        rms={axis: (1e-3, 2e-3) for axis in "xyz"},
+        rms=dict.fromkeys("xyz", (1e-3, 2e-3)),
         line=("z", 79.0, 3e-3), effect=None, total_effect=None, windows=4,
     )  # fmt: skip
     message = figures.vibration_message(MESSAGES, levels, False, 20e-9, header(MESSAGES, 0, "p"))

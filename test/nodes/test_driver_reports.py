@@ -16,6 +16,8 @@ from omsm_ros.nodes import driver as driving
 from omsm_ros.nodes.diagnostics import ERROR, OK, STALE, WARN
 from omsm_ros.nodes.driver import DriverNode
 
+from .fake_node import FakeNode
+
 
 class Published(list):
     def publish(self, message):
@@ -55,7 +57,7 @@ def driver(monkeypatch):
         _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},
         _messages=message_mapping.ros_messages(),
         _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
-        _settings=Published(),
+        _settings=Published(), _plotted=Published(), get_clock=FakeNode().get_clock,
     )  # fmt: skip
 
     def passes(seconds, samples, **more):

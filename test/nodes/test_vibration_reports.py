@@ -47,7 +47,7 @@ def now(monkeypatch):
 @pytest.fixture
 def made(now):
     def make(mount=PROBE, edges=(5.0, 50.0, 500.0)):
-        reported = []
+        reported, plotted = [], []
         options = MonitorOptions(edges=edges, mount=mount)
         return Monitor(
             _running=RunningSpectrum(options), _alarm=Alarm(LIMIT_M, 0.7), _refused="",
@@ -55,6 +55,8 @@ def made(now):
             _flow=SampleFlow(), _block=0.0, _calibration=None, _task_result=0,
             reported=reported, logged=[],
             values={"mount": mount}, now=now, sent=0,
+            _messages=message_mapping.ros_messages(), plotted=plotted,
+            _plotted=SimpleNamespace(publish=plotted.append),
             _publisher=SimpleNamespace(publish=lambda m: reported.append(json.loads(m.data))),
         )  # fmt: skip
 
@@ -114,6 +116,7 @@ def test_each_spectrum_is_reported_once(made):
         {found["windows"] for found in monitor.reported}
     )
     assert len(monitor.reported) == 7
+    assert [found.windows for found in monitor.plotted] == [f["windows"] for f in monitor.reported]
 
 
 def test_the_alarm_rises_once_stays_and_ends_when_it_is_quiet(made):

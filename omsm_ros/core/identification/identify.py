@@ -154,8 +154,7 @@ def identify(
     use: the scans that will be corrected, and the accuracy asked for; limits follow from it
     origin: who recorded it with what and when, for the certificate
     budget: of the model search; None for the default. A search that it cuts short is reported.
-    progress: called with "steps" (steps: edges found), "order" (order, evaluations) and
-        "uncertainty"; what it raises ends the computation
+    progress: called with "steps", "order" and "uncertainty"; what it raises ends the computation
 
     Raises StepTestError when there is no usable motion, IdentificationError when the probe
     did not measure it, ConfigurationError for an impossible input or mass. A model that cannot be
@@ -167,13 +166,11 @@ def identify(
     progress(STEPS, steps=len(prepared.steps.edges))
     budget = budget or EvaluationBudget()
     budget.watch = lambda poles, done: progress(ORDER, order=poles, evaluations=done)
-    searched = search_model_errors(
-        prepared, partial(_chosen, order=order), budget, may_grow=not order
-    )
+    choose = partial(_chosen, order=order)
+    searched = search_model_errors(prepared, choose, budget, may_grow=not order)
     progress(UNCERTAINTY)
-    prepared, model = searched.prepared, searched.model
-    check_gain(model.chosen.fit.gain)
-    best = model.chosen.fit
+    best = searched.model.chosen.fit
+    check_gain(best.gain)
     evidence = _evidence(record, searched, input, settings or {}, use)
     findings = [finding for check in CHECKS for finding in check(evidence)]
     calibration = Calibration(
@@ -185,7 +182,7 @@ def identify(
         settings=dict(settings or {}),
         certificate=certificate_of(evidence, findings, replace(origin, input=input), mass),
     )
-    return Identification(calibration, prepared, best)
+    return Identification(calibration, searched.prepared, best)
 
 
 def _evidence(
