@@ -135,6 +135,10 @@ def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatc
 _MOST_LISTED = 2_000
 # Blocks of the areal density in each direction: enough for a figure, 70 kB in the file.
 _MOST_BLOCKS = 64
+_NO_NOISE = (
+    "noise of the points is not evaluated: no place of the profile was measured twice, so that it "
+    "cannot be separated from texture; the figures contain it"
+)
 _NO_SYSTEMATIC = (
     "systematic errors of the measurement: the uncertainty covers noise, form and pose only"
 )
@@ -222,6 +226,7 @@ def form_facts(
                 *measured.notes,
                 *_mismatch_text(form, nominal),
                 *_advice(form),
+                *([_NO_NOISE] if form.deviation["point_noise"].value is None else []),
                 *(str(d.reason) for d in form.doubts(decided=True)),
             ],
         },
@@ -233,6 +238,7 @@ def form_facts(
             "rim": form.aperture.rim().tolist(),
             "uncovered": form.uncovered,
             "s_filter": form.bands.s_filter,
+            "resolved": form.bands.resolved,
             "l_filter": form.bands.l_filter,
             "bands": {name: list(ends) for name, ends in form.bands.rms_bands.items()},
             "zernike": "each term is 1 at the rim; cos for m >= 0, sin for m < 0, from x to y",

@@ -13,6 +13,8 @@ from omsm_ros.core.form.deviation_map import (
     GridCells,
     UncertainValue,
     neighbour_noise,
+    profile_noise,
+    repeated_noise,
     root_mean_square,
 )
 from omsm_ros.core.form.part_figures import (
@@ -34,7 +36,7 @@ from omsm_ros.core.form.texture import (
     bands_of,
     power_density,
     profiles,
-    slopes_without_second_order,
+    slopes,
     texture,
 )
 from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
@@ -61,6 +63,8 @@ ZERNIKES = first_terms(37, "fringe")
 _COVERED_WELL = 0.02
 # Points with all their effects take 50 MB. Extremes and counts are of all points.
 MOST_WEIGHED = 2**19
+# Largest width of a profile relative to its length.
+_LINE_WIDTH = 1e-6
 # A hundred points for each Zernike term.
 _MOST_POINTS = 4_000
 
@@ -100,15 +104,15 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     """Return the terms of ISO 10110-5 for deviations along the normal of the surface, each [m].
 
     A (sagitta deviation) is the peak to valley of the power fitted together with piston and
-    tilts; B (irregularity) the extent of the rest over 99.5 % of the area; C the extent of its
-    rotationally symmetric part. RMSt is the rms without piston and tilts, RMSi also without power,
+    tilts; B (irregularity) the peak to valley of the rest; C that of its rotationally symmetric
+    part. RMSt is the rms without piston and tilts, RMSi also without power,
     and RMSa the rms of the asymmetric rest.
     """
     irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
     return {
         "iso10110_A": _sagitta(map_, fit),
-        "iso10110_B": extents_of_part(irregular, fit.disc)[1],
-        "iso10110_C": extents_of_part(_symmetric(map_, fit.disc), fit.disc)[1],
+        "iso10110_B": extents_of_part(irregular, fit.disc)[0],
+        "iso10110_C": extents_of_part(_symmetric(map_, fit.disc), fit.disc)[0],
         "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
         "iso10110_RMSi": rms_of_part(irregular),
         "iso10110_RMSa": rms_of_part(uneven),
@@ -232,7 +236,7 @@ def analyse_form(
     zernike = _terms(map_, found)
     outline = aperture or found.disc
     uncovered, outline = best_covered(map_.x, map_.y, found.spacing, outline, aperture is None)
-    cells = GridCells.of(map_)
+    cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)
     return FormResult(
         registration=found,
@@ -240,7 +244,7 @@ def analyse_form(
         map=map_,
         deviation=_figures(map_, gathered, found)
         | optical_terms(map_, zernike)
-        | _textures(map_, cells, bands, found),
+        | _textures(map_, cells, bands, found, even),
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -268,18 +272,21 @@ def _figures(
         # These are as measured, with noise and systematic errors.
         "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
-        "point_noise": UncertainValue(map_.noise, None),
+        # Of a profile measured once, noise and texture are the same.
+        "point_noise": UncertainValue(map_.noise if map_.noise or map_.noise_known else None, None),
         "rms_before_fit": UncertainValue(found.before, None),
     }
 
 
 def _textures(
-    map_: DeviationMap, cells: GridCells, bands: Bands, found: Registration
+    map_: DeviationMap, cells: GridCells, bands: Bands, found: Registration, even: bool
 ) -> dict[str, UncertainValue]:
-    formless, rest = without_form(map_, found.disc), without_second_order(map_)
-    return texture(cells, GridCells.of(formless), bands) | slopes_without_second_order(
-        GridCells.of(rest), bands
+    formless, rest = (
+        GridCells.of(part, even=even)
+        for part in (without_form(map_, found.disc), without_second_order(map_))
     )
+    steep = slopes(rest, bands)["slope_rms"]
+    return texture(cells, formless, bands) | {"slope_rms_without_second_order": steep}
 
 
 class _Gathered:
@@ -351,15 +358,29 @@ class _Gathered:
         if not self.counts["used"]:
             raise DataError("form.no_usable_point", counts=self.counts)
         rows = np.ascontiguousarray(self._kept.rows().T)
+        noise, known = self._point_noise(rows, found.noise, even)
         return DeviationMap(
             x=rows[0],
             y=rows[1],
             deviation=rows[2],
             area=area_weights(rows[0], rows[1], even=even),
             effects=rows[3:],
-            # Points may come in any order, where successive points are no neighbours.
-            noise=min(float(np.median(self._noise)), neighbour_noise(*rows[:3]), found.noise),
+            noise=noise,
+            noise_known=known,
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
             moves=found.moves,
             taken=found.taken,
         )
+
+    def _point_noise(self, rows: FloatArray, fitted: float, even: bool) -> tuple[float, bool]:
+        """Return the noise of a point [m], and whether it is certainly no texture."""
+        x, y, deviation = rows[:3]
+        if (repeated := repeated_noise(x, y, deviation)) is not None:
+            return repeated, True
+        spans = sorted((float(np.ptp(x)), float(np.ptp(y))))
+        if spans[0] <= _LINE_WIDTH * spans[1]:
+            found = profile_noise(x if np.ptp(x) > np.ptp(y) else y, deviation)
+            return found or 0.0, found is not None
+        # Points may come in any order, where successive points are no neighbours.
+        near = min(float(np.median(self._noise)), neighbour_noise(x, y, deviation), fitted)
+        return near, not even

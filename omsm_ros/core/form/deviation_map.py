@@ -7,6 +7,7 @@ of order zero), so that edges are not drawn to zero.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
-from omsm_ros.core.streams.statistics import noise_of
+from omsm_ros.core.streams.statistics import noise_of, spread
 from omsm_ros.errors import Notice
 
 
@@ -43,6 +44,7 @@ class DeviationMap:
     taken: the first t effects are form that the fit may have taken for a move, so that it is
         missing from the deviations; mean products of their probable shares (t, t), at most one
     noise: standard deviation of one point [m]
+    noise_known: that the noise is not texture that was measured once
     """
 
     x: FloatArray
@@ -54,6 +56,7 @@ class DeviationMap:
     bounds: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     moves: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     taken: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    noise_known: bool = True
 
     def __len__(self) -> int:
         return len(self.x)
@@ -100,45 +103,100 @@ def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> floa
     return noise_of(deviation[np.lexsort((x, strip))])
 
 
-# The mean of eight points has a third of their noise (1/√8).
-_MOST_ACROSS, _POINTS_PER_CELL = 256, 8.0
-# A profile has one row; its cells are as fine as its points.
-_MOST_ALONG = 1024
+# Share of repeated places that determines noise, and their size over the spacing of the points.
+_LEAST_REPEATED, _SAME_PLACE = 0.1, 1 / 50
+# Differences that no smooth form is left in. Of white noise their scatter does not grow with the
+# spacing of the points; of texture whose density falls as 1/f² it grows by √2 with every doubling.
+_ORDER, _WHITE, _LEAST_WHITE = 6, 1.12, 100
+
+
+def repeated_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float | None:
+    """Return the noise of points (n,) from places measured several times; None without them."""
+    spans = float(np.ptp(x)), float(np.ptp(y))
+    side = max(np.sqrt(spans[0] * spans[1] / len(x)), max(spans) / len(x)) * _SAME_PLACE
+    if side == 0:
+        return None
+    column, row = (np.round((v - v.min()) / side).astype(np.int64) for v in (x, y))
+    _, place = np.unique(column * (int(row.max()) + 1) + row, return_inverse=True)
+    counts = np.bincount(place)
+    if len(x) - len(counts) < _LEAST_REPEATED * len(x):
+        return None
+    mean = np.bincount(place, deviation) / counts
+    return float(np.sqrt(np.sum((deviation - mean[place]) ** 2) / (len(x) - len(counts))))
+
+
+def profile_noise(along: FloatArray, deviation: FloatArray) -> float | None:
+    """Return the white noise of a profile measured once, or None if it may be texture.
+
+    along: positions on the line (n,), in any order
+    """
+    if len(along) < _LEAST_WHITE:
+        return None
+    values = deviation[np.argsort(along, kind="stable")]
+    root = math.sqrt(math.comb(2 * _ORDER, _ORDER))
+    near, far = (spread(np.diff(v, _ORDER)) / root for v in (values, values[::2]))
+    return near if far <= _WHITE * near else None
+
+
+# Four cells along, the shortest cutoff of a filter, hold 72 points.
+_MOST_ACROSS, _POINTS_PER_CELL = 256, 4.5
+# A profile has one row; its cells are as fine as its points. So are those of an even grid.
+_MOST_ALONG, _MOST_OF_GRID = 1024, 512
 # Constant of the weighting function exp(−π (x / α λ)²), which halves a sine of wavelength λ.
 _ALPHA = float(np.sqrt(np.log(2) / np.pi))
+# A mean over a width w passes sinc(f w), nearly a Gaussian of the cutoff w √(π² / 6 ln 2).
+_CUTOFF_OF_MEAN = float(np.pi / np.sqrt(6 * np.log(2)))
+# Steps between columns of a grid are a larger share of the widest, and its places that filled.
+_LEAST_STEP, _LEAST_FILLED = 0.05, 0.2
+# Reach of a Gaussian over its cutoff, where it is 1e-8.
+_REACH = 1.15
+# Share of the weight that keeps the slopes of a lone cell at zero.
+_LEAST_SPREAD = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
 class GridCells:
-    """Means on square cells, rows along y.
+    """Means on cells, rows along y.
 
-    x, y: middles of the columns (c,) and rows (r,) [m];  pitch: of the cells [m]
+    x, y: middles of the columns (c,) and rows (r,) [m];  steps: of the cells along x and y [m]
     present: cells that have points (r, c)
     mean: of the deviations (r, c) [m], zero in empty cells;  noise: of each mean (r, c) [m]
     effects: means of the effects of each error source (e, r, c) [m]
+    offset: of the mean position of the points from the middle, along y and x (2, r, c) [cells]
+    width: over which the points of a cell are spread [cells]; 0: single points
+    noise_known: that the noise is not texture that was measured once
     """
 
     x: FloatArray
     y: FloatArray
-    pitch: float
+    steps: tuple[float, float]
     present: BoolArray
     mean: FloatArray
     noise: FloatArray
     effects: FloatArray
+    offset: FloatArray = field(default_factory=lambda: np.zeros((2, 1, 1)))
+    width: float = 0.0
+    noise_known: bool = True
+
+    @property
+    def pitch(self) -> float:
+        """Longer side of a cell [m]."""
+        return max(self.steps)
 
     @classmethod
-    def of(cls, map_: DeviationMap) -> GridCells:
-        """Return the means of a map on cells as fine as its points allow, at most 256 across."""
-        spans = float(np.ptp(map_.x)), float(np.ptp(map_.y))
-        # The area of a strip is at least 1e-6 of a square's, to keep the cells finite.
-        side = np.sqrt(max(spans[0] * spans[1], 1e-6 * max(spans) ** 2) / len(map_))
-        pitch = max(float(side * np.sqrt(_POINTS_PER_CELL)), max(spans) / _MOST_ACROSS)
-        if min(spans) == 0:
-            pitch = max(spans) / min(max(len(map_) - 1, 1), _MOST_ALONG) or 1.0
-        # A point within rounding of an edge belongs to the next cell.
-        column, row = (
-            ((values - values.min()) / pitch + 1e-9).astype(np.int64) for values in (map_.x, map_.y)
+    def of(cls, map_: DeviationMap, *, even: bool = False) -> GridCells:
+        """Return the means of a map on cells as fine as its points allow, at most 256 across.
+
+        even: the points are an evenly spaced grid; each has its own cell, up to 512 across
+        """
+        steps, before = (_of_grid(map_.x, map_.y) if even else None) or _of_scattered(
+            map_.x, map_.y
         )
+        at = [
+            (values - values.min()) / step + before
+            for values, step in zip((map_.x, map_.y), steps, strict=True)
+        ]
+        column, row = (values.astype(np.int64) for values in at)
         shape = int(row.max()) + 1, int(column.max()) + 1
         place = row * shape[1] + column
         size = shape[0] * shape[1]
@@ -146,43 +204,126 @@ class GridCells:
         divisor = np.maximum(counts, 1)
 
         def mean(values: FloatArray) -> FloatArray:
-            return np.asarray((np.bincount(place, values, size) / divisor).reshape(shape))
+            return np.asarray(np.bincount(place, values, size) / divisor)
 
-        effects = [mean(effect) for effect in map_.effects]
-        starts = float(map_.x.min()), float(map_.y.min())
+        inner = [at[1] - row - 0.5, at[0] - column - 0.5]
+        offset = np.array([mean(away) for away in inner])
+        across = [a - o[place] for a, o, n in zip(inner, offset, shape, strict=True) if n > 1]
         x, y = (
-            np.asarray(start + pitch * (np.arange(count) + 0.5), np.float64)
-            for start, count in zip(starts, reversed(shape), strict=True)
+            np.asarray(values.min() + step * (np.arange(count) + 0.5 - before), np.float64)
+            for values, step, count in zip((map_.x, map_.y), steps, reversed(shape), strict=True)
         )
         return cls(
             x=x,
             y=y,
-            pitch=pitch,
+            steps=steps,
             present=(counts > 0).reshape(shape),
-            mean=mean(map_.deviation),
+            mean=mean(map_.deviation).reshape(shape),
             noise=(map_.noise / np.sqrt(divisor)).reshape(shape),
-            effects=np.array(effects).reshape(len(effects), *shape),
+            effects=np.array([mean(e) for e in map_.effects]).reshape(-1, *shape),
+            offset=offset.reshape(2, *shape),
+            width=float(np.sqrt(12 * np.mean(np.square(across)))) if across else 0.0,
+            noise_known=map_.noise_known,
         )
+
+    def planes(
+        self, images: FloatArray, cutoff: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return level [m] and slopes [1] along x and y, each (k, r, c), after a low-pass.
+
+        Weighted linear regression with the Gaussian of ``cutoff`` [m] (ISO 16610-28). Inside the
+        map it is the Gaussian filter of ISO 16610-61, and its slopes are the derivatives. It takes
+        the points of a cell where they are, and makes up for their mean.
+        """
+        shape, width = self.present.shape, _CUTOFF_OF_MEAN * self.width
+        narrow = [float(np.sqrt((cutoff / step) ** 2 - width**2)) for step in reversed(self.steps)]
+        ways = [axis for axis, size in enumerate(shape) if size > 1]
+        middle = np.indices(shape) - np.array(shape)[:, np.newaxis, np.newaxis] / 2.0
+        at = (middle + self.offset)[ways]
+        basis = np.concatenate([np.ones((1, *shape)), at]) * self.present
+        products = _blurred(basis[:, np.newaxis] * basis, narrow)
+        right = _blurred(basis[:, np.newaxis] * images, narrow)
+        # From the middle of the map to that of each cell.
+        for k, axis in enumerate(ways, 1):
+            products[k] -= middle[axis] * products[0]
+            right[k] -= middle[axis] * right[0]
+        for k, axis in enumerate(ways, 1):
+            products[:, k] -= middle[axis] * products[:, 0]
+        gram = np.moveaxis(products, (0, 1), (2, 3))
+        weight = np.where(self.present, gram[..., 0, 0], 1.0)
+        gram = gram + (_LEAST_SPREAD * weight)[..., np.newaxis, np.newaxis] * np.eye(len(basis))
+        solve = np.linalg.inv(gram) * self.present[..., np.newaxis, np.newaxis]
+        found = np.einsum("rcij,jkrc->ikrc", solve, right)
+        flat = np.zeros_like(found[0])
+        slopes = {axis: found[k + 1] / self.steps[1 - axis] for k, axis in enumerate(ways)}
+        return found[0], slopes.get(1, flat), slopes.get(0, flat)
 
     def smoothed(self, images: FloatArray, cutoff: float) -> FloatArray:
         """Return images (…, r, c) after a Gaussian low-pass of ``cutoff`` [m] (ISO 16610-61)."""
-        rows, columns = (gaussian_weights(size, cutoff / self.pitch) for size in self.present.shape)
+        rows, columns = self._weights(cutoff)
         weight = rows @ self.present @ columns
         made = rows @ (images * self.present) @ columns
         return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) * self.present)
 
     def smoothed_square(self, variance: FloatArray, cutoff: float) -> FloatArray:
         """Return the variance (r, c) of independent cells after :meth:`smoothed`."""
-        rows, columns = (gaussian_weights(size, cutoff / self.pitch) for size in self.present.shape)
+        rows, columns = self._weights(cutoff)
         weight = rows @ self.present @ columns
         made = rows**2 @ (variance * self.present) @ columns**2
         return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) ** 2 * self.present)
+
+    def _weights(self, cutoff: float) -> list[FloatArray]:
+        sizes = zip(self.present.shape, reversed(self.steps), strict=True)
+        return [gaussian_weights(size, cutoff / step) for size, step in sizes]
+
+
+Sides = tuple[tuple[float, float], float]
+
+
+def _of_scattered(x: FloatArray, y: FloatArray) -> Sides:
+    """Return the sides of square cells [m], and the place of the first point in its own [cells]."""
+    spans = float(np.ptp(x)), float(np.ptp(y))
+    # The area of a strip is at least 1e-6 of a square's, to keep the cells finite.
+    side = np.sqrt(max(spans[0] * spans[1], 1e-6 * max(spans) ** 2) / len(x))
+    pitch = max(float(side * np.sqrt(_POINTS_PER_CELL)), max(spans) / _MOST_ACROSS)
+    if min(spans) == 0:
+        pitch = max(spans) / min(max(len(x) - 1, 1), _MOST_ALONG) or 1.0
+    # A point within rounding of an edge belongs to the next cell.
+    return (pitch, pitch), 1e-9
+
+
+def _of_grid(x: FloatArray, y: FloatArray) -> Sides | None:
+    """Return the same for cells that hold one point each of a grid, or whole blocks of them.
+
+    None for a grid that is turned, so that its points form no columns and rows.
+    """
+    spacings = []
+    for values in (x, y):
+        steps = np.diff(np.sort(values))
+        # Points of one column differ by rounding, and by what the tilt of the part moves them.
+        wide = steps[steps > _LEAST_STEP * np.max(steps, initial=0.0)]
+        spacings.append(float(np.median(wide)) if len(wide) else np.inf)
+    counts = [float(np.ptp(v) / step) + 1 for v, step in zip((x, y), spacings, strict=True)]
+    if min(counts) < 2 or np.prod(counts) * _LEAST_FILLED > len(x):
+        return None
+    block = int(np.ceil(max(counts) / _MOST_OF_GRID))
+    return (spacings[0] * block, spacings[1] * block), 0.5 / block
 
 
 def gaussian_weights(size: int, cutoff: float) -> FloatArray:
     """Return the weight of each cell for each other (size, size); ``cutoff`` in cells."""
     apart = np.subtract.outer(np.arange(size), np.arange(size)) / (_ALPHA * cutoff)
     return np.asarray(np.exp(-np.pi * apart**2))
+
+
+def _blurred(images: FloatArray, cutoffs: Sequence[float]) -> FloatArray:
+    """Return images (…, r, c) times the Gaussian weights of ``cutoffs`` along y and x [cells]."""
+    from scipy.ndimage import correlate1d  # takes 0.1 s to load
+
+    for axis, cutoff in zip((-2, -1), cutoffs, strict=True):
+        kernel = gaussian_weights(2 * math.ceil(_REACH * cutoff) + 1, cutoff)
+        images = correlate1d(images, kernel[len(kernel) // 2], axis, mode="constant")
+    return images
 
 
 HOLDS, FAILS, OPEN = "holds", "fails", "cannot tell"

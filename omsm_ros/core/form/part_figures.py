@@ -71,7 +71,7 @@ def rms_of_part(map_: DeviationMap) -> UncertainValue:
     of_bounds = 4 * float(np.sum(shared[map_.bounds] ** 2)) + bounded**2
     of_errors = of_form + of_bounds + 2 * float(np.sum(products**2))
     variance = of_errors + _variance_by_noise(map_, share)
-    return _of_square(square, float(np.sqrt(variance)))
+    return of_square(square, float(np.sqrt(variance)))
 
 
 def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue, UncertainValue]:
@@ -117,7 +117,7 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue,
         # An extent has two ends, each blurred independently.
         of_blur = 2 * of_some * float(np.sqrt(2)) * blurred
         spread = _length(of_errors, _rms(more - again), of_taken, of_blur)
-        figure = _of_square(square, spread)
+        figure = of_square(square, spread)
         found.append(UncertainValue((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
 
@@ -303,7 +303,7 @@ def _variance_by_noise(map_: DeviationMap, share: FloatArray) -> float:
     return float(np.sum(share**2 * (4 * map_.deviation**2 * noise + 4 * noise**2)))
 
 
-def _of_square(square: float, spread: float) -> UncertainValue:
+def of_square(square: float, spread: float) -> UncertainValue:
     """Return the root of a ``square`` [m²] with its standard uncertainty ``spread`` [m²].
 
     The uncertainty is half the larger side of the interval of the root for k = 2 of the square. A

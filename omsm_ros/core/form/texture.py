@@ -7,21 +7,32 @@ the area of the ring: ``Σ 2π f S(f) Δf`` is the mean square in the band of th
 density is the mean square per radian of half a turn.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.form.part_figures import of_square
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.deviation import Profile, line_profile, radial_profile
 from omsm_ros.errors import DataError
 
-# Fixed seeds, so that the same points give the same figures.
-_NOISE_SEED, _DENSITY_NOISE_SEED = 21, 22
+# A fixed seed, so that the same points give the same figures.
+_NOISE_SEED = 21
 # Least cutoff of the S-filter in cells; a shorter one would pass aliased wavelengths.
-_LEAST_CELLS = 3.0
+_LEAST_CELLS = 4.0
+# Weights of the cutoffs 1, √2, √3 for the figure at zero: by the first, the first two, all.
+_EXTRAPOLATED = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
+# Draws of the noise; and share of the subtracted noise that is uncertain, where noise and form
+# do not add as squares.
+_DRAWS, _UNSURE = 4, 0.25
+# A cutoff of so many cells is not changed by their width.
+_MANY_CELLS = 12.0
 # Limits of the bands, as shares of the longest side.
 _BANDS = {"form": (np.inf, 1 / 4), "waviness": (1 / 4, 1 / 20), "finer": (1 / 20, 0.0)}
 # Default cutoff of the L-filter, the limit of form.
@@ -40,47 +51,89 @@ _RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
 
 @dataclass(frozen=True, slots=True)
 class Bands:
-    """Cutoff wavelengths [m] of the S- and the L-filter, and limits of the bands of rms."""
+    """Cutoff wavelengths [m] of the S- and the L-filter, and limits of the bands of rms.
 
-    s_filter: float
+    s_filter: None: no wavelength is removed;  resolved: the shortest that the cells resolve
+    """
+
+    s_filter: float | None
+    resolved: float
     l_filter: float
-    rms_bands: dict[str, tuple[float | None, float]]
+    rms_bands: dict[str, tuple[float | None, float | None]]
 
 
 def bands_of(
     cells: GridCells, s_filter: float | None = None, l_filter: float | None = None
 ) -> Bands:
-    """Return the cutoffs asked for; by default three cells and a quarter of the longest side.
+    """Return the cutoffs asked for; by default no S-filter, and a quarter of the longest side.
 
     Raises DataError for an L-filter that is not longer than the S-filter.
     """
-    across = max(cells.present.shape) * cells.pitch
-    shortest = max(s_filter or 0.0, _LEAST_CELLS * cells.pitch)
+    across = max(len(v) * step for v, step in zip((cells.x, cells.y), cells.steps, strict=True))
+    resolved = _LEAST_CELLS * cells.pitch
+    shortest = max(s_filter or 0.0, resolved)
     longest = l_filter or _DEFAULT_L * across
     if l_filter is not None and longest <= shortest:
         raise DataError("form.empty_filter_band", l_filter=longest, s_filter=shortest)
-    ends = {
-        name: (None if long == np.inf else long * across, max(short * across, shortest))
-        for name, (long, short) in _BANDS.items()
-    }
-    found = {name: (long, short) for name, (long, short) in ends.items() if (long or 1e9) > short}
-    return Bands(shortest, longest, found)
+    found: dict[str, tuple[float | None, float | None]] = {}
+    for name, (long, short) in _BANDS.items():
+        if long * across > shortest:
+            end = short * across if short * across > shortest else s_filter and shortest
+            found[name] = (None if long == np.inf else long * across, end)
+    return Bands(s_filter and shortest, resolved, longest, found)
 
 
 @dataclass(frozen=True, eq=False)
 class _FilteredBand:
-    """One band of the cells: the map, the map with as much noise again, and the error effects."""
+    """One band of the cells after each cutoff of the S-filter, to extrapolate to none.
+
+    values: (levels, …);  noisy: with noise added anew (draws, levels, …)
+    effects: of the error sources, after the first cutoff (e, …)
+    noise_known: that the values contain this noise
+    """
 
     values: FloatArray
-    noisier: FloatArray
+    noisy: FloatArray
     effects: FloatArray
+    noise_known: bool
 
-    def figure(self, of: Callable[[FloatArray], float]) -> UncertainValue:
-        """Return a figure of the values with its uncertainty from noise and all effects."""
-        value = of(self.values)
-        noise = (of(self.noisier) - value) / (np.sqrt(2) - 1)
-        shares = [(of(self.values + e) - of(self.values - e)) / 2 for e in self.effects]
-        return UncertainValue(value, float(np.sqrt(noise**2 + np.sum(np.square(shares)))))
+    @classmethod
+    def of(cls, made: list[FloatArray], effects: FloatArray, cells: GridCells) -> _FilteredBand:
+        """Return a band of images of the values and draws of their noise, one for each cutoff."""
+        values = np.stack([m[0] for m in made])
+        noisy = np.stack([m[0] + m[1:] for m in made], axis=1)
+        return cls(values, noisy, effects, cells.noise_known)
+
+    def figure(self, of: Callable[[FloatArray], float], *, square: bool = True) -> UncertainValue:
+        """Return a figure of the values, without noise and without loss by the S-filter.
+
+        Noise adds to the square of a size, so that its own addition is subtracted. The loss of the
+        square is a smooth function of the square of the cutoff, so that the cutoffs 1, √2, √3 give
+        it at zero; so many of them are used that noise and the next step are smallest together.
+        Both belong to the uncertainty, with all effects and the change by every other cell alone.
+
+        square: of a figure that is a size
+        """
+
+        def measure(levels: FloatArray) -> FloatArray:
+            return np.array([of(v) ** 2 if square else of(v) for v in levels])
+
+        weights = _EXTRAPOLATED[: len(self.values), : len(self.values)]
+        here = weights @ measure(self.values)
+        again = np.array([weights @ measure(levels) for levels in self.noisy])
+        added = again.mean(axis=0) - here
+        values = here - added if self.noise_known else here
+        steps = np.append(np.diff(values), values[-1] - values[-2:][0])
+        of_noise = np.hypot(again.std(axis=0), added * (_UNSURE if self.noise_known else 1.0))
+        spread = np.hypot(of_noise, steps)
+        best = int(np.argmin(spread))
+        value, deviation = float(values[best]), float(spread[best])
+        figure = of_square(value, deviation) if square else UncertainValue(value, deviation)
+        first = self.values[0]
+        shares = [(of(first + e) - of(first - e)) / 2 for e in self.effects]
+        shares.append(of(first) - of(first[..., ::2]))
+        whole = np.hypot(figure.uncertainty or 0.0, np.sqrt(np.sum(np.square(shares))))
+        return UncertainValue(figure.value, float(whole))
 
 
 def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, UncertainValue]:
@@ -88,40 +141,84 @@ def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, Un
 
     formless: the same cells after the F-operation
     """
-    surface = _band(formless, bands.l_filter, bands.s_filter)
-    found = {name: surface.figure(of) for name, of in _PARAMETERS.items()}
+    waves = _waves(formless, bands.s_filter)
+    surface = waves.without(bands.l_filter)
+    found = {name: surface.figure(of) for name, of in _SIZES.items()}
+    found |= {
+        f"S{name}": surface.figure(lambda v, n=order: _moment(v, n), square=False)  # type: ignore[misc]
+        for name, order in (("sk", 3), ("ku", 4))
+    }
     for name, (long, short) in bands.rms_bands.items():
-        found[f"rms_{name}"] = _band(formless if long else cells, long, short).figure(_rms)
-    return found | _slope_figures(cells, bands)
+        band = waves if long and not short else _waves(formless if long else cells, short)
+        found[f"rms_{name}"] = band.without(long).figure(_rms)
+    return found | slopes(cells, bands)
 
 
-def slopes_without_second_order(rest: GridCells, bands: Bands) -> dict[str, UncertainValue]:
-    """Return the rms slope [1] of cells without their second order."""
-    return {"slope_rms_without_second_order": _slope_figures(rest, bands)["slope_rms"]}
-
-
-def _slope_figures(cells: GridCells, bands: Bands) -> dict[str, UncertainValue]:
-    smooth = _band(cells, None, bands.s_filter, whole=True)
-    if not len(_slopes(smooth.values, cells)):
+def slopes(cells: GridCells, bands: Bands) -> dict[str, UncertainValue]:
+    """Return the rms and the largest slope [1] of the cells."""
+    chosen = cells.present & _neighboured(cells.present)
+    if not np.any(chosen):
         return dict.fromkeys(("slope_rms", "slope_largest"), UncertainValue(None, None))
+    images = np.concatenate([_with_noise(cells), cells.effects])
+    made: list[FloatArray] = []
+    for cutoff in _cutoffs(cells, bands.s_filter):
+        steep = cells.planes(images if not made else images[: 1 + _DRAWS], cutoff)[1:]
+        made.append(np.stack(steep, axis=1)[..., chosen])
+    band = _FilteredBand.of([m[: 1 + _DRAWS] for m in made], made[0][1 + _DRAWS :], cells)
     return {
-        "slope_rms": smooth.figure(lambda image: _rms_about_zero(_slopes(image, cells))),
-        "slope_largest": smooth.figure(lambda image: float(np.max(_slopes(image, cells)))),
+        "slope_rms": band.figure(lambda v: float(np.sqrt(np.mean(np.sum(v**2, axis=0))))),
+        "slope_largest": band.figure(lambda v: float(np.max(np.hypot(*v)))),
     }
 
 
-def _band(cells: GridCells, long: float | None, short: float, whole: bool = False) -> _FilteredBand:
-    """Return the wavelengths from ``short`` to ``long``, of present cells or as ``whole`` images.
+def _with_noise(cells: GridCells) -> FloatArray:
+    """Return the means of the cells, and draws of their noise (1 + draws, r, c)."""
+    random = np.random.default_rng(_NOISE_SEED)
+    noise = random.normal(size=(_DRAWS, *cells.mean.shape)) * cells.noise
+    return np.concatenate([cells.mean[np.newaxis], noise])
 
-    The L-filter acts on the result of the S-filter (ISO 25178-2).
-    """
-    more = np.random.default_rng(_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
-    images = np.concatenate([[cells.mean, more], cells.effects])
-    fine = cells.smoothed(images, short)
-    if long is not None:
-        fine = fine - cells.smoothed(fine, long)
-    rows = fine if whole else fine[:, cells.present]
-    return _FilteredBand(rows[0], rows[0] + rows[1], rows[2:])
+
+def _cutoffs(cells: GridCells, short: float | None) -> list[float]:
+    return [short] if short else [_LEAST_CELLS * cells.pitch * k**0.5 for k in (1, 2, 3)]
+
+
+class _Waves(NamedTuple):
+    """Cells after each cutoff of the S-filter, each (1 + draws, r, c), and effects (e, r, c)."""
+
+    cells: GridCells
+    levels: list[FloatArray]
+    effects: FloatArray
+
+    def without(self, long: float | None) -> _FilteredBand:
+        """Return the present cells, less what an L-filter passes (ISO 25178-2)."""
+
+        def kept(images: FloatArray) -> FloatArray:
+            rest = images if long is None else images - self.cells.smoothed(images, long)
+            return np.asarray(rest[:, self.cells.present])
+
+        return _FilteredBand.of([*map(kept, self.levels)], kept(self.effects), self.cells)
+
+
+def _waves(cells: GridCells, short: float | None) -> _Waves:
+    images = _with_noise(cells)
+    if short is not None and short > _MANY_CELLS * cells.pitch:
+        return _Waves(cells, [cells.smoothed(images, short)], cells.smoothed(cells.effects, short))
+    if short is None and cells.width == 0:
+        return _Waves(cells, [images], cells.effects)
+    # The effects of systematic errors have no short waves.
+    return _Waves(
+        cells, [cells.planes(images, c)[0] for c in _cutoffs(cells, short)], cells.effects
+    )
+
+
+def _neighboured(present: BoolArray) -> BoolArray:
+    """Return which cells (r, c) have a neighbour along each axis that has several cells."""
+    found = np.full(present.shape, max(present.shape) > 1)
+    for axis in [axis for axis, size in enumerate(present.shape) if size > 1]:
+        pad = np.pad(present, [(1, 1) if n == axis else (0, 0) for n in (0, 1)])
+        size = present.shape[axis]
+        found &= pad.take(range(size), axis) | pad.take(range(2, size + 2), axis)
+    return found
 
 
 def _rms(values: FloatArray) -> float:
@@ -133,32 +230,11 @@ def _moment(values: FloatArray, order: int) -> float:
     return float(np.mean(((values - values.mean()) / size) ** order)) if size > 0 else 0.0
 
 
-_PARAMETERS: dict[str, Callable[[FloatArray], float]] = {
+_SIZES: dict[str, Callable[[FloatArray], float]] = {
     "Sa": lambda values: float(np.mean(np.abs(values - values.mean()))),
     "Sq": _rms,
     "Sz": lambda values: float(np.ptp(values)),
-    "Ssk": lambda values: _moment(values, 3),
-    "Sku": lambda values: _moment(values, 4),
 }
-
-
-def _rms_about_zero(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
-def _slopes(image: FloatArray, cells: GridCells) -> FloatArray:
-    """Return slopes (k,) over two cells with all neighbours present; of one row, along it."""
-    ways = [axis for axis, size in enumerate(image.shape) if size > 1]
-    inside = cells.present.copy()
-    square = np.zeros(image.shape)
-    for axis in ways:
-        before, after = (np.roll(image, way, axis) for way in (1, -1))
-        square += (after - before) ** 2
-        # Values rolled in from the opposite side are no neighbours.
-        there = np.pad(cells.present, [(1, 1) if n == axis else (0, 0) for n in (0, 1)])
-        size = image.shape[axis]
-        inside &= there.take(range(size), axis) & there.take(range(2, size + 2), axis)
-    return np.asarray(np.sqrt(square[inside]) / (2 * cells.pitch)) if ways else np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,18 +287,34 @@ class PowerDensity:
 def power_density(cells: GridCells) -> PowerDensity:
     """Return the densities of a map, with their uncertainty from the scatter of the periodogram.
 
-    A mean over k independent frequencies has a relative uncertainty of 1/√k. The density of the
-    noise of the points is not subtracted, but added to the uncertainty.
+    A mean over k independent frequencies has a relative uncertainty of 1/√k. The radial and the
+    azimuthal density are without that of the noise of the points, if it is known.
     """
     window = _window(cells)
-    areal, mean_square = _areal(cells, cells.mean, window)
-    noise = np.random.default_rng(_DENSITY_NOISE_SEED).normal(size=cells.mean.shape) * cells.noise
-    of_noise, _ = _areal(cells, noise, window)
-    y, x = (np.asarray(np.fft.fftfreq(size, cells.pitch), np.float64) for size in cells.mean.shape)
-    radial, step = _over_frequency(x, y, areal, of_noise)
+    y, x = (
+        np.asarray(np.fft.fftfreq(size, step), np.float64)
+        for size, step in zip(cells.mean.shape, reversed(cells.steps), strict=True)
+    )
+    # What the mean over a cell passes of each frequency.
+    along, across = (
+        np.sinc(v * step * cells.width)
+        for v, step in zip((y, x), reversed(cells.steps), strict=True)
+    )
+    passed = np.outer(along, across) ** 2
+    image = cells.mean
+    if cells.width > 0:
+        # The mean position of the points is not the middle of the cell.
+        _, *steep = cells.planes(image[np.newaxis], _LEAST_CELLS * cells.pitch)
+        steps = np.reshape(cells.steps, (2, 1, 1))
+        image = image - np.sum(np.concatenate(steep) * cells.offset[::-1] * steps, axis=0)
+    areal = _areal(cells, image, window) / passed
+    white = np.sum((window * cells.noise) ** 2) / np.sum(window**2) * np.prod(cells.steps)
+    of_noise = white / passed
+    mean_square = float(areal.sum()) * abs(_steps(x, y)[0] * _steps(x, y)[1])
+    radial, step = _over_frequency(x, y, areal, of_noise, cells.noise_known)
     band = (step / 2, float(radial.position[-1]) + step / 2)
     inside = float(np.sum(2 * np.pi * radial.position * radial.value) * step)
-    azimuthal = _over_direction(x, y, areal, of_noise)
+    azimuthal = _over_direction(x, y, areal, of_noise, cells.noise_known)
     return PowerDensity(x, y, areal, mean_square, radial, azimuthal, band, inside)
 
 
@@ -233,14 +325,12 @@ def _window(cells: GridCells) -> FloatArray:
     return np.asarray(np.cos(np.pi * radius / 2) ** 2 * cells.present)
 
 
-def _areal(cells: GridCells, image: FloatArray, window: FloatArray) -> tuple[FloatArray, float]:
-    square = float(np.sum(window**2))
+def _areal(cells: GridCells, image: FloatArray, window: FloatArray) -> FloatArray:
     # The mean under the window would leak into the lowest frequencies.
     level = float(np.sum(window * image) / np.sum(window))
     tapered = window * (image - level)
     spectrum = np.abs(np.fft.fft2(tapered)) ** 2
-    density = spectrum * cells.pitch**2 / square
-    return np.asarray(density), float(np.sum(tapered**2) / square)
+    return np.asarray(spectrum * np.prod(cells.steps) / np.sum(window**2), np.float64)
 
 
 def _steps(x: FloatArray, y: FloatArray) -> tuple[float, float]:
@@ -250,7 +340,7 @@ def _steps(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 
 def _over_frequency(
-    x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray
+    x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray, known: bool
 ) -> tuple[UncertainCurve, float]:
     """Return S over radial frequency, and the width of its rings [1/m]."""
     steps = _steps(x, y)
@@ -272,11 +362,20 @@ def _over_frequency(
     value, floor = (total[1:] * cell / _PARTS**2 / area for total in (content, of_noise))
     # The spectrum of a real map holds each frequency twice.
     independent = np.maximum(area / cell / 2, 1.0)
-    return UncertainCurve(position, value, np.hypot(value / np.sqrt(independent), floor)), step
+    return _without_noise(position, value, value / np.sqrt(independent), floor, known), step
+
+
+def _without_noise(
+    position: FloatArray, value: FloatArray, scatter: FloatArray, noise: FloatArray, known: bool
+) -> UncertainCurve:
+    """Return the density less that of the noise, if it is known to be noise."""
+    left = np.maximum(value - noise, 0.0) if known else value
+    spread = np.hypot(scatter, noise * (_UNSURE if known else 1.0))
+    return UncertainCurve(position, left, np.asarray(spread, np.float64))
 
 
 def _over_direction(
-    x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray
+    x: FloatArray, y: FloatArray, areal: FloatArray, noise: FloatArray, known: bool
 ) -> UncertainCurve:
     steps = _steps(x, y)
     angle = np.arctan2(y[:, np.newaxis] + 0 * x, x[np.newaxis] + 0 * y[:, np.newaxis]).ravel()
@@ -288,7 +387,7 @@ def _over_direction(
     )
     scatter = np.sqrt(np.bincount(sector, areal.ravel() ** 2, _SECTORS)) * per_angle
     directions = np.asarray((np.arange(_SECTORS) + 0.5) * np.pi / _SECTORS, np.float64)
-    return UncertainCurve(directions, content, np.asarray(np.hypot(scatter, of_noise)))
+    return _without_noise(directions, content, scatter, of_noise, known)
 
 
 Averaging = Callable[[FloatArray], Profile]

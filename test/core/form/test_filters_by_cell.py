@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.deviation_map import GridCells, UncertainValue, gaussian_weights
-from omsm_ros.core.form.texture import bands_of, power_density, slopes_without_second_order, texture
+from omsm_ros.core.form.texture import bands_of, power_density, slopes, texture
 
 RNG = np.random.default_rng(12)
 
@@ -16,8 +16,8 @@ def cells_of(values, present=None, noise=0.0, effects=()):
     present = np.ones(shape, bool) if present is None else present
     rows = np.array(effects).reshape(len(effects), *shape)
     return GridCells(
-        x=1e-4 * np.arange(shape[1]), y=1e-4 * np.arange(shape[0]), pitch=1e-4, present=present,
-        mean=values, noise=np.full(shape, noise), effects=rows,
+        x=1e-4 * np.arange(shape[1]), y=1e-4 * np.arange(shape[0]), steps=(1e-4, 1e-4),
+        present=present, mean=values, noise=np.full(shape, noise), effects=rows,
     )  # fmt: skip
 
 
@@ -47,18 +47,18 @@ def test_of_a_wave_at_the_cutoff_the_weights_pass_half(cutoff):
 
 
 def test_texture_of_two_levels_is_known_by_hand():
-    """A quarter of the cells a above the rest, and no filter that matters: cells of 0.1 mm."""
-    block = np.zeros((10, 10))
-    block[::2, ::2] = 1.0
+    """Part of the cells a above the rest, and no filter that matters: cells of 0.1 mm."""
+    block = np.zeros((9, 9))
+    block[1::2, 1::2] = 1.0
     values = 40e-9 * np.kron(block, np.ones((24, 24)))
     cells = cells_of(values)
     found = texture(cells, cells, bands_of(cells, None, 1.0))
-    p = 0.25
-    assert found["Sq"].value == pytest.approx(40e-9 * np.sqrt(p * (1 - p)), rel=0.06)
-    assert found["Sa"].value == pytest.approx(40e-9 * 2 * p * (1 - p), rel=0.06)
-    assert found["Sz"].value == pytest.approx(40e-9, rel=0.02)
-    assert found["Ssk"].value == pytest.approx((1 - 2 * p) / np.sqrt(p * (1 - p)), rel=0.06)
-    assert found["Sku"].value == pytest.approx(1 / (p * (1 - p)) - 3, rel=0.08)
+    p = 16 / 81
+    assert found["Sq"].value == pytest.approx(40e-9 * np.sqrt(p * (1 - p)), rel=2e-3)
+    assert found["Sa"].value == pytest.approx(40e-9 * 2 * p * (1 - p), rel=2e-3)
+    assert found["Sz"].value == pytest.approx(40e-9, rel=2e-3)
+    assert found["Ssk"].value == pytest.approx((1 - 2 * p) / np.sqrt(p * (1 - p)), rel=2e-3)
+    assert found["Sku"].value == pytest.approx(1 / (p * (1 - p)) - 3, rel=2e-3)
 
 
 def test_texture_upside_down_and_turned_is_the_same_but_for_its_skewness():
@@ -77,11 +77,10 @@ def test_slopes_of_a_plane_are_its_own_whatever_cells_are_missing():
     rows, columns = np.mgrid[:20, :30]
     plane = 1e-4 * (3e-6 * columns - 4e-6 * rows)
     holed = cells_of(plane, RNG.random((20, 30)) > 0.1)
-    found = slopes_without_second_order(cells_of(plane), bands_of(cells_of(plane)))
-    middle = texture(holed, holed, bands_of(holed))
-    # At the rim a Gaussian has more cells on one side, and flattens.
-    assert found["slope_rms_without_second_order"].value == pytest.approx(5e-6, rel=0.1)
-    assert middle["slope_rms"].value == pytest.approx(5e-6, rel=0.15)
+    for cells in (cells_of(plane), holed):
+        found = slopes(cells, bands_of(cells))
+        assert found["slope_rms"].value == pytest.approx(5e-6, rel=1e-4)
+        assert found["slope_largest"].value == pytest.approx(5e-6, rel=1e-3)
 
 
 def test_a_single_cell_has_no_slope():
@@ -92,10 +91,10 @@ def test_a_single_cell_has_no_slope():
 def test_a_constant_effect_makes_no_texture_uncertain():
     values = RNG.normal(0, 1e-9, (40, 40))
     cells = cells_of(values, effects=[np.full((40, 40), 1e-6)])
-    found = texture(cells, cells, bands_of(cells))
+    found, bare = (texture(c, c, bands_of(c)) for c in (cells, cells_of(values)))
     assert {"Sa", "Sq", "Sz"} <= set(found)
     for name, figure in found.items():
-        assert figure.uncertainty < 1e-6 * max(abs(figure.value), 1e-9), name
+        assert figure.uncertainty == pytest.approx(bare[name].uncertainty, rel=1e-3, abs=0), name
 
 
 # Densities.
