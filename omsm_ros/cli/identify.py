@@ -24,14 +24,16 @@ from omsm_ros.cli.command import (
     table,
     written,
 )
-from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import Origin
 from omsm_ros.core.calibration.typed_json import from_json
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, HOLDS
+from omsm_ros.core.estimation.preparation import joined_recordings
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.sampled_identification import identify_samples
+from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import save_calibration
@@ -68,14 +70,15 @@ def _declare(add: Arguments) -> None:
         "recordings",
         nargs="+",
         metavar="RECORDING",
-        help="bag of a motion on a fixed target, or tables RECORD.csv that one model describes",
+        help="bags of motions on a fixed target, or tables RECORD.csv, that one model describes",
     )
     add("--out", "CAL.json", required=True)
     add("--order", ORDER, "number of poles; 0 = choose", default=0)
     add(
         "--input",
         str,
-        "of a bag, 'encoder' or 'reference'; of a table, the input columns, A or A,B,C",
+        "of a bag, 'encoder' or 'reference' for Z, then other axes that move the probe, as "
+        "encoder,x,c; of a table, the input columns, A or A,B,C",
         default=ENCODER,
     )
     add("--output", str, "of a table, the output column")
@@ -137,26 +140,20 @@ def _identify(args: argparse.Namespace) -> Facts:
     _check_arguments(args, of_table)
     if of_table:
         return _of_tables(args)
-    bag, stated = cell_of(first, args), args.settings or {}
-    with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
-        motion = recording.motion(
-            duration=args.duration,
-            time_lapse=stated.get("time_lapse", 1.0),
-            trigger=trigger_of(args),
-            by_stamps=args.by_stamps,
-        )
-        settings = recording.settings(stated) if args.hold == BAND_LIMITED else stated
+    source, *further = args.input.split(",")
+    motions, settings, recorded = _motions(args, further)
     if args.hold != BAND_LIMITED:
-        return _model_facts([record_of_motion(motion)], motion.sample_period, args)
+        records = [record_of_motion(motion) for motion in motions]
+        return _model_facts(records, motions[0].sample_period, args)
     identified = identify(
-        motion,
+        joined_recordings(motions),
         order=args.order,
-        input=args.input,
+        input=source,
         settings=settings,
         use=intended_use_of(args.scan, args.accuracy),
         origin=replace(
             from_json(Origin, args.origin, "origin"),
-            recorded_ns=recording.recorded_ns,
+            recorded_ns=recorded,
             software=f"omsm_ros {__version__}",
         ),
     )
@@ -169,15 +166,40 @@ def _identify(args: argparse.Namespace) -> Facts:
         *facts["warnings"],
         *record_in_catalogue(
             args.catalogue,
-            lambda: keep_calibration(
-                args.catalogue, calibration, path, first, recording.recorded_ns
-            ),
+            lambda: keep_calibration(args.catalogue, calibration, path, first, recorded),
         ),
     ]
     if args.report is not None:
         page = write_certificate(args.report, identified, source=first.name)
         facts["report"] = str(page)
     return facts
+
+
+def _motions(
+    args: argparse.Namespace, further: Sequence[str]
+) -> tuple[list[MotionRecord], dict[str, object], int | None]:
+    """Return the motion of each bag, the settings that they share, and when the last was recorded.
+
+    further: axes besides Z
+    """
+    motions, stated, recorded = [], args.settings or {}, []
+    for path in args.recordings:
+        bag = cell_of(path, args)
+        with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
+            motions.append(
+                recording.motion(
+                    duration=args.duration,
+                    time_lapse=stated.get("time_lapse", 1.0),
+                    trigger=trigger_of(args),
+                    by_stamps=args.by_stamps,
+                    further=further,
+                )
+            )
+            if args.hold == BAND_LIMITED:
+                stated = recording.settings(stated)
+            recorded.append(recording.recorded_ns)
+    known = [moment for moment in recorded if moment is not None]
+    return motions, stated, max(known, default=None)
 
 
 def _of_tables(args: argparse.Namespace) -> Facts:
@@ -205,11 +227,6 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
             f"{TABLE_SUFFIX} file, and a bag states both: leave them out"
         )
 
-    if not of_table and len(args.recordings) > 1:
-        raise ConfigurationError(
-            f"{len(args.recordings)} bags are given, expected one; several recordings of one model "
-            f"are tables ({TABLE_SUFFIX}) with the same columns"
-        )
     if args.max_delay is not None and args.hold == BAND_LIMITED:
         raise ConfigurationError(
             "--max-delay is for a held input; give --hold zero-order or first-order, or leave it "
@@ -220,6 +237,8 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
             f"--hold takes the encoder of a bag as its input, not {shown(args.input)}; leave out "
             "--input, or --hold"
         )
+    if not of_table:
+        _check_axes(args.input.split(",")[1:])
 
 
 def _check_for_bags(args: argparse.Namespace) -> None:
@@ -237,6 +256,15 @@ def _check_for_bags(args: argparse.Namespace) -> None:
         raise ConfigurationError(
             f"{' and '.join(unused)} is for a bag; a table has no counters, stamps or settings: "
             "leave it out"
+        )
+
+
+def _check_axes(names: Sequence[str]) -> None:
+    """Raise ConfigurationError for further axes that a bag does not have, or has once."""
+    if len({*names}) < len(names) or not {*names} <= {*FURTHER_AXES}:
+        raise ConfigurationError(
+            f"--input names the axes {shown(','.join(names))} besides Z, expected each of "
+            f"{', '.join(FURTHER_AXES)} once at most"
         )
 
 
@@ -278,6 +306,13 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "static_gain": calibration.static_gain,
         "static_gain_uncertainty": certificate.static_gain.uncertainty,
         "valid_up_to": calibration.valid_up_to,
+        "further_axes": {
+            name: {
+                "gain": float(numerator[0]),
+                "gain_uncertainty": calibration.further_gain_u(name),
+            }
+            for name, numerator in calibration.further.items()
+        },
         "polarity": certificate.static_gain.polarity,
     }
 
@@ -312,6 +347,9 @@ def _show(facts: Facts) -> None:
             ("static gain", _stated(facts, "static_gain", "")),
             ("valid up to", quantity(facts["valid_up_to"], "Hz")),
         ]
+        for name, found in facts["further_axes"].items():
+            text = measured(found["gain"], found["gain_uncertainty"], "", 6)
+            rows.append((f"gain of {name.upper()}", f"{text} (k = 1)"))
         if facts["polarity"] == -1:
             rows.append(("distance", _RISES))
     for kind in ("reasons", "reservations", "warnings"):

@@ -6,7 +6,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.core.calibration.calibration import SCHEMA, SCHEMA_1, Calibration, content_id
+from omsm_ros.core.calibration.calibration import FURTHER, SCHEMA, SCHEMA_1, Calibration, content_id
 from omsm_ros.core.calibration.calibration_set import (
     AXES,
     MOST_MEMBERS,
@@ -36,7 +36,9 @@ _PROPERTIES = {
     "settings": {"type": "object"},
     "certificate": {"type": "object"},
 }
-_FORM = form(_PROPERTIES, tuple(_PROPERTIES))
+_NUMERATORS = {"type": "object", "additionalProperties": _COEFFICIENTS, "maxProperties": 4}
+_FURTHER = {"numerators": _NUMERATORS, "covariance": _PROPERTIES["covariance"]}
+_FORM = form({**_PROPERTIES, FURTHER: form(_FURTHER, tuple(_FURTHER))}, tuple(_PROPERTIES))
 
 
 _MEMBER = form({"position": NUMBER, "calibration": _FORM}, ("position", "calibration"))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from omsm_ros.core.calibration.calibration import SCHEMA, SCHEMA_1, Calibration, content_id
+from omsm_ros.core.calibration.calibration import FURTHER, SCHEMA, SCHEMA_1, Calibration, content_id
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
 from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, POINT_DTYPE
 from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
@@ -108,8 +108,10 @@ def calibration(message: Any) -> Calibration:
     """Return the record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
 
     The certificate of a set contains the whole set; the other fields are of its middle member.
+    The certificate also contains the responses to further axes.
     """
     certificate = _json_object("certificate", message.certificate)
+    further = {FURTHER: certificate.pop(FURTHER)} if FURTHER in certificate else {}
     if isinstance(content := certificate.get(_SET), dict):
         return calibration_of({**content, "id": message.id}, "calibration message")
     content = {
@@ -122,6 +124,7 @@ def calibration(message: Any) -> Calibration:
         "covariance": list(message.covariance),
         "settings": _json_object("settings", message.settings),
         "certificate": certificate,
+        **further,
     }
     # The message does not name its schema; its id does.
     schemas = (SCHEMA, SCHEMA_1)
@@ -207,8 +210,11 @@ def block_message(messages: Messages, block: Block, frame: str | None = None) ->
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
     """Return ``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
     certificate = record.certificate.content()
+    content = record.content()
     if isinstance(record, CalibrationSet):
-        certificate[_SET] = record.content()
+        certificate[_SET] = content
+    elif FURTHER in content:
+        certificate[FURTHER] = content[FURTHER]
     return messages.make(
         "Calibration",
         header=header(messages, stamp_ns, "machine"),

@@ -16,6 +16,10 @@ TEMPLATES: dict[str, str] = {
     "calibration.covariance_shape": (
         "covariance of shape {shape}, expected ({size}, {size}) finite numbers; identify again"
     ),
+    "calibration.further": (
+        "responses to the axes {axes!r}, expected finite numerators of {known}, no longer than the "
+        "denominator, and their joint covariance; identify again"
+    ),
     "calibration.unstable": "G_m is unstable: poles {poles} rad/s; identify again",
     "calibration.dc_gain": (
         "G_m(0), the first coefficient of the numerator, is {gain!r}, expected 1; the static gain "

@@ -49,6 +49,10 @@ TEMPLATES: dict[str, str] = {
         "model is {residual:m} (rms) at a noise of {noise:m}: record the encoder in finer steps, "
         "and write its positions with all their digits"
     ),
+    "estimation.unlike_recordings": (
+        "recording {number} has another sample period, other axes or another reference sensor than "
+        "the first; identify it alone"
+    ),
     # Orders and excitation.
     "estimation.order": "order {order!r}, expected 0 (choose) to {most}",
     "estimation.too_many_samples": (

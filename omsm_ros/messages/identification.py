@@ -137,6 +137,11 @@ TEMPLATES: dict[str, str] = {
         "{p:chance}), and the band includes the difference: let the machine warm up and settle "
         "before the test, and repeat the test"
     ),
+    "identification.recordings_differ": (
+        "{parts}: they differ by {lag_s:s/2} in lag and {gain:%} in gain (by chance: {p:chance}), "
+        "and the band includes the difference: look for what changed between the recordings, and "
+        "identify this one alone"
+    ),
     "identification.sizes_differ": (
         "small steps and large differ by {lag_s:s/2} in lag and {gain:%} in gain (by chance: "
         "{p:chance}), and the band includes the difference: make steps as small as the deflections "

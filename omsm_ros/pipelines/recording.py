@@ -100,12 +100,14 @@ class Recording:
         time_lapse: object = 1.0,
         trigger: CommonTrigger = EQUAL_COUNTS,
         by_stamps: bool = False,
+        further: Sequence[str] = (),
     ) -> MotionRecord:
         """Return the motion to identify from, its first ``duration`` seconds (0 = all).
 
         time_lapse: how much faster than real time the recording was played [1]
         trigger: what is stated of the counters of axes and distance
         by_stamps: join both by their stamps, not by their counters
+        further: axes besides Z that may move the probe
         The reference sensor is used if it was recorded.
 
         Raises DataError if the stamps contradict the sample period, or the counters each other.
@@ -126,6 +128,7 @@ class Recording:
             *reference,
             trigger=trigger,
             by_stamps=by_stamps,  # type: ignore[arg-type]
+            further=further,
         )
 
 

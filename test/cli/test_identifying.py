@@ -121,10 +121,13 @@ def test_two_inputs_of_two_records_give_one_model(capsys, tmp_path):
     assert json.loads(capsys.readouterr().out)["residual_rms"] == pytest.approx(0.01, rel=0.1)
 
 
-def test_several_bags_are_refused(capsys, tmp_path):
-    status, said = run(capsys, tmp_path / "a", tmp_path / "b", "--out", tmp_path / "m.json")
+@pytest.mark.parametrize("axes", ["x,x", "x,q"])
+def test_axes_that_a_bag_does_not_have_are_refused(capsys, tmp_path, axes):
+    status, said = run(
+        capsys, tmp_path / "a", "--input", f"encoder,{axes}", "--out", tmp_path / "m.json"
+    )
     assert status == 2
-    assert "2 bags are given" in said.err
+    assert "besides Z" in said.err
 
 
 def test_duration_cuts_the_table(capsys, table, tmp_path):

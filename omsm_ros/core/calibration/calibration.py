@@ -40,6 +40,10 @@ _SIGNIFICANT = 3.0
 # A difference of two covariances this little indefinite, of correlations, is rounding.
 _ROUNDING = 1e-9
 
+# Axes besides Z whose motion may reach the probe; key of their responses in a file.
+FURTHER_AXES = ("x", "y", "b", "c")
+FURTHER = "further_axes"
+
 PROBE = "probe."
 """Prefix of the names of settings that the driver of the probe reports."""
 
@@ -56,6 +60,9 @@ class Calibration:
     covariance: (p, p), order numerator, denominator[1:], delay; zero rows for fixed parameters
     settings: probe rate, exposure, averaging, machine, fixture …; JSON values
     certificate: how it was obtained and the verdict
+    further: responses of the probe to further axes, by their names: numerators over the same
+        denominator and delay, ascending powers of s, relative to the static gain
+    joint: covariance (P, P) from noise, in the order of ``covariance``, then the numerators
 
     Raises CalibrationError when the parts do not fit each other.
     """
@@ -67,6 +74,8 @@ class Calibration:
     covariance: FloatArray
     settings: Mapping[str, object] = field(default_factory=dict)
     certificate: Certificate = field(default_factory=Certificate)
+    further: Mapping[str, FloatArray] = field(default_factory=dict)
+    joint: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         GAIN.checked(self.static_gain, CalibrationError, "static_gain")
@@ -77,8 +86,25 @@ class Calibration:
             raise CalibrationError(
                 "calibration.covariance_shape", shape=repr(self.covariance.shape), size=p
             )
+        self._check_further(p)
         if not self.dynamics.is_stable:
             raise CalibrationError("calibration.unstable", poles=repr(self.dynamics.poles()))
+
+    def _check_further(self, p: int) -> None:
+        proper = [len(n) <= len(self.dynamics.denominator) for n in self.further.values()]
+        known = set(self.further) <= set(FURTHER_AXES) and all(map(len, self.further.values()))
+        total = p + sum(map(len, self.further.values())) if self.further else 0
+        finite = all(np.all(np.isfinite(n)) for n in (*self.further.values(), self.joint))
+        if not (known and all(proper) and finite and self.joint.shape == (total, total)):
+            raise CalibrationError(
+                "calibration.further", axes=", ".join(self.further), known=", ".join(FURTHER_AXES)
+            )
+
+    def further_gain_u(self, name: str) -> float:
+        """Return the standard uncertainty of the static response to a further axis."""
+        before = [len(n) for n in self.further.values()][: list(self.further).index(name)]
+        place = len(self.covariance) + sum(before)
+        return float(np.sqrt(max(self.joint[place, place], 0.0)))
 
     @property
     def static_gain_uncertainty(self) -> float:
@@ -138,7 +164,14 @@ class Calibration:
             "covariance": self.covariance.ravel().tolist(),
             "settings": dict(self.settings),
             "certificate": self.certificate.content(),
+            **self._further_content(),
         }
+
+    def _further_content(self) -> dict[str, object]:
+        if not self.further:
+            return {}
+        numerators = {name: numerator.tolist() for name, numerator in self.further.items()}
+        return {FURTHER: {"numerators": numerators, "covariance": self.joint.ravel().tolist()}}
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Calibration:
@@ -167,6 +200,7 @@ class Calibration:
             covariance=covariance.reshape(p, p) if covariance.size == p * p else covariance,
             settings=content["settings"],
             certificate=certificate_from_content(content["certificate"]),
+            **_further_of(content.get(FURTHER)),
         )
         for covariance in (calibration.covariance, calibration.noise_covariance):
             check_covariance(covariance, dynamics, calibration.valid_up_to)
@@ -176,6 +210,20 @@ class Calibration:
     def id(self) -> str:
         """SHA-256 over the canonical content, hexadecimal."""
         return content_id(self.content())
+
+
+def _further_of(content: Any) -> dict[str, Any]:
+    if content is None:
+        return {}
+    covariance = np.asarray(content["covariance"], np.float64)
+    size = round(len(covariance) ** 0.5)
+    if size**2 != len(covariance):
+        raise CalibrationError("calibration.covariance_shape", shape=len(covariance), size=size)
+    numerators = content["numerators"].items()
+    return {
+        "further": {name: np.asarray(one, np.float64) for name, one in numerators},
+        "joint": covariance.reshape(size, size),
+    }
 
 
 def certificate_from_content(content: Mapping[str, Any]) -> Certificate:

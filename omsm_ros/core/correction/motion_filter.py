@@ -7,8 +7,8 @@ within the settling time are marked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -30,6 +30,7 @@ from omsm_ros.core.streams.pairing import SampleRun
 # Share of a wrong initial state that may remain in the first published point.
 SETTLED = 1e-6
 _X, _Y, _Z, _B, _C = range(5)
+_AXES = "xyzbc"
 _LATERAL = (_X, _Y, _B, _C)
 Past = Callable[[FloatArray], FloatArray]
 # Rows of the output: x, y, b, c, z - H(z), H(z), rate of H(z), sensitivities.
@@ -47,15 +48,18 @@ class MotionFilters:
     forgotten: samples after which a wrong initial state of G has decayed to ``SETTLED``
     undetected: number of the last of ``dynamics`` that are of undetected model error
     pasts: motion before the first samples that each of ``dynamics`` assumes
+    further: of each further axis that moves the probe: its part of ``height``, and of ``rate``
+    Each of ``dynamics`` has filters by the name of the axis.
     """
 
     height: DigitalFilter
-    dynamics: list[DigitalFilter]
+    dynamics: list[dict[str, DigitalFilter]]
     rate: DigitalFilter
     lateral: DigitalFilter | None
     forgotten: int = 2**31
     undetected: int = 0
     pasts: tuple[Past, ...] = ()
+    further: Mapping[str, tuple[DigitalFilter, DigitalFilter]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -67,7 +71,14 @@ class MotionFilters:
     ) -> MotionFilters:
         """Return the filters of ``calibration`` at ``sample_period`` [s]; lags in seconds."""
         g = calibration.dynamics
-        rate = np.append(0.0, g.numerator)
+
+        def rate_of(numerator: FloatArray) -> DigitalFilter:
+            rate = np.append(0.0, numerator)
+            return derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles())
+
+        def response_of(numerator: FloatArray) -> DigitalFilter:
+            return derivative_filter(numerator, g.denominator, g.delay, sample_period, g.poles())
+
         delay = TransferFunction(np.ones(1), np.ones(1), probe_latency)
         noise, undetected = (
             [(f, filter_history(part)) for f in sensitivity_filters(part, sample_period)]
@@ -76,11 +87,15 @@ class MotionFilters:
         return cls(
             height=discretise(g, sample_period, order),
             dynamics=[f for f, _ in noise + undetected],
-            rate=derivative_filter(rate, g.denominator, g.delay, sample_period, g.poles()),
+            rate=rate_of(g.numerator),
             lateral=discretise(delay, sample_period, order) if probe_latency > 0 else None,
             forgotten=forgetting_samples(g, sample_period),
             undetected=len(undetected),
             pasts=tuple(past for _, past in noise + undetected),
+            further={
+                axis: (response_of(numerator), rate_of(numerator))
+                for axis, numerator in calibration.further.items()
+            },
         )
 
     def settling_samples(self) -> int:
@@ -121,29 +136,34 @@ def forgetting_samples(dynamics: TransferFunction, sample_period: float) -> int:
 
 
 class _Bank:
-    """The running filters of one calibration."""
+    """The running filters of one calibration: of each output, the recursions of its axes."""
 
     def __init__(self, filters: MotionFilters) -> None:
-        self._height = Recursion(filters.height)
-        self._rate = Recursion(filters.rate)
-        self._dynamics = [Recursion(f) for f in filters.dynamics]
-        self._pasts = filters.pasts or (past_motion,) * len(filters.dynamics)
+        height = {"z": filters.height} | {a: pair[0] for a, pair in filters.further.items()}
+        rate = {"z": filters.rate} | {a: pair[1] for a, pair in filters.further.items()}
+        self._rows = [
+            {_AXES.index(axis): Recursion(one) for axis, one in row.items()}
+            for row in (height, rate, *filters.dynamics)
+        ]
+        pasts = filters.pasts or (past_motion,) * len(filters.dynamics)
+        self._pasts = (past_motion, past_motion, *pasts)
 
-    def start(self, z: FloatArray) -> None:
-        motion = past_motion(z.copy())
-        self._height.start(motion)
-        self._rate.start(motion)
-        for recursion, past in zip(self._dynamics, self._pasts, strict=True):
-            recursion.start(past(z.copy()))
+    def start(self, axes: FloatArray) -> None:
+        for row, past in zip(self._rows, self._pasts, strict=True):
+            for axis, recursion in row.items():
+                recursion.start(past(axes[axis].copy()))
 
-    def run(self, z: FloatArray, out: FloatArray) -> None:
+    def run(self, axes: FloatArray, out: FloatArray) -> None:
         """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""
-        for recursion, row in zip((self._height, self._rate, *self._dynamics), out, strict=True):
-            recursion.run(z, row)
+        for recursions, row in zip(self._rows, out, strict=True):
+            z, *others = recursions.items()
+            z[1].run(axes[z[0]], row)
+            for axis, recursion in others:
+                row += recursion.run(axes[axis])
 
     @property
     def outputs(self) -> int:
-        return 2 + len(self._dynamics)
+        return len(self._rows)
 
 
 class Blend:
@@ -192,7 +212,8 @@ class MotionFilter:
         self._blend = blend
         lateral = filters[0].lateral
         self._lateral = {axis: Recursion(lateral) for axis in _LATERAL} if lateral else {}
-        self._turned = AngleUnwrapper()
+        turns = any("c" in each.further for each in filters)
+        self._turned = AngleUnwrapper() if lateral or turns else None
         settling = max(each.settling_samples() for each in filters)
         self._start_samples = max(settling // 2, START_SAMPLES)
         self._settling = max(settling, self._start_samples)
@@ -234,13 +255,12 @@ class MotionFilter:
     def _unwrapped(self, run: SampleRun) -> SampleRun:
         """Return the run with C unwrapped, so that it can be delayed."""
         c = run.values[_C]
-        if (turned := self._turned.of(c)) is c:
+        if self._turned is None or (turned := self._turned.of(c)) is c:
             return run
         return replace(run, values=np.concatenate([run.values[:_C], turned[np.newaxis]]))
 
     def _push_finite(self, run: SampleRun) -> list[SampleRun]:
-        if self._lateral:
-            run = self._unwrapped(run)
+        run = self._unwrapped(run)
         if self._unsettled < self._settling:
             return [self._filtered(run)]
         self._waiting.append(run)
@@ -252,7 +272,7 @@ class MotionFilter:
 
     def _start(self, first: FloatArray) -> None:
         for bank in self._banks:
-            bank.start(first[_Z])
+            bank.start(first)
         for axis, recursion in self._lateral.items():
             recursion.start(past_motion(first[axis].copy()))
 
@@ -273,10 +293,10 @@ class MotionFilter:
     def _moved(self, axes: FloatArray, out: FloatArray) -> None:
         """Write H(z), its rate and its sensitivities into ``out`` (2 + r, n)."""
         if not self._blend:
-            return self._banks[0].run(axes[_Z], out)
+            return self._banks[0].run(axes, out)
         outputs = [np.empty((bank.outputs, axes.shape[1])) for bank in self._banks]
         for bank, rows in zip(self._banks, outputs, strict=True):
-            bank.run(axes[_Z], rows)
+            bank.run(axes, rows)
         out[:] = self._blend.blended(axes, outputs)
 
     @property

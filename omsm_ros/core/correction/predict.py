@@ -73,7 +73,10 @@ class Residual:
         self._linear = ErrorSources.of(calibration).motion_error ** 2
         self._digital = discretise(calibration.dynamics, sample_period)
         self._parts = [
-            (sensitivity_filters(part, sample_period), filter_history(part))
+            (
+                [row["z"] for row in sensitivity_filters(part, sample_period) if "z" in row],
+                filter_history(part),
+            )
             for part in covariance_parts(calibration)
         ]
 

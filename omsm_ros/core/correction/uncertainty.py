@@ -152,30 +152,42 @@ def with_lateral_uncertainty(
 def covariance_parts(calibration: Calibration) -> tuple[Calibration, Calibration]:
     """Return the calibration with the covariance of noise, and of undetected model error."""
     undetected = calibration.undetected_error_covariance
+    alone = replace(calibration, further={}, joint=np.zeros((0, 0)))
     return (
         replace(calibration, covariance=calibration.covariance - undetected),
-        replace(calibration, covariance=undetected),
+        replace(alone, covariance=undetected),
     )
 
 
-def sensitivity_filters(calibration: Calibration, sample_period: float) -> list[DigitalFilter]:
-    """Return filters F_r with ``variance of H(z) = Σ_r (F_r z)²``; none for a zero covariance."""
+def sensitivity_filters(
+    calibration: Calibration, sample_period: float
+) -> list[dict[str, DigitalFilter]]:
+    """Return filters F_r of each axis with ``variance of H = Σ_r (Σ_axes F_r)²``.
+
+    There are none for a zero covariance.
+    """
     g = calibration.dynamics
     square = np.asarray(polynomial.polymul(g.denominator, g.denominator), np.float64)
     combined, poles = sensitivity_numerators(calibration), np.tile(g.poles(), 2)
-    slow = static_until(calibration)
+    height, slow = combined["z"], static_until(calibration)
     if slow > 0:
         # G(0) = 1 exactly: an uncertain gain acts on motion only, see at_rest_until.
-        combined = slow * np.column_stack([np.zeros(len(combined)), combined])
+        combined["z"] = slow * np.column_stack([np.zeros(len(height)), height])
         square = np.asarray(polynomial.polymul(square, [1.0, slow]), np.float64)
         poles = np.append(poles, -1 / slow)
     band = 2j * np.pi * np.linspace(0.0, calibration.valid_up_to, 64)
-    power = np.abs(polynomial.polyval(band, combined.T)) ** 2
-    share = power / np.maximum(power.sum(axis=0), np.finfo(np.float64).tiny)
+    shares = []
+    for numerators in combined.values():
+        power = np.abs(polynomial.polyval(band, numerators.T)) ** 2
+        shares.append(power / np.maximum(power.sum(axis=0), np.finfo(np.float64).tiny))
+    kept = np.flatnonzero(np.max(shares, axis=(0, 2), initial=0.0) > _NEGLIGIBLE)
     return [
-        derivative_filter(numerator, square, g.delay, sample_period, poles)
-        for numerator, largest in zip(combined, share.max(axis=1), strict=True)
-        if largest > _NEGLIGIBLE
+        {
+            axis: derivative_filter(numerators[row], square, g.delay, sample_period, poles)
+            for axis, numerators in combined.items()
+            if np.any(numerators[row])
+        }
+        for row in kept
     ]
 
 
@@ -219,11 +231,24 @@ def derivative_filter(
         return bilinear(ratio, sample_period, poles)
 
 
-def sensitivity_numerators(calibration: Calibration) -> FloatArray:
-    """Return F_r times denominator², ascending powers of s, one row for each direction r."""
-    g = calibration.dynamics
-    per_parameter = _sensitivity_numerators(g.numerator, g.denominator)
-    return np.asarray(_factor(calibration.covariance).T @ per_parameter, np.float64)
+def sensitivity_numerators(calibration: Calibration) -> dict[str, FloatArray]:
+    """Return F_r times denominator² of each axis, ascending powers of s, rows for directions r."""
+    g, size = calibration.dynamics, len(calibration.covariance)
+    every, further = calibration.covariance, calibration.further
+    if further and np.any(every):
+        # The covariance of noise, which alone correlates the axes.
+        every = calibration.joint.copy()
+        every[:size, :size] = calibration.covariance
+    factor = _factor(every).T
+    per_z = _sensitivity_numerators(g.numerator, g.denominator)
+    found, first = {"z": factor[:, :size] @ per_z}, size
+    for axis, numerator in further.items() if len(every) > size else ():
+        own = slice(first, first + len(numerator))
+        per_axis = _sensitivity_numerators(numerator, g.denominator)
+        shared = factor[:, len(g.numerator) : size] @ per_axis[len(numerator) :]
+        found[axis] = shared + factor[:, own] @ per_axis[: len(numerator)]
+        first = own.stop
+    return found
 
 
 def _sensitivity_numerators(numerator: FloatArray, denominator: FloatArray) -> FloatArray:

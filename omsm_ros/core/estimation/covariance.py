@@ -95,15 +95,20 @@ def parameter_covariance(
     """
     samples, size = columns.shape
     residual = residual * np.sqrt(samples / max(samples - size, 1))
-    length = fft.next_fast_len(len(problem.used) + _MAX_NOISE_ORDER, real=True)
-    noise = noise_spectrum(residual, length)
-    if passed is not None:
-        came = _motion_noise_spectrum(problem, passed, length)
-        noise = np.maximum(noise, np.mean(residual**2) - np.mean(came) + came)
     on_grid = np.zeros((size, len(problem.used)))
     on_grid[:, problem.used] = columns.T
     uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
-    score_covariance = weighted_gram(on_grid, length, noise) + uneven.T @ uneven
+    score_covariance = uneven.T @ uneven
+    missed = problem.on_grid(residual, np.nan)
+    for part in problem.recordings:
+        # Each recording has noise of its own.
+        own = missed[part][problem.used[part]]
+        length = fft.next_fast_len(part.stop - part.start + _MAX_NOISE_ORDER, real=True)
+        noise = noise_spectrum(own, length)
+        if passed is not None:
+            came = _motion_noise_spectrum(problem, passed, length)
+            noise = np.maximum(noise, np.mean(own**2) - np.mean(came) + came)
+        score_covariance = score_covariance + weighted_gram(on_grid[:, part], length, noise)
     gram = columns.T @ columns
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0] = 1.0

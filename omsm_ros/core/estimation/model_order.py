@@ -277,6 +277,8 @@ def coarser(problem: Problem, every: int) -> Problem:
     return replace(
         problem,
         input=thinned(problem.input),
+        further=np.array([thinned(motion) for motion in problem.further]),
+        starts=tuple(start // every for start in problem.starts),
         output=thinned(output),
         used=_bridged(problem.used, every),
         period=problem.period * every,

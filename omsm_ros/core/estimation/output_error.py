@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -31,7 +32,7 @@ _BRIDGE_S = 0.3
 # Least length of the bridge, so that it is smooth at a low sampling rate too.
 _MIN_BRIDGE_SAMPLES = 64
 # Rest after the bridge, in which a lightly damped mode decays.
-_STATIONARY_S = 1.0
+STATIONARY_S = 1.0
 # Most rest per duration: a record of milliseconds shows no mode that rings for a second.
 _PLATEAU_SHARE = 4.0
 # Lines over which power is averaged: it is then known to 10 %.
@@ -45,7 +46,7 @@ def close_period(motion: FloatArray, period: float) -> FloatArray:
     """
     duration = len(motion) * period
     bridge = max(round(min(_BRIDGE_S, duration) / period), _MIN_BRIDGE_SAMPLES)
-    rest = round(min(_STATIONARY_S, _PLATEAU_SHARE * duration) / period)
+    rest = round(min(STATIONARY_S, _PLATEAU_SHARE * duration) / period)
     total = fft.next_fast_len(len(motion) + bridge + rest, real=True)
     phase = np.arange(1, total - len(motion) + 1) / bridge
     way_back = motion[-1] + (motion[0] - motion[-1]) * s_curve(np.asarray(phase))
@@ -98,7 +99,9 @@ class Problem:
     background: (n, q) columns added to the output, independent of G (offset, drift …)
     rate: [rad/s] unit of s inside the fit
     noise: standard deviation of a sample of the motion [m]
-    fits_initial_condition: fit the response to the unknown motion before the first sample too
+    fits_initial_condition: fit the response to the unknown motion before each recording too
+    further: motions (m, n) of further axes that reach the probe, about their means
+    starts: first sample of each recording
     plateau: number of the plateau of a sample, (n,), -1 elsewhere; or None
     shared: variance of the rounding error that the readings of a plateau share [m²]
     input_rounding: variance of the rounding error of the input while it moves [m²]
@@ -113,10 +116,17 @@ class Problem:
     rate: float
     noise: float = 0.0
     fits_initial_condition: bool = False
+    further: FloatArray | tuple[()] = ()
+    starts: tuple[int, ...] = (0,)
     plateau: IntArray | None = None
     shared: float = 0.0
     input_rounding: float = 0.0
     errors_in_variables: FloatArray | None = None
+
+    @property
+    def recordings(self) -> list[slice]:
+        """Return the samples of each recording, with the rest that follows it."""
+        return [slice(a, b) for a, b in pairwise([*self.starts, len(self.used)])]
 
     @cached_property
     def closed_length(self) -> int:
@@ -134,9 +144,9 @@ class Problem:
     @cached_property
     def _spectrum(self) -> ComplexArray:
         moved = motion_spectrum(self.input, self.period, self.noise)
-        # The initial-condition response may be faster than the motion: it needs the whole band.
-        missing = self.closed_length // 2 + 1 - len(moved)
-        return np.pad(moved, (0, missing)) if self.fits_initial_condition else moved
+        # The initial-condition response, or a further axis, may be faster than the motion.
+        whole = self.fits_initial_condition or len(self.further) > 0
+        return np.pad(moved, (0, self.closed_length // 2 + 1 - len(moved))) if whole else moved
 
     @cached_property
     def s(self) -> ComplexArray:
@@ -146,26 +156,37 @@ class Problem:
 
     def drives(self, structure: Structure) -> list[tuple[ComplexArray, int]]:
         """Return the inputs: spectra (k,), each with its number of numerator terms."""
-        motion = (self._spectrum, structure.zeros + 1)
-        return [motion, (self._pulse, structure.poles)] if self.fits_initial_condition else [motion]
+        pulses = self._pulses if self.fits_initial_condition else []
+        return [
+            (self._spectrum, structure.zeros + 1),
+            *((motion, structure.poles + 1) for motion in self._further),
+            *((pulse, structure.poles) for pulse in pulses),
+        ]
 
     @cached_property
-    def _pulse(self) -> ComplexArray:
-        """Spectrum (k,) of a Gaussian pulse that has decayed before the first sample.
+    def _further(self) -> list[ComplexArray]:
+        return [self.closed_spectrum(motion) for motion in self.further]
+
+    @cached_property
+    def _pulses(self) -> list[ComplexArray]:
+        """Spectra (k,) of Gaussian pulses that have decayed before each recording starts.
 
         Through n poles, the pulse and its derivatives make any initial-condition response.
         """
         angle = self.s.imag * self.rate
         width = np.sqrt(2 * _PULSE_END) / max(float(angle[-1]), np.finfo(np.float64).tiny)
-        centre = -np.sqrt(2 * _PULSE_END) * width
-        return np.asarray(np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * centre))
+        before = np.sqrt(2 * _PULSE_END) * width
+        return [
+            np.exp(-0.5 * (angle * width) ** 2 - 1j * angle * (start * self.period - before))
+            for start in self.starts
+        ]
 
     def initial_condition_response(self, fitted: Fit) -> FloatArray:
-        """Return the decays (n, poles) at the poles of ``fitted`` from before the first sample."""
+        """Return the decays (n, …) at the poles of ``fitted`` from before each recording."""
         lag = fitted.scaled.lag(fitted.nonlinear, self.s)
         powers = self.s ** np.arange(fitted.structure.poles)[:, np.newaxis]
-        decays = fft.irfft(powers * (lag * self._pulse), self.closed_length)
-        return np.asarray(decays[:, : len(self.input)].T)
+        every = np.concatenate([powers * (lag * pulse) for pulse in self._pulses])
+        return np.asarray(fft.irfft(every, self.closed_length)[:, : len(self.input)].T)
 
     @cached_property
     def _target(self) -> FloatArray:
@@ -246,6 +267,11 @@ class Problem:
         grid = np.full(len(self.used), elsewhere)
         grid[self.used] = values
         return grid
+
+    def further_numerators(self, fitted: Fit) -> list[slice]:
+        """Return the places of the numerator of each further axis in ``fitted.driven``."""
+        first, count = fitted.structure.zeros + 1, fitted.structure.poles + 1
+        return [slice(first + i * count, first + (i + 1) * count) for i in range(len(self.further))]
 
     def response(self, fitted: Fit) -> FloatArray:
         """Return the motion through the G of ``fitted``, G(0) = 1, at every sample, (n,)."""

@@ -9,7 +9,9 @@ axis moves, with the mean of |G|² over all frequencies. A search for other erro
 would be in vain.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import ndimage, signal
@@ -17,7 +19,7 @@ from scipy import ndimage, signal
 from omsm_ros.core.estimation.model_order import StartingPoints
 from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
-from omsm_ros.core.estimation.output_error import Fit, Problem, fit
+from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, fit
 from omsm_ros.core.estimation.steps import (
     LEAST_SAMPLES,
     NOISE_FACTOR,
@@ -28,9 +30,9 @@ from omsm_ros.core.estimation.steps import (
     find_steps,
     sample_noise,
 )
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import SAME_PERIOD, BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
-from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
+from omsm_ros.errors import ConfigurationError, DataError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import least_squares
 
 # Time after which the motion before the record has no effect.
@@ -137,16 +139,81 @@ def _problem(record: MotionRecord, motion: FloatArray, steps: Steps) -> Problem:
             least=LEAST_SAMPLES,
         )
     output = np.where(record.ok, record.distance, 0.0)
-    ramp = np.linspace(-1.0, 1.0, samples)
     return Problem(
         input=carried - np.mean(motion),
         output=output - np.mean(output[used]),
         used=used,
         period=record.sample_period,
-        background=np.column_stack([np.ones(samples), ramp]),
+        background=_offsets_and_drifts(record),
         rate=2 * np.pi * input_bandwidth(motion, record.sample_period),
         noise=steps.noise,
+        further=np.array([m - np.mean(m) for m in record.further.values()]),
+        starts=record.starts,
     )
+
+
+def _offsets_and_drifts(record: MotionRecord) -> FloatArray:
+    """Return columns (n, 2 r) by which each of r recordings has its own offset and drift."""
+    samples = len(record)
+    columns = [np.ones(samples), np.linspace(-1.0, 1.0, samples)]
+    for start, end in pairwise([*record.starts[1:], samples]):
+        for shape in (np.ones(end - start), np.linspace(-1.0, 1.0, end - start)):
+            columns.append(np.pad(shape, (start, samples - end)))
+    return np.column_stack(columns)
+
+
+def joined_recordings(records: Sequence[MotionRecord]) -> MotionRecord:
+    """Return one record of several recordings of one machine, with rests between them.
+
+    Each later one starts where the one before it ended, in Z and at the probe: it has an offset of
+    its own, and the rest is motion that nothing is compared at. Counts are added.
+
+    Raises DataError for recordings of different sample periods, axes or sensors.
+    """
+    if len(records) == 1:
+        return records[0]
+    first = records[0]
+    for number, record in enumerate(records[1:], start=2):
+        if (
+            abs(record.sample_period / first.sample_period - 1) > SAME_PERIOD
+            or record.further.keys() != first.further.keys()
+            or (record.reference is None) != (first.reference is None)
+        ):
+            raise DataError("estimation.unlike_recordings", number=number)
+    motions = [
+        faded_to_stationary(r.z, find_steps(r.z, r.sample_period).moving, r.sample_period)
+        for r in records
+    ]
+    rest = round(STATIONARY_S / first.sample_period)
+    starts = [sum(len(r) + rest for r in records[:i]) for i in range(len(records))]
+    gap = np.concatenate([np.arange(len(r) + rest) >= len(r) for r in records])[:-rest]
+    lost = [np.zeros(len(r), np.bool_) if r.z_lost is None else r.z_lost for r in records]
+    compared = [r.ok & (m == r.z) for r, m in zip(records, motions, strict=True)]
+    second = [r.reference for r in records if r.reference is not None]
+    return replace(
+        first,
+        z=_chained(motions, rest),
+        distance=np.where(gap, np.nan, _chained([r.distance for r in records], rest)),
+        ok=~gap & np.concatenate([np.pad(c, (0, rest)) for c in compared])[:-rest],
+        reference=np.where(gap, np.nan, _chained(second, rest)) if second else None,
+        z_lost=gap | np.concatenate([np.pad(each, (0, rest)) for each in lost])[:-rest],
+        further={
+            name: _chained([r.further[name] for r in records], rest) for name in first.further
+        },
+        starts=tuple(starts),
+        counts={name: sum(r.counts.get(name, 0) for r in records) for name in first.counts},
+    )
+
+
+def _chained(parts: Sequence[FloatArray], rest: int) -> FloatArray:
+    """Return ``parts`` in a row, each from where the one before ended and held for ``rest``."""
+    level, found = 0.0, list[FloatArray]()
+    for part in parts:
+        known = part[np.isfinite(part)]
+        shift = level - known[0] if found else 0.0
+        level = float(known[-1] + shift)
+        found += [part + shift, np.full(rest, level)]
+    return np.concatenate(found[:-1])
 
 
 def faded_to_stationary(motion: FloatArray, moving: BoolArray, period: float) -> FloatArray:
@@ -197,7 +264,7 @@ def input_bandwidth(motion: FloatArray, sample_period: float) -> float:
 
 
 def _static_gain(problem: Problem) -> float:
-    columns = np.column_stack([problem.input, problem.background])[problem.used]
+    columns = np.column_stack([problem.input, *problem.further, problem.background])[problem.used]
     return float(least_squares(columns, problem.output[problem.used])[0])
 
 

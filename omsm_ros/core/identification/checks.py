@@ -232,12 +232,18 @@ _DIFFERENT_PARTS = {
 
 
 def consistency(found: Sequence[Contrast]) -> Findings:
-    """Reserve a test whose parts differ by more than chance."""
-    for contrast in found:
-        if contrast.significant:
-            values = {"lag_s": contrast.lag, "gain": contrast.gain, "p": contrast.p}
-            limits = {"consistency_p_least": FALSE_ALARM}
-            yield Finding(_DIFFERENT_PARTS[contrast.parts], RESERVATION, values, limits)
+    """Reserve a test whose parts differ by more than chance; of recordings, name the one apart."""
+    differing = [contrast for contrast in found if contrast.significant]
+    recordings = [c for c in differing if c.parts not in _DIFFERENT_PARTS]
+    farthest = max(recordings, key=lambda c: abs(c.lag / c.lag_uncertainty), default=None)
+    for contrast in differing:
+        values: dict[str, object] = {"lag_s": contrast.lag, "gain": contrast.gain, "p": contrast.p}
+        code = _DIFFERENT_PARTS.get(contrast.parts)
+        if code is None:
+            if contrast is not farthest:
+                continue
+            code, values["parts"] = "identification.recordings_differ", contrast.parts
+        yield Finding(code, RESERVATION, values, {"consistency_p_least": FALSE_ALARM})
 
 
 def trusted_range(valid_up_to: float, limits: ResponseLimits, least: float) -> Findings:

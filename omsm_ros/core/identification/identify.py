@@ -19,6 +19,7 @@ are three, and two of them show whether the scale of the probe or that of the en
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps
+from itertools import pairwise
 from typing import ParamSpec
 
 import numpy as np
@@ -76,7 +77,7 @@ from omsm_ros.core.lti.modes import (
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.families import DRIFT
 from omsm_ros.core.model_errors.residual_diagnostics import Contrast, contrasts
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError, StepTestError
 from omsm_ros.linear_algebra import one_blas_thread, unit_columns
@@ -181,8 +182,20 @@ def identify(
         covariance=evidence.known.covariance,
         settings=dict(settings or {}),
         certificate=certificate_of(evidence, findings, replace(origin, input=input), mass),
+        further=_further(record, prepared, best),
+        joint=evidence.known.joint if record.further else np.zeros((0, 0)),
     )
     return Identification(calibration, searched.prepared, best)
+
+
+def _further(record: MotionRecord, prepared: Prepared, best: Fit) -> dict[str, FloatArray]:
+    """Return the numerators of the further axes of ``record``, relative to the static gain."""
+    places = prepared.problem.further_numerators(best)
+    unit = best.gain * best.scaled.rate ** np.arange(best.structure.poles + 1.0)
+    return {
+        name: np.asarray(best.driven[place] / unit)
+        for name, place in zip(record.further, places, strict=True)
+    }
 
 
 def _evidence(
@@ -392,17 +405,24 @@ def static_gains(record: MotionRecord) -> StaticGain:
     slip. Raises StepTestError with fewer than four plateaus.
     """
     steps = find_steps(record.z, record.sample_period)
-    rests = _stationary_segments(steps.edges, len(record), round(_SETTLE_S / record.sample_period))
+    rests = [
+        piece
+        for a, b in _stationary_segments(
+            steps.edges, len(record), round(_SETTLE_S / record.sample_period)
+        )
+        for piece in pairwise([a, *(start for start in record.starts if a < start < b), b])
+    ]
     readings = np.where(record.ok, record.distance, np.nan)
     time = _means(np.arange(len(record), dtype=np.float64), rests)
+    part = np.searchsorted(record.starts, [start for start, _ in rests], side="right")
     encoder, probe = _means(record.z, rests), _means(np.asarray(readings), rests)
     if record.reference is None:
-        return StaticGain(probe_per_encoder=_ratio(encoder, probe, time))
+        return StaticGain(probe_per_encoder=_ratio(encoder, probe, time, part))
     reference = _means(record.reference, rests)
     return StaticGain(
-        probe_per_encoder=_ratio(encoder, probe, time),
-        probe_per_reference=_ratio(reference, probe, time),
-        reference_per_encoder=_ratio(encoder, reference, time),
+        probe_per_encoder=_ratio(encoder, probe, time, part),
+        probe_per_reference=_ratio(reference, probe, time, part),
+        reference_per_encoder=_ratio(encoder, reference, time, part),
     )
 
 
@@ -425,18 +445,21 @@ def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:
     return np.asarray(means)
 
 
-def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray) -> GainEstimate:
+def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray, part: IntArray) -> GainEstimate:
+    """Return the ratio; part: number of the recording of each plateau, with its own offset."""
     known = np.isfinite(travel) & np.isfinite(other)
     if np.sum(known) < _LEAST_PLATEAUS:
         raise StepTestError(
             "identification.few_plateaus", found=int(np.sum(known)), least=_LEAST_PLATEAUS
         )
     x, t, y = travel[known], time[known], other[known]
-    columns = np.column_stack([x - x.mean(), t / t[-1], np.ones(len(x))])
+    own = [part[known] == number for number in np.unique(part[known])]
+    each = [column for one in own for column in (one, one * t / t[-1])]
+    columns = np.column_stack([x - x.mean(), *each]).astype(np.float64)
     unit, scale = unit_columns(columns)
     inverse = np.linalg.pinv(unit)
     solved = inverse @ y
     residual = y - unit @ solved
-    variance = float(residual @ residual) / max(len(y) - 3, 1)
+    variance = float(residual @ residual) / max(len(y) - columns.shape[1], 1)
     uncertainty = np.sqrt(variance * (inverse[0] @ inverse[0])) / scale[0]
     return GainEstimate(float(abs(solved[0]) / scale[0]), float(uncertainty))

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft, linalg, signal
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, parameter_covariance
 from omsm_ros.core.estimation.output_error import Fit, Problem
@@ -33,6 +33,7 @@ class ResponseUncertainty:
 
     covariance: (p, p) of the coefficients, all terms included;  from_noise: (p, p) without them
     gain_variance: of the static gain [1]
+    joint: (P, P) from noise, of the coefficients and of the numerators of all further axes
     excited_up_to: [Hz] beyond which the motion would show no error of the response
     valid_up_to: [Hz] up to which the response is trusted; 0 if nowhere
     widened: factor on the uncertainties;  clearly_better: number of poles, see
@@ -44,6 +45,7 @@ class ResponseUncertainty:
     gain_variance: float
     excited_up_to: float
     valid_up_to: float
+    joint: FloatArray
     widened: float = 1.0
     clearly_better: int | None = None
 
@@ -74,7 +76,26 @@ def response_uncertainty(
         gain_variance=float(every[size, size]),
         excited_up_to=shown,
         valid_up_to=_trusted_up_to(model, band, limits, shown),
+        joint=_joint_covariance(problem, best, transform, every),
     )
+
+
+def _joint_covariance(
+    problem: Problem, best: Fit, transform: FloatArray, every: FloatArray
+) -> FloatArray:
+    """Return the covariance (P, P) of the coefficients and of the numerators of further axes.
+
+    every: of the parameters of ``problem.sensitivity``;  transform: of the first of them
+    A numerator is relative to the static gain, as that of Z is.
+    """
+    size, places = best.structure.size, problem.further_numerators(best)
+    powers = np.tile(np.arange(best.structure.poles + 1.0), len(places))
+    unit = 1 / (best.gain * best.scaled.rate**powers)
+    driven = best.driven[len(best.numerator) :][: len(powers)]
+    by_further = np.column_stack([-driven / best.gain * unit, np.diag(unit)])
+    jacobian = linalg.block_diag(transform, by_further)
+    last = size + 1 + len(powers)
+    return _symmetric(jacobian @ every[:last, :last] @ jacobian.T)
 
 
 def inflate_to_free_choice(
@@ -106,6 +127,7 @@ def inflate_to_free_choice(
     return replace(
         known,
         covariance=covariance,
+        joint=factor**2 * known.joint,
         valid_up_to=_trusted_up_to(model, band, limits, known.excited_up_to),
         widened=factor,
         clearly_better=other.structure.poles if better else None,

@@ -10,7 +10,7 @@ parts of the test (steps up and down, small and large, early and late) by ``±d`
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -168,13 +168,15 @@ class ResidualSpace:
 
         The noise is the residual without ``rows`` times ``found`` (c,).
         """
-        used = self.problem.used
-        samples = len(used)
-        length = fft.next_fast_len(samples, real=True)
-        residual = (self._residual - found @ rows)[used]
-        noise = smoothed_noise_spectrum(residual, self._places, samples, length)
-        noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
-        even = weighted_gram(rows, length, noise)
+        used, even = self.problem.used, np.zeros((len(rows), len(rows)))
+        missed = self._residual - found @ rows
+        for part in self.problem.recordings:
+            # Each recording has noise of its own.
+            samples, places = part.stop - part.start, np.flatnonzero(used[part])
+            length = fft.next_fast_len(samples, real=True)
+            noise = smoothed_noise_spectrum(missed[part][places], places, samples, length)
+            noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
+            even += weighted_gram(rows[:, part], length, noise)
         if self._scatter == 0 and self.problem.shared == self.problem.input_rounding == 0:
             return even
         uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
@@ -384,6 +386,7 @@ class ResidualDiagnostics:
 UP_DOWN = "steps up against steps down"
 HALVES = "first half against second"
 SIZES = "small steps against large"
+RECORDING = "recording {} against the others"
 # Fewest edges: two of each kind show their scatter.
 _LEAST_EDGES = 4
 # Least ratio of heights that are intended to differ.
@@ -413,11 +416,19 @@ class Contrast:
 
 def contrasts(diagnostics: ResidualDiagnostics) -> list[Contrast]:
     """Return the contrasts that the steps of this test allow."""
-    samples = len(diagnostics.problem.input)
-    return [
-        _contrast_of(diagnostics, name, weight)
-        for name, weight in _weights(diagnostics.steps, samples)
-    ]
+    starts, samples = diagnostics.problem.starts, len(diagnostics.problem.input)
+    weights = [*_weights(diagnostics.steps, samples), *_recordings(starts, samples)]
+    if len(starts) > 1:
+        weights = [(name, weight) for name, weight in weights if name != HALVES]
+    return [_contrast_of(diagnostics, name, weight) for name, weight in weights]
+
+
+def _recordings(starts: Sequence[int], samples: int) -> Iterator[tuple[str, FloatArray]]:
+    """Yield 1 in one recording and -1 in the others, (n,), for each of several."""
+    place = np.searchsorted(starts, np.arange(samples), side="right")
+    # Of two, the second adds nothing to the first.
+    for number in range(1, len(starts) + 1 - (len(starts) <= 2)):
+        yield RECORDING.format(number), np.where(place == number, 1.0, -1.0)
 
 
 def _weights(steps: Steps, samples: int) -> Iterator[tuple[str, FloatArray]]:

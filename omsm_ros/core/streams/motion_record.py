@@ -53,6 +53,8 @@ class MotionRecord:
     ok: True where both are measured and valid
     reference: second sensor along the same motion [m], NaN where it has no reading, or None
     z_lost: True where z is interpolated, None if it never is
+    further: positions of further axes that may move the probe [m], of b and c [rad], by name
+    starts: first sample of each recording, where several were joined
     by_stamps: True if the samples were paired by stamps instead of a common trigger
     counts: number of samples by what became of them
 
@@ -65,11 +67,13 @@ class MotionRecord:
     ok: BoolArray
     reference: FloatArray | None = None
     z_lost: BoolArray | None = None
+    further: Mapping[str, FloatArray] = field(default_factory=dict)
+    starts: tuple[int, ...] = (0,)
     by_stamps: bool = False
     counts: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        arrays = [self.z, self.distance, self.ok]
+        arrays = [self.z, self.distance, self.ok, *self.further.values()]
         if self.reference is not None:
             arrays.append(self.reference)
         lengths = sorted({len(a) for a in arrays})
@@ -118,10 +122,12 @@ def assemble(
     reference: Sequence[DistanceBlock] = (),
     trigger: CommonTrigger = EQUAL_COUNTS,
     by_stamps: bool = False,
+    further: Sequence[str] = (),
 ) -> MotionRecord:
     """Pair the blocks of one recording, in any order, with gaps, repeats and dropouts.
 
     by_stamps: pair them by their stamps also at equal rates.
+    further: axes besides z that the record keeps, of x, y, b, c
 
     Raises DataError if nothing can be paired, for more than one recording, or if the counters of
     axes and distance slipped against each other.
@@ -131,8 +137,8 @@ def assemble(
     period = _one_period("axis", axes)
     probe_period = _one_period("distance", distance)
     if abs(probe_period / period - 1) < SAME_PERIOD and not by_stamps:
-        return _by_counter(axes, distance, reference, period, trigger)
-    return _by_stamp(axes, distance, reference)
+        return _by_counter(axes, distance, reference, period, trigger, further)
+    return _by_stamp(axes, distance, reference, further)
 
 
 def _one_period(name: str, blocks: Sequence[AxisBlock] | Sequence[DistanceBlock]) -> float:
@@ -147,47 +153,54 @@ def _ordered(blocks: Iterable[B]) -> list[B]:
 
 
 def _runs(blocks: Iterable[Block], values: Values, stream: StreamInput) -> Iterator[SampleRun]:
-    """Yield the new samples of each block; ``values`` gives its channel and validity, each (n,)."""
+    """Yield the new samples of each block; ``values`` gives channels (a, n) and validity (n,)."""
     for block in _ordered(blocks):
         if (arrival := stream.new(block)) is not None:
             value, ok = values(block)
             reasons = np.where(ok, RejectionReason.NONE, RejectionReason.INVALID).astype(np.uint8)
-            yield SampleRun.of(block, arrival, reasons, np.asarray(value, np.float64)[np.newaxis])
+            yield SampleRun.of(block, arrival, reasons, np.asarray(value, np.float64))
 
 
-def _position(block: Any) -> tuple[FloatArray, BoolArray]:
-    return block.z, np.isfinite(block.z)
+def _positions(names: Sequence[str]) -> Values:
+    def values(block: Any) -> tuple[FloatArray, BoolArray]:
+        every = np.array([block.z, *(getattr(block, name) for name in names)])
+        return every, np.all(np.isfinite(every), axis=0)
+
+    return values
 
 
 def _reading(block: Any) -> tuple[FloatArray, BoolArray]:
-    return block.distance, block.ok
+    return block.distance[np.newaxis], block.ok
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """The axis on the counts of one session from ``first`` on, (n,); NaN where not ``known``."""
+    """Axes (a, n) on the counts of one session from ``first`` on; NaN where not ``known`` (n,)."""
 
     runs: list[SampleRun]
     first: int
-    z: FloatArray
+    positions: FloatArray
     known: BoolArray
     account: StreamAccount
 
+    def __len__(self) -> int:
+        return len(self.known)
+
     @classmethod
-    def of(cls, axes: Sequence[AxisBlock]) -> _Grid:
+    def of(cls, axes: Sequence[AxisBlock], further: Sequence[str]) -> _Grid:
         stream = StreamInput()
-        runs = list(_runs(axes, _position, stream))
+        runs = list(_runs(axes, _positions(further), stream))
         sessions = len({run.session for run in runs})
         first, samples = runs[0].first, runs[-1].end - runs[0].first
         if sessions > 1 or samples > MAX_RECORD_SAMPLES:
             raise DataError(
                 "streams.record_span", samples=samples, sessions=sessions, most=MAX_RECORD_SAMPLES
             )
-        z, known = np.full(samples, np.nan), np.zeros(samples, np.bool_)
+        every, known = np.full((1 + len(further), samples), np.nan), np.zeros(samples, np.bool_)
         for run in runs:
             place = slice(run.first - first, run.end - first)
-            z[place], known[place] = run.values[0], run.reasons == RejectionReason.NONE
-        return cls(runs, first, z, known, stream.tally.snapshot(0))
+            every[:, place], known[place] = run.values, run.reasons == RejectionReason.NONE
+        return cls(runs, first, every, known, stream.tally.snapshot(0))
 
     def matched(
         self, name: str, blocks: Sequence[DistanceBlock], trigger: CommonTrigger
@@ -203,7 +216,7 @@ class _Grid:
             pairing.axes.push(run)
         for run in _runs(blocks, _reading, stream):
             pairing.distance.push(run)
-        seen, ok = np.full(len(self.z), np.nan), np.zeros(len(self.z), np.bool_)
+        seen, ok = np.full(len(self), np.nan), np.zeros(len(self), np.bool_)
         for axis, reading in chain(pairing.pairs(), pairing.end()):
             place = slice(axis.first - self.first, axis.end - self.first)
             usable = reading.reasons == RejectionReason.NONE
@@ -221,22 +234,25 @@ def _by_counter(
     reference: Sequence[DistanceBlock],
     period: float,
     trigger: CommonTrigger = EQUAL_COUNTS,
+    further: Sequence[str] = (),
 ) -> MotionRecord:
-    grid = _Grid.of(axes)
+    grid = _Grid.of(axes, further)
     output, ok, account = grid.matched("distance", distance, trigger)
     lost = account.counted.get("unmatched", 0) + account.counted.get("duplicate", 0)
     if lost + account.counted.get("late", 0) == account.received:
         raise DataError(
             "streams.nothing_in_common",
             first=grid.first,
-            last=grid.first + len(grid.z) - 1,
+            last=grid.first + len(grid) - 1,
             distance=distance[0].first_sample,
             tolerance=STAMP_TOLERANCE_S,
         )
     own = replace(trigger, counter_offset=0)
+    z, *others = (_filled(row, grid.known) for row in grid.positions)
     return MotionRecord(
         sample_period=period,
-        z=_filled(grid.z, grid.known),
+        z=z,
+        further=dict(zip(further, map(_turned, further, others), strict=True)),
         distance=output,
         ok=grid.known & ok,
         reference=grid.matched("reference", reference, own)[0] if reference else None,
@@ -252,11 +268,16 @@ def _counts(grid: _Grid, probe: StreamAccount) -> dict[str, int]:
         "received": probe.received,
         "duplicates": lost.get("duplicate", 0) + lost.get("late", 0),
         "axis_duplicates": axis_lost.get("duplicate", 0) + axis_lost.get("late", 0),
-        "missing_axis": len(grid.z) - on_grid,
+        "missing_axis": len(grid) - on_grid,
         "unmatched": lost.get("unmatched", 0),
         "not_ok": lost.get("invalid", 0),
         "paired": probe.corrected,
     }
+
+
+def _turned(name: str, position: FloatArray) -> FloatArray:
+    """Return ``position`` (n,), an angle C without its jumps of whole turns."""
+    return np.asarray(np.unwrap(position)) if name == "c" else position
 
 
 def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
@@ -267,7 +288,10 @@ def _filled(z: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def _by_stamp(
-    axes: Sequence[AxisBlock], distance: Sequence[DistanceBlock], reference: Sequence[DistanceBlock]
+    axes: Sequence[AxisBlock],
+    distance: Sequence[DistanceBlock],
+    reference: Sequence[DistanceBlock],
+    further: Sequence[str],
 ) -> MotionRecord:
     """Interpolate the axis at the samples of the grid, and pair both by counter."""
     axis_period, probe_period = axes[0].sample_period, distance[0].sample_period
@@ -282,7 +306,7 @@ def _by_stamp(
     if reference:
         carried = axes_at_probe([_as_axis(block) for block in _ordered(reference)], grid)
         second = [replace(g, distance=c.z) for g, c in zip(grid, carried, strict=True)]
-    record = _covered(_by_counter(moved, grid, second, probe_period / finer))
+    record = _covered(_by_counter(moved, grid, second, probe_period / finer, further=further))
     received = sum(map(len, distance))
     duplicates, unmatched = (record.counts[name] // finer for name in ("duplicates", "unmatched"))
     paired = record.counts["paired"]
@@ -331,6 +355,7 @@ def _covered(record: MotionRecord) -> MotionRecord:
     return replace(
         record,
         z=record.z[part],
+        further={name: position[part] for name, position in record.further.items()},
         distance=record.distance[part],
         ok=record.ok[part],
         reference=None if record.reference is None else record.reference[part],
