@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps
 from itertools import pairwise
-from typing import ParamSpec
+from typing import Any, ParamSpec
 
 import numpy as np
 
@@ -161,8 +161,7 @@ def identify(
     did not measure it, ConfigurationError for an impossible input or mass. A model that cannot be
     trusted is returned with the verdict "rejected" in its certificate.
     """
-    mass = table_mass(settings or {})
-    prepared = prepare(record, input)
+    mass, prepared = table_mass(settings or {}), prepare(record, input)
     check_axis_steps(prepared)
     progress(STEPS, steps=len(prepared.steps.edges))
     budget = budget or EvaluationBudget()
@@ -182,19 +181,22 @@ def identify(
         covariance=evidence.known.covariance,
         settings=dict(settings or {}),
         certificate=certificate_of(evidence, findings, replace(origin, input=input), mass),
-        further=_further(record, prepared, best),
-        joint=evidence.known.joint if record.further else np.zeros((0, 0)),
+        **_further(record, evidence),
     )
     return Identification(calibration, searched.prepared, best)
 
 
-def _further(record: MotionRecord, prepared: Prepared, best: Fit) -> dict[str, FloatArray]:
+def _further(record: MotionRecord, evidence: IdentificationEvidence) -> dict[str, Any]:
     """Return the numerators of the further axes of ``record``, relative to the static gain."""
-    places = prepared.problem.further_numerators(best)
+    if not record.further:
+        return {}
+    best = evidence.fit
+    places = evidence.prepared.problem.further_numerators(best)
     unit = best.gain * best.scaled.rate ** np.arange(best.structure.poles + 1.0)
+    numerators = (np.asarray(best.driven[place] / unit) for place in places)
     return {
-        name: np.asarray(best.driven[place] / unit)
-        for name, place in zip(record.further, places, strict=True)
+        "further": dict(zip(record.further, numerators, strict=True)),
+        "joint": evidence.known.joint,
     }
 
 
