@@ -9,7 +9,7 @@ from omsm_ros.io.descriptions import load_surface
 from omsm_ros.pipelines.correct import Admission
 from omsm_ros.pipelines.publish import publish_spectra
 from omsm_ros.pipelines.spectrum import SpectrumOptions
-from omsm_ros.quantities import FREQUENCY
+from omsm_ros.quantities import EXPOSURE, FREQUENCY, SPOT
 from omsm_ros.readable import plain, quantity
 
 
@@ -27,6 +27,9 @@ def _declare_spectrum(add: Arguments) -> None:
         default=[],
         metavar=("FROM_HZ", "TO_HZ"),
     )
+    add("--remove-vibration", None, "remove lines of the bag's accelerometer, in their phase")
+    add("--exposure", EXPOSURE, "exposure of a reading [s]; estimated from scans at two speeds")
+    add("--spot", SPOT, "diameter of the probe's spot [m], for the amplitude of marks", default=0.0)
     add("--settings", json_object, "settings of these scans", metavar="JSON")
     add.polarity()
     add("--no-report", None, "write results without a report")
@@ -40,6 +43,9 @@ def _spectrum(args: argparse.Namespace) -> Facts:
         nominal=load_surface(args.nominal) if args.nominal else None,
         stop=tuple((low, high) for low, high in args.stop),
         polarity=args.polarity,
+        remove_vibration=args.remove_vibration,
+        exposure=args.exposure,
+        spot=args.spot,
     )
     with progress_bar("reading", args.json) as progress:
         bags = [cell_of(path, args) for path in args.scans]
@@ -50,10 +56,13 @@ def _spectrum(args: argparse.Namespace) -> Facts:
 
 
 def _show_spectrum(facts: Facts) -> None:
+    if facts["exposure"] is not None:
+        say(facts["exposure"]["finding"])
     for scan in facts["scans"]:
         say(f"{scan['name']}: {scan['samples']['analysed']} points, "
               f"{quantity(scan['noise']['rms'], 'm')} rms without its lines")  # fmt: skip
         table([_peak_row(peak) for peak in scan["peaks"]] or [("", "no line beyond 3 σ")])
+        table([("  vibration", one["finding"]) for one in scan["vibration_removed"]])
         if stopped := scan["band_stop"]:
             say(f"band stop, zero phase: {quantity(stopped['rms_before'], 'm')} → "
                   f"{quantity(stopped['rms_after'], 'm')} rms")  # fmt: skip
@@ -70,6 +79,9 @@ def _peak_row(peak: Facts) -> tuple[str, str]:
         what += f" ({quantity(peak['true_wavelength'], 'm', 4)})"
     why = "; ".join([*peak["evidence"], *([peak["needs"]] if peak["needs"] else [])])
     size = quantity(peak["amplitude"], "m")
+    if peak["amplitude_on_part"] is not None:
+        size += f" (on the part {quantity(peak['amplitude_on_part'], 'm')} ± "
+        size += f"{quantity(peak['amplitude_on_part_uncertainty'], 'm', 2)})"
     return f"  {where}", f"{size}, {plain(peak['significance'])} σ: {what}: {why}"
 
 

@@ -33,6 +33,30 @@ TEMPLATES: dict[str, str] = {
         "scan {name!r} has {readings} readings between the trigger numbers of its positions, "
         "expected {least} or more; record both from the same triggers"
     ),
+    "ripple.bad_exposure": "exposure {exposure!r} s; give zero or more seconds",
+    "ripple.exposure": (
+        "exposure {seconds:s/4} ± {uncertainty:s/2} (k = 1) from amplitudes that fall with speed"
+    ),
+    "ripple.exposure_doubtful": (
+        "{found}; reduced χ² {chi:.0f}: the amplitudes differ by something else, too"
+    ),
+    "ripple.exposure_declared": "exposure {seconds:s/4}, as declared",
+    "ripple.exposure_not_resolved": (
+        "exposure < {longest:s/2} (k = 2), not resolved: the amplitudes do not fall with speed "
+        "beyond their noise, or they allow several exposures; scan at further speeds"
+    ),
+    "ripple.vibration_removed": (
+        "{frequency:Hz/6}, in the heights at {apparent:Hz/5}: {amplitude:m/3} ± {uncertainty:m/2} "
+        "removed in its phase; {left:m/2} is left there, noise included"
+    ),
+    "ripple.vibration_not_in_heights": (
+        "{frequency:Hz/6}: the heights do not follow it at {apparent:Hz/5} beyond their noise of "
+        "{uncertainty:m/2}; nothing removed"
+    ),
+    "ripple.vibration_like_form": (
+        "{frequency:Hz/6}: in the heights it is at {apparent:Hz/5}, among the waves of form; "
+        "nothing removed"
+    ),
     # Evidence for the source of a line.
     "ripple.same_wavelength_on_path": "the same wavelength along the path in {scans:list}",
     "ripple.same_wavelength_on_radius": "the same wavelength from ring to ring in {scans:list}",

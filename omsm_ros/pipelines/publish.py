@@ -29,13 +29,7 @@ from omsm_ros.io.results import CloudFile, PlyWriter, read_curves, read_form, re
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import MOST_DRAWN
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.spectrum import (
-    SpectrumOfScan,
-    SpectrumOptions,
-    spectra_of,
-    summary_of,
-    without_bands,
-)
+from omsm_ros.pipelines.spectrum import SpectrumOptions, cleaned_points, spectra_of, summary_of
 from omsm_ros.readable import date_text, quantity
 from omsm_ros.report import style
 from omsm_ros.report.measurement.figures import levelled, registered_map, surface_figures
@@ -134,14 +128,18 @@ def publish_spectra(
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Analyse the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
-    clouds = [f"band_stopped_{k + 1}.ply" for k in range(len(paths))]
+    kind = "band_stopped" if options.stop else "vibration_removed"
+    clouds = [f"{kind}_{k + 1}.ply" for k in range(len(paths))]
     with result_folder(out, (*clouds, *_clouds_before(out), REPORT, SPECTRUM)) as folder:
         scans = spectra_of(paths, options, progress)
         summary = summary_of(scans, options)
         files = {"spectrum": SPECTRUM}
-        for name, scan in zip(clouds, scans, strict=True) if options.stop else ():
-            _write_cloud(folder / name, scan)
-            files[f"{scan.studied.signal.name} without the band"] = name
+        is_cleaned = options.stop or options.remove_vibration
+        for name, scan in zip(clouds, scans, strict=True) if is_cleaned else ():
+            with PlyWriter(folder / name, f"omsm_ros, metres, {kind.replace('_', ' ')}") as ply:
+                ply.write(cleaned_points(scan))
+            what = "the band" if options.stop else "its vibration"
+            files[f"{scan.studied.signal.name} without {what}"] = name
         if report:
             # Imported on demand, because loading the figures takes longer than the analysis.
             from omsm_ros.report.spectrum import SpectrumPage, drawn, render
@@ -156,13 +154,9 @@ def publish_spectra(
 
 
 def _clouds_before(out: Path) -> list[str]:
-    earlier = out.glob("band_stopped_*.ply") if (out / SPECTRUM).is_file() else ()
-    return [path.name for path in earlier]
-
-
-def _write_cloud(path: Path, scan: SpectrumOfScan) -> None:
-    with PlyWriter(path, "omsm_ros, metres, a band of frequencies taken out") as ply:
-        ply.write(without_bands(scan))
+    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply")
+    is_result = (out / SPECTRUM).is_file()
+    return [path.name for kind in kinds for path in out.glob(kind) if is_result]
 
 
 # Relative difference of the rms of evenly chosen points from that of the whole cloud.

@@ -19,6 +19,14 @@ from omsm_ros.core.ripple.accelerometer import (
     accelerations_of,
 )
 from omsm_ros.core.ripple.density import BandStopped, Density, band_stop, density
+from omsm_ros.core.ripple.exposure import (
+    Exposure,
+    declared_exposure,
+    estimate_exposure,
+    passing_frequency,
+    passing_textures,
+    wavelength_of,
+)
 from omsm_ros.core.ripple.ripple_guard import NamedLine, analyse_scans, name_lines
 from omsm_ros.core.ripple.scan_signal import (
     PATH,
@@ -30,6 +38,7 @@ from omsm_ros.core.ripple.scan_signal import (
     scan_signal,
 )
 from omsm_ros.core.ripple.source_hypotheses import KINDS, UNDECIDED, StudiedScan
+from omsm_ros.core.ripple.vibration_removal import REMOVED, RemovedVibration, remove_vibrations
 from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
@@ -55,7 +64,8 @@ class SpectrumOptions:
 
     calibration: None adds encoder and probe without a dynamic correction
     nominal: surface to subtract first;  stop: bands to remove from the heights [Hz]
-    polarity: of the probe
+    polarity: of the probe;  remove_vibration: by the accelerometer, in its phase
+    exposure: of the probe [s], None estimates it;  spot: diameter of its spot on the part [m]
     """
 
     calibration: Calibration | None = None
@@ -63,6 +73,9 @@ class SpectrumOptions:
     nominal: Surface | None = None
     stop: tuple[tuple[float, float], ...] = ()
     polarity: int = 1
+    remove_vibration: bool = False
+    exposure: float | None = None
+    spot: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -72,6 +85,7 @@ class SpectrumOfScan:
     motion: density of the Z encoder's motion;  points: as corrected
     received: number of points before the cut to MOST_SAMPLES
     stopped: heights without the stopped bands, None without bands
+    vibrations: lines of the accelerometer and what was removed of them
     """
 
     studied: StudiedScan
@@ -81,12 +95,21 @@ class SpectrumOfScan:
     account: dict[str, Any]
     received: int
     stopped: BandStopped | None = None
+    vibrations: Sequence[RemovedVibration] = ()
+
+    @property
+    def removed(self) -> FloatArray:
+        """Vibration and bands that were removed from the heights (n,) [m]."""
+        parts = [one.removed for one in self.vibrations if one.outcome == REMOVED]
+        parts += [] if self.stopped is None else [self.stopped.removed]
+        return np.asarray(sum(parts, np.zeros(len(self.studied.signal))))
 
 
 @dataclass(frozen=True, eq=False)
 class _Read:
     signal: ScanSignal
     acceleration_lines: AccelerationLines | None
+    acceleration: list[AccelerationBlock]
     points: SurfacePoints
     motion: Density
     account: dict[str, Any]
@@ -106,17 +129,37 @@ def spectra_of(
     studied = analyse_scans([(one.signal, one.acceleration_lines) for one in read])
     named = name_lines(studied)
     return [
-        SpectrumOfScan(
-            studied=scan,
-            named=rows,
-            motion=one.motion,
-            points=one.points,
-            account=one.account,
-            received=one.received,
-            stopped=_stopped(scan, options.stop) if options.stop else None,
+        _cleaned(
+            SpectrumOfScan(
+                studied=scan,
+                named=rows,
+                motion=one.motion,
+                points=one.points,
+                account=one.account,
+                received=one.received,
+            ),
+            one.acceleration,
+            options,
         )
         for one, scan, rows in zip(read, studied, named, strict=True)
     ]
+
+
+def _cleaned(
+    scan: SpectrumOfScan, acceleration: list[AccelerationBlock], options: SpectrumOptions
+) -> SpectrumOfScan:
+    """Return ``scan`` with what is to be removed from it: first vibration, then bands."""
+    signal, points = scan.studied.signal, scan.points
+    if options.remove_vibration and len(points) == len(signal):
+        every = int(np.gcd.reduce(np.diff(points.sample.astype(np.int64))))
+        time = points.sample * signal.period / every
+        found = remove_vibrations(scan.studied, time, acceleration)
+        scan = replace(scan, vibrations=found)
+    if options.stop:
+        left = scan.studied.formless.residual - scan.removed
+        stopped = band_stop(signal.sample, left, signal.period, options.stop)
+        scan = replace(scan, stopped=stopped)
+    return scan
 
 
 def _names(paths: Sequence[AnyBag]) -> list[str]:
@@ -137,7 +180,7 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
             if points is not None:
                 parts.append(points)
         account, period = scan.account.as_dict(), scan.sample_period
-        shaken = _acceleration_lines(recording)
+        shaken = _acceleration(recording)
     every = join_points(parts)
     points = every.part(slice(0, MOST_SAMPLES))
     height = points.height
@@ -148,7 +191,8 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     signal = scan_signal(name, period, (points.sample, height), (count, x, y, c))
     return _Read(
         signal=signal,
-        acceleration_lines=shaken,
+        acceleration_lines=acceleration_lines(*accelerations_of(shaken)) if shaken else None,
+        acceleration=shaken,
         points=points,
         motion=_motion_density(z, period),
         account=account,
@@ -156,13 +200,11 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     )
 
 
-def _acceleration_lines(recording: Recording) -> AccelerationLines | None:
+def _acceleration(recording: Recording) -> list[AccelerationBlock]:
     if not recording.holds(bags.ACCELERATION_TOPIC):
-        return None
+        return []
     blocks = [block for _, block in recording.bag.records(bags.ACCELERATION_TOPIC)]
-    return acceleration_lines(
-        *accelerations_of([b for b in blocks if isinstance(b, AccelerationBlock)])
-    )
+    return [b for b in blocks if isinstance(b, AccelerationBlock)]
 
 
 def _motion_density(z: FloatArray, period: float) -> Density:
@@ -170,40 +212,48 @@ def _motion_density(z: FloatArray, period: float) -> Density:
     return density(known - np.mean(known), period)
 
 
-def _stopped(studied: StudiedScan, bands: Sequence[tuple[float, float]]) -> BandStopped:
-    signal = studied.signal
-    return band_stop(signal.sample, studied.formless.residual, signal.period, bands)
+def cleaned_points(scan: SpectrumOfScan) -> SurfacePoints:
+    """Return the points of ``scan`` without the vibration and the bands that were removed.
 
-
-def without_bands(scan: SpectrumOfScan) -> SurfacePoints:
-    """Return the points of ``scan`` with the stopped bands removed from their heights.
-
-    Raises ConfigurationError if no band was stopped or the points are not those analysed.
+    Raises ConfigurationError if the points are not those analysed.
     """
-    if scan.stopped is None or len(scan.points) != len(scan.stopped.removed):
+    if len(scan.points) != len(scan.studied.signal):
         raise ConfigurationError(
-            f"{scan.studied.signal.name!r}: no band was stopped, or its trigger counter restarted; "
-            "give --stop FROM TO and a scan in one piece"
+            f"{scan.studied.signal.name!r}: its trigger counter restarted, so that its heights "
+            "are not those analysed; give a scan in one piece"
         )
-    return replace(scan.points, height=scan.points.height - scan.stopped.removed)
+    return replace(scan.points, height=scan.points.height - scan.removed)
+
+
+def exposure_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> Exposure | None:
+    """Return the exposure of the probe, declared or from the amplitudes of the scans."""
+    if options.exposure is not None:
+        return declared_exposure(options.exposure)
+    textures = passing_textures([(scan.studied, scan.named) for scan in scans])
+    return estimate_exposure(textures, max(scan.studied.signal.period for scan in scans))
 
 
 def summary_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> dict[str, Any]:
     """Return the content of ``spectrum.json``, in SI units."""
     rows = [row for scan in scans for row in scan.named]
-    calibration = options.calibration
+    calibration, exposure = options.calibration, exposure_of(scans, options)
     return {
         "schema": SCHEMA,
         "normalisation": NORMALISATION,
         "calibration": None if calibration is None else calibration.id,
         "counts": {kind: sum(row.kind == kind for row in rows) for kind in KINDS},
         "undecided": sum(row.kind == UNDECIDED for row in rows),
-        "scans": [_scan_facts(scan, options) for scan in scans],
+        "exposure": None
+        if exposure is None
+        else asdict(exposure) | {"spot": options.spot, "finding": str(exposure.finding())},
+        "scans": [_scan_facts(scan, options, exposure) for scan in scans],
         "versions": {"omsm_ros": __version__},
     }
 
 
-def _scan_facts(scan: SpectrumOfScan, options: SpectrumOptions) -> dict[str, Any]:
+def _scan_facts(
+    scan: SpectrumOfScan, options: SpectrumOptions, exposure: Exposure | None
+) -> dict[str, Any]:
     studied, signal = scan.studied, scan.studied.signal
     turn, minutes = studied.coordinates.get(TURN), 60.0
     return {
@@ -226,7 +276,15 @@ def _scan_facts(scan: SpectrumOfScan, options: SpectrumOptions) -> dict[str, Any
         },
         "motion": _motion_facts(scan.motion, options.calibration),
         "accelerometer": _acceleration_facts(studied.acceleration_lines),
-        "peaks": [_peak_facts(studied, row) for row in scan.named],
+        "peaks": [
+            _peak_facts(studied, row) | _on_the_part(studied, row, exposure, options.spot)
+            for row in scan.named
+        ],
+        "vibration_removed": [
+            {name: value for name, value in asdict(one).items() if name != "removed"}
+            | {"finding": str(one.finding())}
+            for one in scan.vibrations
+        ],
         "band_stop": _stop_facts(scan, options.stop),
     }
 
@@ -275,6 +333,19 @@ def _peak_facts(studied: StudiedScan, row: NamedLine) -> dict[str, Any]:
         "evidence": [*map(str, row.evidence)],
         "needs": None if row.needs is None else str(row.needs),
     }
+
+
+def _on_the_part(
+    studied: StudiedScan, row: NamedLine, exposure: Exposure | None, spot: float
+) -> dict[str, float | None]:
+    """Return the amplitude of a texture without exposure and spot [m], None where unknown."""
+    wave, found = wavelength_of(row), None
+    if wave is not None and exposure is not None:
+        passing = passing_frequency(studied.signal, wave)
+        size, sigma = row.line.amplitude, row.line.amplitude_uncertainty
+        found = exposure.undone(passing, spot, wave, size, sigma)
+    amplitude, uncertainty = found or (None, None)
+    return {"amplitude_on_part": amplitude, "amplitude_on_part_uncertainty": uncertainty}
 
 
 def _over(frequency: float | None) -> float | None:

@@ -197,7 +197,7 @@ def render(page: SpectrumPage) -> str:
                 Section("Lines", ("time",), tuple(_peak_table(scan) for scan in scans)),
                 Section("Evidence", ("evidence", "path"), (_acceleration_table(scans),)),
                 Section("Scans", ("motion",), (_scan_table(scans), _sampling_table(scans))),
-                Section("Band stop", tables=(_stop_table(scans),)),
+                Section("Removed", tables=(_stop_table(scans), _vibration_table(scans))),
             ),
             captions=CAPTIONS,
             figures=page.figures,
@@ -209,6 +209,7 @@ def render(page: SpectrumPage) -> str:
 def _verdict(summary: Mapping[str, Any]) -> PageVerdict:
     counts = summary["counts"]
     found = tuple(f"{counts[kind]} {kind}" for kind in KINDS if counts[kind])
+    found += (summary["exposure"]["finding"],) if summary["exposure"] else ()
     if not found:
         return PageVerdict("good", "No line above 3 σ", ("noise only",))
     if counts[UNDECIDED]:
@@ -224,13 +225,17 @@ def _peak_table(scan: Mapping[str, Any]) -> Table:
             quantity(peak["frequency"], "Hz", 5),
             quantity(peak["wavelength_along_path"] or peak["wavelength_along_radius"], "m", 4),
             quantity(peak["amplitude"], "m"),
+            quantity(peak["amplitude_on_part"], "m"),
             plain(peak["significance"]),
             _true(peak),
             "; ".join([*peak["evidence"], *([peak["needs"]] if peak["needs"] else [])]),
         )
         for peak in scan["peaks"]
     ]
-    columns = ("apparent frequency", "wavelength", "amplitude", "σ", "true value", "evidence")
+    columns = (
+        *("apparent frequency", "wavelength", "amplitude", "on the part", "σ"),
+        *("true value", "evidence"),
+    )
     return Table(scan["name"], columns, rows, prose="evidence")
 
 
@@ -309,3 +314,8 @@ def _stop_table(scans: Sequence[Mapping[str, Any]]) -> Table:
     ]
     columns = ("bands", "rms before", "rms after", "removed", "phase", "settling at the ends")
     return Table("", columns, rows)
+
+
+def _vibration_table(scans: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [(scan["name"], one["finding"]) for scan in scans for one in scan["vibration_removed"]]
+    return Table("Vibration, in phase with the accelerometer", ("result",), rows, prose="result")

@@ -25,7 +25,7 @@ from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
 from omsm_ros.twin.machine_errors import Shift, random_walk
-from omsm_ros.twin.part import mounted_surface
+from omsm_ros.twin.part import UnderSpot, mounted_surface
 from omsm_ros.twin.plant import Plant, TimeGrid, move
 from omsm_ros.twin.probe import LEVEL, Probe, ProbeRandom, read, slope_of
 from omsm_ros.twin.record_checks import is_default
@@ -192,6 +192,8 @@ def scene_of(
     if not is_default(disturbances.structure):
         slide_x = Trajectory(times[0], timing.period, motion.positions(times).x)
         moved = deform(disturbances.structure, moved, slide_x)
+    if spot := disturbances.probe.spot_m:
+        surface = UnderSpot(surface, spot)
     vibration = Vibration.of(disturbances.vibration, random["vibration"])
     return Scene(
         disturbances=disturbances,

@@ -41,6 +41,7 @@ class Probe:
 class ProbeErrors:
     """Errors of timing, distance and light; none by default.
 
+    spot_m: diameter of the spot, a disc over which the height of the part is averaged
     latency_s: from the end of the exposure to the trigger of the reading
     exposure_s, averages: the reading is the mean over ``averages`` successive exposures
     noise_m: additional noise, added in quadrature
@@ -53,6 +54,7 @@ class ProbeErrors:
     dropout_probability: probability of a random dropout [1]
     """
 
+    spot_m: float = 0.0
     latency_s: float = 0.0
     exposure_s: float = 0.0
     averages: int = 1
@@ -70,7 +72,7 @@ class ProbeErrors:
         check_numbers(
             self,
             positive=("period_m", "intensity_slope_rad", "dropout_slope_rad"),
-            not_negative=("latency_s", "exposure_s", "noise_m", "dropout_probability"),
+            not_negative=("spot_m", "latency_s", "exposure_s", "noise_m", "dropout_probability"),
             lags=("latency_s", "exposure_s"),
         )
         if self.averages < 1 or self.window_s > LONGEST_LAG_S:

@@ -13,7 +13,7 @@ from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.pipelines import publish as publish_spectrum
 from omsm_ros.pipelines.publish import publish_spectra
-from omsm_ros.pipelines.spectrum import SpectrumOptions, without_bands
+from omsm_ros.pipelines.spectrum import SpectrumOptions, cleaned_points
 
 
 def points(count):
@@ -24,10 +24,19 @@ def points(count):
     )  # fmt: skip
 
 
+class Named(SimpleNamespace):
+    """A signal with a name and a length."""
+
+    def __init__(self, name, count):
+        super().__init__(name=name, count=count)
+
+    def __len__(self):
+        return self.count
+
+
 def scan(name, count, removed=0.25):
-    stopped = SimpleNamespace(removed=np.full(count, removed))
-    studied = SimpleNamespace(signal=SimpleNamespace(name=name))
-    return SimpleNamespace(studied=studied, points=points(count), stopped=stopped)
+    studied = SimpleNamespace(signal=Named(name, count))
+    return SimpleNamespace(studied=studied, points=points(count), removed=np.full(count, removed))
 
 
 @pytest.fixture
@@ -74,7 +83,7 @@ def test_clouds_of_an_earlier_run_with_more_scans_go(publish, tmp_path, counts, 
 def test_a_run_that_fails_leaves_the_earlier_one(publish, tmp_path, monkeypatch):
     publish([5, 6])
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
-    monkeypatch.setattr(publish_spectrum, "without_bands", lambda _: 1 / 0)
+    monkeypatch.setattr(publish_spectrum, "cleaned_points", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         publish([1])
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
@@ -88,14 +97,11 @@ def test_a_cloud_of_that_name_that_is_no_result_stays(publish, tmp_path):
     assert (tmp_path / "out" / "band_stopped_9.ply").read_text() == "mine"
 
 
-@pytest.mark.parametrize("stopped", [None, SimpleNamespace(removed=np.zeros(4))])
-def test_a_band_that_is_not_of_these_points_is_refused(stopped):
+def test_points_that_were_not_analysed_are_refused():
     one = scan("s", 5)
-    one.stopped = stopped
-    with pytest.raises(
-        ConfigurationError, match="'s': no band was stopped, or its trigger counter restart"
-    ):
-        without_bands(one)
+    one.studied.signal.count = 4
+    with pytest.raises(ConfigurationError, match="'s': its trigger counter restarted"):
+        cleaned_points(one)
 
 
 def test_the_folder_of_another_command_is_refused(publish, tmp_path):

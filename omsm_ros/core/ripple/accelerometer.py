@@ -23,6 +23,12 @@ _LEAST_SAMPLES = 256
 # A line is spread over ±4 resolutions by the window; four times as many make a band.
 _LEAST_RESOLUTIONS = 16
 _LOBE = 4
+# Blocks of frequencies of which the quietest shows the noise of the sensor, up to this share of
+# half its rate, because a filter may lower it above.
+_BLOCKS, _BELOW_FILTER = 24, 0.8
+# Standard deviations of noise that a level has to exceed, and mean of the square of correlated
+# neighbours under the window.
+_NOISE_SIGMAS, _CORRELATED = 4.0, 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,12 +118,13 @@ def _lines(period: float, axis: str, values: FloatArray) -> list[AccelerationLin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VibrationLevels:
-    """Vibration averaged over the last windows.
+    """Vibration averaged over the last windows, without the white noise of the sensor.
 
     bands: (from, to) [Hz];  rms: of each axis [m/s²], one value for each band
     line: strongest of all axes: axis, frequency [Hz], amplitude [m/s²]
     effect: rms effect on the height for each band [m]; None if unknown
     total_effect: of all bands [m];  windows: number averaged so far
+    noise_effect: what the noise of the sensor would be in all bands, and hides [m]
     height_line: strongest line in the height: frequency [Hz], amplitude [m]
     """
 
@@ -127,6 +134,7 @@ class VibrationLevels:
     effect: tuple[float, ...] | None
     total_effect: float | None
     windows: int
+    noise_effect: float | None = None
     height_line: tuple[float, float] | None = None
 
     def entry(self) -> dict[str, Any]:
@@ -138,6 +146,7 @@ class VibrationLevels:
             "line": {"axis": axis, "frequency": frequency, "amplitude": amplitude},
             "height": None if self.effect is None else list(self.effect),
             "height_total": self.total_effect,
+            "height_noise": self.noise_effect,
             "windows": self.windows,
         } | (
             {}
@@ -246,22 +255,78 @@ class RunningSpectrum:
         bands = tuple(
             pairwise([*edges, nyquist] if len(edges) < len(self.options.edges) else edges)
         )
-        height = self._height(response)
-        effect = None if height is None else _by_band(height, bands)
+        share = self._height_share(response)
+        effect = total = hidden = line = None
+        if share is not None:
+            effect, hidden = self._levels(self.options.axis, bands, share)
+            total = float(np.linalg.norm(effect))
+            spectrum = self._mean[self.options.axis]
+            most = self._floor(spectrum)[0] * (1 + _NOISE_SIGMAS / self._averaged**0.5)
+            clear = np.maximum(spectrum.density - most, 0.0)
+            height = Density(spectrum.frequency, clear * share, spectrum.step)
+            found = _strongest(height, bands)
+            line = found if found[1] > 0 else None
         return VibrationLevels(
             bands=bands,
-            rms={axis: _by_band(spectrum, bands) for axis, spectrum in self._mean.items()},
+            rms={axis: self._levels(axis, bands)[0] for axis in self._mean},
             line=max(
                 ((axis, *_strongest(spectrum, bands)) for axis, spectrum in self._mean.items()),
                 key=lambda line: line[2],
             ),
             effect=effect,
-            total_effect=None if effect is None else float(np.sqrt(np.sum(np.square(effect)))),
+            total_effect=total,
             windows=self._windows,
-            height_line=None if height is None else _strongest(height, bands),
+            noise_effect=hidden,
+            height_line=line,
         )
 
-    def _height(self, response: TransferFunction | None) -> Density | None:
+    def _floor(self, spectrum: Density) -> tuple[float, float]:
+        """Return density of the sensor's white noise, of the quietest frequencies; relative σ.
+
+        The median of an average of n exponential variables is 1 - 1/(3 n) of their mean, and the
+        least of 24 medians two σ below it.
+        """
+        quiet = spectrum.density[1 : int(_BELOW_FILTER * len(spectrum.density))]
+        parts = [part for part in np.array_split(quiet, _BLOCKS) if len(part)]
+        sigma = 1.25 * float(np.sqrt(_CORRELATED / (len(parts[-1]) * self._averaged)))
+        least = min(float(np.median(part)) for part in parts)
+        return least * (1 + 2 * sigma) / (1 - 1 / (3 * self._averaged)), sigma
+
+    @property
+    def _averaged(self) -> int:
+        return min(self._windows, self.options.averages)
+
+    def _levels(
+        self, axis: str, bands: Sequence[tuple[float, float]], share: FloatArray | float = 1.0
+    ) -> tuple[tuple[float, ...], float]:
+        """Return the rms by band beyond noise, and the rms of noise that may be in all bands.
+
+        Each third of an octave counts that exceeds its own noise, so that noise at 5 Hz, which
+        ``a/ω²`` amplifies most, hides no motion at 30 Hz.
+        """
+        spectrum = self._mean[axis]
+        weight = share + np.zeros(len(spectrum.density))
+        floor, sigma = self._floor(spectrum)
+        levels, hidden = [], 0.0
+        for low, high in bands:
+            parts = int(np.ceil(3 * np.log2(high / low)))
+            top = high if high == bands[-1][1] else np.nextafter(high, 0)
+            edges = list(pairwise([low, *np.geomspace(low, high, parts + 1)[1:-1], top]))
+            seen, mean, squared = (
+                np.square(_by_band(Density(spectrum.frequency, d, spectrum.step), edges))
+                for d in (spectrum.density * weight, weight, weight**2)
+            )
+            spread = np.hypot(
+                np.sqrt(_CORRELATED * spectrum.step * squared / self._averaged), sigma * mean
+            )
+            noise = floor * (mean + _NOISE_SIGMAS * spread)
+            # Of a level beyond its noise only the mean of the noise is taken away.
+            levels.append(float(np.sqrt(np.sum(np.where(seen > noise, seen - floor * mean, 0.0)))))
+            hidden += float(np.sum(noise))
+        return tuple(levels), hidden**0.5
+
+    def _height_share(self, response: TransferFunction | None) -> FloatArray | None:
+        """Return the square of height over acceleration by frequency, None if it is unknown."""
         seen = self.options.mount == SLIDE
         if seen and response is None:
             return None
@@ -270,9 +335,7 @@ class RunningSpectrum:
         share = np.ones(len(omega))
         if seen and response is not None:
             share = np.abs(1 - response.response(spectrum.frequency))
-        return Density(
-            spectrum.frequency, spectrum.density * (share / omega**2) ** 2, spectrum.step
-        )
+        return np.asarray((share / omega**2) ** 2)
 
 
 def _by_band(spectrum: Density, bands: Sequence[tuple[float, float]]) -> tuple[float, ...]:

@@ -105,6 +105,25 @@ def test_a_gap_or_a_lost_sample_spoils_no_window():
     assert running.levels().rms["z"][1] == pytest.approx(0.02 / 2**0.5, rel=1e-3)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_noise_of_the_sensor_is_no_vibration(seed):
+    """White noise of 0.5 mm/s² from 5 to 50 Hz would be 90 nm by a/ω²; a line stands out of it."""
+    random = np.random.default_rng(seed)
+    noise = random.normal(0, 0.5e-3 * np.sqrt(RATE / 2 / 45), int(4 * RATE))
+    quiet = fed(noise).levels()
+    assert quiet.total_effect == 0.0
+    assert quiet.rms["z"] == (0.0,) * 4
+    f = np.linspace(5, 50, 1000)
+    white = np.sqrt(np.trapezoid((0.5e-3) ** 2 / 45 / (2 * np.pi * f) ** 4, f))
+    assert white < quiet.noise_effect < 4 * white
+    line = shaken(30.0, 150e-9 * (2 * np.pi * 30) ** 2, seconds=4.0)
+    assert fed(noise + line).levels().total_effect == pytest.approx(150e-9 / 2**0.5, rel=0.15)
+    fast = shaken(680.0, 20e-9 * (2 * np.pi * 680) ** 2, seconds=4.0)
+    levels = fed(noise + fast).levels()
+    assert levels.total_effect == pytest.approx(20e-9 / 2**0.5, rel=0.05)
+    assert levels.height_line[0] == pytest.approx(680, abs=1)
+
+
 def test_a_slow_sensor_has_fewer_bands():
     levels = fed(shaken(100.0, 0.01), edges=(10.0, 200.0, 1000.0, 9000.0)).levels()
     assert levels.bands == ((10.0, 200.0), (200.0, 1000.0), (1000.0, 2000.0))
