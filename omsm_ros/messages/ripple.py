@@ -47,7 +47,7 @@ TEMPLATES: dict[str, str] = {
     ),
     "ripple.vibration_removed": (
         "{frequency:Hz/6}, in the heights at {apparent:Hz/5}: {amplitude:m/3} ± {uncertainty:m/2} "
-        "removed in its phase; {left:m/2} is left there, noise included"
+        "removed in its phase; at most {left:m/2} is left near it, noise included"
     ),
     "ripple.vibration_not_in_heights": (
         "{frequency:Hz/6}: the heights do not follow it at {apparent:Hz/5} beyond their noise of "

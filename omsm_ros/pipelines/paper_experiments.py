@@ -335,7 +335,7 @@ def _spectrum_page(
     scans: list[SpectrumOfScan], options: SpectrumOptions, rows: list[Compared], title: str,
     summary: str, figures: dict[str, tuple[str, bytes | Figure]],
 ) -> Done:  # fmt: skip
-    made = drawn([(s.studied, s.named, s.motion) for s in scans], None)
+    made = drawn([(s.studied, s.named, s.read.motion) for s in scans], None)
     kept: dict[str, tuple[str, bytes | Figure]] = {
         n: (CAPTIONS[n], made[n]) for n in ("time", "path", "evidence") if n in made
     }

@@ -145,7 +145,7 @@ def publish_spectra(
             from omsm_ros.report.spectrum import SpectrumPage, drawn, render
 
             valid = options.calibration.valid_up_to if options.calibration else None
-            figures = drawn([(s.studied, s.named, s.motion) for s in scans], valid)
+            figures = drawn([(s.studied, s.named, s.read.motion) for s in scans], valid)
             save_text(folder / REPORT, render(SpectrumPage(summary, figures)))
             files["report"] = REPORT
         summary["files"] = files

@@ -78,24 +78,35 @@ class SpectrumOptions:
     spot: float = 0.0
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
+class ReadScan:
+    """A scan as read: its signal, points as corrected, and account of all samples.
+
+    motion: density of the Z encoder's motion;  acceleration: blocks of the accelerometer
+    received: number of points before the cut to MOST_SAMPLES
+    """
+
+    signal: ScanSignal
+    acceleration: list[AccelerationBlock]
+    points: SurfacePoints
+    motion: Density
+    account: dict[str, Any]
+    received: int
+
+
+@dataclass(frozen=True, eq=False)
 class SpectrumOfScan:
     """Result of the spectral analysis of one scan.
 
-    motion: density of the Z encoder's motion;  points: as corrected
-    received: number of points before the cut to MOST_SAMPLES
-    stopped: heights without the stopped bands, None without bands
     vibrations: lines of the accelerometer and what was removed of them
+    stopped: heights without the stopped bands, None without bands
     """
 
+    read: ReadScan
     studied: StudiedScan
     named: list[NamedLine]
-    motion: Density
-    points: SurfacePoints
-    account: dict[str, Any]
-    received: int
-    stopped: BandStopped | None = None
     vibrations: Sequence[RemovedVibration] = ()
+    stopped: BandStopped | None = None
 
     @property
     def removed(self) -> FloatArray:
@@ -103,17 +114,6 @@ class SpectrumOfScan:
         parts = [one.removed for one in self.vibrations if one.outcome == REMOVED]
         parts += [] if self.stopped is None else [self.stopped.removed]
         return np.asarray(sum(parts, np.zeros(len(self.studied.signal))))
-
-
-@dataclass(frozen=True, eq=False)
-class _Read:
-    signal: ScanSignal
-    acceleration_lines: AccelerationLines | None
-    acceleration: list[AccelerationBlock]
-    points: SurfacePoints
-    motion: Density
-    account: dict[str, Any]
-    received: int
 
 
 def spectra_of(
@@ -126,34 +126,22 @@ def spectra_of(
     """
     names = _names(paths)
     read = [_read(path, name, options, progress) for path, name in zip(paths, names, strict=True)]
-    studied = analyse_scans([(one.signal, one.acceleration_lines) for one in read])
-    named = name_lines(studied)
-    return [
-        _cleaned(
-            SpectrumOfScan(
-                studied=scan,
-                named=rows,
-                motion=one.motion,
-                points=one.points,
-                account=one.account,
-                received=one.received,
-            ),
-            one.acceleration,
-            options,
-        )
-        for one, scan, rows in zip(read, studied, named, strict=True)
+    shaken = [
+        acceleration_lines(*accelerations_of(r.acceleration)) if r.acceleration else None
+        for r in read
     ]
+    studied = analyse_scans([(r.signal, s) for r, s in zip(read, shaken, strict=True)])
+    scans = zip(read, studied, name_lines(studied), strict=True)
+    return [_cleaned(SpectrumOfScan(*scan), options) for scan in scans]
 
 
-def _cleaned(
-    scan: SpectrumOfScan, acceleration: list[AccelerationBlock], options: SpectrumOptions
-) -> SpectrumOfScan:
+def _cleaned(scan: SpectrumOfScan, options: SpectrumOptions) -> SpectrumOfScan:
     """Return ``scan`` with what is to be removed from it: first vibration, then bands."""
-    signal, points = scan.studied.signal, scan.points
-    if options.remove_vibration and len(points) == len(signal):
-        every = int(np.gcd.reduce(np.diff(points.sample.astype(np.int64))))
-        time = points.sample * signal.period / every
-        found = remove_vibrations(scan.studied, time, acceleration)
+    signal, sample = scan.studied.signal, scan.read.points.sample
+    if options.remove_vibration and len(sample) == len(signal):
+        every = int(np.gcd.reduce(np.diff(sample.astype(np.int64))))
+        time = sample * signal.period / every
+        found = remove_vibrations(scan.studied, time, scan.read.acceleration)
         scan = replace(scan, vibrations=found)
     if options.stop:
         left = scan.studied.formless.residual - scan.removed
@@ -167,7 +155,7 @@ def _names(paths: Sequence[AnyBag]) -> list[str]:
     return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 
 
-def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> _Read:
+def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> ReadScan:
     axes: list[AxisBlock] = []
     parts: list[SurfacePoints] = []
     how = CorrectionOptions(polarity=options.polarity, accept_other_rate=options.admission.override)
@@ -189,15 +177,8 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     count = np.concatenate([np.arange(len(b)) + b.first_sample for b in axes])
     x, y, z, c = (np.concatenate([getattr(b, n) for b in axes]) for n in "xyzc")
     signal = scan_signal(name, period, (points.sample, height), (count, x, y, c))
-    return _Read(
-        signal=signal,
-        acceleration_lines=acceleration_lines(*accelerations_of(shaken)) if shaken else None,
-        acceleration=shaken,
-        points=points,
-        motion=_motion_density(z, period),
-        account=account,
-        received=len(every),
-    )
+    motion = _motion_density(z, period)
+    return ReadScan(signal, shaken, points, motion, account, len(every))
 
 
 def _acceleration(recording: Recording) -> list[AccelerationBlock]:
@@ -217,12 +198,12 @@ def cleaned_points(scan: SpectrumOfScan) -> SurfacePoints:
 
     Raises ConfigurationError if the points are not those analysed.
     """
-    if len(scan.points) != len(scan.studied.signal):
+    if len(scan.read.points) != len(scan.studied.signal):
         raise ConfigurationError(
             f"{scan.studied.signal.name!r}: its trigger counter restarted, so that its heights "
             "are not those analysed; give a scan in one piece"
         )
-    return replace(scan.points, height=scan.points.height - scan.removed)
+    return replace(scan.read.points, height=scan.read.points.height - scan.removed)
 
 
 def exposure_of(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> Exposure | None:
@@ -258,7 +239,11 @@ def _scan_facts(
     turn, minutes = studied.coordinates.get(TURN), 60.0
     return {
         "name": signal.name,
-        "samples": {"received": scan.received, "analysed": len(signal), "account": scan.account},
+        "samples": {
+            "received": scan.read.received,
+            "analysed": len(signal),
+            "account": scan.read.account,
+        },
         "sample_rate": signal.rate,
         "duration": signal.duration,
         "turns": signal.turns,
@@ -274,7 +259,7 @@ def _scan_facts(
             "rms": studied.spectrum.noise,
             "amplitude": float(np.median(studied.spectrum.amplitude_floor)),
         },
-        "motion": _motion_facts(scan.motion, options.calibration),
+        "motion": _motion_facts(scan.read.motion, options.calibration),
         "accelerometer": _acceleration_facts(studied.acceleration_lines),
         "peaks": [
             _peak_facts(studied, row) | _on_the_part(studied, row, exposure, options.spot)

@@ -36,7 +36,8 @@ class Named(SimpleNamespace):
 
 def scan(name, count, removed=0.25):
     studied = SimpleNamespace(signal=Named(name, count))
-    return SimpleNamespace(studied=studied, points=points(count), removed=np.full(count, removed))
+    read = SimpleNamespace(points=points(count))
+    return SimpleNamespace(studied=studied, read=read, removed=np.full(count, removed))
 
 
 @pytest.fixture

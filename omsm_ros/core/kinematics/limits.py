@@ -92,41 +92,28 @@ def highest_factor(
     now: ``value_at(1)``, if known already
 
     The factor lies between 1 / FASTEST and FASTEST and is never too large; 0 if none is allowed.
-    The method is false position with the Illinois modification, on logarithms, where a power of
-    the factor is a straight line, because each value takes time.
+    It is found by Brent's method on logarithms, where a power of the factor is a straight line.
     """
+    from scipy.optimize import brentq
 
-    def over(value: float) -> float:
-        return float(np.log(max(value / allowed, _TINY)))
+    known: dict[float, float] = {}
 
     def excess(logarithm: float) -> float:
-        return over(value_at(float(np.exp(logarithm))))
+        if logarithm not in known:
+            value = (
+                now if logarithm == 0 and now is not None else value_at(float(np.exp(logarithm)))
+            )
+            known[logarithm] = float(np.log(max(value / allowed, _TINY)))
+        return known[logarithm]
 
-    low = high = 0.0
-    below = above = excess(0.0) if now is None else over(now)
-    if below <= 0:
-        high = float(np.log(FASTEST))
-        if (above := excess(high)) <= 0:
-            return FASTEST
-    else:
-        low = -float(np.log(FASTEST))
-        if (below := excess(low)) > 0:
-            return 0.0
-    stayed = 0
-    while high - low > _PRECISION:
-        middle = low + (high - low) * below / (below - above)
-        found = excess(middle)
-        if found > 0:
-            high, above = middle, found
-            below *= 0.5 if stayed > 0 else 1.0
-            stayed = 1
-        else:
-            low, below = middle, found
-            if found >= -_PRECISION:
-                break
-            above *= 0.5 if stayed < 0 else 1.0
-            stayed = -1
-    return float(np.exp(low))
+    end = float(np.log(FASTEST))
+    low, high = (0.0, end) if excess(0.0) <= 0 else (-end, 0.0)
+    if excess(high) <= 0:
+        return FASTEST
+    if excess(low) > 0:
+        return 0.0
+    brentq(excess, low, high, xtol=_PRECISION / 2)
+    return float(np.exp(max(place for place, over in known.items() if over <= 0)))
 
 
 def speed_limits(

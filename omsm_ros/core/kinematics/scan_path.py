@@ -182,12 +182,9 @@ def _with_small_factors(number: int) -> int:
 def _slow_part(velocity: FloatArray) -> FloatArray:
     """Return the least-squares cubic of ``velocity`` (n,)."""
     along = np.linspace(-1.0, 1.0, len(velocity))
-    part = np.zeros(len(velocity))
-    for degree in range(min(4, len(velocity))):
-        basis = np.asarray(np.polynomial.legendre.Legendre.basis(degree)(along), np.float64)
-        # Fitted to the remainder each time, because the basis is only nearly orthogonal.
-        part += basis * (basis @ (velocity - part) / (basis @ basis))
-    return part
+    legendre = np.polynomial.legendre
+    degree = min(3, len(velocity) - 1)
+    return np.asarray(legendre.legval(along, legendre.legfit(along, velocity, degree)), np.float64)
 
 
 def steepest(z: FloatArray, sample_period: float, content: float) -> tuple[float, float, float]:

@@ -39,8 +39,8 @@ class RemovedVibration:
 
     frequency: of the line;  apparent: in the heights [Hz];  outcome: REMOVED, or why it was not
     amplitude: of the removed part;  uncertainty: standard, of that amplitude [m]
-    left: amplitude that remains at the apparent frequency, with the noise there [m]
-    gain: height over ``a/ω²`` [1];  phase: [rad];  significance: [σ]
+    left: largest amplitude within four resolutions of the apparent frequency, noise included [m]
+    gain: height over ``a/ω²`` [1];  significance: [σ]
     clock_ppm: by which the clock of the accelerometer is fast
     """
 
@@ -51,7 +51,6 @@ class RemovedVibration:
     uncertainty: float = 0.0
     left: float = 0.0
     gain: float = 0.0
-    phase: float = 0.0
     significance: float = 0.0
     clock_ppm: float = 0.0
     removed: FloatArray = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -149,13 +148,14 @@ def _fitted(
     gain = amplitude / size
     is_there = sure >= _LEAST_SIGMA and _LEAST_GAIN <= gain <= _GREATEST_GAIN
     left = heights - removed if is_there else heights
-    wave = np.exp(-2j * np.pi * seen * time)
+    around = seen + np.arange(-4.0, 4.5, 0.5) * scan.resolution(TIME)
+    remaining = [2 * abs(np.mean(left * np.exp(-2j * np.pi * f * time))) for f in around]
     return RemovedVibration(
         frequency=frequency, apparent=seen,
         outcome=REMOVED if is_there else NOT_IN_HEIGHTS,
         amplitude=amplitude if is_there else 0.0, uncertainty=sigma,
-        left=float(2 * abs(np.mean(left * wave))),
-        gain=gain, phase=float(np.arctan2(solution[1], solution[0])), significance=sure,
+        left=float(max(remaining)),
+        gain=gain, significance=sure,
         clock_ppm=1e6 * shift / frequency,
         removed=np.asarray(removed) if is_there else np.zeros(0),
     )  # fmt: skip
