@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from omsm_ros import __version__
@@ -27,6 +27,7 @@ from omsm_ros.cli.command import (
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import Origin
 from omsm_ros.core.calibration.typed_json import from_json
+from omsm_ros.core.estimation.equivalent_time import fast_mode
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, HOLDS
 from omsm_ros.core.estimation.preparation import joined_recordings
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
@@ -105,6 +106,8 @@ def _declare(add: Arguments) -> None:
         default={},
         metavar="JSON",
     )
+    add("--equivalent-time", None, "find a mode beyond half the sampling rate from the edges, if "
+        "they are sharp and start at different fractions of a sample")  # fmt: skip
     _declare_use(add)
     add.trigger()
     add("--report", "DIR", "write the certificate, or the model's page")
@@ -162,6 +165,9 @@ def _identify(args: argparse.Namespace) -> Facts:
     path = output_path_for(args.out, facts["verdict"])
     save_calibration(path, calibration)
     facts["calibration"] = str(path)
+    if args.equivalent_time:
+        mode = fast_mode(motion)
+        facts["equivalent_time"] = {**asdict(mode), "finding": str(mode.finding)}
     facts["warnings"] = [
         *facts["warnings"],
         *record_in_catalogue(
@@ -352,6 +358,8 @@ def _show(facts: Facts) -> None:
             rows.append((f"gain of {name.upper()}", f"{text} (k = 1)"))
         if facts["polarity"] == -1:
             rows.append(("distance", _RISES))
+    if "equivalent_time" in facts:
+        rows.append(("edges", facts["equivalent_time"]["finding"]))
     for kind in ("reasons", "reservations", "warnings"):
         rows += [(kind.removesuffix("s"), text) for text in facts.get(kind, [])]
     rows.append(written([facts.get("calibration") or facts["model"]]))

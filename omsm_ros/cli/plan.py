@@ -38,6 +38,8 @@ def _declare_plan(add: Arguments) -> None:
     steps("--dwell", DWELL, "time from edge to edge [s]; four times the dwell halves the "
           "undetected creep", default=PLANNED_DWELL_S)  # fmt: skip
     steps("--rise", RISE, "rise time of an edge [s]", default=20e-3)
+    steps("--sharp", None, "edges as sharp as the axis makes them, for 'omsm identify "
+          "--equivalent-time' alone: as a calibration they mislead")  # fmt: skip
     steps("--half-range", STEP, "half the measuring range of the probe [m]", default=50e-6)
     _declare_scans(add.group("scans"))
 
@@ -54,6 +56,7 @@ def _plan_steps(args: argparse.Namespace) -> Facts:
         count=args.count,
         dwell=args.dwell,
         rise=args.rise,
+        sharp=args.sharp,
         half_range=args.half_range,
     )
     csv, gcode = args.out / "steps.csv", args.out / "steps.nc"

@@ -21,6 +21,31 @@ TEMPLATES: dict[str, str] = {
         "{samples} samples are too few to identify anything; record at least {least}, a step test "
         "takes about ten seconds"
     ),
+    # Equivalent time.
+    "estimation.few_edges": (
+        "mode in equivalent time: {edges} edges, expected {least} or more; run a longer step test"
+    ),
+    "estimation.other_axis": (
+        "mode in equivalent time: not evaluated. The encoder's edges deviate by {misfit:.1f} times "
+        "their noise from an axis of second order that follows an S-curve"
+    ),
+    "estimation.not_dithered": (
+        "mode in equivalent time: not evaluated. The edges leave {gap:%} of the sample period "
+        "without a start; run the edges of 'omsm plan steps', which are dithered, and trigger "
+        "independently of the controller's cycle"
+    ),
+    "estimation.fast_mode": (
+        "mode in equivalent time: {frequency:Hz/5} ± {frequency_uncertainty:Hz/2}, damping ratio "
+        "{damping:.4f} ± {damping_uncertainty:.4f} (k = 1, noise alone; χ² falls by {fall:.0f})"
+    ),
+    "estimation.doubtful_fast_mode": (
+        "mode in equivalent time: {frequency:Hz/5} ± {frequency_uncertainty:Hz/2}, but reduced χ² "
+        "is {reduced_chi_squared:.1f}: the response is not one mode and a real pole"
+    ),
+    "estimation.no_fast_mode": (
+        "mode in equivalent time: not resolved. The edges do not excite one, or its frequency is "
+        "known to {frequency_uncertainty:Hz/2} only (χ² falls by {fall:.0f}); give a shorter --rise"
+    ),
     # Preparation.
     "estimation.unknown_input": "input {input!r}, expected 'encoder' or 'reference'",
     "estimation.no_reference": (

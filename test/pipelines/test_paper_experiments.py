@@ -37,6 +37,8 @@ def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path):
     settled = np.array(facts["settled"])
     assert abs(np.diff(settled)) == pytest.approx(np.full(20, 78.7e-9), abs=3e-9)
     assert np.ptp(settled) == pytest.approx(787e-9, rel=0.01)
+    # The poles of Eq. 12 are at 804.0 Hz.
+    assert abs(facts["mode"][0] - 804.0) < 4 * facts["mode"][1] < 12
     with bags.BagReader(tmp_path / "s/steps.mcap") as bag:
         held = {topic.topic: topic.messages for topic in bag.topics()}
     assert held[bags.REFERENCE_TOPIC] == held[bags.DISTANCE_TOPIC] > 0

@@ -248,6 +248,7 @@ def plan_steps(
     dwell: float = 0.5,
     rise: float = 20e-3,
     half_range: float = 50e-6,
+    sharp: bool = False,
 ) -> StepPlan:
     """Return ``count`` steps up and as many down, dithered within ``sample_period`` [s].
 
@@ -257,11 +258,14 @@ def plan_steps(
     step: [m];  second_step: height of every other step [m], None for equal steps; two heights
         separate non-linearity (backlash, friction, stiffening) from linear dynamics
     dwell: from edge to edge [s], as long as the slowest relaxation to be separated from gain
+    sharp: edges rise within a tenth of a sample, for a mode in equivalent time alone
     rise: of an edge [s];  half_range: of the probe [m], which must include the whole travel
 
     Raises ConfigurationError for a plan that the probe or the sampling cannot follow.
     """
-    if rise < _LEAST_RISE_SAMPLES * sample_period:
+    if sharp:
+        rise = sample_period / 10
+    elif rise < _LEAST_RISE_SAMPLES * sample_period:
         raise ConfigurationError(
             "kinematics.rise",
             rise=rise,

@@ -1,0 +1,201 @@
+"""Find a mode beyond half the sampling rate from sharp edges at different fractions of a sample.
+
+Edges that start at other fractions of the sample period are sampled at other times since their
+start: together they are one edge on a finer grid (equivalent-time sampling). The starts are fitted
+to the encoder, through an axis of second order that follows an S-curve; a free curve through the
+samples would absorb errors of the starts that repeat with the sample period.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from omsm_ros.core.estimation.steps import Edge, find_steps
+from omsm_ros.core.kinematics.trajectories import s_curve
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.motion_record import MotionRecord
+from omsm_ros.errors import Notice
+from omsm_ros.linear_algebra import least_squares
+
+# Samples of an edge before and after the middle of its height, and those of the level before it.
+_BEFORE, _AFTER, _LEVEL = 15, 45, slice(-30, -6)
+# Values of the fine grid in a sample period: cubics between them are exact to 1e-6.
+_FINE = 50
+_LEAST_EDGES = 8
+# Largest part of the sample period without an edge, and encoder residual over its noise.
+_LARGEST_GAP, _MOST_MISFIT = 0.3, 3.0
+# Start of the search: axis [Hz] and rise [s]; mode [Hz], damping, and a real pole [rad/s].
+_AXES = ((50.0, 2e-4), (200.0, 2e-4), (100.0, 5e-3))
+_MODES_HZ = (150.0, 250.0, 400.0, 600.0, 800.0, 1000.0, 1300.0, 1800.0)
+_REAL = (600.0, 6000.0, 40_000.0)
+# Fall of χ² by the mode, and relative uncertainty of its frequency, from which it is there.
+_LEAST_FALL, _MOST_UNCERTAIN = 25.0, 0.2
+# Damping ratio from which two poles are no resonance.
+_MOST_DAMPED = 0.9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FastMode:
+    """Mode from edges in equivalent time; each uncertainty is k = 1, of noise alone.
+
+    finding: what was found, or why nothing is known
+    frequency: [Hz];  damping: ratio [1];  fall: of χ² by the mode
+    reduced_chi_squared: of the probe, against its noise between the edges
+    """
+
+    finding: Notice
+    frequency: float = float("nan")
+    frequency_uncertainty: float = float("nan")
+    damping: float = float("nan")
+    damping_uncertainty: float = float("nan")
+    fall: float = 0.0
+    reduced_chi_squared: float = float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class _Edges:
+    """Normalised edges (e, n): place [samples], encoder and probe [1]; their noise over height."""
+
+    place: FloatArray
+    encoder: FloatArray
+    probe: FloatArray
+    encoder_noise: float
+    probe_noise: float
+    half: FloatArray
+
+
+def fast_mode(record: MotionRecord) -> FastMode:
+    """Return the mode that sharp, dithered edges of a step test show.
+
+    Raises StepTestError for a record without motion.
+    """
+    period, steps = record.sample_period, find_steps(record.z, record.sample_period)
+    whole = [e for e in steps.edges if e.start >= 40 and e.start + 80 < len(record)]
+    if len(whole) < _LEAST_EDGES:
+        return FastMode(
+            finding=Notice("estimation.few_edges", edges=len(whole), least=_LEAST_EDGES)
+        )
+    edges = _normalised(record, whole)
+    grid = np.arange(-_BEFORE * _FINE, _AFTER * _FINE) / _FINE
+    command, start, misfit = _axis(edges, grid, period)
+    phase = np.sort(start % 1)
+    gap = float(np.max(np.diff(np.r_[phase, phase[0] + 1])))
+    if misfit > _MOST_MISFIT:
+        return FastMode(finding=Notice("estimation.other_axis", misfit=misfit))
+    if gap > _LARGEST_GAP:
+        return FastMode(finding=Notice("estimation.not_dithered", gap=gap))
+    return _mode(edges, grid, command, edges.place - start[:, np.newaxis], period)
+
+
+def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
+    place, encoder, probe, half, noise = [], [], [], [], []
+    for edge in edges:
+        level = slice(edge.start + _LEVEL.start, edge.start + _LEVEL.stop)
+        u = (record.z - np.mean(record.z[level])) / edge.height
+        y = -(record.distance - np.nanmean(record.distance[level])) / edge.height
+        first = edge.start - 1 + int(np.argmax(u[edge.start - 1 : edge.stop + 1] >= 0.5))
+        samples = np.arange(first - _BEFORE, first + _AFTER)
+        half.append(first - 1 + (0.5 - u[first - 1]) / (u[first] - u[first - 1]))
+        place.append(samples)
+        encoder.append(u[samples])
+        probe.append(np.where(record.ok[samples], y[samples], np.nan))
+        noise.append((np.std(u[level]), np.nanstd(y[level])))
+    of_encoder, of_probe = np.sqrt(np.mean(np.square(noise), axis=0))
+    return _Edges(
+        np.array(place, np.float64), np.array(encoder), np.array(probe),
+        float(of_encoder), float(of_probe), np.array(half),
+    )  # fmt: skip
+
+
+def _axis(edges: _Edges, grid: FloatArray, period: float) -> tuple[FloatArray, FloatArray, float]:
+    """Return the edge on ``grid`` [samples], the starts (e,), and the residual over its noise."""
+    from scipy import optimize, signal
+    from scipy.interpolate import CubicSpline
+
+    step = period / _FINE
+    start = edges.half - 1.5
+
+    def edge(q: FloatArray) -> FloatArray:
+        omega, damping, rise = np.exp(q)
+        moved = s_curve(np.clip(grid * period / rise, 0.0, 1.0))
+        system = ([omega**2], [1.0, 2 * damping * omega, omega**2])
+        b, a, _ = signal.cont2discrete(system, step, "foh")
+        return np.asarray(signal.lfilter(b.ravel(), a, moved))
+
+    def residual(q: FloatArray) -> FloatArray:
+        nonlocal start
+        curve = CubicSpline(grid, edge(q))
+        slope = curve.derivative()
+        for _ in range(6):
+            at = np.clip(edges.place - start[:, np.newaxis], grid[0], grid[-1])
+            left, along = edges.encoder - curve(at), slope(at)
+            move = np.sum(left * along, axis=1) / np.maximum(np.sum(along**2, axis=1), 1e-12)
+            start = np.clip(start - move, edges.half - 30, edges.half + 3)
+        return np.asarray(left.ravel())
+
+    found = []
+    for frequency, rise in _AXES:
+        start = edges.half - 1.5 - rise / period / 2
+        first = np.log([2 * np.pi * frequency, 1.0, rise])
+        bounds = np.log([30.0, 0.2, period / 20]), np.log([2e4, 5.0, 0.05])
+        made = optimize.least_squares(residual, first, bounds=bounds, diff_step=1e-4)
+        residual(made.x)
+        found.append((made.cost, edge(made.x), start))
+    cost, curve, start = min(found, key=lambda one: one[0])
+    rms = np.sqrt(2 * cost / edges.encoder.size)
+    return curve, start, float(rms / max(edges.encoder_noise, 1e-9))
+
+
+def _mode(
+    edges: _Edges, grid: FloatArray, command: FloatArray, place: FloatArray, period: float
+) -> FastMode:
+    from scipy import optimize, signal
+    from scipy.interpolate import CubicSpline
+
+    known = np.isfinite(edges.probe)
+    at, seen = np.clip(place[known], grid[0], grid[-1]), edges.probe[known]
+    step = period / _FINE
+
+    def through(pole: complex) -> list[FloatArray]:
+        """Return the edge through 1/(s - p), linear between values of the grid."""
+        grown = np.exp(pole * step)
+        end = (grown - 1 - pole * step) / (pole**2 * step)
+        b = abs(pole) * np.array([end, (grown - 1) / pole - end])
+        moved = CubicSpline(grid, signal.lfilter(b, [1.0, -grown], command + 0j))(at)
+        return [moved.real, moved.imag] if pole.imag else [moved.real]
+
+    fixed = [np.ones(len(at)), CubicSpline(grid, command)(at)]
+
+    def residual(p: FloatArray, with_mode: bool = True) -> FloatArray:
+        omega, damping = 2 * np.pi * np.exp(p[0]), p[1]
+        pole = omega * complex(-damping, np.sqrt(1 - damping**2))
+        parts = [*fixed, *through(complex(-np.exp(p[2])))]
+        columns = np.column_stack([*parts, *(through(pole) if with_mode else [])])
+        return np.asarray((seen - columns @ least_squares(columns, seen)) / edges.probe_noise)
+
+    tried = [np.array([np.log(f), 0.2, np.log(a)]) for f in _MODES_HZ for a in _REAL]
+    start = min(tried, key=lambda p: float(np.sum(residual(p) ** 2)))
+    bounds = [np.log(30.0), 1e-3, np.log(10.0)], [np.log(2.5 / period), 0.98, np.log(1e6)]
+    best = optimize.least_squares(residual, start, bounds=bounds)
+    alone = [
+        optimize.least_squares(lambda a: residual(np.array([0.0, 0.5, a[0]]), False), [np.log(a)])
+        for a in _REAL
+    ]
+    without = 2 * min(one.cost for one in alone)
+    reduced = 2 * best.cost / (len(seen) - 8)
+    spread = np.linalg.pinv(best.jac.T @ best.jac) * max(reduced, 1.0)
+    frequency = float(np.exp(best.x[0]))
+    values = {
+        "frequency": frequency,
+        "frequency_uncertainty": frequency * float(spread[0, 0] ** 0.5),
+        "damping": float(best.x[1]),
+        "damping_uncertainty": float(spread[1, 1] ** 0.5),
+        "fall": float((without - 2 * best.cost) / max(reduced, 1.0)),
+        "reduced_chi_squared": float(reduced),
+    }
+    is_there = values["fall"] > _LEAST_FALL and spread[0, 0] ** 0.5 < _MOST_UNCERTAIN
+    is_there = is_there and values["damping"] < _MOST_DAMPED
+    code = "estimation.fast_mode" if is_there else "estimation.no_fast_mode"
+    if is_there and reduced > _MOST_MISFIT:
+        code = "estimation.doubtful_fast_mode"
+    return FastMode(finding=Notice(code, **values), **values)
