@@ -44,7 +44,8 @@ TEMPLATES: dict[str, str] = {
     ),
     "estimation.no_fast_mode": (
         "mode in equivalent time: not resolved. The edges do not excite one, or its frequency is "
-        "known to {frequency_uncertainty:Hz/2} only (χ² falls by {fall:.0f}); give a shorter --rise"
+        "known to {frequency_uncertainty:Hz/2} only (χ² falls by {fall:.0f}); give --sharp to "
+        "omsm plan steps"
     ),
     # Preparation.
     "estimation.unknown_input": "input {input!r}, expected 'encoder' or 'reference'",

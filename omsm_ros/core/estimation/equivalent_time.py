@@ -146,56 +146,65 @@ def _axis(edges: _Edges, grid: FloatArray, period: float) -> tuple[FloatArray, F
     return curve, start, float(rms / max(edges.encoder_noise, 1e-9))
 
 
+@dataclass(frozen=True, eq=False)
+class _ProbeFit:
+    """Probe at places ``at`` (m,) [samples] of the edge ``command`` on ``grid``, over its noise."""
+
+    at: FloatArray
+    seen: FloatArray
+    grid: FloatArray
+    command: FloatArray
+    step: float
+
+    def _through(self, pole: complex) -> list[FloatArray]:
+        """Return the edge through 1/(s - p), linear between values of the grid."""
+        from scipy import signal
+        from scipy.interpolate import CubicSpline
+
+        grown = np.exp(pole * self.step)
+        end = (grown - 1 - pole * self.step) / (pole**2 * self.step)
+        b = abs(pole) * np.array([end, (grown - 1) / pole - end])
+        moved = CubicSpline(self.grid, signal.lfilter(b, [1.0, -grown], self.command + 0j))(self.at)
+        return [moved.real, moved.imag] if pole.imag else [moved.real]
+
+    def residual(self, p: FloatArray) -> FloatArray:
+        """Return the residual (m,) at p: log of a real pole [rad/s]; log frequency and damping."""
+        parts = [np.ones(len(self.at)), np.interp(self.at, self.grid, self.command)]
+        parts += self._through(complex(-np.exp(p[0])))
+        if len(p) > 1:
+            damping = p[2]
+            omega = 2 * np.pi * np.exp(p[1])
+            parts += self._through(omega * complex(-damping, np.sqrt(1 - damping**2)))
+        columns = np.column_stack(parts)
+        return np.asarray(self.seen - columns @ least_squares(columns, self.seen))
+
+
 def _mode(
     edges: _Edges, grid: FloatArray, command: FloatArray, place: FloatArray, period: float
 ) -> FastMode:
-    from scipy import optimize, signal
-    from scipy.interpolate import CubicSpline
+    from scipy import optimize
 
     known = np.isfinite(edges.probe)
-    at, seen = np.clip(place[known], grid[0], grid[-1]), edges.probe[known]
-    step = period / _FINE
-
-    def through(pole: complex) -> list[FloatArray]:
-        """Return the edge through 1/(s - p), linear between values of the grid."""
-        grown = np.exp(pole * step)
-        end = (grown - 1 - pole * step) / (pole**2 * step)
-        b = abs(pole) * np.array([end, (grown - 1) / pole - end])
-        moved = CubicSpline(grid, signal.lfilter(b, [1.0, -grown], command + 0j))(at)
-        return [moved.real, moved.imag] if pole.imag else [moved.real]
-
-    fixed = [np.ones(len(at)), CubicSpline(grid, command)(at)]
-
-    def residual(p: FloatArray, with_mode: bool = True) -> FloatArray:
-        omega, damping = 2 * np.pi * np.exp(p[0]), p[1]
-        pole = omega * complex(-damping, np.sqrt(1 - damping**2))
-        parts = [*fixed, *through(complex(-np.exp(p[2])))]
-        columns = np.column_stack([*parts, *(through(pole) if with_mode else [])])
-        return np.asarray((seen - columns @ least_squares(columns, seen)) / edges.probe_noise)
-
-    tried = [np.array([np.log(f), 0.2, np.log(a)]) for f in _MODES_HZ for a in _REAL]
+    at = np.clip(place[known], grid[0], grid[-1])
+    seen = edges.probe[known] / edges.probe_noise
+    residual = _ProbeFit(at, seen, grid, command, period / _FINE).residual
+    tried = [np.array([np.log(a), np.log(f), 0.2]) for f in _MODES_HZ for a in _REAL]
     start = min(tried, key=lambda p: float(np.sum(residual(p) ** 2)))
-    bounds = [np.log(30.0), 1e-3, np.log(10.0)], [np.log(2.5 / period), 0.98, np.log(1e6)]
+    bounds = [np.log(10.0), np.log(30.0), 1e-3], [np.log(1e6), np.log(2.5 / period), 0.98]
     best = optimize.least_squares(residual, start, bounds=bounds)
-    alone = [
-        optimize.least_squares(lambda a: residual(np.array([0.0, 0.5, a[0]]), False), [np.log(a)])
-        for a in _REAL
-    ]
-    without = 2 * min(one.cost for one in alone)
+    without = min(2 * optimize.least_squares(residual, [np.log(a)]).cost for a in _REAL)
     reduced = 2 * best.cost / (len(seen) - 8)
-    spread = np.linalg.pinv(best.jac.T @ best.jac) * max(reduced, 1.0)
-    frequency = float(np.exp(best.x[0]))
+    sigma = np.sqrt(np.diag(np.linalg.pinv(best.jac.T @ best.jac)) * max(reduced, 1.0)).tolist()
+    frequency, damping = float(np.exp(best.x[1])), float(best.x[2])
     values = {
         "frequency": frequency,
-        "frequency_uncertainty": frequency * float(spread[0, 0] ** 0.5),
-        "damping": float(best.x[1]),
-        "damping_uncertainty": float(spread[1, 1] ** 0.5),
+        "frequency_uncertainty": frequency * sigma[1],
+        "damping": damping,
+        "damping_uncertainty": sigma[2],
         "fall": float((without - 2 * best.cost) / max(reduced, 1.0)),
         "reduced_chi_squared": float(reduced),
     }
-    is_there = values["fall"] > _LEAST_FALL and spread[0, 0] ** 0.5 < _MOST_UNCERTAIN
-    is_there = is_there and values["damping"] < _MOST_DAMPED
-    code = "estimation.fast_mode" if is_there else "estimation.no_fast_mode"
-    if is_there and reduced > _MOST_MISFIT:
-        code = "estimation.doubtful_fast_mode"
+    code = "estimation.fast_mode" if reduced <= _MOST_MISFIT else "estimation.doubtful_fast_mode"
+    if values["fall"] <= _LEAST_FALL or sigma[1] >= _MOST_UNCERTAIN or damping >= _MOST_DAMPED:
+        code = "estimation.no_fast_mode"
     return FastMode(finding=Notice(code, **values), **values)

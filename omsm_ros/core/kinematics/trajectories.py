@@ -266,12 +266,8 @@ def plan_steps(
     if sharp:
         rise = sample_period / 10
     elif rise < _LEAST_RISE_SAMPLES * sample_period:
-        raise ConfigurationError(
-            "kinematics.rise",
-            rise=rise,
-            period=sample_period,
-            least=_LEAST_RISE_SAMPLES * sample_period,
-        )
+        least = _LEAST_RISE_SAMPLES * sample_period
+        raise ConfigurationError("kinematics.rise", rise=rise, period=sample_period, least=least)
     upward = np.where(np.arange(count) % 2, step if second_step is None else second_step, step)
     travel = float(np.sum(upward))
     if travel > 2 * half_range:
