@@ -166,7 +166,7 @@ def _identify(args: argparse.Namespace) -> Facts:
     save_calibration(path, calibration)
     facts["calibration"] = str(path)
     if args.equivalent_time:
-        mode = fast_mode(motion)
+        mode = fast_mode(motions[0])
         facts["equivalent_time"] = {**asdict(mode), "finding": str(mode.finding)}
     facts["warnings"] = [
         *facts["warnings"],

@@ -29,7 +29,7 @@ def figure(facts, name):
     return float(row["ratio"]), row["ours"]
 
 
-def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path):
+def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path, capsys):
     """Fig. 6: 2.288 µm by integration of a critically damped 200 Hz axis through Eq. 12."""
     facts = run_experiment("steps", tmp_path / "s")
     assert facts["peak"] == pytest.approx(2.288e-6, rel=0.02)
@@ -37,8 +37,12 @@ def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path):
     settled = np.array(facts["settled"])
     assert abs(np.diff(settled)) == pytest.approx(np.full(20, 78.7e-9), abs=3e-9)
     assert np.ptp(settled) == pytest.approx(787e-9, rel=0.01)
-    # The poles of Eq. 12 are at 804.0 Hz.
+    # The poles of Eq. 12 are at 804.0 Hz; the command finds them in the bag, and rejects its edges.
     assert abs(facts["mode"][0] - 804.0) < 4 * facts["mode"][1] < 12
+    recording, out = str(tmp_path / "s/sharp_steps.mcap"), str(tmp_path / "cal.json")
+    cli.main(["identify", recording, "--out", out, "--equivalent-time", "--json"])
+    found = json.loads(capsys.readouterr().out)["equivalent_time"]
+    assert [found["frequency"], found["frequency_uncertainty"]] == pytest.approx(facts["mode"])
     with bags.BagReader(tmp_path / "s/steps.mcap") as bag:
         held = {topic.topic: topic.messages for topic in bag.topics()}
     assert held[bags.REFERENCE_TOPIC] == held[bags.DISTANCE_TOPIC] > 0
