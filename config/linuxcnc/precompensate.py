@@ -17,6 +17,7 @@ from behind import commanded
 
 from omsm_ros.core.adjustment import ScanDesign
 from omsm_ros.core.kinematics.planner import plan_path
+from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
 from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
@@ -110,8 +111,7 @@ def precompensated(path, duration, taps, calibration=None):
 
 def predicted(plan, path, taps, calibration=None):
     """Return the rms [m] by which the encoder, or the probe, will be off the path."""
-    # The planner's position at the end of a cycle is that of the middle of the cycle before.
-    time = (np.arange(int(plan.time[-1] / CYCLE_S)) + 0.5) * CYCLE_S
+    time = np.arange(int(plan.time[-1] / CYCLE_S)) * CYCLE_S
     z = plan.motion(time)[1]
     moved = np.convolve(z - z[0], taps)[: len(z)] + taps.sum() * z[0]
     if calibration:
@@ -142,6 +142,10 @@ def main(command, steps, surface, rpm, radius, turns, out, calibration=None):
     Path(out).write_text(path_gcode(plan, [f"precompensated scan at {rpm:g} rpm"]))
     before, after = (predicted(p, path, taps, known) for p in (plain, plan))
     print(f"off the path: {before * 1e9:.4g} nm rms before, {after * 1e9:.4g} nm after, predicted")
+    if known:
+        speed = float(np.std(np.diff(plan.height) / plan.segment))
+        lag = 2 * low_frequency_delay_uncertainty(known.dynamics, known.covariance)
+        print(f"and {speed * lag * 1e9:.3g} nm (k = 2) for a lag known to {lag * 1e6:.2g} µs")
     print(f"acceleration of Z at most {worst:.3g} m/s²")
     return plain, plan, before, after
 

@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,11 +24,14 @@ from omsm_ros.io.bags import BagReader
 from omsm_ros.io.gcode_file import steps_gcode
 from omsm_ros.pipelines.plan_scans import scan_path, scan_program, write_scans
 from omsm_ros.pipelines.record_device import record_device
+from omsm_ros.pipelines.record_twin import write_nominal, write_recording
 from omsm_ros.twin.cell import Cell, record
+from omsm_ros.twin.disturbances import Disturbances
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "config" / "linuxcnc"))
 import behind
 import demo
+import precompensate
 import start
 
 REAL = pytest.mark.skipif(bool(start.missing()), reason=start.missing())
@@ -51,6 +55,11 @@ def test_a_program_is_executed_as_planned_and_no_cycle_is_lost(tmp_path):
     assert judged["within"]
     assert judged["rate"] == pytest.approx(2 * np.pi, rel=1e-3)
     assert judged["rate_rms"] < 0.02 * 2 * np.pi
+    axes, _ = behind.commanded(tmp_path / "command.mcap")
+    time_ = (axes.c - path.c[0]) / (2 * np.pi)
+    inner = (time_ > 0.1) & (time_ < path.time[-1] - 0.1)
+    off = (axes.z - path.motion(time_)[1])[inner]
+    assert np.max(np.abs(off)) < 1e-10  # the planner is known
     found = behind.behind(tmp_path / "command.mcap", None, Cell(), PAPER_MIRROR, 0.0)
     # The reading is what the twin's truth says, within its noise and resolution.
     truth = Cell().probe.scale * (found.surface_height - found.probe_motion)
@@ -144,13 +153,49 @@ class Wave:
         return AxisPositions(zero, zero, z, zero, zero)
 
 
-def test_a_motion_in_servo_cycles_is_the_motion():
-    time_ = np.arange(1000) * 1e-3
-    zero = np.zeros(1000)
-    block = AxisBlock(
-        stamp_ns=0, first_sample=0, sample_period=1e-3,
-        x=zero, y=zero, z=Wave().positions(time_).z, b=zero, c=zero,
+def in_cycles(axes):
+    """The block of a motion x, y, z, b, c (n,) in servo cycles."""
+    return AxisBlock(
+        stamp_ns=0, first_sample=0, sample_period=1e-3, **dict(zip("xyzbc", axes, strict=True))
+    )
+
+
+@pytest.mark.parametrize("rpm", [60.0, 120.0])
+def test_filtered_commands_leave_what_is_predicted(tmp_path, rpm):
+    """The planner is its model here; servo, structure and encoder are the twin's."""
+    cell = Cell(disturbances=Disturbances(servo_bandwidth_hz=200.0))
+    steps = plan_steps(sample_period=1e-3, second_step=3e-6, count=8, dwell=1.0)
+    found = record(cell, steps, Flat())
+    asked = steps.positions(np.arange(len(found.axes)) * 1e-3)
+    command = replace(found, axes=in_cycles((asked.x, asked.y, asked.z, asked.b, asked.c)))
+    write_recording(tmp_path / "steps.mcap", found)
+    write_recording(tmp_path / "command.mcap", command)
+    write_nominal(tmp_path / "mirror.yaml")
+    plain, plan, before, after = precompensate.main(
+        tmp_path / "command.mcap", tmp_path / "steps.mcap", tmp_path / "mirror.yaml",
+        rpm, 12.7e-3, rpm / 20, tmp_path / "out.nc",
     )  # fmt: skip
+
+    def off_the_path(planned):
+        time_ = np.arange(0.0, planned.time[-1], 1e-3)
+        x, z, c = planned.motion(time_)
+        zero = np.zeros_like(x)
+        motion = behind.CommandedMotion(in_cycles((x, zero, z, zero, c)))
+        wanted = PAPER_MIRROR.height(x * np.cos(c), -x * np.sin(c))
+        off = (
+            record(cell, motion, PAPER_MIRROR).truth.slide - wanted[: round(motion.duration / 1e-3)]
+        )
+        return np.std(off[500:-500])
+
+    assert off_the_path(plain) == pytest.approx(before, rel=0.02)
+    assert off_the_path(plan) == pytest.approx(after, rel=0.2)
+    assert after < before / 100
+    assert np.max(np.abs(np.diff(plan.motion(np.arange(0.5, 2.0, 1e-3))[1], 2))) < 1e-6 * 10
+
+
+def test_a_motion_in_servo_cycles_is_the_motion():
+    zero = np.zeros(1000)
+    block = in_cycles((zero, zero, Wave().positions(np.arange(1000) * 1e-3).z, zero, zero))
     sampled = record(Cell(), behind.CommandedMotion(block), Flat())
     direct = record(Cell(), Wave(), Flat())
     inner = slice(50, -10)

@@ -17,8 +17,8 @@ def spiral(rpm, radius=12.7e-3, feed=2e-4):
 
 
 def executed(path, period):
-    """Return z and c of each cycle: segments ramp up, run, ramp down, and overlap."""
-    cycles, ramp = round(path.segment / period), round(path.cycle / period)
+    """Return z and c of each cycle: segments ramp up, run, ramp down, overlap; then cubics."""
+    cycles, ramp = round(path.segment / period), 2 * round(path.cycle / period)
     fine = 64
     n, r = cycles * fine, ramp * fine
     speed = np.convolve(np.full(n, 1.0 / n), np.full(r, 1.0 / r))  # trapezoid of one segment
@@ -27,8 +27,10 @@ def executed(path, period):
     for k, (dz, dc) in enumerate(zip(np.diff(path.z), np.diff(path.c), strict=True)):
         z[k * n : k * n + len(speed)] += dz * speed
         c[k * n : k * n + len(speed)] += dc * speed
-    at = slice(r // 2 + fine, -r, fine)
-    return path.z[0] + np.cumsum(z)[at], path.c[0] + np.cumsum(c)[at]
+    at = slice(r // 2 + fine - 1, -r, fine)
+    kernel = np.array([1.0, 4.0, 1.0]) / 6
+    z, c = (np.convolve(np.cumsum(v)[at], kernel, "valid") for v in (z, c))
+    return path.z[0] + z, path.c[0] + c
 
 
 @pytest.mark.parametrize(("rpm", "bound"), [(30, 100e-9), (60, 100e-9), (120, 300e-9)])
