@@ -49,6 +49,7 @@ def _declare(add: Arguments) -> None:
     )
     add("--override", None, "ignore a settings mismatch (logged)")
     add("--no-report", None, "no page")
+    add.origin()
     add.polarity()
 
 
@@ -72,6 +73,8 @@ def _adjust(args: argparse.Namespace) -> Facts:
             progress=progress,
         )
     facts = adjustment_facts(found, scans, calibration, args.tolerance)
+    if args.origin:
+        facts["origin"] = args.origin
     write_adjustment(args.out, facts, found, scans, report=not args.no_report)
     return {**facts, "out": str(args.out)}
 
@@ -85,7 +88,8 @@ def _show(facts: Facts) -> None:
             ("result", headline(facts)),
             ("verdict", facts["verdict"]["text"]),
             *(("", text) for text in next_steps(facts["verdict"])),
-            *((name, f"{'' if declared.startswith('not') else 'declared '}{declared}, found {found}"
+            *((name, f"{'' if declared.startswith('not') else 'declared '}{declared}, "
+               f"{'' if found.startswith('not') else 'found '}{found}"
                + (f": {status}" if status else ""))
               for name, declared, found, _, status in source_table(facts).rows),
             ("", tested_text(facts)),

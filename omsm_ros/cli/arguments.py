@@ -74,6 +74,24 @@ def json_object(text: str) -> dict[str, object]:
         raise argparse.ArgumentTypeError(str(err)) from err
 
 
+PART_ENTRIES = ("title", "part", "drawing")
+"""Entries of ``--origin`` that belong to a part, not to a calibration."""
+_ORIGINS = (
+    *PART_ENTRIES, "machine", "probe", "probe_serial_number", "target", "temperature_c",
+    "operator", "laboratory", "customer", "method", "traceability",
+)  # fmt: skip
+
+
+def _origin(text: str) -> dict[str, object]:
+    """Parse the title block of a report or certificate; one file serves all commands."""
+    found = json_object(text)
+    if unknown := sorted(set(found) - set(_ORIGINS)):
+        raise argparse.ArgumentTypeError(
+            f"{unknown!r}: unknown entries, expected {', '.join(_ORIGINS)}"
+        )
+    return found
+
+
 def _topics(text: str) -> dict[str, str]:
     known = {relative(topic): topic for topic in TOPIC_TYPES}
     found = dict(part.partition("=")[::2] for part in text.split(","))
@@ -176,6 +194,11 @@ class Arguments:
     def override(self) -> None:
         """Add ``--override``."""
         self("--override", None, "ignore a settings mismatch of the calibration (logged)")
+
+    def origin(self) -> None:
+        """Add ``--origin``, the title block of report or certificate."""
+        self("--origin", _origin, f"title block: {', '.join(_ORIGINS)}", default={},
+             metavar="JSON|FILE.yaml")  # fmt: skip
 
     def unit(self) -> None:
         """Add the unit of files that do not state it."""

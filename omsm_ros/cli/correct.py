@@ -89,6 +89,7 @@ def _declare_correct(add: Arguments) -> None:
     add("--no-report", None, "write cloud and summary only")
     add.polarity()
     add.override()
+    add.origin()
     declare_fit(add, None)
     declare_tolerance(add)
     add.catalogue()
@@ -162,6 +163,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             if args.fit
             else None,
             report=not args.no_report,
+            origin=args.origin,
             progress=progress,
         )
     warnings = record_in_catalogue(args.catalogue, lambda: _keep(args))

@@ -276,6 +276,7 @@ def _declare_form(add: Arguments) -> None:
     add.unit()
     declare_fit(add, (AUTO,))
     declare_tolerance(add)
+    add.origin()
     add("--no-report", None, "write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
         add(
@@ -306,7 +307,7 @@ def _form(args: argparse.Namespace) -> Facts:
             points, surface, out, args.fit, args.aperture, filters, args.tolerance, args.dust
         )
         if not args.no_report:
-            draw_form(source, out)
+            draw_form(source, out, args.origin)
             facts = {**facts, "report": REPORT}
     return {**facts, "out": str(args.out)}
 

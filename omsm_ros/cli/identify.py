@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omsm_ros import __version__
 from omsm_ros.cli.arguments import (
+    PART_ENTRIES,
     TABLE_SUFFIX,
     Arguments,
     cell_of,
@@ -127,14 +128,11 @@ def _declare_use(add: Arguments) -> None:
         UNCERTAINTY,
         "required expanded uncertainty of a height of that scan, k = 2 [m]",
     )
-    add(
-        "--origin",
-        json_object,
-        "entries of the certificate: machine, probe, probe_serial_number, target, "
-        "temperature_c, operator, laboratory, customer, method",
-        default={},
-        metavar="JSON|FILE.yaml",
-    )
+    add.origin()
+
+
+def _of_calibration(origin: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in origin.items() if name not in PART_ENTRIES}
 
 
 def _identify(args: argparse.Namespace) -> Facts:
@@ -155,7 +153,7 @@ def _identify(args: argparse.Namespace) -> Facts:
         settings=settings,
         use=intended_use_of(args.scan, args.accuracy),
         origin=replace(
-            from_json(Origin, args.origin, "origin"),
+            from_json(Origin, _of_calibration(args.origin), "origin"),
             recorded_ns=recorded,
             software=f"omsm_ros {__version__}",
         ),

@@ -1,8 +1,9 @@
 """From a cloud and a nominal surface to ``form.json``."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -180,10 +181,11 @@ def judge_form(
     return facts
 
 
-def draw_form(measured: Path, out: Path) -> None:
+def draw_form(measured: Path, out: Path, origin: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Write the report of a form whose results :func:`judge_form` wrote into ``out``.
 
     measured: file or folder of the measurement; its summary, if any, is part of the report
+    origin: entries of the title block
     """
     # Imported on demand, because loading the figures takes longer than many evaluations.
     from omsm_ros.pipelines.publish import publish_form
@@ -191,7 +193,7 @@ def draw_form(measured: Path, out: Path) -> None:
     folder = measured if measured.is_dir() else measured.parent
     fields_path = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
     summary = read_summary(fields_path) if fields_path and fields_path.is_file() else None
-    publish_form(out, f"Form of {measured.resolve().name}", summary)
+    publish_form(out, f"Form of {measured.resolve().name}", summary, origin)
 
 
 def _deviations(form: FormResult) -> np.ndarray[Any, np.dtype[np.void]]:

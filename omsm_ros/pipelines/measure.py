@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -283,6 +284,7 @@ def measure(
     accuracy: float | None = None,
     register: RegistrationOptions | None = None,
     report: bool = True,
+    origin: Mapping[str, Any] = MappingProxyType({}),
     progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
@@ -293,6 +295,7 @@ def measure(
     by_stamps: see :func:`omsm_ros.pipelines.correct.correct_bag`
     stated: uncertainty sources;  accuracy: required expanded uncertainty, k = 2 [m]
     register: options of a registration to ``nominal``, or None;  report: False writes no report
+    origin: entries of the report's title block
 
     Raises CalibrationError for a calibration that does not match the scan, unless overridden.
     """
@@ -308,6 +311,8 @@ def measure(
         if register is not None and nominal is not None:
             add_form(out, summary, nominal, register)
         add_verdict(summary, done, calibration, judgement, register)
+    if origin:
+        summary["origin"] = dict(origin)
     if report:
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)

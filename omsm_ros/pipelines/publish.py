@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -91,10 +92,11 @@ def publish(
     calibration: Calibration | None,
     figures: Mapping[str, bytes],
     surface: EmbeddedMap | None = None,
+    origin: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write ``report.html`` into ``out``, with the content of ``form.json`` there, if any.
 
-    surface: zoomable map
+    surface: zoomable map;  origin: title block, default: that of the summary
     """
     form = read_form(out / FORM) if (out / FORM).is_file() else {}
     curves = read_curves(out / CURVES) if (out / CURVES).is_file() else {}
@@ -105,18 +107,24 @@ def publish(
             drawn = registered_map(part.x, part.y, part.height, form)
             figures["form_map"] = style.png(drawn)
     date = date_text(datetime.now(timezone.utc))
-    page = render(Report(title, date, summary, calibration, figures, form, curves, surface))
+    block = origin or summary.get("origin") or {}
+    page = render(Report(title, date, summary, calibration, figures, form, curves, surface, block))
     save_text(out / REPORT, page)
 
 
-def publish_form(out: Path, title: str, summary: Mapping[str, Any] | None = None) -> None:
+def publish_form(
+    out: Path,
+    title: str,
+    summary: Mapping[str, Any] | None = None,
+    origin: Mapping[str, Any] = MappingProxyType({}),
+) -> None:
     """Write ``report.html`` of a registered part from its results in ``out``.
 
     summary: of the measurement of its points, if there is one
     """
     part = read_points(out / DEVIATION)
     layer = Layer("registered deviation", part.x, part.y, part.height, "nm")
-    publish(out, title, summary or {}, None, {}, embedded([layer]))
+    publish(out, title, summary or {}, None, {}, embedded([layer]), origin)
 
 
 def publish_spectra(

@@ -1,16 +1,18 @@
 """The page of an adjustment: verdict and figures, the map, sources declared and found."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from omsm_ros.core.adjustment import Adjustment
+from omsm_ros.messages import sentence
 from omsm_ros.readable import NOTHING, count, expanded, plain, quantity
 from omsm_ros.report import style
-from omsm_ros.report.page_parts import Section, StudyPage, fill_study
-from omsm_ros.report.tables import Table
+from omsm_ros.report.page_parts import Section, StudyPage, fill_study, title_block
+from omsm_ros.report.tables import Table, sized
 from omsm_ros.report.verdict import headline, page_verdict
 from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
 
@@ -18,7 +20,7 @@ CAPTIONS = {
     "map": "Form deviation from the nominal surface, pose removed; mean of each cell.",
     "uncertainty": "Standard uncertainty (k = 1) of the map, all sources together.",
     "profiles": "Sections through the map along x, y and 45°, with the band of k = 2.",
-    "agreement": "E_n of each scan against the others: beyond ±1 they disagree.",
+    "agreement": "E_n of each scan against the others: above 1 they disagree.",
     "sources": "Effect on the heights (rms) of what was found; red: refuted declarations.",
 }
 
@@ -28,23 +30,30 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
 
     facts: the content of ``adjustment.json``;  found: from which it was made
     """
+    origin, verdict = facts.get("origin") or {}, page_verdict(facts["verdict"])
     figures = {
         "map": form_map(found),
         "uncertainty": uncertainty_map(found),
         "profiles": profiles(found),
     }
-    if source_table(facts).rows:
-        figures["sources"] = sources(facts)
+    if (drawn := sources(facts)) is not None:
+        figures["sources"] = drawn
     if found.agreement:
         figures["agreement"] = agreement(found)
+    reasons = [(reason,) for reason in verdict.reasons]
     return fill_study(
         StudyPage(
-            title=f"{title}: {headline(facts)}",
+            title=f"{origin.get('title') or title}: {headline(facts)}",
+            block=title_block(origin),
             subtitle="; ".join(_scan_text(scan) for scan in facts["scans"]),
-            verdict=page_verdict(facts["verdict"]),
+            verdict=replace(verdict, reasons=verdict.reasons[:1]),
             sections=(
+                Section("Form", ("map",)),
+                Section("Reasons for the verdict", (), (Table("", (), reasons),)),
                 Section(
-                    "Form", ("map", "uncertainty", "profiles"), (_truth(facts), _figures(facts))
+                    "Uncertainty and sections",
+                    ("uncertainty", "profiles"),
+                    (_truth(facts), _figures(facts)),
                 ),
                 Section(
                     "Sources: declared and found",
@@ -122,7 +131,9 @@ def tested_text(facts: Mapping[str, Any]) -> str:
 def declared_text(source: Mapping[str, Any]) -> str:
     """Return the declared standard uncertainty, or that there is none."""
     declared = source["declared"]
-    return "not declared" if declared is None else quantity(declared, source["unit"])
+    if declared is None:
+        return "not declared"
+    return sized(declared, source["unit"]) if declared else "no effect"
 
 
 def _status(source: Mapping[str, Any]) -> str:
@@ -134,10 +145,11 @@ def _status(source: Mapping[str, Any]) -> str:
 def found_text(source: Mapping[str, Any]) -> str:
     """Return the found value with its uncertainty, or which scan would show it."""
     if not source["identifiable"]:
-        return f"not identifiable; {source['identified_by'].replace('_', ' ')} would show it"
+        wanted = sentence(f"verdict.add_{source['identified_by']}", {})
+        return f"not identifiable; to find it, {wanted}"
     size = float(np.linalg.norm(source["found"]))
     spread = float(np.sqrt(np.mean(np.square(source["uncertainty"]))))
-    return f"{quantity(size, source['unit'])} ± {quantity(spread, source['unit'], 2)}"
+    return f"{sized(size, source['unit'])} ± {sized(spread, source['unit'], 2)}"
 
 
 def _scans(facts: Mapping[str, Any]) -> Table:
@@ -219,17 +231,21 @@ def agreement(found: Adjustment) -> Figure:
     return made
 
 
-def sources(facts: Mapping[str, Any]) -> Figure:
-    """Draw the effects of declared and of significant sources, the largest first."""
+def sources(facts: Mapping[str, Any]) -> Figure | None:
+    """Draw the effects of the sources that were found, the largest first; None without any."""
     rows = sorted(
-        (s for s in facts["sources"] if s["declared"] is not None or s["refuted"]),
-        key=lambda s: -(s["effect"] or 0.0),
-    )[:12]
-    made, axes = style.figure(9.2, 0.9 + 0.32 * max(len(rows), 1))
+        (s for s in facts["sources"] if s["effect"] and s["identifiable"]
+         and (s["declared"] is not None or s["refuted"])),
+        key=lambda s: -s["effect"],
+    )[:12]  # fmt: skip
+    if not rows:
+        return None
+    made, axes = style.figure(9.2, 0.9 + 0.32 * len(rows))
     ax = axes[0, 0]
+    place = ax.get_position()
+    ax.set_position((0.36, place.y0, place.x1 - 0.36, place.height))  # room for the names
     colours = [style.BEFORE if row["refuted"] else style.AFTER for row in rows]
-    sizes = [(row["effect"] or 0.0) / NANOMETRE_M for row in rows]
-    ax.barh(np.arange(len(rows)), sizes, color=colours)
+    ax.barh(np.arange(len(rows)), [row["effect"] / NANOMETRE_M for row in rows], color=colours)
     ax.set_yticks(np.arange(len(rows)), [row["text"] for row in rows])
     ax.invert_yaxis()
     style.label(ax, x="effect on the heights, rms [nm]")

@@ -33,6 +33,22 @@ def fill(template: str, **content: object) -> str:
     return environment.get_template(template).render(**content)
 
 
+_ORIGINS = (
+    "part", "drawing", "customer", "machine", "probe", "probe_serial_number", "target",
+    "temperature_c", "operator", "laboratory", "method", "traceability",
+)  # fmt: skip
+
+
+def title_block(origin: Mapping[str, object], *more: tuple[str, str]) -> list[tuple[str, str]]:
+    """Return the entries of a title block with their names, and ``more`` after them.
+
+    origin: as ``--origin`` gives it, without what is None
+    """
+    named = [(name, origin[name]) for name in _ORIGINS if origin.get(name) is not None]
+    rows = [(name.removesuffix("_c").replace("_", " "), name, value) for name, value in named]
+    return [*((text, f"{v} °C" if n == "temperature_c" else str(v)) for text, n, v in rows), *more]
+
+
 def check_places(figures: Iterable[str], places: Iterable[str]) -> None:
     """Raise ConfigurationError for a figure whose name is not in ``places``."""
     unknown = sorted(set(figures) - set(places))
@@ -114,6 +130,7 @@ class StudyPage:
     """A page of a study: verdict, then sections of figures and tables.
 
     captions, figures: captions and PNG files by name;  narrow: figures placed three in a row
+    block: entries of the title block
     """
 
     title: str
@@ -123,6 +140,7 @@ class StudyPage:
     captions: Mapping[str, str] = field(default_factory=dict)
     figures: Mapping[str, bytes] = field(default_factory=dict)
     narrow: tuple[str, ...] = ()
+    block: Sequence[tuple[str, str]] = ()
     footer: str = ""
 
 

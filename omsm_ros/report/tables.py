@@ -69,18 +69,18 @@ def _budget_row(row: Mapping[str, Any]) -> tuple[str, ...]:
     known = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
     return (
         f"{row['source'].replace('_', ' ')} ({row['says']})",
-        _sized(size, unit),
+        sized(size, unit),
         quantity(row["height"], "m"),
         "none" if row["kind"] == "random" else "all points",
         known,
     )
 
 
-def _sized(size: object, unit: str) -> str:
+def sized(size: object, unit: str, digits: int = 3) -> str:
     """Return a size in its unit; a size without a unit has no SI prefix."""
     if unit == "1":
-        return plain(size) if size is not None else NOTHING
-    return quantity(size, unit)
+        return plain(size, digits) if size is not None else NOTHING
+    return quantity(size, unit, digits)
 
 
 def sample_table(summary: Mapping[str, object]) -> Table:

@@ -1,5 +1,6 @@
 """Effects of the options of ``omsm form`` and ``compensate``, against closed forms."""
 
+import argparse
 import json
 
 import numpy as np
@@ -92,3 +93,18 @@ def test_a_compensation_is_of_the_aperture_alone(facts):
     table = np.loadtxt(out / "compensation.csv", delimiter=",", skiprows=1)
     assert np.max(np.hypot(table[:, 0], table[:, 1])) < 5.2e-3
     assert part["places"] < whole["places"]
+
+
+def test_the_title_block_stands_on_the_page_and_an_unknown_entry_is_named(tmp_path):
+    """The same file serves a report and a certificate."""
+    from omsm_ros.cli.arguments import _origin
+    from omsm_ros.report.measurement.page import Report, render
+
+    file = tmp_path / "origin.yaml"
+    file.write_text("title: First cut\npart: S80-07\ntemperature_c: 20.1\n")
+    page = render(Report("Surface", "today", {}, origin=_origin(str(file))))
+    assert "<h1>First cut</h1>" in page
+    assert "<dt>part</dt><dd>S80-07</dd>" in page
+    assert "<dt>temperature</dt><dd>20.1" in page
+    with pytest.raises(argparse.ArgumentTypeError, match="'pert'"):
+        _origin('{"pert": "S80-07"}')

@@ -39,6 +39,7 @@ class Origin:
 
     recorded_ns: when the recording began [ns, ROS time]
     input: of the identification, "encoder" or "reference"
+    traceability: of encoder, reference sensor and artefacts
     software: name and version;  temperature_c: of the machine [°C];  target: what the probe read
     made_from: id of the file of version 1 that this was read from
     """
@@ -52,6 +53,7 @@ class Origin:
     laboratory: str | None = None
     customer: str | None = None
     method: str | None = None
+    traceability: str | None = None
     software: str | None = None
     input: str | None = None
     recorded_ns: int | None = None

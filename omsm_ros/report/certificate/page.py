@@ -8,6 +8,7 @@ import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedEntry
+from omsm_ros.core.calibration.typed_json import to_json
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,
@@ -22,7 +23,15 @@ from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate import tables
 from omsm_ros.report.certificate.tables import known_rows
-from omsm_ros.report.page_parts import Headline, IssuedPage, Section, fill, picture, present
+from omsm_ros.report.page_parts import (
+    Headline,
+    IssuedPage,
+    Section,
+    fill,
+    picture,
+    present,
+    title_block,
+)
 from omsm_ros.report.response_figures import step_response
 from omsm_ros.report.tables import Table, latency_text, mapping_table
 from omsm_ros.report.verdict import PageVerdict, verdict_text
@@ -207,6 +216,8 @@ def render(certificate: CertificatePage) -> str:
         verdict=verdict_on_calibration(certificate.calibration),
         headlines=headlines(certificate.calibration),
         sections=sections(certificate),
+        block=title_block(to_json(certificate.calibration.certificate.origin)),
+        signer=certificate.calibration.certificate.origin.operator or "",
         band=BAND,
         picture=lambda name: picture(certificate.figures[name]),
         caption=CAPTIONS.__getitem__,
@@ -340,6 +351,7 @@ def sections(page: CertificatePage) -> list[Section]:
     identity = tables.identity_table(calibration, page.source, page.version)
     every = [
         Section("Warnings", (), (Table("", (), warnings),)),
+        *_laboratory(calibration),
         Section(
             "Fit to the recording",
             ("step", "residual"),
@@ -378,9 +390,47 @@ def sections(page: CertificatePage) -> list[Section]:
     return present(every, page.figures)
 
 
+def _laboratory(calibration: Calibration) -> list[Section]:
+    """Return what a laboratory's certificate states: results, method, conditions, validity."""
+    certificate = calibration.certificate
+    origin, validity = certificate.origin, certificate.validity
+    results = []
+    for one in dcc_quantities(calibration):
+        unit = _UNITS[one.unit]
+        value = measured(one.value, (one.expanded or 0.0) / 2, unit).partition(" ±")[0]
+        wide = quantity(one.expanded, unit, 2) if unit else plain(one.expanded, 2)
+        wide = _UNSTATED if one.expanded is None else wide
+        results.append((one.name, value, wide))
+    start = quantity(validity.from_hz or 0.0, "Hz", 2)
+    stated = (
+        ("method", origin.method or "step test on a fixed target; transfer function from encoder "
+         "to probe, doi 10.37188/lam.2025.078"),
+        ("conditions", "; ".join(filter(None, (
+            f"{quantity(origin.temperature_c, '°C', 4)}" if origin.temperature_c else
+            "temperature not stated",
+            f"sample period {quantity(calibration.sample_period, 's', 4)}",
+            "settings as listed under Records" if calibration.settings else "",
+        )))),
+        ("uncertainty", "expanded, k = 2, about 95 %: noise, undetected model errors, motion "
+         "between samples"),
+        ("traceability", origin.traceability or "not stated: lengths are those of the encoder"),
+        ("validity", f"{verdict_text(calibration) or 'no verdict'}; for the settings of the "
+         f"recording, motion from {start} to {quantity(calibration.valid_up_to, 'Hz')}, until "
+         "machine, probe or settings change"),
+    )  # fmt: skip
+    return [
+        Section("Results", (), (Table("", ("value", "U (k = 2)"), results),)),
+        Section("Statements", (), (Table("", ("statement",), stated, prose="statement"),)),
+    ]
+
+
+_UNITS = {r"\second": "s", r"\one": "", r"\hertz": "Hz", r"\radian": "rad"}
 # Shares of the valid band at which gain and phase are stated.
 _DCC_SHARES = (0.01, 0.1, 0.25, 0.5, 0.75, 1.0)
 _UNSTATED = "not stated"
+_ENCODER = (
+    "Lengths are those of the encoder of Z. Its traceability is not part of this certificate."
+)
 
 
 class Quantity(NamedTuple):
@@ -432,6 +482,7 @@ def render_dcc(calibration: Calibration, version: str) -> str:
         laboratory=_word(origin.laboratory),
         customer=_word(origin.customer),
         operator=_word(origin.operator),
+        traceability=_word(origin.traceability or _ENCODER),
         method=_word(origin.method or "step test on a fixed target"),
         verdict=_word(verdict_text(calibration) or "no certificate"),
         temperature=None if warm is None else Quantity(

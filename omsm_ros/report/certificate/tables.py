@@ -258,6 +258,7 @@ _ORIGINS = {
     "laboratory": "laboratory",
     "customer": "customer",
     "method": "method",
+    "traceability": "traceability",
     "software": "software",
     "made_from": "made from",
 }

@@ -19,7 +19,7 @@ from omsm_ros.readable import (
 )
 from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
-from omsm_ros.report.page_parts import Headline, check_places, fill, picture
+from omsm_ros.report.page_parts import Headline, check_places, fill, picture, title_block
 from omsm_ros.report.tables import Table, part
 from omsm_ros.report.verdict import PageVerdict, covered, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
@@ -297,7 +297,7 @@ class Report:
     calibration: of the correction, if any
     figures: PNG files by the names in :data:`CAPTIONS`
     form: the content of ``form.json``, if the part was registered;  curves: of ``curves.json``
-    map: zoomable map
+    map: zoomable map;  origin: entries of the title block, as ``--origin`` gives them
 
     Raises ConfigurationError for a figure of another name.
     """
@@ -310,6 +310,7 @@ class Report:
     form: Mapping[str, Any] = field(default_factory=dict)
     curves: Mapping[str, Any] = field(default_factory=dict)
     map: EmbeddedMap | None = None
+    origin: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_places(self.figures, CAPTIONS)
@@ -321,6 +322,8 @@ def render(report: Report) -> str:
     return fill(
         "report.html",
         report=report,
+        heading=str(report.origin.get("title") or report.title),
+        block=title_block(report.origin),
         on_part=verdict_on_part(report.summary, report.form),
         verdict=_trust_section(report),
         removed=removed_table(report.form),
@@ -387,12 +390,10 @@ def _sections(report: Report) -> list[tuple[str, list[str]]]:
 
 def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
-    verdict = _trust_section(report)
     found = [
         form_table(report.form, report.curves, part(summary, "figures")),
         tables.error_table(summary),
         tables.budget_table(summary),
-        tables.Table("Reasons for the verdict", (), [(reason,) for reason in verdict.reasons]),
         limits_table(summary),
         tables.sample_table(summary),
     ]
