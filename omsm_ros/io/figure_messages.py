@@ -1,16 +1,20 @@
 """Messages of figures to watch and to plot: certificate, account, verdict, probe and vibration."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import PROBE, Calibration
-from omsm_ros.core.ripple.accelerometer import VibrationLevels
 from omsm_ros.core.streams.blocks import Account
 from omsm_ros.io.message_mapping import Messages, header
 from omsm_ros.units import MICROMETRE_M
+
+if TYPE_CHECKING:  # it takes seconds to load, and most nodes do not need it
+    from omsm_ros.core.ripple.accelerometer import VibrationLevels
 
 _PERCENT = 0.01
 # Settings of probes: name as the device reports it, field of the message, its unit in SI.

@@ -40,9 +40,9 @@ from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, publish_o
 from omsm_ros.quantities import Parameter
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# A tenth of a queue; half of the default shared memory of Fast DDS, beyond which it drops messages
-# and sends them again three seconds later.
-_MOST_OPEN, _MOST_OPEN_BYTES = 200, 256 * 1024
+# A tenth of a queue; what the receive buffer of a socket holds on a usual Linux, beyond which it
+# drops messages, and they are sent again later.
+_MOST_OPEN, _MOST_OPEN_BYTES = 200, 128 * 1024
 # A service just discovered may drop a request, or its node is busy [s].
 _RETRY_S = 2.0
 # A subscriber without an answer, and messages not processed, for this time are not waited for; the
@@ -74,8 +74,11 @@ class Listeners:
     lost: messages that a node never processed, by its name;  deaf: nodes without the service
     """
 
-    def __init__(self, node: Node, publishers: Sequence[Publisher], undo: ExitStack) -> None:
-        self._node, self._publishers = node, publishers
+    def __init__(
+        self, node: Node, publishers: Sequence[Publisher], undo: ExitStack, answered: Any = None
+    ) -> None:
+        """answered: called with each answer of a subscriber."""
+        self._node, self._publishers, self._answered = node, publishers, answered
         self._published: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()
         self._listeners: dict[str, _Listener] = {}
@@ -147,6 +150,8 @@ class Listeners:
                 each.last_progress = now
             if each.asked is None and (waiting or not each.taken or self.lost[name]):
                 each.asked = each.client.call_async(Trigger.Request()), now
+                if self._answered is not None:
+                    each.asked[0].add_done_callback(self._answered)
             patience = _PATIENCE_S if each.client.service_is_ready() else _DISCOVERY_S
             if not each.taken and now - each.met > patience:
                 self._give_up(name)
@@ -314,7 +319,8 @@ class PlayerNode(ManagedNode):
         """Play."""
         # Latched messages are not lost, and other nodes may publish them too.
         streams = [p for topic, p in self._offers.items() if topic not in topics.LATCHED_TOPICS]
-        self._listeners = Listeners(self, streams, undo)
+        # An answer makes room at once; a tick later the subscribers would have waited.
+        self._listeners = Listeners(self, streams, undo, lambda _: self._tick())
         self._time = (
             publish_on(self, undo, ClockMessage, "/clock") if self.values["clock"] else None
         )
@@ -365,6 +371,7 @@ class PlayerNode(ManagedNode):
                 break
             self._late = late
             self._publish_next()
+        self._listeners.look()
         self._tell_time(now)
         answered = now - self._asked_at >= _ANSWER_S
         if self._next is None and not self._listeners.pending_listeners and answered:

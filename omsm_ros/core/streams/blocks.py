@@ -283,7 +283,7 @@ class Tally:
 B = TypeVar("B", AxisBlock, DistanceBlock)
 AnyBlock = TypeVar("AnyBlock", bound=Block)
 
-MOST_TOGETHER = 100
+MOST_TOGETHER = 1000
 """Most samples of a joined block; DDS keeps room for the longest message in each queue."""
 
 # Joining moves the stamps of a block onto the line from the first one; this is the most [s].

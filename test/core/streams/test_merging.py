@@ -62,7 +62,10 @@ def test_no_more_than_so_many_samples_become_one_block() -> None:
     z = np.arange(10_250.0) * 1e-6
     blocks = merged(cut(z, [*range(0, 8001, 20), 10_000, 10_250]))
     assert np.array_equal(np.concatenate([block.z for block in blocks]), z)
-    assert [len(block) for block in blocks] == [MOST_TOGETHER] * 80 + [2000, 250]
+    assert [len(block) for block in blocks] == [MOST_TOGETHER] * (8000 // MOST_TOGETHER) + [
+        2000,
+        250,
+    ]
 
 
 @pytest.mark.parametrize("gap", ["count", "stamp", "period"])
