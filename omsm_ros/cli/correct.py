@@ -130,7 +130,7 @@ def _check_options(args: argparse.Namespace) -> None:
 
 def _correct(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
-    nominal = load_surface(args.nominal) if args.nominal else None
+    nominal = load_surface(args.nominal, args.fit or ()) if args.nominal else None
     _check_options(args)
     options = CorrectionOptions(
         polarity=args.polarity,

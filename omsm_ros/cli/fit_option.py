@@ -7,6 +7,7 @@ from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.isolated_points import DustRule
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.core.surface.shape_parameters import SHAPE_PARAMETERS
 from omsm_ros.errors import ConfigurationError, SurfaceError
 from omsm_ros.quantities import COUNTER, TOLERANCE, shown
 from omsm_ros.readable import count, measured
@@ -45,7 +46,8 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     add(
         "--fit",
         dofs,
-        "pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power",
+        "pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power; and unknown "
+        "parameters of the shape: radius, radius_x, radius_y, conic, 'focal length', …",
         default=default,
         metavar="PARAMETERS",
     )
@@ -72,6 +74,7 @@ def declare_tolerance(add: Arguments) -> None:
 
 
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
+_UNITS |= {n: "" if n.startswith("conic") else "m" for n in SHAPE_PARAMETERS}
 
 
 def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
@@ -101,5 +104,6 @@ def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
 def _pose(facts: Facts, name: str) -> str:
     from omsm_ros.report.measurement.page import settled
 
-    value, spread = facts["pose"][name]["value"], settled(facts, name)
+    value = {**facts["pose"], **facts["shape"]}[name]["value"]
+    spread = settled(facts, name)
     return f"{measured(value, spread, _UNITS.get(name, 'rad'))} (k = 1)"

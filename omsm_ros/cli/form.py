@@ -188,6 +188,7 @@ def compensate_form(
     Raises DataError for a wavelength below the points, and where the previous cut went wrong.
     """
     form = measured.form(surface, asked, aperture)
+    surface = form.registration.surface
     found = compensation(form.map, surface, low_pass)
     (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
     share, total = None, found.offset
@@ -288,7 +289,7 @@ def _declare_form(add: Arguments) -> None:
 
 
 def _form(args: argparse.Namespace) -> Facts:
-    surface, filters = load_surface(args.nominal), (args.s_filter, args.l_filter)
+    surface, filters = load_surface(args.nominal, args.fit), (args.s_filter, args.l_filter)
     with result_folder(args.out, MEASUREMENT_FILES if args.calibration else FORM_FILES) as out:
         source = args.measured
         if args.calibration:
@@ -348,7 +349,7 @@ def _declare_compensate(add: Arguments) -> None:
 
 
 def _compensate(args: argparse.Namespace) -> Facts:
-    surface = load_surface(args.nominal)
+    surface = load_surface(args.nominal, args.fit)
     spiral = (args.spiral, int(args.per_turn)) if args.spiral else None
     cut = None
     if args.tool_radius:

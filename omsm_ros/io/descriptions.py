@@ -176,11 +176,18 @@ def _stated(item: Mapping[str, Any]) -> StatedSource:
 MOST_SHAPES, MOST_FRAMES = 50, 3
 _GRID = "grid"
 _INTEGER: Mapping[str, Any] = {"type": "integer"}
+# Value of a parameter that is fitted, where none is stated [m], [1]; the estimate does not keep it.
+_START = 0.1
 _LIST: Mapping[str, Any] = {"type": "array", "maxItems": 1000}
 
 
-def load_surface(path: Path | str) -> Surface:
-    """Read ``SURFACE.yaml``; SurfaceError if it is malformed."""
+def load_surface(path: Path | str, fitted: Sequence[str] = ()) -> Surface:
+    """Read ``SURFACE.yaml``, or take the name of a shape; SurfaceError if it is malformed.
+
+    fitted: parameters that are estimated from points, and need not be stated
+    """
+    if str(path) in SHAPES:
+        return surface_of(_with_starts({"shape": str(path)}, fitted), f"surface {str(path)!r}")
     text = read_text(path, MAX_YAML_BYTES, SurfaceError, "surface")
     what = f"surface {str(path)!r}"
     description = json_and_yaml.mapping_of(text, SurfaceError, what)
@@ -190,7 +197,15 @@ def load_surface(path: Path | str) -> Surface:
             f"{what} has {shapes} shapes and {frames} turned frames within one another, expected "
             f"at most {MOST_SHAPES} and {MOST_FRAMES}; describe it by a grid"
         )
-    return surface_of(description, what, Path(path).parent)
+    return surface_of(_with_starts(description, fitted), what, Path(path).parent)
+
+
+def _with_starts(description: Mapping[str, Any], fitted: Sequence[str]) -> Mapping[str, Any]:
+    """Return the description with values for the parameters that are fitted and not stated."""
+    kind = SHAPES.get(str(description.get("shape")))
+    own = [each.name for each in fields(kind)] if is_dataclass(kind) else []
+    starts = {name: _START for name in fitted if name in own and name not in description}
+    return {**description, **starts}
 
 
 def _extent(content: Any) -> tuple[int, int]:

@@ -4,6 +4,9 @@ TEMPLATES: dict[str, str] = {
     "registration.unknown_freedom": (
         "pose parameter {name!r} is unknown, expected a list of {known}"
     ),
+    "registration.no_parameter": (
+        "{surface} has no parameter {name!r}; name one of the shape in {opt.fit}"
+    ),
     "registration.repeated_freedom": "pose parameter {name!r} stands twice; name it once",
     "registration.no_freedom": "no pose parameter is named, expected a list of {known}",
     "registration.not_determined": "{name} cannot be fitted: {reason}; leave it out of {opt.fit}",

@@ -11,7 +11,7 @@ import numpy as np
 from omsm_ros.core.comparison.stated_errors import ComparedMeasurement, ErrorFields
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
-from omsm_ros.core.form.deviation_map import conformity
+from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import (
@@ -28,6 +28,7 @@ from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, without_duplicates
+from omsm_ros.core.surface.shape_parameters import external
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.maps.read_map import read_points
@@ -169,7 +170,7 @@ def judge_form(
     Raises DataError for points that do not fit the surface or do not determine the pose asked for.
     """
     form = measured.form(surface, asked, aperture, filters, ISOLATED if dust is None else dust)
-    facts = form_facts(form, measured, surface)
+    facts = form_facts(form, measured)
     doubts = form.doubts(decided=dust is not None)
     facts["open"] = [{"reason": str(d.reason), "peak_to_valley": d.peak_to_valley} for d in doubts]
     if tolerance is not None:
@@ -202,9 +203,7 @@ def _deviations(form: FormResult) -> np.ndarray[Any, np.dtype[np.void]]:
     return table
 
 
-def form_facts(
-    form: FormResult, measured: MeasurementMeasuredPortions, nominal: Surface
-) -> dict[str, Any]:
+def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[str, Any]:
     """Return the content of ``form.json``; lengths in metres, angles in radians."""
     found = form.registration
     placement = found.placement
@@ -213,6 +212,10 @@ def form_facts(
             name: {"value": placement.value(name), "uncertainty": found.uncertainty(name)}
             for name in POSE_PARAMETERS
         },
+        "shape": {
+            name: UncertainValue(*external(name, v, found.uncertainty(name))).entry()
+            for name, v in placement.shape
+        },
         "deviation": {name: figure.entry() for name, figure in form.deviation.items()},
         "zernike": _terms(form),
         "removed": {
@@ -220,13 +223,16 @@ def form_facts(
             "not_determined": {name: str(why) for name, why in found.dofs.refused.items()},
             "held": {name: str(why) for name, why in found.dofs.held.items()},
             "pose_uncertainty": {
-                source: dict(zip(found.dofs.fitted, map(float, shares), strict=True))
+                source: {
+                    name: _share(found, name, float(share))
+                    for name, share in zip(found.dofs.fitted, shares, strict=True)
+                }
                 for source, shares in found.from_source.items()
             },
             "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
             "notes": [
                 *measured.notes,
-                *_mismatch_text(form, nominal),
+                *_mismatch_text(form),
                 *_advice(form),
                 *([_NO_NOISE] if form.deviation["point_noise"].value is None else []),
                 *(str(d.reason) for d in form.doubts(decided=True)),
@@ -253,8 +259,12 @@ def form_facts(
     }
 
 
-def _mismatch_text(form: FormResult, nominal: Surface) -> list[str]:
-    x, y = form.map.x, form.map.y
+def _share(found: Registration, name: str, share: float) -> float:
+    return external(name, found.placement.value(name), share)[1] or 0.0
+
+
+def _mismatch_text(form: FormResult) -> list[str]:
+    x, y, nominal = form.map.x, form.map.y, form.registration.surface
     return [*map(str, mismatch(x, y, nominal.height(x, y) + form.map.deviation, nominal))]
 
 

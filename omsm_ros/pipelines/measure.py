@@ -40,6 +40,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, within_aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.posed import Pose, PosedSurface
+from omsm_ros.core.surface.shape_parameters import with_parameters
 from omsm_ros.errors import DataError, Notice
 from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATIC, save_json
 from omsm_ros.io.results import save_fields
@@ -150,7 +151,7 @@ def add_verdict(
         found = adjust(
             [scan],
             priors_of(judgement.stated, judgement.options.geometry.abbe_arm, calibration),
-            nominal=nominal if form is None or nominal is None else _posed(nominal, form["pose"]),
+            nominal=nominal if form is None or nominal is None else _posed(nominal, form),
             accuracy=judgement.accuracy,
             removed=POSE if form is None else _aligned(form["removed"]),
         )
@@ -193,8 +194,10 @@ def _aligned(removed: Mapping[str, Any]) -> list[str]:
     return [name for name in _DOFS if name in every]
 
 
-def _posed(nominal: Surface, pose: Mapping[str, Mapping[str, float]]) -> Surface:
-    """Return the surface where the registration found the part, unless it is near enough."""
+def _posed(nominal: Surface, form: Mapping[str, Any]) -> Surface:
+    """Return the surface as the registration found it, where that is unless it is near enough."""
+    pose, shape = form["pose"], form.get("shape", {})
+    nominal = with_parameters(nominal, {name: v["value"] for name, v in shape.items()})
     found = Pose(**{name: float(pose[name]["value"] or 0.0) for name in _DOFS})
     angles, shifts = (found.tip, found.tilt, found.clocking), (found.x, found.y)
     small = max(map(abs, angles)) < _SMALL_ANGLE_RAD and max(map(abs, shifts)) < _SMALL_SHIFT_M

@@ -18,6 +18,7 @@ from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.height_grid import gradient_of, unit_normal
 from omsm_ros.core.surface.posed import Pose
+from omsm_ros.core.surface.shape_parameters import estimated_shape, shape_columns
 from omsm_ros.errors import DataError, SurfaceError
 
 # Four points for each of the 49 columns of pose and form.
@@ -50,10 +51,14 @@ PointBatches: TypeAlias = Callable[[], Iterable[PointBatch]]
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """Pose of a part, and its curvature in excess of the nominal surface, ``power`` [1/m]."""
+    """Pose of a part, and its curvature in excess of the nominal surface, ``power`` [1/m].
+
+    shape: names and values of estimated parameters of the nominal surface
+    """
 
     pose: Pose = field(default_factory=Pose)
     power: float = 0.0
+    shape: tuple[tuple[str, float], ...] = ()
 
     def moved(self, dofs: Sequence[str], step: FloatArray) -> Placement:
         """Return the placement after a ``step`` (p,) of the pose parameters ``dofs``.
@@ -62,15 +67,26 @@ class Placement:
         """
         changes = dict(zip(dofs, map(float, step), strict=True))
         power = self.power + changes.pop("power", 0.0)
+        shape = tuple((n, v + changes.pop(n, 0.0)) for n, v in self.shape)
         try:
             pose = replace(self.pose, **{k: getattr(self.pose, k) + v for k, v in changes.items()})
         except SurfaceError as err:
             raise DataError("registration.no_pose") from err
-        return Placement(pose, power)
+        return Placement(pose, power, shape)
 
     def value(self, dof: str) -> float:
         """Return the value of one pose parameter [m], [rad] or [1/m]."""
+        known = dict(self.shape)
+        if dof in known:
+            return known[dof]
         return self.power if dof == "power" else float(getattr(self.pose, dof))
+
+    def of(self, surface: Surface) -> Surface:
+        """Return the ``surface`` with the estimated parameters; DataError if there is none."""
+        try:
+            return estimated_shape(surface, dict(self.shape)) if self.shape else surface
+        except SurfaceError as err:
+            raise DataError("registration.no_pose") from err
 
 
 class Placed(NamedTuple):
@@ -78,6 +94,7 @@ class Placed(NamedTuple):
 
     x, y: [m], (n,);  deviation: along the normal [m], (n,);  normal: of the surface there (3, n)
     from_origin: vector from the part's origin, in the machine's frame [m], (3, n)
+    by_shape: derivatives of the deviation by the estimated parameters of the surface (s, n)
     """
 
     x: FloatArray
@@ -85,6 +102,7 @@ class Placed(NamedTuple):
     deviation: FloatArray
     normal: FloatArray
     from_origin: FloatArray
+    by_shape: FloatArray
 
     def part(self, chosen: BoolArray | IntArray) -> Placed:
         """Return the chosen points (n,)."""
@@ -97,7 +115,7 @@ def placed(surface: Surface, placement: Placement, portion: PointBatch) -> Place
     The foot of each point is estimated along the normal below it; the deviation is the distance
     from the tangent plane there, exact to first order in deviation times curvature.
     """
-    pose = placement.pose
+    pose, nominal, surface = placement.pose, surface, placement.of(surface)
     away = np.stack([portion.x, portion.y, portion.height]) - pose.origin[:, np.newaxis]
     x, y, z = pose.rotation.T @ away
     half_power = placement.power / 2
@@ -109,7 +127,10 @@ def placed(surface: Surface, placement: Placement, portion: PointBatch) -> Place
     normal = unit_normal(slope_x, slope_y)
     foot_z = surface.height(foot_x, foot_y) + half_power * (foot_x**2 + foot_y**2)
     deviation = (x - foot_x) * normal[0] + (y - foot_y) * normal[1] + (z - foot_z) * normal[2]
-    return Placed(x, y, np.asarray(deviation), normal, away)
+    by_shape = np.empty((0, len(x)))
+    if placement.shape:
+        by_shape = -normal[2] * shape_columns(nominal, dict(placement.shape), foot_x, foot_y)
+    return Placed(x, y, np.asarray(deviation), normal, away, by_shape)
 
 
 def _slopes(
@@ -123,12 +144,15 @@ def dof_columns(placement: Placement, points: Placed, dofs: Sequence[str]) -> Fl
     """Return the derivatives (p, n) of the deviation by each pose parameter."""
     rates, rotation = placement.pose.rotation_rates(), placement.pose.rotation
     columns = np.empty((len(dofs), len(points.x)))
+    shape = [name for name, _ in placement.shape]
     for row, name in enumerate(dofs):
         if name in _SHIFTS:
             columns[row] = -rotation[_SHIFTS[name]] @ points.normal
         elif name in _TURNS:
             moved = rates[_TURNS[name]].T @ points.from_origin
             columns[row] = np.einsum("in,in->n", points.normal, moved)
+        elif name in shape:
+            columns[row] = points.by_shape[shape.index(name)]
         else:
             columns[row] = -0.5 * (points.x**2 + points.y**2) * points.normal[2]
     return columns

@@ -24,6 +24,7 @@ from omsm_ros.core.registration.placement import (
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.core.surface.shape_parameters import ALIASES, SHAPE_PARAMETERS, shape_range
 from omsm_ros.errors import ConfigurationError, DataError, Notice
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M
 
@@ -46,6 +47,8 @@ def typical_range(dof: str) -> float:
     """
     if dof == "power":
         return 1.0
+    if dof in SHAPE_PARAMETERS:
+        return shape_range(dof)
     return MILLIMETRE_M if dof in ("x", "y", "piston") else DEGREE_RAD
 
 
@@ -70,8 +73,9 @@ def parse_dofs(text: str) -> tuple[str, ...]:
 
     Raises ConfigurationError for an unknown or repeated name.
     """
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    known = [AUTO, *POSE_PARAMETERS]
+    stripped = [name.strip() for name in text.split(",") if name.strip()]
+    names = [ALIASES.get(name, name) for name in stripped]
+    known = [AUTO, *POSE_PARAMETERS, *SHAPE_PARAMETERS]
     for name in names:
         if name not in known:
             raise ConfigurationError("registration.unknown_freedom", name=name, known=known)
@@ -86,16 +90,18 @@ def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> Pose
     """Return which of the pose parameters ``asked`` for the surface determines.
 
     asked: names, or "auto" for all rigid ones that are determined, alone or with "power"
-    gram: sums of products (7, 7) of the columns of all pose parameters over ``points``
+    gram: sums of products of the columns of all pose parameters, and of the shape parameters asked
+        for, over ``points``
 
     Raises DataError if one that was named is not determined.
     """
     automatic = AUTO in asked
-    wanted = [n for n in POSE_PARAMETERS if n in asked or (automatic and n in RIGID)]
+    known = (*POSE_PARAMETERS, *shape_asked(asked))
+    wanted = [n for n in known if n in asked or (automatic and n in RIGID)]
     fitted: list[str] = []
     refused: dict[str, Notice] = {}
     for name in wanted:
-        reason = _undetermined(name, fitted, gram / points)
+        reason = _undetermined(name, fitted, gram / points, known)
         if reason is None:
             fitted.append(name)
         elif automatic and name not in asked:
@@ -139,9 +145,16 @@ def weakest_dof(
     )
 
 
-def _undetermined(name: str, before: Sequence[str], gram: FloatArray) -> Notice | None:
+def shape_asked(asked: Sequence[str]) -> tuple[str, ...]:
+    """Return the parameters of the nominal shape among those ``asked`` for."""
+    return tuple(name for name in SHAPE_PARAMETERS if name in asked)
+
+
+def _undetermined(
+    name: str, before: Sequence[str], gram: FloatArray, known: Sequence[str]
+) -> Notice | None:
     """Return why ``name`` is not determined in a fit with those ``before`` it, None if it is."""
-    places, own = [POSE_PARAMETERS.index(n) for n in before], POSE_PARAMETERS.index(name)
+    places, own = [known.index(n) for n in before], known.index(name)
     alone = float(np.sqrt(gram[own, own]))
     if alone * typical_range(name) < _LEAST_FORM_M:
         return Notice("registration.surface_unchanged")

@@ -47,6 +47,7 @@ from omsm_ros.core.registration.pose_parameters import (
     determined_dofs,
     held_dof_effects,
     root_of,
+    shape_asked,
     shares_of,
     typical_range,
     weakest_dof,
@@ -56,6 +57,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, disc_of, within_aperture
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.posed import PosedSurface
+from omsm_ros.core.surface.shape_parameters import start_of
 from omsm_ros.errors import DataError
 
 # With the refinement that follows, spheres and off-axis paraboloids with form took 12 to 36
@@ -151,13 +153,14 @@ def register(
     """
     surface, aperture = within_aperture(surface, aperture)
     chosen = selection(portions, _MOST_SELECTED)
-    start = Placement()
+    start = Placement(shape=_start_of_shape(surface, chosen, shape_asked(asked)))
     dofs = _determined(surface, chosen, asked, aperture, start)
     try:
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     except DataError:
         # On a tilted part an undetermined rotation may seem to be determined; seat it first.
-        seated = coarse_placement(surface, chosen, POSE_PARAMETERS[:3], aperture, start)
+        seat = (*POSE_PARAMETERS[:3], *shape_asked(asked))
+        seated = coarse_placement(surface, chosen, seat, aperture, start)
         dofs = _determined(surface, chosen, asked, aperture, seated)
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     points = inside_aperture(placed(surface, at, chosen), aperture)
@@ -174,6 +177,14 @@ def register(
     return _over_all(fit, stand, portions, sources, open_, dust, disc)
 
 
+def _start_of_shape(
+    surface: Surface, chosen: PointBatch, names: tuple[str, ...]
+) -> tuple[tuple[str, float], ...]:
+    if not names:
+        return ()
+    return tuple(start_of(surface, names, chosen.x, chosen.y, chosen.height).items())
+
+
 def _determined(
     surface: Surface,
     chosen: PointBatch,
@@ -183,7 +194,7 @@ def _determined(
 ) -> PoseParameters:
     """Return which pose parameters the surface determines where the part is ``at``."""
     points = inside_aperture(placed(surface, at, chosen), aperture)
-    columns = dof_columns(at, points, POSE_PARAMETERS)
+    columns = dof_columns(at, points, (*POSE_PARAMETERS, *shape_asked(asked)))
     return determined_dofs(asked, columns @ columns.T, len(points.x))
 
 
@@ -258,7 +269,7 @@ class _PoseFit:
         """
         every = max(len(chosen.x) // _ENOUGH_FOR_A_CURVE, 1)
         few = PointBatch(*(v[..., ::every] for v in chosen))
-        few = few._replace(height=PosedSurface(self.surface, at.pose).height(few.x, few.y))
+        few = few._replace(height=PosedSurface(at.of(self.surface), at.pose).height(few.x, few.y))
         few = PointBatch(*(v[..., np.isfinite(few.height)] for v in few))
         rigid = replace(at, power=0.0)
         found: dict[str, dict[str, FloatArray]] = {}
@@ -379,7 +390,7 @@ def _over_all(
     square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []
     for portion in portions():
         beyond.append(fit.sums(stand, portion, held, sums, far))
-        before = placed(fit.surface, Placement(), portion).deviation
+        before = placed(stand.at.of(fit.surface), Placement(), portion).deviation
         square += float(np.nansum(before**2))
         points += float(np.sum(np.isfinite(before)))
     left_out, form = far.dust(dust)
@@ -391,9 +402,10 @@ def _over_all(
     moved = found.covariance[:free] / found.noise @ sums.gram[:, sums.columns + 1 :]
     covariance, names = found.covariance[:free, :free], (*sources, *[HELD] * 2 * len(held))
     by_source = open_.by_source(fit.names, covariance, names, moved)
+    at = stand.at.moved(fit.names, found.step)
     return Registration(
-        surface=fit.surface,
-        placement=stand.at.moved(fit.names, found.step),
+        surface=at.of(fit.surface),
+        placement=at,
         dofs=fit.dofs,
         from_source=by_source,
         pose_effects=root_of(covariance),

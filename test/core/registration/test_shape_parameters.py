@@ -1,0 +1,69 @@
+"""Estimated parameters of a shape: exact on exact points, and covered on parts with form."""
+
+import numpy as np
+import pytest
+
+from omsm_ros.core.registration.placement import PointBatch
+from omsm_ros.core.registration.register import register
+from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.nominal import OffAxisParaboloid, Sphere
+from omsm_ros.core.surface.posed import Pose, PosedSurface
+from omsm_ros.core.surface.shape_parameters import external
+from omsm_ros.errors import ConfigurationError
+
+R, N = 12e-3, 2000
+TURN = np.linspace(0.01, 1, N)
+X, Y = R * TURN * np.cos(240 * TURN), R * TURN * np.sin(240 * TURN)
+POSE = Pose(piston=2e-6, tip=3e-4, tilt=-2e-4)
+
+
+def fitted(guess, height, asked):
+    batch = PointBatch(X, Y, height, np.empty((0, N)))
+    found = register(guess, lambda: [batch], asked)
+    return found, {n: external(n, v, found.uncertainty(n)) for n, v in found.placement.shape}
+
+
+@pytest.mark.parametrize(
+    ("guess", "true"),
+    [
+        (Sphere(1.0), {"radius": 0.05}),
+        (Sphere(0.1), {"radius": -0.015}),
+        (Toroid(0.1), {"radius_x": 0.08}),
+        (Toroid(0.1, 0.1), {"radius_x": 0.1, "radius_y": -0.3}),
+        (OffAxisParaboloid(0.1, 50.8e-3), {"parent_focal_length": 25.4e-3}),
+        (Asphere(None, 0.0, (0.0, 3.0)), {"radius": 0.04, "conic_constant": -1.2}),
+    ],
+)
+def test_exact_points_give_the_parameters_from_any_start(guess, true):
+    made = type(guess)(**{f: getattr(guess, f) for f in guess.__dataclass_fields__} | true)
+    height = PosedSurface(made, POSE).height(X, Y)
+    _, found = fitted(guess, height, ("auto", *true))
+    for name, value in true.items():
+        size = max(abs(value), 1e-3)
+        assert found[name][0] == pytest.approx(value, abs=3e-7 * size)
+
+
+def test_the_radius_is_within_two_uncertainties_on_parts_with_form():
+    """Power of the part is part of its form, so that it counts in the uncertainty of the radius."""
+    u, v = X / R, Y / R
+    s = u * u + v * v
+    form = [2 * s - 1, u * u - v * v, 2 * u * v, (3 * s - 2) * u, (3 * s - 2) * v,
+            u**3 - 3 * u * v * v, v**3 - 3 * u * u * v, 6 * s * s - 6 * s + 1]  # fmt: skip
+    hits = []
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        size = 30e-9 * np.array([1, 1, 1, 0.4, 0.4, 0.4, 0.4, 0.2])
+        height = PosedSurface(Sphere(0.08), POSE).height(X, Y) + rng.normal(0, 3e-9, N)
+        height += (rng.normal(size=8) * size) @ np.array(form)
+        value, spread = fitted(Sphere(0.1), height, ("piston", "tip", "tilt", "radius"))[1][
+            "radius"
+        ]
+        hits.append(abs(value - 0.08) <= 2 * spread)
+        assert spread < 20e-6
+    # Fewer than 20 of 25 have a probability of 2e-4 at 95 %.
+    assert sum(hits) >= 20
+
+
+def test_a_parameter_that_the_shape_does_not_have_is_named():
+    with pytest.raises(ConfigurationError, match="conic_constant"):
+        fitted(Sphere(0.1), np.zeros(N), ("auto", "conic_constant"))
