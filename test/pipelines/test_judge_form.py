@@ -70,6 +70,7 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
     found = json.loads(path.read_text())
     assert set(found) == {
         "pose",
+        "shape",
         "deviation",
         "zernike",
         "removed",

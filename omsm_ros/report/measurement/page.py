@@ -146,7 +146,11 @@ def removed_table(form: Mapping[str, Any]) -> Table:
         return Table(title, columns, [])
     fitted = []
     for name in part(form, "removed", "fitted") or ():
-        pose, unit = part(form, "pose", name) or {}, _POSE_UNITS.get(name, "")
+        shape = part(form, "shape", name) or {}
+        pose, unit = (
+            part(form, "pose", name) or shape,
+            _POSE_UNITS.get(name, "" if not shape or "conic" in name else "m"),
+        )
         spread = settled(form, name)
         fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
@@ -178,7 +182,8 @@ def correlated_moves(form: Mapping[str, Any], name: str) -> str:
     if not shares:
         return ""
     sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
-    stated = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in sizes.items() if v]
+    moves = {n: v for n, v in sizes.items() if v and n in form["pose"]}
+    stated = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in moves.items()]
     if len(stated) < 2:
         return ""
     own, *others = stated
