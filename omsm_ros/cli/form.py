@@ -188,8 +188,7 @@ def compensate_form(
     Raises DataError for a wavelength below the points, and where the previous cut went wrong.
     """
     form = measured.form(surface, asked, aperture)
-    surface = form.registration.surface
-    found = compensation(form.map, surface, low_pass)
+    found = compensation(form.map, surface := form.registration.surface, low_pass)
     (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
     share, total = None, found.offset
     if previous is not None:

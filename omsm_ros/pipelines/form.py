@@ -223,11 +223,7 @@ def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[
             "not_determined": {name: str(why) for name, why in found.dofs.refused.items()},
             "held": {name: str(why) for name, why in found.dofs.held.items()},
             "pose_uncertainty": {
-                source: {
-                    name: _share(found, name, float(share))
-                    for name, share in zip(found.dofs.fitted, shares, strict=True)
-                }
-                for source, shares in found.from_source.items()
+                source: _shares(found, shares) for source, shares in found.from_source.items()
             },
             "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
             "notes": [
@@ -259,8 +255,10 @@ def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[
     }
 
 
-def _share(found: Registration, name: str, share: float) -> float:
-    return external(name, found.placement.value(name), share)[1] or 0.0
+def _shares(found: Registration, shares: FloatArray) -> dict[str, float]:
+    """Return the standard uncertainties of the fitted parameters themselves."""
+    named = zip(found.dofs.fitted, map(float, shares), strict=True)
+    return {n: external(n, found.placement.value(n), share)[1] or 0.0 for n, share in named}
 
 
 def _mismatch_text(form: FormResult) -> list[str]:

@@ -381,10 +381,7 @@ def _over_all(
     dust: DustRule,
     disc: Aperture,
 ) -> Registration:
-    """Return the registration from one pass over all points at the converged pose.
-
-    Points far from the smooth form are added last, once all of them tell form from dust.
-    """
+    """Return the registration from one pass over all points, in which dust comes last."""
     free, held = len(fit.names), root_of(open_.held)
     sums = fit.new_sums(len(sources) + 2 * len(held))
     square, points, far, beyond = 0.0, 0.0, FarPoints(stand.limit), []

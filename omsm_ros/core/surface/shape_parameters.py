@@ -104,13 +104,13 @@ def start_of(
     u, v = x - x.mean(), y - y.mean()
     columns = np.stack([np.ones_like(u), u, v, u * u / 2, v * v / 2, u * v])
     good = np.isfinite(rest)
-    bent = np.linalg.lstsq(columns[:, good].T, rest[good], rcond=1e-12)[0]
+    curved = np.linalg.lstsq(columns[:, good].T, rest[good], rcond=1e-12)[0]
     most = 1 / (_LEAST_RADIUS * float(np.hypot(u, v).max()))
-    curvature = {"radius_x": bent[3], "radius_y": bent[4], "parent_focal_length": 2 * bent[4]}
+    curvature = {"radius_x": curved[3], "radius_y": curved[4], "parent_focal_length": 2 * curved[4]}
     found = {}
     for name in names:
         if name in INVERSE:
-            value = float(curvature.get(name, (bent[3] + bent[4]) / 2))
+            value = float(curvature.get(name, (curved[3] + curved[4]) / 2))
             found[name] = float(np.clip(value, -most, most))
         else:
             found[name] = float(stated[name])

@@ -146,11 +146,10 @@ def removed_table(form: Mapping[str, Any]) -> Table:
         return Table(title, columns, [])
     fitted = []
     for name in part(form, "removed", "fitted") or ():
-        shape = part(form, "shape", name) or {}
-        pose, unit = (
-            part(form, "pose", name) or shape,
-            _POSE_UNITS.get(name, "" if not shape or "conic" in name else "m"),
-        )
+        pose, unit = part(form, "pose", name), _POSE_UNITS.get(name, "")
+        if pose is None:
+            pose = part(form, "shape", name) or {}
+            unit = "" if name.startswith("conic") else "m"
         spread = settled(form, name)
         fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
