@@ -2,14 +2,22 @@
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from omsm_ros.cli.arguments import Arguments
-from omsm_ros.cli.command import CliCommand, Facts, table, written
+from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
+from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.limits import MachineLimits
+from omsm_ros.core.kinematics.motion_choice import (
+    KnownOfMachine,
+    choose_motion,
+    harmonic_orders,
+    margins,
+)
 from omsm_ros.core.kinematics.trajectories import (
     PLANNED_COUNT,
     PLANNED_DWELL_S,
@@ -17,16 +25,31 @@ from omsm_ros.core.kinematics.trajectories import (
     plan_csv,
     plan_steps,
 )
+from omsm_ros.core.lti.modes import known_modes
+from omsm_ros.core.surface.aperture import BoundedSurface
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_limits, load_sources, load_surface
 from omsm_ros.io.files import save_text
 from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
-from omsm_ros.quantities import COUNT, DWELL, LENGTH, RISE, SAMPLE_PERIOD, SPEED, STEP, UNCERTAINTY
-from omsm_ros.readable import quantity
+from omsm_ros.quantities import (
+    COUNT,
+    DWELL,
+    FREQUENCY,
+    LENGTH,
+    RISE,
+    SAMPLE_PERIOD,
+    SPACING,
+    SPEED,
+    STEP,
+    UNCERTAINTY,
+)
+from omsm_ros.readable import count, quantity
 
 
 def _declare_plan(add: Arguments) -> None:
-    add("what", str, "a step test, or scans of a part", choices=("steps", "scans"))
+    add("what", str, "a step test, scans of a part, or speed and feed that avoid modes and lines",
+        choices=("steps", "scans", "motion"))  # fmt: skip
     add("--out", "DIR", required=True)
     add("--dialect", str, "controller that reads the G-code", choices=DIALECTS, default="linuxcnc")
     steps = add.group("steps")
@@ -41,11 +64,19 @@ def _declare_plan(add: Arguments) -> None:
     steps("--sharp", None, "edges as sharp as the axis makes them, for 'omsm identify "
           "--equivalent-time' alone: as a calibration they mislead")  # fmt: skip
     steps("--half-range", STEP, "half the measuring range of the probe [m]", default=50e-6)
-    _declare_scans(add.group("scans"))
+    _declare_scans(add.group("scans and motion"))
+    motion = add.group("motion")
+    motion("--calibration", "CAL.json", "whose modes are to be avoided")
+    motion("--mode", FREQUENCY, "further modes of the machine [Hz]", nargs="+", default=[])
+    motion("--line", FREQUENCY, "known vibrations [Hz]", nargs="+", default=[])
+    motion("--marks", SPACING, "pitch of the rings that the tool left [m]", nargs="+", default=[])
+    motion("--rate", FREQUENCY, "rates of the probe [Hz], the preferred one first", nargs="+",
+           default=[1000.0])  # fmt: skip
 
 
 def _plan(args: argparse.Namespace) -> Facts:
-    return _plan_scans(args) if args.what == "scans" else _plan_steps(args)
+    plans = {"steps": _plan_steps, "scans": _plan_scans, "motion": _plan_motion}
+    return plans[args.what](args)
 
 
 def _plan_steps(args: argparse.Namespace) -> Facts:
@@ -77,8 +108,8 @@ def _lengths(lengths: Sequence[float]) -> str:
 
 
 def _show_plan(facts: Facts) -> None:
-    if "sets" in facts:
-        _show_scans(facts)
+    if "sets" in facts or "motion" in facts:
+        _show_scans(facts) if "sets" in facts else _show_motion(facts)
         return
     table(
         [
@@ -97,7 +128,12 @@ def _declare_scans(add: Arguments) -> None:
     add("--limits", "LIMITS.yaml", "of machine and probe")
     for name, kind, default, meaning in (
         ("--accuracy", UNCERTAINTY, 20e-9, "expanded uncertainty asked for, k = 2 [m]"),
-        ("--radius", LENGTH, 12.7e-3, "radius of the part [m]"),
+        (
+            "--radius",
+            LENGTH,
+            None,
+            "radius of the scan [m]; that of the surface's aperture, or 0.0127",
+        ),
         ("--feed", LENGTH, 1e-4, "radial feed of a turn [m]"),
         ("--rpm", SPEED, 30.0, "spindle speed of the first scan [1/min]"),
         ("--path-error", UNCERTAINTY, 1e-7, "bound on Z of the executed path [m]"),
@@ -106,15 +142,20 @@ def _declare_scans(add: Arguments) -> None:
         add(name, kind, meaning, default=default)
 
 
+def _radius(args: argparse.Namespace, nominal: Surface) -> float:
+    """Return the radius of the scan [m]: as asked, or to the rim of the nominal's aperture."""
+    if args.radius is None and isinstance(nominal, BoundedSurface):
+        return float(np.max(np.hypot(*nominal.aperture.rim())))
+    return 12.7e-3 if args.radius is None else float(args.radius)
+
+
 def _plan_scans(args: argparse.Namespace) -> Facts:
     # Here, because a step test needs nothing of what adjusts scans.
     from omsm_ros.core.adjustment import ScanDesign
     from omsm_ros.pipelines.plan_scans import plan_facts, planned_sets
 
-    if args.nominal is None:
-        raise ConfigurationError("the surface of the part is missing; give --nominal SURFACE.yaml")
-    nominal = load_surface(args.nominal)
-    first = ScanDesign(rpm=args.rpm, start=args.radius, end=0.0, pitch=args.feed)
+    nominal = _nominal(args)
+    first = ScanDesign(rpm=args.rpm, start=_radius(args, nominal), end=0.0, pitch=args.feed)
     sets = planned_sets(
         first,
         nominal,
@@ -125,6 +166,58 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
     return plan_facts(
         sets, args.accuracy, args.out, nominal, args.dialect, args.path_error, args.servo_period
     )
+
+
+def _plan_motion(args: argparse.Namespace) -> Facts:
+    from omsm_ros.core.adjustment import ScanDesign
+    from omsm_ros.pipelines.plan_scans import write_scans
+
+    nominal = _nominal(args)
+    modes = [(frequency, 0.0) for frequency in args.mode]
+    if args.calibration:
+        cal = load_calibration(args.calibration)
+        found = known_modes(cal.dynamics, cal.covariance)
+        modes += [(m.frequency, m.damping) for m in found if m.residue is not None]
+    known = KnownOfMachine(modes=modes, lines=args.line, marks=args.marks)
+    orders = harmonic_orders(nominal, abs(_radius(args, nominal)))
+    asked = margins(args.rpm, args.feed, args.rate[0], orders, known)
+    best = choose_motion(args.rpm, args.feed, args.rate, orders, known)
+    design = ScanDesign(
+        rpm=best.rpm, start=_radius(args, nominal), end=0.0, pitch=best.feed, rate=best.rate
+    )
+    write_scans([design], nominal, args.out, args.path_error, args.servo_period, args.dialect)
+    rows = [{**asdict(one), "score": one.score} for one in (asked, best)]
+    return {
+        "motion": [{k: v if np.isfinite(v) else None for k, v in row.items()} for row in rows],
+        "modes": modes,
+        "orders": orders.tolist(),
+        "duration": design.duration,
+        "files": [str(args.out / f"scan_1.{end}") for end in ("csv", "nc")],
+    }
+
+
+def _show_motion(facts: Facts) -> None:
+    names = {
+        "harmonic": "harmonic of Z to a mode: {:.3g} half-widths",
+        "image": "alias of a vibration to a mode: {:.3g} half-widths",
+        "phase": "vibration from turn to turn: {:.2f} of a wave",
+        "pitch": "marks from turn to turn: {:.2f} of a pitch",
+    }
+    for title, one in zip(("as asked", "proposed"), facts["motion"], strict=True):
+        say(f"{title}: {one['rpm']:.5g} rpm, feed {quantity(one['feed'], 'm', 4)}, "
+            f"rate {quantity(one['rate'], 'Hz')}")  # fmt: skip
+        for name, text in names.items():
+            if one[name] is not None:
+                say("  " + text.format(one[name]))
+    if facts["motion"][1]["score"] < 1:
+        say("no speed or feed within 20 % keeps all apart; give another --rate, --rpm or --feed")
+    table([("duration", quantity(facts["duration"], "s")), written(facts["files"])])
+
+
+def _nominal(args: argparse.Namespace) -> Surface:
+    if args.nominal is None:
+        raise ConfigurationError("the surface of the part is missing; give --nominal SURFACE.yaml")
+    return load_surface(args.nominal)
 
 
 def _scan_text(scan: Mapping[str, Any]) -> str:
@@ -138,7 +231,8 @@ def _path_text(path: Mapping[str, float], bound: float) -> str:
     kept = "" if path["error"] <= bound else f", MORE than {quantity(bound, 'm')}"
     error, allowed = quantity(path["error"], "m"), np.degrees(path["c_acceleration"])
     segment = f"{path['segment'] * 1e3:g} ms"
-    return f"Z within {error}{kept}; segments of {segment}; allow C {allowed:.0f} °/s²"
+    points = f"; {count(path['points'])} points on the part" if "points" in path else ""
+    return f"Z within {error}{kept}; segments of {segment}; allow C {allowed:.0f} °/s²{points}"
 
 
 def _show_scans(facts: Facts) -> None:

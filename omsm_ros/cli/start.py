@@ -17,7 +17,8 @@ def _declare_twin(add: Arguments) -> None:
     add(
         "--radius",
         RADIUS,
-        "start radius of the spiral [m]; 0.002 scans for 40 s, 0.0127 the whole mirror",
+        "start radius of the spiral [m]; 0.002 scans for 20 s, 0.0127 the inner circle, 0.01796 "
+        "the whole ellipse of the mirror",
         default=2e-3,
     )
     add("--rpm", SPEED, "spindle speed [rpm]", default=usual.spindle_speed)

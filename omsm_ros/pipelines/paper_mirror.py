@@ -32,7 +32,7 @@ from omsm_ros.report.measurement.page import CAPTIONS as SCAN_CAPTIONS
 from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Recording
 from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
-from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of
+from omsm_ros.twin.scenario import MIRROR_APERTURE, Scenario, planned_test_of, scan_of, spiral_of
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
 # Figures of Fig. 8: deviation before and after, and sections.
@@ -84,8 +84,7 @@ def explanations() -> list[tuple[str, list[float], str]]:
 
 def on_the_mirror(x: FloatArray, y: FloatArray, share: float = 1.0) -> np.ndarray:
     """Return which places are inside the mirror's outline, or its ``share``."""
-    along, across = PAPER_MIRROR_HALF_LENGTH_M * share, PAPER_MIRROR_RADIUS_M * share
-    return np.asarray((x / along) ** 2 + (y / across) ** 2 <= 1.0)
+    return MIRROR_APERTURE.holds(x / share, y / share)
 
 
 def mirror(out: Path, seed: int) -> Done:

@@ -15,6 +15,7 @@ from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
 from omsm_ros.core.kinematics.planner import PlannedPath, plan_path
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import BoundedSurface
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.files import save_text
 from omsm_ros.io.gcode_file import path_gcode
@@ -124,12 +125,25 @@ def plan_facts(
         ],
         "paths": [
             {field: getattr(path, field) for field in ("error", "rms", "segment", "c_acceleration")}
-            for path in paths
+            | (
+                {"points": _on_the_part(design, nominal)}
+                if isinstance(nominal, BoundedSurface)
+                else {}
+            )
+            for path, design in zip(paths, best.designs, strict=True)
         ],
         "files": [
             str(out / f"scan_{k + 1}.{end}") for k in range(len(paths)) for end in ("csv", "nc")
         ],
     }
+
+
+def _on_the_part(design: ScanDesign, nominal: BoundedSurface) -> int:
+    """Return the number of readings on the part."""
+    time = np.arange(0.0, design.duration, 1 / design.rate, dtype=np.float64)
+    x = design.start + (design.end - design.start) * time / design.duration
+    place = x * np.exp(-1j * (design.rpm * RPM_RAD_S * time + design.clocking))
+    return int(np.count_nonzero(nominal.aperture.holds(place.real, place.imag)))
 
 
 def write_scans(

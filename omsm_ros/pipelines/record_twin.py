@@ -6,7 +6,11 @@ from pathlib import Path
 
 import yaml
 
-from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_HALF_LENGTH_M
+from omsm_ros.core.surface.nominal import (
+    PAPER_MIRROR,
+    PAPER_MIRROR_HALF_LENGTH_M,
+    PAPER_MIRROR_RADIUS_M,
+)
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
@@ -15,7 +19,14 @@ from omsm_ros.io.files import save_text
 from omsm_ros.readable import count, quantity
 from omsm_ros.twin.cell import Recording, blocks_of, pieces
 from omsm_ros.twin.disturbances import NOTHING
-from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, source_recording, spiral_of
+from omsm_ros.twin.scenario import (
+    MIRROR_APERTURE,
+    Scenario,
+    planned_test_of,
+    scan_of,
+    source_recording,
+    spiral_of,
+)
 
 _BLOCK_SAMPLES = 1000
 # Bounds memory to half a gigabyte with all disturbances.
@@ -62,7 +73,7 @@ def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = N
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
     steps = _write(out / STEPS, planned_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
-    write_nominal(out / NOMINAL)
+    write_nominal(out / NOMINAL, scenario.start_radius > PAPER_MIRROR_RADIUS_M)
     return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
 
 
@@ -92,13 +103,16 @@ def _check(scenario: Scenario) -> None:
         )
 
 
-def write_nominal(path: Path) -> None:
-    """Write the nominal surface of the twin's mirror."""
-    nominal = {
+def write_nominal(path: Path, whole: bool = False) -> None:
+    """Write the nominal surface of the twin's mirror, with its elliptic aperture if ``whole``."""
+    sizes = ", ".join(f"{size:.6g}" for size in MIRROR_APERTURE.sizes)
+    nominal: dict[str, object] = {
         "shape": "off_axis_paraboloid",
         "parent_focal_length": PAPER_MIRROR.parent_focal_length,
         "off_axis_distance": PAPER_MIRROR.off_axis_distance,
     }
+    if whole:
+        nominal["aperture"] = f"ellipse: {sizes}"
     save_text(path, yaml.safe_dump(nominal, sort_keys=False))
 
 

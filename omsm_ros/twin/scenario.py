@@ -17,6 +17,7 @@ from omsm_ros.core.kinematics.trajectories import (
     s_curve,
 )
 from omsm_ros.core.streams.blocks import FloatArray, Status
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,
     PAPER_MIRROR_HALF_LENGTH_M,
@@ -29,6 +30,9 @@ from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances
 from omsm_ros.twin.part import FigureError, PartPose
 from omsm_ros.units import RPM_HZ
+
+MIRROR_APERTURE = Aperture.of("ellipse", PAPER_MIRROR_HALF_LENGTH_M, PAPER_MIRROR_RADIUS_M)
+"""The paper's mirror seen along the normal at its centre, 25.4 × 35.9 mm."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +102,7 @@ def scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recordi
     if scenario.start_radius <= PAPER_MIRROR_RADIUS_M:
         return made
     assert made.truth is not None
-    along = made.truth.x / PAPER_MIRROR_HALF_LENGTH_M
-    off = np.hypot(along, made.truth.y / PAPER_MIRROR_RADIUS_M) > 1.0
+    off = ~MIRROR_APERTURE.holds(made.truth.x, made.truth.y)
     seen = replace(
         made.distance,
         distance=np.where(off, np.nan, made.distance.distance),

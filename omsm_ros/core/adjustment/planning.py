@@ -27,6 +27,7 @@ from omsm_ros.core.adjustment.scan_data import ScanData, view_of
 from omsm_ros.core.adjustment.sources import Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.aperture import BoundedSurface
 
 # Points and turns of a design: sets with more turns are planned with fewer, each counting for
 # more and the time running faster.
@@ -228,17 +229,16 @@ def design_scan(design: ScanDesign, nominal: Surface, begin: float, shown: float
     chuck = slide * np.exp(-1j * c)
     part = chuck * np.exp(-1j * design.clocking)
     motion = nominal.height(part.real, part.imag)
+    # Off the part the probe sees nothing.
+    seen = np.ones(number, bool)
+    if isinstance(nominal, BoundedSurface):
+        seen = nominal.aperture.holds(part.real, part.imag)
     # The probe is driven through some of its range on the way, else its scale would not show.
     distance = _RANGE_M * np.sin(2 * np.pi * 7 * share)
+    channels = (begin + time, chuck.real, chuck.imag, motion, distance, motion, np.zeros(number), c)
+    names = ("time", "x", "y", "height", "distance", "motion", "removed", "c")
     return ScanData(
-        time=begin + time,
-        x=chuck.real,
-        y=chuck.imag,
-        height=motion,
-        distance=distance,
-        motion=motion,
-        removed=np.zeros(number),
-        c=c,
+        **{name: values[seen] for name, values in zip(names, channels, strict=True)},
         clocking=design.clocking,
         clamping=design.clamping,
         weight=max(design.duration * design.rate / number, 1e-9),
