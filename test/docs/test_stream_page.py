@@ -15,7 +15,7 @@ from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
 from omsm_ros.pipelines.record_device import record_device
 
 PAGE = (Path(__file__).parents[2] / "docs" / "stream.md").read_text()
-PER_UNIT = {"x": 1e3, "y": 1e3, "z": 1e3, "b": 57.29577951308232, "c": 57.29577951308232}
+PER_UNIT = dict(re.findall(r"(\w\.counts_per_unit)=([\d.]+)", PAGE))
 
 
 def code(language):
@@ -55,8 +55,7 @@ def test_a_sender_of_the_page_is_read_completely(tmp_path, made):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     given = {"device": "six_channel_text", "port": f"tcp://127.0.0.1:{port}"}
-    given |= {"columns": "sequence device_time distance status x y z b c"}
-    given |= {f"{axis}.counts_per_unit": value for axis, value in PER_UNIT.items()}
+    given |= {name: float(value) for name, value in PER_UNIT.items()}
     with subprocess.Popen(made(tmp_path, port)) as sender:
         try:
             found = record_device(given, tmp_path / "1.mcap", lambda n, s: n >= 500 or s > 10.0)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -142,6 +143,26 @@ def test_a_killed_linuxcnc_is_a_restart_of_the_count(tmp_path):
     steps = np.diff(numbers(bag))
     assert np.sum(steps != 1) == 1
     assert numbers(bag)[np.flatnonzero(steps != 1)[0] + 1] == 1
+
+
+@pytest.mark.soak
+@REAL
+@pytest.mark.timeout(900)
+def test_the_commands_of_the_page_lead_from_step_test_to_report(tmp_path):
+    root = Path(__file__).parents[2]
+    page = (root / "docs/howto/linuxcnc.md").read_text()
+    (commands,) = (b for b in re.findall(r"```\n(.*?)```", page, re.DOTALL) if "plan steps" in b)
+    (tmp_path / "config").symlink_to(root / "config")
+    with (tmp_path / "log.txt").open("w") as log:
+        done = subprocess.run(
+            ["bash", "-ec", commands], cwd=tmp_path, check=False, stdout=log, stderr=log
+        )
+    assert done.returncode == 0, (tmp_path / "log.txt").read_text()
+    assert (tmp_path / "part" / "report.html").exists()
+    found = json.loads((tmp_path / "part" / "adjustment.json").read_text())
+    # The twin's mirror has 113 nm.
+    pv = found["figures"]["peak_to_valley"]
+    assert abs(pv["value"] - 113e-9) < 2 * pv["standard_uncertainty"] + 10e-9
 
 
 class Wave:
