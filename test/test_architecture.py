@@ -181,7 +181,7 @@ def loaded_by_name():
     return {
         *(f"cli.{word.module}" for word in WORDS.values() if word.module),
         *(f"nodes.{place.partition(':')[0]}" for place in NODES.values()),
-        *(f"instruments.{place.partition(':')[0]}" for place in places if place),
+        *(f"instruments{place.partition(':')[0]}" for place in places if place.startswith(".")),
         "nodes.start",  # by setup.py
     }
 

@@ -19,6 +19,8 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # Bytes that hold no sample for this long come from another device or at another baud rate [s].
 UNREADABLE_S = 2.0
+# A loss of so few samples, or a multiple, is likely enough to be stated.
+_SMALL_COUNTER = 16
 # Between two looks at the time-out of an answer [s].
 _ANSWER_S = 0.05
 
@@ -88,6 +90,8 @@ class StreamDevice:
         self._now_ns = now_ns
         self._monotonic = monotonic
         self._tracker = SequenceTracker(counting)
+        small = not counting.timed and counting.modulus <= _SMALL_COUNTER
+        self._small_counter = counting.modulus if small else 0
         self._cutter = BlockCutter(settings, channels)
         self.decoded = 0
         self._heard = self._opened = monotonic()
@@ -175,6 +179,11 @@ class StreamDevice:
             return (
                 f"{self._transport.name}: the rate of the samples is not verified yet; they carry "
                 "no time, and arrivals show the rate after 5 s"
+            )
+        if self._small_counter:
+            return (
+                f"{self._transport.name}: a counter of {self._small_counter} without time shows no "
+                f"loss of {self._small_counter} samples or a multiple; let the device send its time"
             )
         if self._cutter.perhaps_at_zero:
             return (

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import numpy as np
+
 import omsm_ros
 
 PAGE = Path(omsm_ros.__file__).resolve().parent.parent / "docs" / "adding_a_probe.md"
@@ -10,10 +12,26 @@ PAGE = Path(omsm_ros.__file__).resolve().parent.parent / "docs" / "adding_a_prob
 
 def test_the_page_runs_from_top_to_bottom():
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     names = {"__name__": "page"}
     exec("\n".join(blocks), names)
     assert len(names["blocks"]) > 30
+    line = names["Loopback"]()
+    line.instrument = names["PolledEmulator"](line.line, clock=line.clock)
+    settings = names["BlockSettings"](sample_period=0.02, block_size=10)
+    polled = names["PolledLamp"](line, settings, line.clock.nanoseconds, line.clock)
+    polled.open()
+    blocks = [block for _ in range(4000) for block in polled.poll(0.05)]
+    polled.close()
+    counts = np.concatenate([b.distance.first_sample + np.arange(len(b.distance)) for b in blocks])
+    read = np.concatenate([b.distance.distance for b in blocks])
+    assert len(counts) > 200
+    assert polled.statistics.lost <= 0.02 * len(counts)  # an answer that came a moment late
+    assert np.all(np.diff(counts) > 0)
+    # The source encodes the number of the sample; answers are some milliseconds of it late.
+    number = np.round(read * 1e6) - 10
+    off = (20 * (counts - counts[0]) - (number - number[0]) + 40) % 80 - 40
+    assert np.all(np.abs(off) <= 20)
 
 
 def test_every_name_the_page_points_at_exists():
