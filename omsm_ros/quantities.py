@@ -151,6 +151,7 @@ DURATION = Quantity("duration", "s", 0.0, 1e7, "give it in seconds; 0 = all")
 DELAY = Quantity("delay", "s", 0.0, 1.0, "identify again; the loop's delay is milliseconds")
 # A drift over hours is no dynamics of a servo; below a nanosecond no sensor resolves it.
 TIME_CONSTANT = Quantity("time constant", "s", 1e-10, 1000.0, "identify again")
+ACCELERATION_LIMIT = Quantity("acceleration", "m/s²", 1e-9, 1e5, "give it in m/s²")
 FREQUENCY = Quantity("frequency", "Hz", 1e-6, 1e9, "give it in hertz")
 GAIN = Quantity("static gain", "", 1e-6, 1e6, "check the units of encoder and probe")
 MAX_DELAY_SAMPLES = Quantity("longest delay", "samples", 0, 50, "0 = none", whole=True)
@@ -200,6 +201,7 @@ ANGLE_UNCERTAINTY = Quantity(
     "standard uncertainty", "rad", 0.0, 10.0, "give it in radians, k = 1; 10 = not known"
 )
 SLOPE_ERROR = Quantity("standard uncertainty", "m/rad", 0.0, 1.0, "give it in m/rad, k = 1")
+RATE = Quantity("speed", "m/s", 1e-9, 100.0, "give it in m/s")
 RATE_UNCERTAINTY = Quantity("standard uncertainty", "m/s", 0.0, 1.0, "give it in m/s, k = 1")
 WALK_UNCERTAINTY = Quantity("standard uncertainty", "m/√s", 0.0, 1.0, "give it in m/√s, k = 1")
 PER_TURN = Quantity("waves a turn", "", 1, 10_000, "negative turns against it", True, True)

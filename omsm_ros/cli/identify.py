@@ -6,6 +6,8 @@ from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
+
 from omsm_ros import __version__
 from omsm_ros.cli.arguments import (
     PART_ENTRIES,
@@ -27,18 +29,25 @@ from omsm_ros.cli.command import (
 )
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import Origin
+from omsm_ros.core.calibration.finding import NOTE, of_severity
 from omsm_ros.core.calibration.typed_json import from_json
 from omsm_ros.core.estimation.equivalent_time import fast_mode
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, HOLDS
 from omsm_ros.core.estimation.preparation import joined_recordings
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
-from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.identification.best_linear import (
+    best_linear_approximation,
+    differing_lines,
+    multisine_findings,
+)
+from omsm_ros.core.identification.identify import Identification, identify
 from omsm_ros.core.identification.sampled_identification import identify_samples
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import save_calibration
+from omsm_ros.io.descriptions import load_multisine
 from omsm_ros.io.files import atomic_file
 from omsm_ros.pipelines.history import keep_calibration, record_in_catalogue
 from omsm_ros.pipelines.identify import (
@@ -110,6 +119,13 @@ def _declare(add: Arguments) -> None:
     add("--equivalent-time", None, "find a mode beyond half the sampling rate from the edges, if "
         "they are sharp and start at different fractions of a sample")  # fmt: skip
     _declare_use(add)
+    add(
+        "--multisine",
+        "BAG",
+        "recording of a multisine on the fixed target: confirms the response without a model, and "
+        "tells whether the machine is linear enough",
+    )
+    add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
     add.trigger()
     add("--report", "DIR", "write the certificate, or the model's page")
     add.catalogue()
@@ -158,8 +174,11 @@ def _identify(args: argparse.Namespace) -> Facts:
             software=f"omsm_ros {__version__}",
         ),
     )
+    facts = {}
+    if args.multisine is not None:
+        identified, facts = _with_multisine(identified, args)
     calibration = identified.calibration
-    facts = calibration_facts(calibration)
+    facts |= calibration_facts(calibration)
     path = output_path_for(args.out, facts["verdict"])
     save_calibration(path, calibration)
     facts["calibration"] = str(path)
@@ -177,6 +196,38 @@ def _identify(args: argparse.Namespace) -> Facts:
         page = write_certificate(args.report, identified, source=first.name)
         facts["report"] = str(page)
     return facts
+
+
+def _with_multisine(
+    identified: Identification, args: argparse.Namespace
+) -> tuple[Identification, Facts]:
+    """Return the identification with the findings of the multisine, and its lines."""
+    plan = load_multisine(args.plan)
+    bag = cell_of(args.multisine, args)
+    with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
+        motion = recording.motion(trigger=trigger_of(args), by_stamps=args.by_stamps)
+    found = best_linear_approximation(motion, plan)
+    calibration = identified.calibration
+    findings = multisine_findings(found, calibration, args.accuracy)
+    judged = replace(calibration, certificate=calibration.certificate.judged(findings))
+    differs, apart = differing_lines(found, calibration)
+    facts = {
+        "multisine": {
+            "frequency": found.frequency.tolist(),
+            "gain": np.abs(found.response).tolist(),
+            "phase": np.angle(found.response).tolist(),
+            "uncertainty": found.uncertainty.tolist(),
+            "noise_m": found.noise.tolist(),
+            "distortion_m": found.distortion.tolist(),
+            "transient_m": found.transient.tolist(),
+            "even_m": found.even[1].tolist(),
+            "odd_m": found.odd[1].tolist(),
+            "differs": differs.tolist(),
+            "difference": apart.tolist(),
+            "bands": found.bands(),
+        }
+    }
+    return replace(identified, calibration=judged), facts
 
 
 def _motions(
@@ -231,6 +282,12 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
             f"{TABLE_SUFFIX} file, and a bag states both: leave them out"
         )
 
+    if (args.multisine is None) != (args.plan is None) or (
+        args.plan is not None and (of_table or args.hold != BAND_LIMITED)
+    ):
+        raise ConfigurationError(
+            "--multisine BAG and --plan PLAN.json go together, with a step test in a bag"
+        )
     if args.max_delay is not None and args.hold == BAND_LIMITED:
         raise ConfigurationError(
             "--max-delay is for a held input; give --hold zero-order or first-order, or leave it "
@@ -304,6 +361,7 @@ def calibration_facts(calibration: Calibration) -> Facts:
         "reasons": [str(reason) for reason in certificate.reasons],
         "reservations": [str(reservation) for reservation in certificate.reservations],
         "warnings": [str(warning) for warning in certificate.warnings],
+        "notes": [str(note) for note in of_severity(certificate.findings, NOTE)],
         "order": len(calibration.dynamics.denominator) - 1,
         "low_frequency_delay": calibration.dynamics.low_frequency_delay,
         "low_frequency_delay_uncertainty": calibration.low_frequency_delay_uncertainty,
@@ -358,7 +416,7 @@ def _show(facts: Facts) -> None:
             rows.append(("distance", _RISES))
     if "equivalent_time" in facts:
         rows.append(("edges", facts["equivalent_time"]["finding"]))
-    for kind in ("reasons", "reservations", "warnings"):
+    for kind in ("reasons", "reservations", "warnings", "notes"):
         rows += [(kind.removesuffix("s"), text) for text in facts.get(kind, [])]
     rows.append(written([facts.get("calibration") or facts["model"]]))
     if "report" in facts:

@@ -23,20 +23,23 @@ from omsm_ros.core.kinematics.trajectories import (
     PLANNED_DWELL_S,
     SECOND_SHARE,
     plan_csv,
+    plan_multisine,
     plan_steps,
 )
 from omsm_ros.core.lti.modes import known_modes
 from omsm_ros.core.surface.aperture import BoundedSurface
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.io.descriptions import load_limits, load_sources, load_surface
-from omsm_ros.io.files import save_text
+from omsm_ros.io.descriptions import MULTISINE_SCHEMA, load_limits, load_sources, load_surface
+from omsm_ros.io.files import save_json, save_text
 from omsm_ros.io.gcode_file import DIALECTS, steps_gcode
 from omsm_ros.quantities import (
+    ACCELERATION_LIMIT,
     COUNT,
     DWELL,
     FREQUENCY,
     LENGTH,
+    RATE,
     RISE,
     SAMPLE_PERIOD,
     SPACING,
@@ -48,8 +51,8 @@ from omsm_ros.readable import count, quantity
 
 
 def _declare_plan(add: Arguments) -> None:
-    add("what", str, "a step test, scans of a part, or speed and feed that avoid modes and lines",
-        choices=("steps", "scans", "motion"))  # fmt: skip
+    add("what", str, "a step test, a multisine that shows how linear the machine is, scans of a "
+        "part, or speed and feed that avoid modes and lines", choices=tuple(_PLANS))  # fmt: skip
     add("--out", "DIR", required=True)
     add("--dialect", str, "controller that reads the G-code", choices=DIALECTS, default="linuxcnc")
     steps = add.group("steps")
@@ -65,6 +68,7 @@ def _declare_plan(add: Arguments) -> None:
           "--equivalent-time' alone: as a calibration they mislead")  # fmt: skip
     steps("--half-range", STEP, "half the measuring range of the probe [m]", default=50e-6)
     _declare_scans(add.group("scans and motion"))
+    _declare_multisine(add.group("multisine"))
     motion = add.group("motion")
     motion("--calibration", "CAL.json", "whose modes are to be avoided")
     motion("--mode", FREQUENCY, "further modes of the machine [Hz]", nargs="+", default=[])
@@ -74,9 +78,36 @@ def _declare_plan(add: Arguments) -> None:
            default=[1000.0])  # fmt: skip
 
 
+def _declare_multisine(add: Arguments) -> None:
+    for name, kind, default, meaning in (
+        ("--resolution", FREQUENCY, 0.5, "distance of its lines [Hz]"),
+        ("--up-to", FREQUENCY, 60.0, "highest line [Hz]"),
+        ("--periods", COUNT, 3, "periods that are evaluated of each realisation"),
+        ("--realisations", COUNT, 6, "number of sets of random phases"),
+        ("--speed", RATE, 5e-3, "largest speed of Z [m/s]"),
+        ("--acceleration", ACCELERATION_LIMIT, 1.0, "largest acceleration of Z [m/s²]"),
+        ("--seed", COUNT, 1, "of the random phases"),
+    ):
+        add(name, kind, meaning, default=default)
+
+
 def _plan(args: argparse.Namespace) -> Facts:
-    plans = {"steps": _plan_steps, "scans": _plan_scans, "motion": _plan_motion}
-    return plans[args.what](args)
+    return _PLANS[args.what](args)
+
+
+def _plan_multisine(args: argparse.Namespace) -> Facts:
+    names = ("sample_period", "resolution", "up_to", "periods", "realisations", "half_range",
+             "speed", "acceleration", "seed")  # fmt: skip
+    plan = plan_multisine(**{name: getattr(args, name) for name in names})
+    csv, description = args.out / "multisine.csv", args.out / "multisine.json"
+    save_text(csv, plan_csv(plan, args.sample_period))
+    save_json(description, {"schema": MULTISINE_SCHEMA, **asdict(plan)})
+    return {
+        "lines": len(plan.lines),
+        "duration": plan.duration,
+        "travel": float(np.ptp(plan.z(plan.sample_period * np.arange(plan.samples)))),
+        "files": {"csv": str(csv), "json": str(description)},
+    }
 
 
 def _plan_steps(args: argparse.Namespace) -> Facts:
@@ -110,6 +141,10 @@ def _lengths(lengths: Sequence[float]) -> str:
 def _show_plan(facts: Facts) -> None:
     if "sets" in facts or "motion" in facts:
         _show_scans(facts) if "sets" in facts else _show_motion(facts)
+        return
+    if "lines" in facts:
+        rows = [("travel", _lengths([facts["travel"]])), ("duration", f"{facts['duration']:.0f} s")]
+        table([("lines", str(facts["lines"])), *rows, written(facts["files"].values())])
         return
     table(
         [
@@ -262,4 +297,10 @@ def _show_scans(facts: Facts) -> None:
     )
 
 
+_PLANS = {
+    "steps": _plan_steps,
+    "multisine": _plan_multisine,
+    "scans": _plan_scans,
+    "motion": _plan_motion,
+}
 COMMANDS = (CliCommand("plan", _declare_plan, _plan, _show_plan),)

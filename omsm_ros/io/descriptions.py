@@ -14,6 +14,7 @@ from omsm_ros.core.correction.machine_sources import MachineSources, StatedSourc
 from omsm_ros.core.correction.source_kinds import FORMER_NAMES, KINDS
 from omsm_ros.core.kinematics.kinematics import Geometry, PitchCurve, Surface
 from omsm_ros.core.kinematics.limits import MachineLimits
+from omsm_ros.core.kinematics.trajectories import MultisinePlan
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, BoundedSurface
 from omsm_ros.core.surface.height_grid import GridSurface, as_grid
@@ -92,6 +93,37 @@ def load_motion(path: Path | str) -> tuple[FloatArray, float]:
             "expected even steps; sample the motion evenly"
         )
     return z, period
+
+
+# A multisine as ``omsm plan multisine`` writes it: the arguments of the plan.
+MULTISINE_SCHEMA = "omsm-multisine/1"
+_WHOLE = {"type": "integer", "minimum": 1, "maximum": 100_000}
+_MULTISINE = {
+    "schema": {"const": MULTISINE_SCHEMA},
+    "sample_period": {"type": "number", "minimum": 1e-6, "maximum": 10.0},
+    **dict.fromkeys(("period", "periods", "realisations", "seed"), _WHOLE),
+    "lines": {"type": "array", "items": _WHOLE, "minItems": 2, "maxItems": 10_000},
+    "amplitudes": {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 10_000},
+}
+_MOST_MULTISINE_SAMPLES = 1_000_000
+
+
+def load_multisine(path: Path | str) -> MultisinePlan:
+    """Read ``multisine.json``; raise FileError if it is malformed or longer than a recording."""
+    what = f"multisine {str(path)!r}"
+    content = json_and_yaml.object_of(
+        read_text(path, 10 * MAX_YAML_BYTES, FileError, what), FileError, what
+    )
+    check_form(content, form(_MULTISINE, tuple(_MULTISINE)), FileError, what)
+    lists = {name: tuple(content.pop(name)) for name in ("lines", "amplitudes")}
+    del content["schema"]
+    plan = MultisinePlan(**content, **lists)
+    rising = bool(np.all(np.diff(plan.lines) > 0)) and plan.lines[-1] < plan.period / 2
+    evaluated = min(plan.periods, plan.realisations) > 1
+    known = len(plan.lines) == len(plan.amplitudes) and rising and evaluated
+    if not known or plan.samples > _MOST_MULTISINE_SAMPLES:
+        raise FileError(f"{what} is no plan that can be evaluated; plan it again")
+    return plan
 
 
 # ``SOURCES.yaml`` states the sources of uncertainty of the machine:

@@ -147,6 +147,37 @@ TEMPLATES: dict[str, str] = {
         "{p:chance}), and the band includes the difference: make steps as small as the deflections "
         "of a scan, look for a part that is loose or rubs, and repeat the test"
     ),
+    # A multisine.
+    "identification.multisine_lost": (
+        "{lost:%} of the readings of the multisine are lost, at most {most:%} may be; centre the "
+        "probe in its range and record it again"
+    ),
+    "identification.multisine_other": (
+        "the recording lasts {found:s}, the plan {expected:s} in samples of {period:s}; record the "
+        "whole multisine at the sample period of its plan"
+    ),
+    "identification.multisine_motion": (
+        "the recorded motion and the plan correlate by {correlation:%}; give the plan that the "
+        "machine ran"
+    ),
+    "identification.multisine_agrees": (
+        "a multisine confirms the response from {low:Hz} to {high:Hz}, without a model: {share:%} "
+        "of its lines differ by more than both uncertainties, the largest difference is {largest:%}"
+    ),
+    "identification.multisine_differs": (
+        "a multisine contradicts the response from {low:Hz} to {high:Hz}: {share:%} of its lines "
+        "differ by more than both uncertainties, by {largest:%} at most; look for what changed "
+        "between the recordings, and for play or friction"
+    ),
+    "identification.multisine_linear": (
+        "nonlinear distortion of the multisine is {distortion:m} (k = 2), most of it, {level:m}, "
+        "from {first:Hz} to {last:Hz}"
+    ),
+    "identification.multisine_nonlinear": (
+        "the machine is not linear enough: nonlinear distortion of the multisine is {distortion:m} "
+        "(k = 2), {accuracy:m} is asked for; most of it, {level:m}, is from {first:Hz} to "
+        "{last:Hz}: look for play and friction, or move less"
+    ),
     # The residual.
     "identification.noisy_rest": (
         "where the axis moves the residual is only {chi_square:plain/2} times the noise of "

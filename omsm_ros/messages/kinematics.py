@@ -14,6 +14,10 @@ TEMPLATES: dict[str, str] = {
     "kinematics.period": "from {first} on the sample period is {period:.6g} s",
     "kinematics.more_gaps": "{gaps} more gaps",
     # Trajectories
+    "kinematics.multisine": (
+        "multisine: {periods} periods and {realisations} realisations, expected 2 or more of each; "
+        "up to {up_to} Hz, expected {least:.3g} to {most:.3g} Hz"
+    ),
     "kinematics.step_test": (
         "step test: count {count!r} must be 1 or more and dwell {dwell!r} s longer than rise "
         "{rise!r} s, which must not be negative"

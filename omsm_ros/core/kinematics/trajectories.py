@@ -3,7 +3,7 @@
 Each motion gives the commanded axes at any time, also before its start.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -288,7 +288,110 @@ def plan_steps(
     )
 
 
-def plan_csv(plan: StepPlan, period: float) -> str:
+# Of each group of so many odd lines, one is left out to show distortion of odd degree.
+_GROUP = 4
+
+
+@dataclass(frozen=True, slots=True)
+class MultisinePlan:
+    """A random-phase multisine in Z for the best linear approximation.
+
+    sample_period: [s];  period: samples of a period;  periods: that are evaluated
+    realisations: with phases of their own, each after one period in which the phases change
+    lines: that are excited, in periods a period;  amplitudes: of each [m];  seed: of the phases
+    """
+
+    sample_period: float
+    period: int
+    periods: int
+    realisations: int
+    lines: tuple[int, ...]
+    amplitudes: tuple[float, ...]
+    seed: int
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples, with one period in which the motion ends."""
+        return self.period * (self.realisations * (self.periods + 1) + 1)
+
+    @property
+    def duration(self) -> float:
+        """Return the duration [s]."""
+        return self.samples * self.sample_period
+
+    def z(self, time: FloatArray) -> FloatArray:
+        """Return the commanded position [m] at ``time`` (n,) [s]."""
+        turns = np.asarray(time, np.float64) / (self.period * self.sample_period)
+        random, found = np.random.default_rng(self.seed), np.zeros(len(turns))
+        for number in range(self.realisations):
+            start = number * (self.periods + 1)
+            phases = random.uniform(0, 2 * np.pi, len(self.lines))
+            used = np.flatnonzero((turns > start) & (turns < start + self.periods + 2))
+            own, wave = turns[used], np.zeros(len(used))
+            for line, amplitude, phase in zip(self.lines, self.amplitudes, phases, strict=True):
+                wave += amplitude * np.cos(2 * np.pi * line * own + phase)
+            found[used] += wave * (s_curve(own - start) - s_curve(own - start - self.periods - 1))
+        return found
+
+    def positions(self, time: FloatArray) -> AxisPositions:
+        """Return the commanded axes at ``time`` [s]; only Z moves."""
+        return _z_only(self.z(time))
+
+
+def plan_multisine(
+    *,
+    sample_period: float,
+    resolution: float = 0.5,
+    up_to: float = 60.0,
+    periods: int = 3,
+    realisations: int = 6,
+    half_range: float = 50e-6,
+    speed: float = 5e-3,
+    acceleration: float = 1.0,
+    seed: int = 1,
+) -> MultisinePlan:
+    """Return a multisine of odd lines up to ``up_to`` [Hz], as large as the limits allow.
+
+    resolution: distance of lines [Hz];  half_range: of the probe [m]
+    speed, acceleration: largest of the axis [m/s], [m/s²]
+    The amplitude falls with the frequency, as those of scans do.
+
+    Raises ConfigurationError for a plan that cannot be sampled or evaluated.
+    """
+    period = round(1 / (resolution * sample_period))
+    last = int(up_to / resolution)
+    if periods < 2 or realisations < 2 or not 2 * _GROUP <= last < 0.4 * period:
+        raise ConfigurationError(
+            "kinematics.multisine",
+            periods=periods,
+            realisations=realisations,
+            up_to=up_to,
+            least=2 * _GROUP * resolution,
+            most=0.4 / sample_period,
+        )
+    odd = np.arange(1, last + 1, 2)
+    random = np.random.default_rng(seed)
+    left_out = np.arange(0, len(odd) - _GROUP + 1, _GROUP)
+    lines = np.delete(odd, left_out + random.integers(1, _GROUP, len(left_out)))
+    shape = 1 / (lines + 0.1 * last)
+    plan = MultisinePlan(
+        sample_period,
+        period,
+        periods,
+        realisations,
+        tuple(lines.tolist()),
+        tuple(shape.tolist()),
+        seed,
+    )
+    z = plan.z(sample_period * np.arange(plan.samples))
+    rate = np.diff(z) / sample_period
+    sizes = np.max(np.abs(z)), np.max(np.abs(rate)), np.max(np.abs(np.diff(rate))) / sample_period
+    allowed = half_range, speed, acceleration
+    size = 0.98 * min(most / found for most, found in zip(allowed, sizes, strict=True))
+    return replace(plan, amplitudes=tuple((size * shape).tolist()))
+
+
+def plan_csv(plan: StepPlan | MultisinePlan, period: float) -> str:
     """Return ``time_s,z_m`` lines every ``period`` [s]; ConfigurationError beyond a million."""
     if plan.duration > _MOST_LINES * period:
         raise ConfigurationError(
