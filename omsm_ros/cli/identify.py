@@ -119,13 +119,6 @@ def _declare(add: Arguments) -> None:
     add("--equivalent-time", None, "find a mode beyond half the sampling rate from the edges, if "
         "they are sharp and start at different fractions of a sample")  # fmt: skip
     _declare_use(add)
-    add(
-        "--multisine",
-        "BAG",
-        "recording of a multisine on the fixed target: confirms the response without a model, and "
-        "tells whether the machine is linear enough",
-    )
-    add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
     add.trigger()
     add("--report", "DIR", "write the certificate, or the model's page")
     add.catalogue()
@@ -145,6 +138,13 @@ def _declare_use(add: Arguments) -> None:
         "required expanded uncertainty of a height of that scan, k = 2 [m]",
     )
     add.origin()
+    add(
+        "--multisine",
+        "BAG",
+        "recording of a multisine on the fixed target: confirms the response without a model, and "
+        "tells whether the machine is linear enough",
+    )
+    add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
 
 
 def _of_calibration(origin: dict[str, object]) -> dict[str, object]:

@@ -358,8 +358,7 @@ def plan_multisine(
 
     Raises ConfigurationError for a plan that cannot be sampled or evaluated.
     """
-    period = round(1 / (resolution * sample_period))
-    last = int(up_to / resolution)
+    period, last = round(1 / (resolution * sample_period)), int(up_to / resolution)
     if periods < 2 or realisations < 2 or not 2 * _GROUP <= last < 0.4 * period:
         raise ConfigurationError(
             "kinematics.multisine",
