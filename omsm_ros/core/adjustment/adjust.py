@@ -21,6 +21,7 @@ from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, w
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
 from omsm_ros.core.adjustment.refutation import (
+    Doubt,
     Refutation,
     completed,
     fit_and_refute,
@@ -171,11 +172,11 @@ def _adjusted(
     begin = float(min(s.time[0] for s in scans))
     views = [view_of(s, k, begin, surface) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, priors)
-    detecting, refutations = _fitted(network, views, sizes, priors)
+    detecting, refutations, doubts = _fitted(network, views, sizes, priors)
     evidences = _evidences(detecting, refutations)
     solution = completed(detecting, refutations)
     families = solution.network.families
-    form = form_map(solution, surface, removed)
+    form = form_map(solution, surface, removed, doubts)
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
     declared = {p.name for p in priors}
@@ -234,7 +235,7 @@ def _network(
 def _fitted(
     network: Network, views: Sequence[ScanView], sizes: Mapping[str, float],
     priors: Sequence[Source],
-) -> tuple[Solution, tuple[Refutation, ...]]:  # fmt: skip
+) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:  # fmt: skip
     """Return the solution, lines and steps of the residuals among its families."""
     walk = {p.name: p.uncertainty for p in priors}.get("drift_walk")
     y = network.blocks.deviation

@@ -16,6 +16,7 @@ from scipy import linalg, sparse
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
+from omsm_ros.core.adjustment.refutation import Doubt
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -86,21 +87,28 @@ class _Places:
 
 
 def form_map(
-    solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE, seed: int = 0
+    solution: Solution,
+    nominal: Surface | None,
+    removed: Sequence[str] = POSE,
+    doubts: Sequence[Doubt] = (),
+    seed: int = 0,
 ) -> FormMap:
     """Return the form error that ``solution`` found.
 
     nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
-    seed: of the draws
+    doubts: what they change is uncertain;  seed: of the draws
     """
     made = _Made.of(solution, nominal, removed)
     places, rows = made.places, made.rows[:, solution.active]
-    pv, rms = made.pv_and_rms(solution, seed)
+    open_changes = np.stack(
+        [np.zeros(len(made.height)), *(_change(d, nominal, removed) for d in doubts)], axis=1
+    )
+    pv, rms = made.pv_and_rms(solution, seed, open_changes)
     spread = solution.factor.forward(rows.T)
     raw = spread.T @ spread
     of_cells = made.member @ sparse.diags_array(made.share) @ made.member.T
     raw += of_cells.toarray()
-    covariance = made.free(made.free(raw).T)
+    covariance = made.free(made.free(raw).T) + open_changes @ open_changes.T
     terms, by_heights = _term_fit(solution, places)
     return FormMap(
         x=places.x,
@@ -117,6 +125,12 @@ def form_map(
         removed=tuple(removed),
         pose=made.pose,
     )
+
+
+def _change(doubt: Doubt, nominal: Surface | None, removed: Sequence[str]) -> FloatArray:
+    """Return what ``doubt`` leaves open of the map, one standard uncertainty, (n,) [m]."""
+    before, after = (_Made.of(s, nominal, removed).height for s in (doubt.before, doubt.after))
+    return np.asarray(doubt.share * (after - before))
 
 
 def pv_and_rms(
@@ -191,9 +205,17 @@ class _Made:
             rows, share, member, columns, fit,
         )  # fmt: skip
 
-    def pv_and_rms(self, solution: Solution, seed: int) -> tuple[Figure, Figure]:
-        """Return PV and rms with their uncertainty by draws."""
+    def pv_and_rms(
+        self, solution: Solution, seed: int, open_changes: FloatArray | None = None
+    ) -> tuple[Figure, Figure]:
+        """Return PV and rms with their uncertainty by draws.
+
+        open_changes: further changes of the map (n, k), each as likely as a normal deviate [m]
+        """
         draws = self.free(self.errors(solution, seed))
+        if open_changes is not None:
+            chance = np.random.default_rng([seed, 1])
+            draws += open_changes @ chance.standard_normal((open_changes.shape[1], _DRAWS))
         rms = _figure(self.height, draws, lambda h: _rms(self.places, h))
         return _figure(self.height, draws, _pv), rms
 

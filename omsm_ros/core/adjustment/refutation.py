@@ -25,6 +25,10 @@ _LEAST_GAIN = 10.0
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
+# What a first cause leaves for others is the error of its model, if it is less than this share.
+_MODEL_SHARE = 0.01
+# Families that explain this share of the cause may stand behind it: no model of one is exact.
+_RIVAL_SHARE = 0.2
 # A family whose value changes by less than this share is a cause of its own.
 _UNCHANGED = 0.3
 # A lag that depends on something has an unknown mean, which is no further cause.
@@ -44,11 +48,13 @@ class Refutation:
     """A family that the scans show beyond what was declared.
 
     evidence: when it was released;  others: of the families that explain the same
+    rivals: of those that explain a part of it, and would make another form
     explains: True if it, or one that is alike, explains all that belongs together
     """
 
     evidence: Evidence
     others: tuple[Evidence, ...]
+    rivals: tuple[Evidence, ...] = ()
     explains: bool = True
 
     @property
@@ -60,6 +66,18 @@ class Refutation:
     def alike(self) -> tuple[str, ...]:
         """Names of the families that explain the same."""
         return tuple(e.family.name for e in self.others)
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """A release that may not be right: the form by ``after`` less that by ``before``.
+
+    share: of this difference that is a standard uncertainty of the form
+    """
+
+    before: Solution
+    after: Solution
+    share: float
 
 
 def start_scales(network: Network, walk: float | None) -> Scales:
@@ -94,16 +112,19 @@ def _alike(one: Scales, other: Scales) -> bool:
 
 def fit_and_refute(
     network: Network, y: FloatArray, scales: Scales, sizes: Mapping[str, float]
-) -> tuple[Solution, tuple[Refutation, ...]]:
-    """Return the solution with all refuted families released, and which they are."""
+) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
+    """Return the solution with all refuted families released, which they are, and what is open."""
     solution = settled(solve(network, y, scales, sizes), _FIRST_STEPS)
-    before = {f.name: evidence_of(solution, f).values for f in network.families}
+    first = {f.name: evidence_of(solution, f).values for f in network.families}
     found: list[Refutation] = []
+    steps = [solution]
+    least = _LEAST_GAIN
     while len(found) < _MOST_RELEASED:
-        beyond = refuted_by(solution, [r.name for r in found])
+        beyond = [e for e in refuted_by(solution, [r.name for r in found]) if e.gain > least]
         if not beyond:
             break
         best = _culprit(beyond)
+        least = max(least, _MODEL_SHARE * best.gain)
         family = best.family
         # As large as it was found, if that is more than plausible.
         size = max(family.wide, float(np.sqrt(np.mean(best.values**2))))
@@ -111,35 +132,52 @@ def fit_and_refute(
             solve(network, y, solution.scales, {**solution.sizes, family.name: size}),
             _FURTHER_STEPS,
         )
+        steps.append(solution)
         still = {e.family.name for e in refuted_by(solution, [*(r.name for r in found)])}
-        alike = [e for e in beyond if e is not best and e.family.named and _as_good(e, best)]
-        found.append(Refutation(best, tuple(e for e in alike if e.family.name not in still)))
-    return solution, tuple(_grouped(found, before))
+        named = [e for e in beyond if e is not best and e.family.named]
+        alike = [e for e in named if _as_good(e, best) and e.family.name not in still]
+        rivals = [e for e in named if e.gain > _RIVAL_SHARE * best.gain]
+        found.append(Refutation(best, tuple(alike), tuple(rivals)))
+    left = max((e.gain for e in refuted_by(solution, [r.name for r in found])), default=0.0)
+    return solution, *_grouped(found, steps, first, left)
 
 
-def _grouped(found: Sequence[Refutation], before: Mapping[str, FloatArray]) -> list[Refutation]:
-    """Return causes; a family released because of an earlier one belongs to that one.
+def _grouped(
+    found: Sequence[Refutation], steps: Sequence[Solution], first: Mapping[str, FloatArray],
+    rest: float,
+) -> tuple[tuple[Refutation, ...], tuple[Doubt, ...]]:  # fmt: skip
+    """Return causes and doubts; a family released because of an earlier one belongs to that one.
 
     A family that was found as large before anything was released is a cause of its own, as is the
-    same cause in another scan. What
-    became so, or less so, by a release is what that one leaves; more than a model error's share of
-    it, and no single family explains what the scans show.
-    before: found value of each family before the first release
+    same cause in another scan. What became so, or less so, by a release is what that one leaves:
+    more than a model error's share, and no single family explains what the scans show.
+    first: found value of each family before the first release;  rest: gain that is left at the end
     """
     causes: list[Refutation] = []
     left: list[float] = []
+    of: list[int] = []
     for one in found:
-        moved = np.linalg.norm(one.evidence.values - before[one.name])
+        moved = np.linalg.norm(one.evidence.values - first[one.name])
         again = base_name(one.name) in {base_name(c.name) for c in causes}
         if not causes or again or moved < _UNCHANGED * np.linalg.norm(one.evidence.values):
             causes.append(one)
             left.append(0.0)
-        elif one.name != _OFFSET:
+            of.append(len(causes) - 1)
+            continue
+        of.append(0)
+        if one.name != _OFFSET:
             left[0] += one.evidence.chi_square
-    return [
-        replace(c, explains=more <= max(_ALIKE, _ALIKE_SHARE * c.evidence.chi_square))
-        for c, more in zip(causes, left, strict=True)
-    ]
+    shares = []
+    for k, (cause, more) in enumerate(zip(causes, left, strict=True)):
+        chi_square = cause.evidence.chi_square
+        explains = more <= max(_ALIKE, _ALIKE_SHARE * chi_square)
+        causes[k] = replace(cause, explains=explains)
+        shares.append(min(np.sqrt((more + rest) / chi_square), 1.0) if explains else 1.0)
+    doubts = (
+        Doubt(before, after, float(shares[k]))
+        for before, after, k in zip(steps, steps[1:], of, strict=False)
+    )
+    return tuple(causes), tuple(doubts)
 
 
 def refuted_by(solution: Solution, released: Sequence[str]) -> list[Evidence]:
@@ -164,7 +202,8 @@ def _as_good(one: Evidence, best: Evidence) -> bool:
 def _culprit(beyond: list[Evidence]) -> Evidence:
     """Return the simplest of those that explain as much; a named one before one that detects."""
     as_good = [e for e in beyond if _as_good(e, beyond[0])]
-    return min(as_good, key=lambda e: (not e.family.named, e.family.size))
+    named = [e for e in as_good if e.family.named] or as_good
+    return min((e for e in named if e.gain >= named[0].gain - _ALIKE), key=lambda e: e.family.size)
 
 
 def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Solution:
@@ -173,7 +212,8 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
     What is neither declared nor seen in the residuals may be there, as large as the residuals and
     its plausible size allow: the form's uncertainty counts its mean square, which is that size
     times the probability that it is there (Hoeting et al., Statist. Sci. 14, 382). Families that
-    explain what was seen as well as the one that was released count by their odds against it.
+    explain a part of what was seen count by that part: no model is exact, so that the likelihood
+    alone would be too sure.
     """
     sizes: dict[str, float | FloatArray] = dict(solution.sizes)
     for family in solution.network.families:
@@ -183,9 +223,8 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
             size = np.sqrt(there) * np.hypot(one.values, one.uncertainty)
             sizes[family.name] = np.minimum(size, family.wide)
     for refutation in refutations:
-        for other in refutation.others:
-            odds = np.exp(min(other.gain - refutation.evidence.gain, 0.0) / 2)
-            size = np.sqrt(odds / (1 + odds)) * np.abs(other.values)
-            name = other.family.name
+        for other in refutation.rivals:
+            share = min(other.gain / refutation.evidence.gain, 1.0)
+            name, size = other.family.name, np.sqrt(share) * np.abs(other.values)
             sizes[name] = np.maximum(sizes.get(name, 0.0), size)
     return solve(solution.network, solution.y, solution.scales, sizes)
