@@ -16,7 +16,14 @@ from omsm_ros.core.adjustment.disturbances import (
 )
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
-from omsm_ros.core.adjustment.figures import POSE, FormMap, effects_on_form, form_map
+from omsm_ros.core.adjustment.figures import (
+    NO_EFFECT,
+    POSE,
+    Effect,
+    FormMap,
+    effects_on_form,
+    form_map,
+)
 from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_squares
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
@@ -181,8 +188,7 @@ def _adjusted(
     wrong = _wrong_signs(views)
     declared = {p.name for p in priors}
     contradictions = reasons_of(
-        refutations, declared, agreement, wrong, _walk(detecting, priors),
-        detecting.scales.texture, accepted,
+        refutations, declared, agreement, wrong, _walk(detecting, priors), accepted
     )  # fmt: skip
     effects = effects_on_form(solution, surface, removed)
     limit = open_limit(accuracy)
@@ -267,7 +273,7 @@ def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[E
 def _findings(
     solution: Solution,
     evidences: Sequence[Evidence],
-    effects: Mapping[str, tuple[float, float]],
+    effects: Mapping[str, Effect],
     priors: Sequence[Source],
     refutations: Sequence[Refutation],
 ) -> tuple[SourceFinding, ...]:
@@ -289,7 +295,7 @@ def _findings(
                     solution.uncertainty(family.name) if takes_part else evidence.uncertainty
                 ),
                 effect=evidence.effect,
-                possible=effects.get(family.name, (0.0, 0.0))[0],
+                possible=effects.get(family.name, NO_EFFECT).left,
                 shown=evidence.shown,
                 shown_by=family.shown_by,
                 deviate=evidence.deviate,

@@ -36,6 +36,7 @@ class Evidence:
         gains less (Occam)
     free: root of the covariance (size, size) that the scans leave if the declaration is worth
         nothing, and the family may be as large as ``wide``
+    declared: True if it takes part by a declared size or a default
     deviate: of a normal distribution, as rare as χ² is
     """
 
@@ -47,6 +48,7 @@ class Evidence:
     effect: float
     gain: float
     free: FloatArray
+    declared: bool
 
     @property
     def shown(self) -> bool:
@@ -153,4 +155,5 @@ def _evidence(
     change = net.column(family.name) @ values
     effect = float(np.sqrt(np.average(change**2, weights=net.blocks.count)))
     chi_square, dof, gain = tested
-    return Evidence(family, values, uncertainty, chi_square, dof, effect, gain, free)
+    declared = family.name in solution.sizes
+    return Evidence(family, values, uncertainty, chi_square, dof, effect, gain, free, declared)

@@ -154,7 +154,9 @@ def _dynamic(r: Ranges) -> list[Family]:
         Family("lag_c", "s", 2, lambda v: v.motion_rate * np.stack(_waves(v.c, 1)), 1e-4,
                RECLOCKED),
         _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
-        _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
+        _one("creep", "1", lambda v: v.motion_fading[:, 0], 1e-3, OTHER_SPEED),
+        # A step test with plateaus of half a second hardly sees it.
+        Family("creep_slow", "1", 2, lambda v: v.motion_fading[:, 1:].T, 2e-4, OTHER_SPEED),
         Family("removed", "1", 1, lambda v: v.removed[np.newaxis], 2.0, OTHER_SPEED, named=False),
     ]  # fmt: skip
     speeds = np.abs(r.speeds)
@@ -324,9 +326,10 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         ("c_error", "rad", 2, _C_HARMONICS, _angular, 2e-5),
     )
     return [
-        # Once a turn, a radial motion looks like a decentred part: only its size tells.
+        # Once a turn, a radial motion looks like a decentred part: only its size tells. Every scale
+        # of C has errors of a few arc seconds.
         Family(order_name(name, n), unit, size, columns(n), wide, RECLOCKED,
-               5e-8 if (name, n) == ("spindle_radial", 1) else None)
+               1e-5 if name == "c_error" else 5e-8 if (name, n) == ("spindle_radial", 1) else None)
         for name, unit, size, usual, columns, wide in table
         for n in orders(name, usual)
     ]  # fmt: skip

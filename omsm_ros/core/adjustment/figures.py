@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse
@@ -140,14 +141,24 @@ def pv_and_rms(
     return _Made.of(solution, nominal, removed).pv_and_rms(solution, seed)
 
 
+class Effect(NamedTuple):
+    """What a family may do to the form, rms over the part, k = 1 [m].
+
+    left: by what scans and prior leave open;  free: by what the scans alone leave open if the prior
+        is worth nothing, and the family may have its size ``wide``
+    """
+
+    left: float
+    free: float
+
+
+NO_EFFECT = Effect(0.0, 0.0)
+
+
 def effects_on_form(
     solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE
-) -> dict[str, tuple[float, float]]:
-    """Return by family what it may do to the form, rms over the part, k = 1 [m].
-
-    First what scans and prior leave open, then what the scans alone leave open if the prior is
-    worth nothing and the family may have its size ``wide``. All others are fitted together with it.
-    """
+) -> dict[str, Effect]:
+    """Return by family what it may do to the form; all others are fitted together with it."""
     made = _Made.of(solution, nominal, removed)
     # L P, with P the covariance of the parameters that take part.
     through = made.free(made.rows[:, solution.active] @ solution.covariance)
@@ -160,9 +171,9 @@ def effects_on_form(
         covariance = solution.covariance_of(here)
         change = through[:, first : first + family.size] @ np.linalg.pinv(covariance, rcond=1e-10)
         share, axes = np.linalg.eigh(covariance)
-        roots = axes * np.sqrt(np.maximum(share, 0.0)), evidence_of(solution, family).free
-        left, free = (float(np.sqrt(np.sum(made.places.area @ (change @ r) ** 2))) for r in roots)
-        found[family.name] = left, max(left, free)
+        left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
+        free = _rms(made.places, change @ evidence_of(solution, family).free)
+        found[family.name] = Effect(left, max(left, free))
     return found
 
 
@@ -216,7 +227,7 @@ class _Made:
         if open_changes is not None:
             chance = np.random.default_rng([seed, 1])
             draws += open_changes @ chance.standard_normal((open_changes.shape[1], _DRAWS))
-        rms = _figure(self.height, draws, lambda h: _rms(self.places, h))
+        rms = _figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
         return _figure(self.height, draws, _pv), rms
 
     def free(self, heights: FloatArray) -> FloatArray:
@@ -240,8 +251,9 @@ def _pv(heights: FloatArray) -> FloatArray:
     return np.asarray(np.ptp(heights, axis=0))
 
 
-def _rms(places: _Places, heights: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(places.area @ heights**2))
+def _rms(places: _Places, shapes: FloatArray) -> float:
+    """Return the rms over the part of the sum of independent ``shapes`` (n, k)."""
+    return float(np.sqrt(np.sum(places.area @ shapes**2)))
 
 
 def _places(solution: Solution) -> _Places:

@@ -28,7 +28,7 @@ _ALIKE, _ALIKE_SHARE = 12.0, 0.05
 # What a first cause leaves for others is the error of its model, if it is less than this share.
 _MODEL_SHARE = 0.01
 # Families that explain this share of the cause may stand behind it: no model of one is exact.
-_RIVAL_SHARE = 0.2
+_RIVAL_SHARE, _RARE, _MOST_WIDE = 0.2, 3.0, 3.0
 # A family whose value changes by less than this share is a cause of its own.
 _UNCHANGED = 0.3
 # A lag that depends on something has an unknown mean, which is no further cause.
@@ -49,12 +49,14 @@ class Refutation:
 
     evidence: when it was released;  others: of the families that explain the same
     rivals: of those that explain a part of it, and would make another form
+    minor: True if texture, which differs from track to track, may have made it
     explains: True if it, or one that is alike, explains all that belongs together
     """
 
     evidence: Evidence
     others: tuple[Evidence, ...]
     rivals: tuple[Evidence, ...] = ()
+    minor: bool = False
     explains: bool = True
 
     @property
@@ -120,7 +122,8 @@ def fit_and_refute(
     steps = [solution]
     least = _LEAST_GAIN
     while len(found) < _MOST_RELEASED:
-        beyond = [e for e in refuted_by(solution, [r.name for r in found]) if e.gain > least]
+        evidences = [evidence_of(solution, f) for f in network.families]
+        beyond = _beyond(evidences, [r.name for r in found], least)
         if not beyond:
             break
         best = _culprit(beyond)
@@ -133,11 +136,13 @@ def fit_and_refute(
             _FURTHER_STEPS,
         )
         steps.append(solution)
-        still = {e.family.name for e in refuted_by(solution, [*(r.name for r in found)])}
-        named = [e for e in beyond if e is not best and e.family.named]
-        alike = [e for e in named if _as_good(e, best) and e.family.name not in still]
-        rivals = [e for e in named if e.gain > _RIVAL_SHARE * best.gain]
-        found.append(Refutation(best, tuple(alike), tuple(rivals)))
+        still = {e.family.name for e in refuted_by(solution, [r.name for r in found])}
+        alike = [e for e in beyond if e is not best and e.family.named and _as_good(e, best)
+                 and e.family.name not in still]  # fmt: skip
+        minor = best.effect < 2 * solution.scales.texture and best.gain < _SURE
+        rivals = [e for e in evidences if e is not best and e.deviate > _RARE and not minor
+                  and explained(e, best) > _RIVAL_SHARE]  # fmt: skip
+        found.append(Refutation(best, tuple(alike), tuple(rivals), minor))
     left = max((e.gain for e in refuted_by(solution, [r.name for r in found])), default=0.0)
     return solution, *_grouped(found, steps, first, left)
 
@@ -182,17 +187,35 @@ def _grouped(
 
 def refuted_by(solution: Solution, released: Sequence[str]) -> list[Evidence]:
     """Return the evidence of the families beyond their declaration, strongest first."""
-    found = []
-    for family in solution.network.families:
-        if family.name in released or base_name(family.name) in FREE:
-            continue
-        declared = family.name in solution.sizes
-        evidence = evidence_of(solution, family)
-        limit = _DECLARED_LIMIT if declared else _UNDECLARED_LIMIT
-        rare = evidence.deviate > limit and evidence.gain > _LEAST_GAIN
-        if rare and evidence.effect > _LEAST_EFFECT_M:
-            found.append(evidence)
+    evidences = [evidence_of(solution, f) for f in solution.network.families]
+    return _beyond(evidences, released, _LEAST_GAIN)
+
+
+def _beyond(evidences: Sequence[Evidence], released: Sequence[str], least: float) -> list[Evidence]:
+    """Return those that are rare and gain more than ``least``, strongest first."""
+    found = [
+        e
+        for e in evidences
+        if e.gain > least
+        and e.effect > _LEAST_EFFECT_M
+        and e.deviate > (_DECLARED_LIMIT if e.declared else _UNDECLARED_LIMIT)
+        and e.family.name not in released
+        and base_name(e.family.name) not in FREE
+    ]
     return sorted(found, key=lambda e: -e.gain)
+
+
+def explained(one: Evidence, best: Evidence) -> float:
+    """Return the share of what ``best`` explains that family ``one`` alone would explain.
+
+    Of a declared family, against the odds that its declaration is wrong; far beyond its plausible
+    size it explains nothing.
+    """
+    beyond = float(np.sqrt(np.mean(one.values**2))) > _MOST_WIDE * one.family.wide
+    if not one.family.named or base_name(one.family.name) in FREE or (one.declared and beyond):
+        return 0.0
+    size = one.gain if one.declared else one.chi_square - one.dof
+    return float(np.clip(size / best.chi_square, 0.0, 1.0))
 
 
 def _as_good(one: Evidence, best: Evidence) -> bool:
@@ -224,7 +247,7 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
             sizes[family.name] = np.minimum(size, family.wide)
     for refutation in refutations:
         for other in refutation.rivals:
-            share = min(other.gain / refutation.evidence.gain, 1.0)
+            share = explained(other, refutation.evidence)
             name, size = other.family.name, np.sqrt(share) * np.abs(other.values)
             sizes[name] = np.maximum(sizes.get(name, 0.0), size)
     return solve(solution.network, solution.y, solution.scales, sizes)

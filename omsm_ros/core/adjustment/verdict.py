@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
+from omsm_ros.core.adjustment.figures import NO_EFFECT, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.sources import FREE, Family, Source, base_name
@@ -77,21 +78,18 @@ def reasons_of(
     agreement: Sequence[ScanAgreement],
     wrong_sign: Sequence[tuple[int, float]],
     walk: tuple[float, float, float | None],
-    texture: float,
     accepted: Collection[str],
 ) -> tuple[Reason, ...]:
     """Return what contradicts the scans or their declarations.
 
     declared: names of the declared sources;  wrong_sign: scan, and share that it follows
     walk: of the drift after one second, found, its relative uncertainty, and declared [m]
-    texture: of the part, which differs from track to track: an effect within k = 2 of it
-        contradicts nothing [m]
     accepted: names of families whose found value somebody has accepted
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
     for refutation in refutations:
         names = (refutation.name, *refutation.alike)
-        if refutation.name in accepted or refutation.evidence.effect < 2 * texture:
+        if refutation.minor or refutation.name in accepted:
             continue
         known = base_name(refutation.name) in declared
         code = REFUTED if known else UNDECLARED_EFFECT
@@ -124,7 +122,7 @@ def open_limit(accuracy: float | None) -> float:
 
 def not_evaluated(
     families: Sequence[Family],
-    effects: Mapping[str, tuple[float, float]],
+    effects: Mapping[str, Effect],
     priors: Sequence[Source],
     limit: float,
 ) -> tuple[Reason, ...]:
@@ -141,7 +139,7 @@ def not_evaluated(
         prior = stated.get(base_name(family.name))
         if not family.named or family.default is not None or (prior and prior.evaluated):
             continue
-        _, free = effects.get(family.name, (0.0, 0.0))
+        free = effects.get(family.name, NO_EFFECT).free
         if free > limit:
             code = NOT_EVALUATED if prior is None else DECLARED_ONLY
             found.append(Reason(code, (family.name, family.shown_by), free, limit))
@@ -149,7 +147,7 @@ def not_evaluated(
 
 
 def rests_on(
-    families: Sequence[Family], effects: Mapping[str, tuple[float, float]], limit: float
+    families: Sequence[Family], effects: Mapping[str, Effect], limit: float
 ) -> tuple[tuple[str, float], ...]:
     """Return the sources that count as they were declared, for these scans do not show them.
 
@@ -157,9 +155,9 @@ def rests_on(
     limit: a source that may do more if its declaration is worth nothing is one of them [m]
     """
     found = [
-        (f.name, effects[f.name][0])
+        (f.name, effects[f.name].left)
         for f in families
-        if base_name(f.name) not in FREE and effects.get(f.name, (0.0, 0.0))[1] > limit
+        if base_name(f.name) not in FREE and effects.get(f.name, NO_EFFECT).free > limit
     ]
     return tuple(sorted(found, key=lambda pair: -pair[1]))
 
