@@ -36,7 +36,7 @@ def table():
 
 
 def test_a_second_speed_takes_away_what_one_scan_cannot(table):
-    """Form error within what is stated, 75 nm of one scan and 5 of two, with the C that nobody evaluated."""
+    """Form error within what is stated: 75 nm of one scan, 5 of two."""
     machine, _, found = table
     for adjustment, least, most in zip(found, (20e-9, 0, 0), (100e-9, 5.5e-9, 4.5e-9), strict=True):
         *_, error = normalised(machine, adjustment)
