@@ -4,8 +4,10 @@ import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
+from omsm_ros.core.ripple.lines import MOST_LINES
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
+from omsm_ros.io.files import SPECTRUM
 from omsm_ros.pipelines.correct import Admission
 from omsm_ros.pipelines.publish import publish_spectra
 from omsm_ros.pipelines.spectrum import SpectrumOptions
@@ -61,7 +63,13 @@ def _show_spectrum(facts: Facts) -> None:
     for scan in facts["scans"]:
         say(f"{scan['name']}: {scan['samples']['analysed']} points, "
               f"{quantity(scan['noise']['rms'], 'm')} rms without its lines")  # fmt: skip
-        table([_peak_row(peak) for peak in scan["peaks"]] or [("", "no line beyond 3 σ")])
+        peaks = scan["peaks"]
+        rows = [_peak_row(peak) for peak in peaks[:_MOST_SHOWN]] or [("", "no line beyond 3 σ")]
+        if more := len(peaks) - _MOST_SHOWN:
+            rows += [("", f"{more} further lines are in {SPECTRUM}")] * (more > 0)
+        table(rows)
+        if scan["lines_limited"]:
+            say(f"weaker lines than the {MOST_LINES} strongest were not sought")
         table([("  vibration", one["finding"]) for one in scan["vibration_removed"]])
         if stopped := scan["band_stop"]:
             say(f"band stop, zero phase: {quantity(stopped['rms_before'], 'm')} → "
@@ -84,5 +92,8 @@ def _peak_row(peak: Facts) -> tuple[str, str]:
         size += f"{quantity(peak['amplitude_on_part_uncertainty'], 'm', 2)})"
     return f"  {where}", f"{size}, {plain(peak['significance'])} σ: {what}: {why}"
 
+
+# Lines of a scan on the terminal.
+_MOST_SHOWN = 40
 
 COMMANDS = (CliCommand("spectrum", _declare_spectrum, _spectrum, _show_spectrum),)

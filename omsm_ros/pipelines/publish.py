@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.ripple.density import Density
+from omsm_ros.core.ripple.scan_signal import PATH, TIME
 from omsm_ros.core.surface.deviation import RunningStatistics, deviation
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.io.files import (
@@ -25,6 +27,7 @@ from omsm_ros.io.files import (
     save_text,
 )
 from omsm_ros.io.folders import result_folder
+from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import CloudFile, PlyWriter, read_curves, read_form, read_summary
 from omsm_ros.io.topics import AnyBag
@@ -138,7 +141,9 @@ def publish_spectra(
     """Analyse the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
     kind = "band_stopped" if options.stop else "vibration_removed"
     clouds = [f"{kind}_{k + 1}.ply" for k in range(len(paths))]
-    with result_folder(out, (*clouds, *_clouds_before(out), REPORT, SPECTRUM)) as folder:
+    densities = [n.format(k + 1) for k in range(len(paths)) for _, n, _ in _DENSITIES]
+    owned = (*clouds, *densities, *_files_before(out), REPORT, SPECTRUM)
+    with result_folder(out, owned) as folder:
         scans = spectra_of(paths, options, progress)
         summary = summary_of(scans, options)
         files = {"spectrum": SPECTRUM}
@@ -148,6 +153,11 @@ def publish_spectra(
                 ply.write(cleaned_points(scan))
             what = "the band" if options.stop else "its vibration"
             files[f"{scan.studied.signal.name} without {what}"] = name
+        for k, scan in enumerate(scans, 1):
+            for coordinate, name, units in _DENSITIES:
+                if coordinate == TIME or coordinate in scan.studied.coordinates:
+                    files[f"density {k} over {coordinate}"] = name.format(k)
+                    _write_density(folder / name.format(k), scan.studied.density(coordinate), units)
         if report:
             # Imported on demand, because loading the figures takes longer than the analysis.
             from omsm_ros.report.spectrum import SpectrumPage, drawn, render
@@ -161,8 +171,20 @@ def publish_spectra(
     return summary
 
 
-def _clouds_before(out: Path) -> list[str]:
-    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply")
+# Coordinate, file, and columns of the densities of each scan.
+_DENSITIES = (
+    (TIME, "density_{}.csv", ("frequency_Hz", "density_m2_per_Hz")),
+    (PATH, "density_path_{}.csv", ("frequency_per_m", "density_m3")),
+)
+
+
+def _write_density(path: Path, found: Density, names: tuple[str, str]) -> None:
+    columns = dict(zip(names, (found.frequency, found.density), strict=True))
+    write_columns(path, columns, csv=True)
+
+
+def _files_before(out: Path) -> list[str]:
+    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply", "density_*.csv")
     is_result = (out / SPECTRUM).is_file()
     return [path.name for kind in kinds for path in out.glob(kind) if is_result]
 

@@ -27,6 +27,7 @@ from omsm_ros.core.ripple.exposure import (
     passing_textures,
     wavelength_of,
 )
+from omsm_ros.core.ripple.lines import MOST_LINES
 from omsm_ros.core.ripple.ripple_guard import NamedLine, analyse_scans, name_lines
 from omsm_ros.core.ripple.scan_signal import (
     PATH,
@@ -270,6 +271,7 @@ def _scan_facts(
             | {"finding": str(one.finding())}
             for one in scan.vibrations
         ],
+        "lines_limited": len(studied.spectrum.lines) >= MOST_LINES,
         "band_stop": _stop_facts(scan, options.stop),
     }
 

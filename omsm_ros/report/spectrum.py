@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from omsm_ros.core.ripple.density import Density, density, evenly, smoothed
+from omsm_ros.core.ripple.density import Density, smoothed
 from omsm_ros.core.ripple.ripple_guard import NamedLine
 from omsm_ros.core.ripple.scan_signal import PATH, TIME
 from omsm_ros.core.ripple.source_hypotheses import (
@@ -46,8 +46,7 @@ def over_time(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figur
     made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(scans) + 0.3, len(scans), 1, sharex=True)
     for row, (studied, named) in zip(axes[:, 0], scans, strict=True):
         signal = studied.signal
-        values = evenly(signal.time, studied.formless.residual, signal.period)
-        _curve(row, density(values, signal.period), 1.0)
+        _curve(row, studied.density(TIME), 1.0)
         _marks(row, named, TIME, 1.0, signal.duration)
         style.label(row, y="nm/√Hz", title=f"{style.named(signal.name)}, over time")
     _kinds(axes[0, 0], [row for _, named in scans for row in named])
@@ -63,9 +62,9 @@ def over_path(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figur
     made, axes = style.figure(_WIDTH_IN, _ROW_IN * len(moving) + 0.3, len(moving), 1, sharex=True)
     for row, (studied, named) in zip(axes[:, 0], moving, strict=True):
         signal = studied.signal
-        step = float(np.median(np.diff(signal.path) / np.diff(signal.sample)))
-        values = evenly(signal.path, studied.formless.residual, step)
-        _curve(row, density(values, step), MICROMETRE_M, over=True)
+        found = studied.density(PATH)
+        step = 0.5 / float(found.frequency[-1])
+        _curve(row, found, MICROMETRE_M, over=True)
         _marks(row, named, PATH, MICROMETRE_M, float(np.ptp(signal.path)))
         row.axvline(2 * step / MICROMETRE_M, color=style.MUTED, linewidth=0.8, linestyle=":")
         style.label(row, y="nm·√mm", title=f"{style.named(signal.name)}, along the path")

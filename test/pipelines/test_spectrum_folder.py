@@ -10,6 +10,7 @@ import plain_readers
 import pytest
 
 from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.ripple.density import Density
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.pipelines import publish as publish_spectrum
 from omsm_ros.pipelines.publish import publish_spectra
@@ -35,7 +36,8 @@ class Named(SimpleNamespace):
 
 
 def scan(name, count, removed=0.25):
-    studied = SimpleNamespace(signal=Named(name, count))
+    values = Density(np.arange(3.0), np.ones(3), 1.0)
+    studied = SimpleNamespace(signal=Named(name, count), coordinates={}, density=lambda _: values)
     read = SimpleNamespace(points=points(count))
     return SimpleNamespace(studied=studied, read=read, removed=np.full(count, removed))
 
@@ -55,7 +57,8 @@ def publish(monkeypatch, tmp_path):
 
 
 def held(tmp_path):
-    return sorted(path.name for path in (tmp_path / "out").iterdir())
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    return [name for name in names if not name.startswith("density")]
 
 
 def test_each_scan_has_its_cloud_without_the_band(publish, tmp_path):
@@ -65,6 +68,7 @@ def test_each_scan_has_its_cloud_without_the_band(publish, tmp_path):
     assert summary["files"] == {
         "spectrum": "spectrum.json", "s0 without the band": "band_stopped_1.ply",
         "s1 without the band": "band_stopped_2.ply",
+        "density 1 over time": "density_1.csv", "density 2 over time": "density_2.csv",
     }  # fmt: skip
     for name, count in (("band_stopped_1.ply", 5), ("band_stopped_2.ply", 7)):
         cloud = plain_readers.ply(tmp_path / "out" / name)
@@ -110,3 +114,11 @@ def test_the_folder_of_another_command_is_refused(publish, tmp_path):
     (tmp_path / "out" / "summary.json").write_text("{}")
     with pytest.raises(FileError, match=r"result of another command \(summary.json\)"):
         publish([5])
+
+
+def test_the_density_of_each_scan_is_written_and_an_earlier_one_goes(publish, tmp_path):
+    publish([3, 4], ())
+    table = np.loadtxt(tmp_path / "out" / "density_2.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(table, [[0, 1], [1, 1], [2, 1]])
+    publish([3], ())
+    assert [path.name for path in (tmp_path / "out").glob("density*")] == ["density_1.csv"]

@@ -7,6 +7,7 @@ lobe of a window, and weak lines from the side lobes of strong ones.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -33,12 +34,14 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 # Noise alone exceeds it in one spectrum of 740.
 LEAST_SIGMA = 3.0
-# A machine shows ten to twenty lines.
-MOST_LINES = 40
+# A machine shows ten to twenty lines: so many are fitted together, and further ones in groups.
+MOST_TOGETHER, MOST_LINES = 40, 400
 # Peaks below this share of the strongest may be its side lobes.
 _TAKEN_TOGETHER = 0.3
 # Distance in resolutions within which a weaker peak may be a side lobe.
 _APART_BINS = 8
+# The same for a line that was fitted without its weaker neighbours.
+_SEPARATE = 2.0
 # Samples between the places at which the rings are evaluated.
 _STRIDE = 50
 # Share of power and distance in resolutions of the image of a line in another coordinate.
@@ -73,10 +76,11 @@ def find_lines(
     values: FloatArray,
     known: Sequence[SpectralLine] = (),
     reserved_orders: Sequence[tuple[float, float]] = (),
+    removed: Sequence[SpectralLine] = (),
 ) -> LineSpectrum:
-    """Find all lines of ``values`` (n,), the heights without form, beyond 3 σ.
+    """Find the strongest lines of ``values`` (n,), the heights without form, beyond 3 σ.
 
-    known: lines to start with
+    known: lines to start with;  removed: lines that ``values`` are without, found before
     reserved_orders: waves a turn of form and orders, which are no lines, and their width in
         resolutions
     """
@@ -90,13 +94,15 @@ def find_lines(
     )
     residual = values - sum_of(lines, coordinates, len(values))
     taken = {name: list(places) for name, places in reserved.items()}
-    for _ in range(MOST_LINES):
+    for line in removed:
+        taken.setdefault(line.coordinate, []).append((line.frequency, _SEPARATE))
+    for _ in range(MOST_TOGETHER):
         new = _strongest(signal, residual, searched, lines, taken)
         if not new:
             break
         for line in new:  # a line that moves in the fit must not be found again
             taken.setdefault(line.coordinate, []).append((line.frequency, CLOSEST))
-        new = [line for line in new if not _is_image(line, lines, coordinates)]
+        new = [line for line in new if not _is_image(line, [*removed, *lines], coordinates)]
         if not new:
             continue
         lines = fitted(lines + new, coordinates, values)
@@ -105,6 +111,27 @@ def find_lines(
         lines = _outside_reserved(lines, coordinates, reserved)
         residual = values - sum_of(lines, coordinates, len(values))
     return _judged(signal, lines, coordinates, residual)
+
+
+def further_lines(
+    signal: ScanSignal, spectrum: LineSpectrum, reserved_orders: Sequence[tuple[float, float]] = ()
+) -> LineSpectrum:
+    """Return ``spectrum`` with all weaker lines, which are fitted to its residual in groups.
+
+    After each group all groups are fitted again, each to what the others leave.
+    """
+    groups = [list(spectrum.lines)]
+    coordinates, residual = spectrum.coordinates, spectrum.residual
+    while len(groups[-1]) > MOST_TOGETHER // 2 and len(spectrum.lines) < MOST_LINES:
+        new = find_lines(signal, residual, (), reserved_orders, [*chain(*groups)])
+        groups.append(list(new.lines))
+        residual = new.residual
+        for k, group in enumerate(groups):
+            values = residual + sum_of(group, coordinates, len(residual))
+            groups[k] = fitted(group, coordinates, values) if group else group
+            residual = values - sum_of(groups[k], coordinates, len(residual))
+        spectrum = _judged(signal, [*chain(*groups)], coordinates, residual)
+    return spectrum
 
 
 def _strongest(
@@ -128,7 +155,7 @@ def _strongest(
         peaks = _peaks(ratio, ratio_at(LEAST_SIGMA, tried))
         if len(peaks) and power[peaks[0]] > best[0]:
             strong = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
-            places = _spaced(strong, MOST_LINES - len(known))
+            places = _spaced(strong, MOST_TOGETHER - len(known))
             new = [start(coordinate, k * spacing, residual) for k in places]
             best = float(power[peaks[0]]), new
     return best[1]

@@ -15,7 +15,7 @@ from omsm_ros.core.ripple.accelerometer import AccelerationLine, AccelerationLin
 from omsm_ros.core.ripple.coordinates import Coordinate
 from omsm_ros.core.ripple.density import aliased_frequency, significance
 from omsm_ros.core.ripple.form_removal import FormFit, FormRemoved, SpindleOrder
-from omsm_ros.core.ripple.lines import LEAST_SIGMA, LineSpectrum, find_lines
+from omsm_ros.core.ripple.lines import LEAST_SIGMA, LineSpectrum, find_lines, further_lines
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.source_hypotheses import (
     ALIASED,
@@ -170,7 +170,7 @@ def _separated(
         spectrum = find_lines(signal, formless.residual, spectrum.lines, form.reserved_orders())
         if not spectrum.lines:
             break
-    return formless, spectrum
+    return formless, further_lines(signal, spectrum, form.reserved_orders())
 
 
 def _order_lines(formless: FormRemoved, spectrum: LineSpectrum) -> Iterable[SpectralLine]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from omsm_ros.core.ripple.accelerometer import AccelerationLines
 from omsm_ros.core.ripple.coordinates import LEAST_WAVES, Coordinate
-from omsm_ros.core.ripple.density import aliased_frequency
+from omsm_ros.core.ripple.density import Density, aliased_frequency, density, evenly
 from omsm_ros.core.ripple.form_removal import HIGHEST_ORDER, FormRemoved
 from omsm_ros.core.ripple.lines import LineSpectrum
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
@@ -62,6 +62,13 @@ class StudiedScan:
     def coordinates(self) -> dict[str, Coordinate]:
         """Coordinates in which the scan moves."""
         return self.spectrum.coordinates
+
+    def density(self, coordinate: str) -> Density:
+        """Return the density of the heights without form over TIME or along PATH."""
+        path, place, step = self.signal.path, self.signal.time, self.signal.period
+        if coordinate == PATH:
+            place, step = path, float(np.median(np.diff(path) / np.diff(self.signal.sample)))
+        return density(evenly(place, self.formless.residual, step), step)
 
     def resolution(self, coordinate: str) -> float:
         """Return the resolution of frequencies over ``coordinate`` [Hz], [1/m] or [1/turn]."""

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal as scipy_signal
 
 from omsm_ros.core.ripple.density import significance
-from omsm_ros.core.ripple.lines import LEAST_SIGMA, MOST_LINES, find_lines
+from omsm_ros.core.ripple.lines import LEAST_SIGMA, MOST_TOGETHER, find_lines, further_lines
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.spectral_line import SpectralLine, sum_of
 
@@ -108,13 +108,21 @@ class TestWhatIsNone:
         free = find_lines(circle(), values).lines
         assert sorted(round(line.frequency) for line in free) == [6, 61]
 
-    def test_the_number_of_reported_items_is_limited(self):
-        frequencies = 9.7 * np.arange(1, 50)
-        values = noise(0.1 * NM) + sum(sine(f, 5 * NM, f) for f in frequencies)
-        found = find_lines(still(), values).lines
-        assert len(found) == MOST_LINES
-        off = [np.min(abs(frequencies - line.frequency)) for line in found]
-        assert np.max(off) < 0.02
+    def test_of_many_lines_none_is_missing_and_none_is_found_twice(self):
+        """Sixty lines, more than are fitted together, each with its own amplitude and phase."""
+        frequencies = 7.9 * np.arange(1, 61)
+        sizes = np.random.default_rng(5).permutation(np.linspace(1, 7, 60)) * NM
+        values = noise(0.1 * NM) + sum(map(sine, frequencies, sizes, frequencies))
+        first = find_lines(still(), values)
+        assert len(first.lines) == MOST_TOGETHER
+        found = further_lines(still(), first).lines
+        assert len(found) == 60
+        for line, (frequency, size) in zip(
+            sorted(found, key=lambda one: one.frequency), zip(frequencies, sizes, strict=True),
+            strict=True,
+        ):  # fmt: skip
+            assert abs(line.frequency - frequency) < 0.02
+            assert line.amplitude == pytest.approx(size, rel=0.03, abs=0)
 
 
 class TestKnown:
