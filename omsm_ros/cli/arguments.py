@@ -205,6 +205,11 @@ class Arguments:
         self("--unit", _unit, "unit of files that do not state it, such as mm, or mm,nm",
              metavar="UNIT[,HEIGHT_UNIT]")  # fmt: skip
 
+    def channel(self) -> None:
+        """Add the channel of a file of several maps."""
+        self("--channel", str, "channel of a file of several maps, by name or number from 0",
+             metavar="NAME|N")  # fmt: skip
+
     def catalogue(self) -> None:
         """Add ``--catalogue``, the database of calibrations and measurements."""
         self("--catalogue", str, f"catalogue (database) to add the result to; default: ${ADDRESS}",

@@ -19,14 +19,14 @@ from omsm_ros.io.maps.grid_sag_file import write_grid_sag
 from omsm_ros.io.maps.instrument_files import write_hdf5
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
-from omsm_ros.io.maps.x3p_file import write_x3p
+from omsm_ros.io.maps.x3p_file import write_sdf, write_x3p
 from omsm_ros.io.results import CloudFile
 from omsm_ros.quantities import SPACING
 from omsm_ros.readable import count, quantity
 from omsm_ros.units import LengthUnits
 
 AS_POINTS = (".csv", ".xyz", ".h5", ".hdf5", ".ply", ".pcd")
-AS_MAP = (".x3p", ".dat")
+AS_MAP = (".x3p", ".dat", ".sdf")
 
 _MOST_ACROSS = 400
 _LENGTHS = ("x", "y", "z", "height", "dynamic_error", "uncertainty")
@@ -34,34 +34,39 @@ _COMMENT = "written by omsm_ros, lengths in metres"
 
 
 def export(
-    source: Path, out: Path, units: LengthUnits | None = None, spacing: float | None = None
+    source: Path,
+    out: Path,
+    units: LengthUnits | None = None,
+    spacing: float | None = None,
+    channel: str | None = None,
 ) -> dict[str, Any]:
     """Write ``source`` to ``out``, whose suffix names the format; return facts of the file.
 
     units: of a source that does not state them;  spacing: of a map made of scattered points [m]
+    channel: of a source of several maps
 
     Raises FileError for an unknown source or format.
     """
     form = out.suffix.lower()
     if form in AS_POINTS:
-        table = _table(source, units)
+        table = _table(source, units, channel)
         _write_points(out, form, table)
         return {"file": str(out), "points": len(table), "columns": list(table.dtype.names or ())}
     if form in AS_MAP:
-        return _write_map(out, form, read_points(source, units), spacing)
+        return _write_map(out, form, read_points(source, units, channel), spacing)
     raise FileError(
         f"format {out.suffix!r} of {str(out)!r} is unknown, expected one of "
         f"{', '.join((*AS_POINTS, *AS_MAP))}"
     )
 
 
-def _table(source: Path, units: LengthUnits | None) -> NDArray[np.void]:
+def _table(source: Path, units: LengthUnits | None, channel: str | None) -> NDArray[np.void]:
     """Return all columns of an own cloud; of another file those that every format has."""
     file = source / CLOUD if source.is_dir() else source
     try:
         cloud = CloudFile(file)
     except FileError:
-        return _records(read_points(file, units))
+        return _records(read_points(file, units, channel))
     return cloud.read()
 
 
@@ -107,6 +112,8 @@ def _write_map(
     comment = f"{_COMMENT}; resampling: {method}, rms error at most {error:.2g} m"
     if form == ".x3p":
         write_x3p(out, grid, comment)
+    elif form == ".sdf":
+        write_sdf(out, grid)
     else:
         write_grid_sag(out, grid)
     return {
@@ -126,15 +133,17 @@ def _declare_export(add: Arguments) -> None:
     add(
         "--out",
         "FILE",
-        "points: .csv .xyz .h5 .ply .pcd; a map: .x3p, .dat (grid sag)",
+        "points: .csv .xyz .h5 .ply .pcd; a map: .x3p, .sdf, .dat (grid sag)",
         required=True,
     )
     add.unit()
+    add.channel()
     add("--spacing", SPACING, "grid spacing for scattered points [m]")
 
 
 def _export(args: argparse.Namespace) -> Facts:
-    return {"source": str(args.source), **export(args.source, args.out, args.unit, args.spacing)}
+    made = export(args.source, args.out, args.unit, args.spacing, args.channel)
+    return {"source": str(args.source), **made}
 
 
 def _show_export(facts: Facts) -> None:

@@ -274,6 +274,7 @@ def _declare_form(add: Arguments) -> None:
     add("--out", "DIR", required=True)
     add("--calibration", "CAL.json", "calibration to correct a scan with")
     add.unit()
+    add.channel()
     declare_fit(add, (AUTO,))
     declare_tolerance(add)
     add.origin()
@@ -302,7 +303,7 @@ def _form(args: argparse.Namespace) -> Facts:
             source = out
         else:
             refuse_cell(source, args)
-        points = open_measurement(source, args.unit)
+        points = open_measurement(source, args.unit, args.channel)
         facts = judge_form(
             points, surface, out, args.fit, args.aperture, filters, args.tolerance, args.dust
         )
@@ -333,6 +334,7 @@ def _declare_compensate(add: Arguments) -> None:
     )
     add("--out", "DIR", required=True)
     add.unit()
+    add.channel()
     add(
         "--spiral",
         SPACING,
@@ -356,7 +358,7 @@ def _compensate(args: argparse.Namespace) -> Facts:
             raise ConfigurationError("--tool-radius needs the feed of the cut: give --spiral FEED")
         cut = NextCut(args.spiral, args.rpm, args.tool_radius)
     with result_folder(args.out, (COMPENSATION, PATH, CUT)) as out:
-        points = open_measurement(args.measured, args.unit)
+        points = open_measurement(args.measured, args.unit, args.channel)
         facts = compensate_form(
             points, surface, out, args.low_pass, args.fit, args.aperture, spiral, cut, args.previous
         )

@@ -34,6 +34,7 @@ from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATI
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_ply
 from omsm_ros.io.results import CloudFile, load_fields, read_summary
+from omsm_ros.readable import quantity
 from omsm_ros.units import NOT_USED, LengthUnits
 
 # Points of a measurement in portions, with what its systematic errors do to them.
@@ -83,11 +84,13 @@ class MeasurementMeasuredPortions:
         )
 
 
-def open_measurement(path: Path, units: LengthUnits | None = None) -> MeasurementMeasuredPortions:
+def open_measurement(
+    path: Path, units: LengthUnits | None = None, channel: str | None = None
+) -> MeasurementMeasuredPortions:
     """Open a result folder, an own cloud, or a map or cloud of any other format.
 
     Own clouds are read in bounded memory, with the systematic fields in the same folder.
-    units: of a file that does not state them
+    units: of a file that does not state them;  channel: of a file of several maps
 
     Raises FileError for a file that cannot be read.
     """
@@ -99,7 +102,7 @@ def open_measurement(path: Path, units: LengthUnits | None = None) -> Measuremen
     try:
         cloud = CloudFile(file)
     except FileError:
-        points = without_duplicates(read_points(file, units))
+        points = without_duplicates(read_points(file, units, channel))
         gridded = as_grid(points) is not None
         return MeasurementMeasuredPortions(
             lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
@@ -138,8 +141,8 @@ _MOST_LISTED = 2_000
 # Blocks of the areal density in each direction: enough for a figure, 70 kB in the file.
 _MOST_BLOCKS = 64
 _NO_NOISE = (
-    "noise of the points is not evaluated: no place of the profile was measured twice, so that it "
-    "cannot be separated from texture; the figures contain it"
+    "noise of the points is not evaluated, at most {}: no place of the profile was measured twice, "
+    "so that it cannot be separated from texture; the figures contain it, and their uncertainty too"
 )
 _NO_SYSTEMATIC = (
     "systematic errors of the measurement: the uncertainty covers noise, form and pose only"
@@ -226,13 +229,7 @@ def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[
                 source: _shares(found, shares) for source, shares in found.from_source.items()
             },
             "not_evaluated": [] if measured.systematic else [_NO_SYSTEMATIC],
-            "notes": [
-                *measured.notes,
-                *_mismatch_text(form),
-                *_advice(form),
-                *([_NO_NOISE] if form.deviation["point_noise"].value is None else []),
-                *(str(d.reason) for d in form.doubts(decided=True)),
-            ],
+            "notes": _notes(form, measured),
         },
         "aperture": {
             "radius": found.disc.radius,
@@ -253,6 +250,12 @@ def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[
             **dict(zip("xyz", form.dust[:, :_MOST_LISTED].tolist(), strict=True)),
         },
     }
+
+
+def _notes(form: FormResult, measured: MeasurementMeasuredPortions) -> list[str]:
+    noise = [] if form.map.noise_known else [_NO_NOISE.format(quantity(form.map.noise, "m"))]
+    doubts = (str(d.reason) for d in form.doubts(decided=True))
+    return [*measured.notes, *_mismatch_text(form), *_advice(form), *noise, *doubts]
 
 
 def _shares(found: Registration, shares: FloatArray) -> dict[str, float]:

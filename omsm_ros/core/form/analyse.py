@@ -71,7 +71,8 @@ _MOST_POINTS = 4_000
 
 def _terms(map_: DeviationMap, found: Registration) -> ZernikeFit:
     points = (map_.x, map_.y, map_.deviation)
-    fit = fit_zernikes(*points, ZERNIKES, found.disc, weights=map_.area, effects=map_.effects)
+    terms = ZERNIKES[: len(map_) // 2]
+    fit = fit_zernikes(*points, terms, found.disc, weights=map_.area, effects=map_.effects)
     return with_pose_uncertainty(fit, map_, found)
 
 
@@ -273,7 +274,7 @@ def _figures(
         "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
         # Of a profile measured once, noise and texture are the same.
-        "point_noise": UncertainValue(map_.noise if map_.noise or map_.noise_known else None, None),
+        "point_noise": UncertainValue(map_.noise if map_.noise_known else None, None),
         "rms_before_fit": UncertainValue(found.before, None),
     }
 
@@ -358,7 +359,7 @@ class _Gathered:
         if not self.counts["used"]:
             raise DataError("form.no_usable_point", counts=self.counts)
         rows = np.ascontiguousarray(self._kept.rows().T)
-        noise, known = self._point_noise(rows, found.noise, even)
+        noise, known = self._point_noise(rows, found.noise)
         return DeviationMap(
             x=rows[0],
             y=rows[1],
@@ -372,15 +373,14 @@ class _Gathered:
             taken=found.taken,
         )
 
-    def _point_noise(self, rows: FloatArray, fitted: float, even: bool) -> tuple[float, bool]:
+    def _point_noise(self, rows: FloatArray, fitted: float) -> tuple[float, bool]:
         """Return the noise of a point [m], and whether it is certainly no texture."""
         x, y, deviation = rows[:3]
         if (repeated := repeated_noise(x, y, deviation)) is not None:
             return repeated, True
         spans = sorted((float(np.ptp(x)), float(np.ptp(y))))
         if spans[0] <= _LINE_WIDTH * spans[1]:
-            found = profile_noise(x if np.ptp(x) > np.ptp(y) else y, deviation)
-            return found or 0.0, found is not None
+            return profile_noise(x if np.ptp(x) > np.ptp(y) else y, deviation)
         # Points may come in any order, where successive points are no neighbours.
         near = min(float(np.median(self._noise)), neighbour_noise(x, y, deviation), fitted)
-        return near, not even
+        return near, True

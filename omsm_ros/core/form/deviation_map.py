@@ -44,7 +44,7 @@ class DeviationMap:
     taken: the first t effects are form that the fit may have taken for a move, so that it is
         missing from the deviations; mean products of their probable shares (t, t), at most one
     noise: standard deviation of one point [m]
-    noise_known: that the noise is not texture that was measured once
+    noise_known: False for an upper bound, as of a profile that was measured once
     """
 
     x: FloatArray
@@ -125,17 +125,15 @@ def repeated_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float
     return float(np.sqrt(np.sum((deviation - mean[place]) ** 2) / (len(x) - len(counts))))
 
 
-def profile_noise(along: FloatArray, deviation: FloatArray) -> float | None:
-    """Return the white noise of a profile measured once, or None if it may be texture.
+def profile_noise(along: FloatArray, deviation: FloatArray) -> tuple[float, bool]:
+    """Return the noise of a profile measured once, and whether it is white, so no texture.
 
     along: positions on the line (n,), in any order
     """
-    if len(along) < _LEAST_WHITE:
-        return None
     values = deviation[np.argsort(along, kind="stable")]
     root = math.sqrt(math.comb(2 * _ORDER, _ORDER))
     near, far = (spread(np.diff(v, _ORDER)) / root for v in (values, values[::2]))
-    return near if far <= _WHITE * near else None
+    return near, len(along) >= _LEAST_WHITE and far <= _WHITE * near
 
 
 # Four cells along, the shortest cutoff of a filter, hold 72 points.
@@ -223,7 +221,7 @@ class GridCells:
             effects=np.array([mean(e) for e in map_.effects]).reshape(-1, *shape),
             offset=offset.reshape(2, *shape),
             width=float(np.sqrt(12 * np.mean(np.square(across)))) if across else 0.0,
-            noise_known=map_.noise_known,
+            noise_known=map_.noise_known and not even,
         )
 
     def planes(

@@ -54,6 +54,8 @@ SYMMETRIC = tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
 
 def rms_of_part(map_: DeviationMap) -> UncertainValue:
     """Return the area-weighted rms of the part about zero, in closed form."""
+    if not map_.noise_known:
+        return _either(*(rms_of_part(one) for one in _with_and_without(map_)))
     share = map_.area / map_.area.sum()
     weighted = map_.effects * share
     products = weighted @ map_.effects.T
@@ -79,6 +81,9 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue,
 
     disc: of the smooth terms
     """
+    if not map_.noise_known:
+        one, other = (extents_of_part(m, disc) for m in _with_and_without(map_))
+        return _either(one[0], other[0]), _either(one[1], other[1])
     few = map_.every(_MOST_FITTED)
     noises = few.noise * np.random.default_rng(_SEED + 1).normal(size=(_NOISES, len(few)))
     fit = _smooth(few, disc, noises)
@@ -120,6 +125,19 @@ def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue,
         figure = of_square(square, spread)
         found.append(UncertainValue((figure.value or 0.0) + of_all - of_some, figure.uncertainty))
     return found[0], found[1]
+
+
+def _with_and_without(map_: DeviationMap) -> tuple[DeviationMap, DeviationMap]:
+    """Return the map as if all that may be noise were texture, and as if it were noise."""
+    return replace(map_, noise=0.0, noise_known=True), replace(map_, noise_known=True)
+
+
+def _either(measured: UncertainValue, quiet: UncertainValue) -> UncertainValue:
+    """Return the figure as measured; what may be noise counts in its uncertainty."""
+    spread = max(measured.uncertainty or 0.0, quiet.uncertainty or 0.0)
+    return UncertainValue(
+        measured.value, _length(spread, (measured.value or 0.0) - (quiet.value or 0.0))
+    )
 
 
 class LocalFeatures(NamedTuple):

@@ -21,8 +21,8 @@ from omsm_ros.core.surface.posed import Pose
 from omsm_ros.core.surface.shape_parameters import estimated_shape, shape_columns
 from omsm_ros.errors import DataError, SurfaceError
 
-# Four points for each of the 49 columns of pose and form.
-LEAST_POINTS = 200
+# Four points for each of the 49 columns of pose and form; on a line, of the 9 that differ there.
+LEAST_POINTS, _LEAST_OF_PROFILE, _LINE_WIDTH = 200, 36, 1e-6
 # A cloud of a nanometre has a wrong unit.
 _LEAST_EXTENT_M = 1e-9
 POSE_PARAMETERS = ("piston", "tip", "tilt", "x", "y", "clocking", "power")
@@ -170,6 +170,12 @@ def selection(portions: PointBatches, most: int) -> PointBatch:
     return PointBatch(x, y, height, np.empty((0, len(x))))
 
 
+def least_points(x: FloatArray, y: FloatArray) -> int:
+    """Return how many points a fit needs at least: fewer of a profile than of a map."""
+    spans = sorted(float(np.ptp(v)) for v in (x, y)) if len(x) else [1.0, 1.0]
+    return _LEAST_OF_PROFILE if spans[0] <= _LINE_WIDTH * spans[1] else LEAST_POINTS
+
+
 def inside_aperture(points: Placed, aperture: Aperture | None) -> Placed:
     """Return the points that have a deviation and lie within the aperture.
 
@@ -178,8 +184,9 @@ def inside_aperture(points: Placed, aperture: Aperture | None) -> Placed:
     good = np.isfinite(points.deviation)
     if aperture is not None:
         good &= aperture.holds(points.x, points.y)
-    if (count := int(np.sum(good))) < LEAST_POINTS:
-        raise DataError("registration.few_points", count=count, least=LEAST_POINTS)
+    least = least_points(points.x[good], points.y[good])
+    if (count := int(np.sum(good))) < least:
+        raise DataError("registration.few_points", count=count, least=least)
     extent = max(float(np.ptp(v[good])) for v in (points.x, points.y))
     if extent < _LEAST_EXTENT_M:
         raise DataError("registration.small_extent", extent=extent)

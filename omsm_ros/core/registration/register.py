@@ -28,13 +28,13 @@ from omsm_ros.core.registration.form_model import (
 )
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule, FarPoints
 from omsm_ros.core.registration.placement import (
-    LEAST_POINTS,
     POSE_PARAMETERS,
     Placement,
     PointBatch,
     PointBatches,
     dof_columns,
     inside_aperture,
+    least_points,
     placed,
     selection,
 )
@@ -83,7 +83,7 @@ def coarse_placement(
             points = points.part(
                 np.abs(middle) <= max(8 * statistics.spread(middle), LEAST_LIMIT_M)
             )
-        if len(points.x) < LEAST_POINTS:
+        if len(points.x) < least_points(points.x, points.y):
             break
         columns = -dof_columns(at, points, names)
         scale = np.sqrt(np.mean(columns**2, axis=1))

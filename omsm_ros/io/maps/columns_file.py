@@ -18,7 +18,15 @@ from omsm_ros.io import json_and_yaml
 from omsm_ros.io.files import atomic_file, open_regular, read_text
 from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import MAP_POINTS
-from omsm_ros.units import NOT_USED, LengthUnits, metres_in, name_and_unit, needed, refuse_other
+from omsm_ros.units import (
+    NOT_USED,
+    WORDS,
+    LengthUnits,
+    metres_in,
+    name_and_unit,
+    needed,
+    refuse_other,
+)
 
 # The greatest number of points of a map, in lines of sixty characters.
 MAX_TEXT_BYTES = 60 * int(MAP_POINTS.high)
@@ -143,13 +151,13 @@ def _columns(
     named, count = _roles(header, _cells(first), what)
     places = {role: place for role, (place, _) in named.items()}
     if not named:
-        other = count == 2 and any(_named(_names(line)) for line in header)
-        if other or not 2 <= count < _LEAST_OF_A_MATRIX:
+        if not 2 <= count < _LEAST_OF_A_MATRIX:
             raise FileError(
                 f"{what} has {count} columns, expected x, y and height in each line, "
                 "or x and height of a profile; write a matrix of heights with its x and y"
             )
         places = {"x": 0, "height": 1} if count == 2 else {"x": 0, "y": 1, "height": 2}
+        named = _of_profile(header, what) if count == 2 else {}
     stated = {role: unit for role, (_, unit) in named.items() if unit is not None}
     scales = dict.fromkeys(places, 1.0)
     for role in places:
@@ -162,6 +170,24 @@ def _columns(
             given = needed(units, what)
             scales[role] = given.lateral if role in "xy" else given.height
     return places, scales, count
+
+
+def _of_profile(header: list[str], what: str) -> dict[str, tuple[int, float | None]]:
+    """Return place and unit of position and height of two columns with names of any language.
+
+    Raises FileError for a unit that is no length, as of slopes.
+    """
+    for line in reversed(header):
+        names = _names(line)
+        if len(names) != 2:
+            continue
+        for name in names:
+            unit = re.search(r"[\[(/_]\s*([^\s\[\](),/_]+)\s*[\])]?\s*$", name)
+            if unit and unit[1] in WORDS and metres_in(unit[1]) is None:
+                raise FileError(f"{what}: {name!r} is no length; give positions and heights")
+        found = {role: (k, name_and_unit(names[k])[1]) for k, role in enumerate(("x", "height"))}
+        return found if any(unit for _, unit in found.values()) else {}
+    return {}
 
 
 def _agreed_until(units: LengthUnits | None, role: str, stated: float, what: str) -> None:
@@ -241,7 +267,9 @@ def _numbers(
         "write decimal points, a height that is missing as nan, and the same columns on every line"
     )
     layout = {"comments": list(_COMMENTS), "delimiter": _delimiter(first), "usecols": columns}
-    lines = islice(body, above, None)
+    lines: Iterator[str] = islice(body, above, None)
+    if ";" in first and "," in first and "." not in first:
+        lines = (line.replace(",", ".") for line in lines)
     return rows_in(lines, what, remedy, above=above, cells=cells, **layout)
 
 

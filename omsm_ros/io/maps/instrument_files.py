@@ -4,7 +4,7 @@ import io
 import math
 import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,33 @@ _NO_LENGTHS = ("sample", "intensity")
 _DATX_SURFACES = "Data/Surface"
 
 
-def read_hdf5(path: Path) -> MeasuredPoints:
-    """Read a table of ours, or the first surface of a ``.datx``; both state their units.
+def chosen_channel(names: Sequence[str], channel: str | None, default: int, what: str) -> int:
+    """Return the index of a ``channel`` given by name or number from 0.
+
+    Raises FileError, which calls the file ``what``, if there is none of that name.
+    """
+    if channel is None:
+        return default
+    if channel in names:
+        return names.index(channel)
+    if channel.isdecimal() and int(channel) < len(names):
+        return int(channel)
+    raise FileError(f"{what} has no channel {channel!r}; give one of {_listed(names)}")
+
+
+def channel_note(names: Sequence[str], chosen: int) -> str:
+    """Return a remark that names the channel that was read, and those that were not."""
+    others = [name for k, name in enumerate(names) if k != chosen]
+    rest = f"; --channel selects another one of {_listed(names)}" if others else ""
+    return f"channel {chosen}, {names[chosen]!r}{rest}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(f"{k} {name!r}" for k, name in enumerate(names))
+
+
+def read_hdf5(path: Path, channel: str | None = None) -> MeasuredPoints:
+    """Read a table of ours, or a surface of a ``.datx``; both state their units.
 
     Raises FileError for other HDF5 files, and for those that are damaged.
     """
@@ -37,10 +62,10 @@ def read_hdf5(path: Path) -> MeasuredPoints:
         walk_in_subprocess(path, what)
         try:
             with h5py.File(stream, "r") as content:
-                if content.attrs.get("schema") == SCHEMA:
+                if content.attrs.get("schema") == SCHEMA and channel is None:
                     return _table(content, what)
                 if _DATX_SURFACES in content:
-                    return _datx(h5py, content, what)
+                    return _datx(h5py, content, channel, what)
         except FileError:
             raise
         except Exception as err:  # the library raises many kinds
@@ -79,12 +104,13 @@ def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:
     return np.asarray(dataset[()])
 
 
-def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
+def _datx(h5py: Any, content: Any, channel: str | None, what: str) -> MeasuredPoints:
     group = content[_DATX_SURFACES]
-    surfaces = [group[name] for name in group if isinstance(group[name], h5py.Dataset)]
-    if not surfaces:
+    names = [name for name in group if isinstance(group[name], h5py.Dataset)]
+    if not names:
         raise FileError(f"{what} holds no surface; save it with one")
-    surface = surfaces[0]
+    chosen = chosen_channel(names, channel, 0, what)
+    surface = group[names[chosen]]
     height = _array(surface, what, 2).astype(np.float64)
     no_data = surface.attrs.get("No Data")
     if no_data is not None:
@@ -92,7 +118,7 @@ def _datx(h5py: Any, content: Any, what: str) -> MeasuredPoints:
     dx, dy = (_pixel(surface, f"{axis} Converter", what) for axis in "XY")
     # The first row is the upper row of the camera.
     scaled = np.flipud(height) * _datx_scale(surface, what)
-    notes = (f"the first of its {len(surfaces)} surfaces",) if len(surfaces) > 1 else ()
+    notes = (channel_note(names, chosen),) if len(names) > 1 else ()
     return HeightGrid(height=scaled, x0=0.0, y0=0.0, dx=dx, dy=dy).points(notes)
 
 
@@ -191,10 +217,14 @@ def _at(form: str, head: bytes, place: int) -> Any:
 MAX_FOREIGN_BYTES = 1_000_000_000
 
 
-def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
-    """Read a map by the library SurfaceTopography; ``units`` if the file states none.
+def read_foreign(
+    path: Path, units: LengthUnits | None, channel: str | None = None
+) -> MeasuredPoints:
+    """Read a map or profile by the library SurfaceTopography; ``units`` if the file states none.
 
-    Raises FileError if no reader knows it, or it is no map of two directions.
+    channel: name or number of a channel; None for the first one with heights
+
+    Raises FileError if no reader knows it, it has no size, or no such channel.
     """
     what = f"map {str(path)!r}"
     open_regular(path, FileError, "map").close()
@@ -205,20 +235,43 @@ def read_foreign(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of missing values, which are checked below
             with topography.open_topography(str(path)) as reader:
-                found = reader.topography()
-            heights = np.asanyarray(found.heights(), np.float64)
-            height = np.ma.filled(heights, np.nan)
+                names = [str(one.name) for one in reader.channels]
+                chosen = chosen_channel(names, channel, _first_of_heights(reader.channels), what)
+                found = reader.topography(channel_index=chosen)
+            height = np.ma.filled(np.asanyarray(found.heights(), np.float64), np.nan)
+            along = np.asarray(found.positions(), np.float64) if height.ndim == 1 else None
+    except FileError:
+        raise
     except Exception as err:  # its readers raise many kinds
         raise FileError(
             f"{what} is of no known format, convert it to xyz: {exception_text(err)}"
         ) from err
-    if height.ndim != 2 or found.physical_sizes is None:
-        raise FileError(f"{what} is no map with its size; convert it to xyz")
+    notes = (f"read by SurfaceTopography as {type(reader).__name__}", channel_note(names, chosen))
+    if not _holds_heights(reader.channels[chosen]):
+        raise FileError(f"{what}: {notes[1]} holds no heights")
     metres = metres_in(str(found.unit)) if found.unit else None
     if metres:
         refuse_other(units, LengthUnits(metres, metres), what)
     scale = LengthUnits(metres, metres) if metres else needed(units, what)
+    if along is not None:
+        place = along * scale.lateral
+        return measured(
+            place, 0 * place, height * scale.height, notes=(*notes, "a profile along x")
+        )
+    if found.physical_sizes is None:
+        raise FileError(f"{what} is no map with its size; convert it to xyz")
     dx, dy = (size / count for size, count in zip(found.physical_sizes, height.shape, strict=True))
     return HeightGrid(
         height=height.T * scale.height, x0=0.0, y0=0.0, dx=dx * scale.lateral, dy=dy * scale.lateral
-    ).points((f"read by SurfaceTopography as {type(reader).__name__}",))
+    ).points(notes)
+
+
+def _first_of_heights(channels: Sequence[Any]) -> int:
+    return next((k for k, one in enumerate(channels) if _holds_heights(one)), 0)
+
+
+def _holds_heights(channel: Any) -> bool:
+    """Return whether a channel of SurfaceTopography holds heights; older ones do not say."""
+    unit = getattr(channel, "data_unit", None)
+    kind = getattr(getattr(channel, "data_kind", None), "name", "HEIGHT")
+    return kind == "HEIGHT" and (unit is None or metres_in(str(unit)) is not None)

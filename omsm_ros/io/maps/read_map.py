@@ -22,16 +22,20 @@ _GRID_SAG_SUFFIXES = (".dat", ".grd")
 _TEXT_SUFFIXES = (".xyz", ".txt", ".asc", ".csv", ".dat", ".tsv")
 
 
-def read_points(path: Path, units: LengthUnits | None = None) -> MeasuredPoints:
+def read_points(
+    path: Path, units: LengthUnits | None = None, channel: str | None = None
+) -> MeasuredPoints:
     """Read a map or cloud; the content determines the format; a folder is a result of ours.
 
     units: of a file that does not state them
+    channel: name or number, from 0, of one of several; None for the first that holds heights
 
-    Raises FileError for a file of unknown format, a damaged one, or one that needs ``units``.
+    Raises FileError for a file of unknown format, a damaged one, one that needs ``units``, or one
+    without this ``channel``.
     """
     file = path / CLOUD if path.is_dir() else path
     try:
-        return _read(file, units)
+        return _read(file, units, channel)
     except DataError as err:
         raise FileError(f"map {str(file)!r}: {err}") from err
     except OSError as err:
@@ -56,8 +60,28 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
+def _read(path: Path, units: LengthUnits | None, channel: str | None) -> MeasuredPoints:
     head = _head(path)
+    if (found := _of_channels(path, head, channel)) is not None:
+        return replace(found, notes=(*found.notes, *([NOT_USED] if units else ())))
+    text, suffix = b"\0" not in head, path.suffix.lower()
+    points = _of_one(path, head, units)
+    if points is None and not (text and suffix in _TEXT_SUFFIXES):
+        return read_foreign(path, units, channel)
+    if channel is not None:
+        raise FileError(f"{str(path)!r} has no channels; leave out --channel")
+    return read_columns(path, units) if points is None else points
+
+
+def _of_channels(path: Path, head: bytes, channel: str | None) -> MeasuredPoints | None:
+    """Read a file of a format with channels that fixes its units; None for any other."""
+    if head.startswith(instrument_files.MAGIC):
+        return instrument_files.read_hdf5(path, channel)
+    return read_x3p(path, channel) if path.suffix.lower() == ".x3p" else None
+
+
+def _of_one(path: Path, head: bytes, units: LengthUnits | None) -> MeasuredPoints | None:
+    """Read a file of a format of one map or cloud; None for any other."""
     if head.startswith((b"ply\n", b"ply\r\n")):
         return read_ply(path, units)
     if head.startswith((b"# .PCD", b"VERSION")):
@@ -66,22 +90,16 @@ def _read(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         # These formats fix the units, so ``units`` are not used.
         unasked = (NOT_USED,) if units else ()
         return replace(found, notes=(*found.notes, *unasked))
-    text, suffix = b"\0" not in head, path.suffix.lower()
-    if text and suffix in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):
-        return read_grid_sag(path, units).points()
-    if text and suffix in _TEXT_SUFFIXES:
-        return read_columns(path, units)
-    return read_foreign(path, units)
+    grid = b"\0" not in head and path.suffix.lower() in _GRID_SAG_SUFFIXES
+    return (
+        read_grid_sag(path, units).points() if grid and is_grid_sag(*_first_lines(head)) else None
+    )
 
 
 def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
     """Read a file of a format that fixes its units; None for any other."""
     if head.startswith(instrument_files.METROPRO_MAGIC):
         return instrument_files.read_metropro(path)
-    if head.startswith(instrument_files.MAGIC):
-        return instrument_files.read_hdf5(path)
-    if path.suffix.lower() == ".x3p":
-        return read_x3p(path)
     return read_dabam(path) if has_dabam_header(path) else None
 
 

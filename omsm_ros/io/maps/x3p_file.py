@@ -1,10 +1,11 @@
-"""Reads and writes x3p (ISO 25178-72): a map, a profile or a cloud, in metres.
+"""Reads and writes x3p (ISO 25178-72): a map, a profile or a cloud, in metres; writes SDF.
 
 Files are written in the revision ``ISO5436 - 2000``, which all readers accept.
 """
 
 import re
 import zipfile
+from datetime import datetime, timezone
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import atomic_file, exception_text, open_regular
+from omsm_ros.io.maps.instrument_files import channel_note, chosen_channel
 from omsm_ros.io.optional_libraries import import_optional
 from omsm_ros.quantities import MAP_POINTS
 
@@ -35,8 +37,8 @@ _REVISIONS = {
 _WHOLE = ("I", "L")
 
 
-def read_x3p(path: Path) -> MeasuredPoints:
-    """Read the first layer of an x3p file, in its global frame.
+def read_x3p(path: Path, channel: str | None = None) -> MeasuredPoints:
+    """Read the first layer of an x3p file, or that of the number ``channel``, in its global frame.
 
     Raises FileError for another or a damaged file, or one that unpacks to too many bytes.
     """
@@ -54,13 +56,14 @@ def read_x3p(path: Path) -> MeasuredPoints:
                 known = _with_known_revision(archive)
             stream.seek(0)
             content = x3pio.read(known or stream)
-            place = _places(x3pio, content)
+            names = [f"layer {k}" for k in range(len(content.layers))]
+            chosen = chosen_channel(names, channel, 0, what)
+            place = _places(x3pio, content, chosen)
         except FileError:
             raise
         except Exception as err:  # the libraries raise many kinds
             raise FileError(f"{what} cannot be read: {exception_text(err)}; save it again") from err
-    layers = len(content.layers)
-    notes = (f"the first of its {layers} layers",) if layers > 1 else ()
+    notes = (channel_note(names, chosen),) if len(names) > 1 else ()
     return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
 
 
@@ -88,9 +91,9 @@ def _with_known_revision(archive: zipfile.ZipFile) -> BytesIO | None:
     return spelled
 
 
-def _places(x3pio: Any, content: Any) -> FloatArray:
-    """Return x, y, height (n, 3) [m] of the first layer; NaN = missing."""
-    layer, header = content.layers[0], content.header
+def _places(x3pio: Any, content: Any, chosen: int = 0) -> FloatArray:
+    """Return x, y, height (n, 3) [m] of one layer; NaN = missing."""
+    layer, header = content.layers[chosen], content.header
     # A missing increment reads as 1: steps of a metre, which no instrument has.
     if header.z.data_type.value in _WHOLE and header.z.increment == 1.0:
         raise ValueError("its heights are whole numbers without an increment; save it with one")
@@ -124,3 +127,21 @@ def write_x3p(path: Path, grid: HeightGrid, comment: str) -> None:
     named = surface.with_metadata(manufacturer="omsm_ros", model="omsm_ros", comment=comment)
     with atomic_file(path) as stream:
         named.save(stream)
+
+
+def write_sdf(path: Path, grid: HeightGrid) -> None:
+    """Write a map [m] as text SDF (ISO 25178-71), profile by profile from the least y."""
+    date = datetime.now(timezone.utc).strftime("%d%m%Y%H%M")
+    rows, columns = grid.height.shape
+    head = {
+        "ManufacID": "omsm_ros", "CreateDate": date, "ModDate": date,
+        "NumPoints": columns, "NumProfiles": rows,
+        "Xscale": f"{grid.dx:.17g}", "Yscale": f"{grid.dy:.17g}", "Zscale": 1, "Zresolution": -1,
+        "Compression": 0, "DataType": 7, "CheckType": 0,
+    }  # fmt: skip
+    with atomic_file(path, "w") as stream:
+        stream.write("aISO-1.0\n" + "".join(f"{k} = {v}\n" for k, v in head.items()) + "*\n")
+        for row in grid.height:
+            cells = (f"{v:.9g}" if np.isfinite(v) else "BAD" for v in row)
+            stream.write(" ".join(cells) + "\n")
+        stream.write("*\n")

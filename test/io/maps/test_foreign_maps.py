@@ -19,11 +19,19 @@ SLOPES, SIZES, PLACES = (3e-3, -1e-3), (40.0, 15.0), (20, 5)
 def map_of(tmp_path, monkeypatch):
     """A file that the library takes for a map, whose heights begin with the direction x."""
 
-    def made(unit="µm", sizes=SIZES, heights=None):
+    def made(unit="µm", sizes=SIZES, heights=None, names=(("Height", "HEIGHT"),)):
         x, y = (size / n * np.arange(n) for size, n in zip(SIZES, PLACES, strict=True))
         plane = SLOPES[0] * x[:, np.newaxis] + SLOPES[1] * y if heights is None else heights
-        found = SimpleNamespace(heights=lambda: plane, physical_sizes=sizes, unit=unit)
-        reader = SimpleNamespace(topography=lambda: found)
+        along = 2.0 * np.arange(len(plane))
+
+        def topography(channel_index):
+            return SimpleNamespace(
+                heights=lambda: plane * (channel_index + 1), positions=lambda: along,
+                physical_sizes=sizes, unit=unit,
+            )  # fmt: skip
+
+        channels = [SimpleNamespace(name=n, data_kind=SimpleNamespace(name=k)) for n, k in names]
+        reader = SimpleNamespace(topography=topography, channels=channels)
         library = SimpleNamespace(open_topography=lambda path: nullcontext(reader))
         monkeypatch.setitem(sys.modules, "SurfaceTopography", library)
         path = tmp_path / "map.other"
@@ -56,7 +64,22 @@ def test_a_unit_that_the_file_lacks_is_asked_for(map_of):
     assert np.ptp(stated.x) == pytest.approx(38e-3)
 
 
-@pytest.mark.parametrize("wrong", [{"sizes": None}, {"heights": np.arange(5.0)}])
-def test_what_is_no_map_of_two_directions_is_refused(map_of, wrong):
+def test_a_map_without_a_size_is_refused_and_a_profile_is_read(map_of):
     with pytest.raises(FileError, match="no map with its size"):
-        read_points(map_of(**wrong))
+        read_points(map_of(sizes=None))
+    profile = read_points(map_of(heights=np.arange(5.0)))
+    np.testing.assert_allclose(profile.x, 2e-6 * np.arange(5))
+    assert "a profile along x" in profile.notes
+
+
+def test_the_channel_is_chosen_and_always_named(map_of):
+    names = (("Phase", "PHASE"), ("Z", "HEIGHT"), ("Z back", "HEIGHT"))
+    path = map_of(names=names)
+    usual = read_points(path)
+    assert any("channel 1, 'Z'; --channel selects" in note for note in usual.notes)
+    for channel in ("Z back", "2"):
+        other = read_points(path, channel=channel)
+        np.testing.assert_allclose(other.height, 1.5 * usual.height)
+    for wrong, text in (("3", "no channel '3'"), ("Phase", "holds no heights")):
+        with pytest.raises(FileError, match=text):
+            read_points(path, channel=wrong)

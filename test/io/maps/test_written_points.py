@@ -8,11 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.instrument_files import write_hdf5
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
+from omsm_ros.io.maps.x3p_file import write_sdf
 from omsm_ros.units import units_of
 
 # Any bits that a place on a machine can have, the sign of zero and the smallest numbers too.
@@ -188,3 +190,18 @@ class Failing(dict):
 
     def values(self):
         raise KeyError("gone")
+
+
+def test_a_written_sdf_is_laid_out_by_iso_25178_71(tmp_path):
+    """Read by the words of the standard: header, ``*``, one number a point, BAD for a lost one."""
+    height = np.arange(12.0).reshape(3, 4) * 1e-9
+    height[1, 2] = np.nan
+    write_sdf(tmp_path / "a.sdf", HeightGrid(height=height, x0=0.0, y0=0.0, dx=2e-6, dy=3e-6))
+    head, body, end = (tmp_path / "a.sdf").read_text().split("*")
+    version, *lines = head.split("\n")
+    fields = dict(line.split(" = ") for line in lines if line)
+    assert (version, end.strip()) == ("aISO-1.0", "")
+    assert (fields["NumPoints"], fields["NumProfiles"]) == ("4", "3")
+    assert (float(fields["Xscale"]), float(fields["Yscale"])) == (2e-6, 3e-6)
+    found = np.array([np.nan if w == "BAD" else float(w) for w in body.split()]).reshape(3, 4)
+    np.testing.assert_allclose(found * float(fields["Zscale"]), height)

@@ -124,7 +124,9 @@ def test_a_quarter_turn_is_applied(tmp_path):
 def test_of_two_layers_the_first_is_read_and_a_note_says_so(tmp_path):
     points = read_points(made(tmp_path / "a.x3p", np.ones((2, 3)) * 1e-6, layers=2))
     assert len(points) == 6
-    assert points.notes == ("the first of its 2 layers",)
+    assert points.notes == (
+        "channel 0, 'layer 0'; --channel selects another one of 0 'layer 0', 1 'layer 1'",
+    )
 
 
 def test_data_that_do_not_have_their_checksum_are_refused(tmp_path):
