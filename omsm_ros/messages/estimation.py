@@ -145,6 +145,7 @@ TEMPLATES: dict[str, str] = {
         "better"
     ),
     "estimation.accepted": "accepted from {low:Hz} to {high:Hz}",
+    "estimation.accepted_apart": "accepted, each input in a range of its own",
     "estimation.poor_prediction": (
         "free runs over held-out parts of the record account for {predicted:%/3} of the variance "
         "there, less than {least:%}: the model describes only what it was fitted to; record "
@@ -155,7 +156,7 @@ TEMPLATES: dict[str, str] = {
         "excite more"
     ),
     "estimation.worse_than_impulse_response": (
-        "a free run over the hidden last part accounts for {model:%/4} at the frequencies of the "
+        "a free run over the held-out last part accounts for {model:%/4} at the frequencies of the "
         "inputs, an impulse response without a model for {comparator:%/4}: ask for another order"
     ),
     "estimation.residual_follows_input": (

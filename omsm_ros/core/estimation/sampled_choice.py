@@ -1,7 +1,7 @@
-"""Choose delays and order of parallel sections by their free runs over hidden parts of the records.
+"""Choose delays and order of parallel sections by their free runs over held-out parts of records.
 
 Models of rising order are fitted to the first part of each record and simulated over the rest. The
-best few are then compared on several hidden parts. The simplest of equally good models is taken,
+best few are then compared on several held-out parts. The simplest of equally good models is taken,
 because superfluous poles would follow a drift. An impulse response without a model is fitted to the
 same first part: a model whose free run over the rest is worse does not describe the records.
 
@@ -31,11 +31,11 @@ from omsm_ros.linear_algebra import least_squares
 # Most poles. Orders that are tried: every one while it is low, then steps.
 MAX_ORDER = 40
 _ORDERS = (*range(7), *range(8, 21, 2), *range(24, MAX_ORDER + 1, 4))
-# Parts of each record: all but the first are hidden in turn, and the last ones together.
+# Parts of each record: all but the first are held out in turn, and the last ones together.
 _PARTS = 6
 # Share of the used samples to which every order is fitted first.
 _FIRST_PART = 0.75
-# Orders compared on every hidden part: the best over the last part, and the lowest orders within
+# Orders compared on every held-out part: the best over the last part, and the lowest orders within
 # this factor of the least error. One part alone is uncertain by about this factor.
 _FINALISTS = 3
 _EQUIVALENT = 2.0
@@ -57,8 +57,8 @@ _MOST_SAMPLES = 1_000_000
 # Used samples on which orders are explored, and parts of a record whose excitation is compared.
 EXPLORED_ON = 8000
 _MOST_PARTS = 16
-# Iterations of an explored fit, of one without a hidden part, and of the final one.
-_EXPLORING, _HIDDEN, _FINAL = 12, 4, 30
+# Iterations of an explored fit, of one without a held-out part, and of the final one.
+_EXPLORING, _REFITTED, _FINAL = 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
 # The comparator's record: half its sampling rate over the frequency below which this share of the
@@ -71,10 +71,10 @@ _BLOCKS, _CLEARLY, _NOTICEABLE = 12, 2.0, 0.005
 
 @dataclass(frozen=True, eq=False)
 class SampledCandidate:
-    """A fit, and its mean square errors of free runs over each hidden part (folds,)."""
+    """A fit, and its mean square errors of free runs over each held-out part (folds,)."""
 
     fit: SectionsFit
-    hidden: FloatArray
+    held_out: FloatArray
 
     @property
     def order(self) -> int:
@@ -128,14 +128,14 @@ def choose_sampled(
     judged = []
     for fitted in (fits[orders.index(n)] for n in _finalists(orders, by_order, order)):
         refitted = explored.fit(fitted.order, [fitted.nonlinear], _EXPLORING)
-        judged.append(SampledCandidate(refitted, hidden_errors(refitted)))
+        judged.append(SampledCandidate(refitted, validation_errors(refitted)))
     free = simplest_undominated(judged)
     chosen = free if not order else next(c for c in judged if c.order == order)
     comparison = _against_impulse_response(explored, fits[orders.index(chosen.order)])
     finished = _finished(whole, chosen, every)
     other = finished if chosen is free else _finished(whole, free, every)
-    bound = _ALIKE * float(np.mean(chosen.hidden))
-    alike = [c for c in judged if c.order > chosen.order and float(np.mean(c.hidden)) <= bound]
+    bound = _ALIKE * float(np.mean(chosen.held_out))
+    alike = [c for c in judged if c.order > chosen.order and float(np.mean(c.held_out)) <= bound]
     larger = [c.fit.model(float(every)) for c in alike]
     return SampledChoice(finished, other, larger, orders, by_order, *comparison)
 
@@ -293,7 +293,7 @@ def _explore(
         if order > most:
             break
         fits.append(_next_fit(early, fits, order, late))
-        explained.append(1 - float(np.mean(_relative(hidden_residual(fits[-1], whole)))))
+        explained.append(1 - float(np.mean(_relative(validation_residual(fits[-1], whole)))))
         if explained[-1] > 1 - _NO_GAIN * (1 - explained[best]):
             best = len(explained) - 1
         if len(explained) - 1 - best >= _FRUITLESS and order >= asked:
@@ -314,8 +314,8 @@ def _next_fit(
     return problem.fit(order, poles, _EXPLORING, race=3)
 
 
-def hidden_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatArray]:
-    """Return output less free run of each record of ``whole``, where it was hidden from the fit.
+def validation_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatArray]:
+    """Return output less free run of each record of ``whole``, where it was held out from the fit.
 
     The initial state and the offset of each record are those of its samples that were fitted. The
     residual is relative to the deviation of the record, NaN elsewhere, (n,).
@@ -328,9 +328,9 @@ def hidden_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatAr
         with np.errstate(all="ignore"):
             state = least_squares(columns[own.used], missed[own.used], 1e-12)
             missed = missed - columns @ state
-        hidden = record.used & ~own.used
+        held_out = record.used & ~own.used
         scale = float(np.std(record.output[record.used])) or 1.0
-        found.append(np.where(hidden, missed / scale, np.nan))
+        found.append(np.where(held_out, missed / scale, np.nan))
     return found
 
 
@@ -348,8 +348,8 @@ def _finalists(orders: Sequence[int], explained: FloatArray, asked: int) -> list
     return sorted({0, 1, asked, *(orders[i] for i in (*best, *alike))} & {*orders})
 
 
-def hidden_errors(fitted: SectionsFit, evaluations: int = _HIDDEN) -> FloatArray:
-    """Return the mean square error over each hidden part, refitted without it, (folds,).
+def validation_errors(fitted: SectionsFit, evaluations: int = _REFITTED) -> FloatArray:
+    """Return the mean square error over each held-out part, refitted without it, (folds,).
 
     Some parts lie inside the records, others reach to their end. Parts inside alone would favour
     models of a drift, because the data constrain the model on both sides.
@@ -365,7 +365,7 @@ def hidden_errors(fitted: SectionsFit, evaluations: int = _HIDDEN) -> FloatArray
             for record, part in zip(problem.records, fold, strict=True)
         ]
         found = replace(problem, records=rest).fit(fitted.order, [fitted.nonlinear], evaluations)
-        errors.append(float(np.mean(_relative(hidden_residual(found, problem)))))
+        errors.append(float(np.mean(_relative(validation_residual(found, problem)))))
     return np.array(errors)
 
 
@@ -375,7 +375,7 @@ def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate
     A candidate dominates if its mean error is lower by more than half a standard error of their
     paired difference (after Breiman et al. 1984).
     """
-    errors = np.array([c.hidden for c in judged])
+    errors = np.array([c.held_out for c in judged])
     with np.errstate(invalid="ignore"):
         worse = errors[:, np.newaxis] - errors[np.newaxis]
         allowed = _IMPROVES_BY * np.std(worse, axis=2, ddof=1) / np.sqrt(errors.shape[1])
@@ -400,14 +400,14 @@ def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -
     if every == 1:
         return replace(candidate, fit=found)
     part = replace(whole, records=[_early(record) for record in whole.records])
-    rest = part.fit(candidate.order, [found.nonlinear], _HIDDEN)
-    return SampledCandidate(found, np.array([np.mean(_relative(hidden_residual(rest, whole)))]))
+    rest = part.fit(candidate.order, [found.nonlinear], _REFITTED)
+    return SampledCandidate(found, np.array([np.mean(_relative(validation_residual(rest, whole)))]))
 
 
 def _against_impulse_response(
     whole: SectionsProblem, fitted: SectionsFit
 ) -> tuple[float | None, float | None, bool]:
-    """Return what an impulse response and ``fitted`` explain of hidden samples, as shares.
+    """Return what an impulse response and ``fitted`` explain of held-out samples, as shares.
 
     The third value is True if the model is worse by more than the uncertainty of the comparison.
     """
@@ -418,19 +418,19 @@ def _against_impulse_response(
     )
     middle = np.mean(record.output[own.used])
     output = _filled(record) - middle
-    residual = hidden_residual(fitted, whole)[0] * np.std(record.output[record.used])
-    hidden = ~np.isnan(residual)
-    missed, used = np.where(hidden, residual, 0.0), own.used
+    residual = validation_residual(fitted, whole)[0] * np.std(record.output[record.used])
+    held_out = ~np.isnan(residual)
+    missed, used = np.where(held_out, residual, 0.0), own.used
     end = int(np.flatnonzero(used)[-1]) + 1
     taps = impulse_response(inputs[:end], output[:end], used[:end])
-    if taps is None or np.sum(hidden) < _BLOCKS:
+    if taps is None or np.sum(held_out) < _BLOCKS:
         return None, None, False
     free = output.copy()
     for drive, response in zip(inputs.T, taps, strict=True):
         free -= signal.fftconvolve(drive, response)[: len(drive)]
     free -= np.mean(free[used])
-    power = float(np.var(output[hidden])) or 1.0
-    blocks = np.array_split(np.flatnonzero(hidden), _BLOCKS)
+    power = float(np.var(output[held_out])) or 1.0
+    blocks = np.array_split(np.flatnonzero(held_out), _BLOCKS)
     means = np.array([[np.mean(e[b] ** 2) for b in blocks] for e in (free, missed)]) / power
     apart = means[1] - means[0]
     uncertain = float(np.std(apart, ddof=1)) / np.sqrt(_BLOCKS)

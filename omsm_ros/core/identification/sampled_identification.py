@@ -40,7 +40,7 @@ from omsm_ros.linear_algebra import one_blas_thread
 
 # Limits of the band, a tenth of gain and of a radian: for a process, not a measuring machine.
 SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
-# Least share of the variance of hidden parts that free runs predict.
+# Least share of the variance of held-out parts that free runs predict.
 _LEAST_PREDICTED = 0.5
 # Least p-value of a residual that is independent of the input.
 _LEAST_INDEPENDENCE_P = 1e-4
@@ -288,7 +288,7 @@ def _entries(
         "delay_samples": (sections.delays / sections.period).tolist(),
         "residual_rms": float(np.sqrt(np.mean(residual**2))),
         "explained": 1 - float(np.mean(residual**2)) / variance,
-        "predicted": 1 - float(np.mean(chosen.hidden)),
+        "predicted": 1 - float(np.mean(chosen.held_out)),
         "last_part_by_order": {
             str(order): float(share) if np.isfinite(share) else None
             for order, share in zip(choice.orders, choice.by_order, strict=True)
@@ -348,8 +348,8 @@ def sampled_certificate(
     order, free_order: number of poles of the model, and of the free choice
     widened: factor on its uncertainties, for an order that was asked for
     valid: range [Hz] within the limits, for each input
-    worse: an impulse response predicts hidden samples better
-    entries: with "predicted", the share of the variance of hidden parts that free runs explain
+    worse: an impulse response predicts held-out samples better
+    entries: with "predicted", the share of the variance of held-out parts that free runs explain
     """
     predicted, limits = entries["predicted"], SAMPLED_LIMITS
     assert isinstance(predicted, float)
@@ -366,6 +366,8 @@ def sampled_certificate(
         reasons.append(Notice("estimation.unknown_response", gain=limits.gain, phase=limits.phase))
     low, high = max(v[0] for v in valid), min(v[1] for v in valid)
     accepted = Notice("estimation.accepted", low=low, high=high)
+    if not high > low:
+        accepted = Notice("estimation.accepted_apart")
     return {
         "order": order,
         "free_order": free_order,

@@ -306,8 +306,8 @@ def test_the_simplest_of_equals_is_taken(better, order):
     problem = SectionsProblem([record(*recorded("zero-order"))], "zero-order", np.zeros(1, int))
     fits = {n: replace(problem.fit(0, [np.empty(0)]), order=n) for n in (1, 3)}
     small = SampledCandidate(fits[1], 1 + 0.05 * rng.normal(size=8))
-    large = SampledCandidate(fits[3], small.hidden - better * (1 + rng.normal(size=8) / 3))
-    large = replace(large, hidden=large.hidden + (better < 0.01) * 0.05 * rng.normal(size=8))
+    large = SampledCandidate(fits[3], small.held_out - better * (1 + rng.normal(size=8) / 3))
+    large = replace(large, held_out=large.held_out + (better < 0.01) * 0.05 * rng.normal(size=8))
     assert simplest_undominated([small, large]).order == order
 
 
