@@ -120,8 +120,8 @@ def _check_options(args: argparse.Namespace) -> None:
         )
     if args.tolerance and not args.fit:
         raise ConfigurationError("--tolerance needs a registered deviation; give --fit auto")
-    if args.aperture and not args.fit:
-        raise ConfigurationError("--aperture limits the fit; give --fit auto")
+    if (args.aperture or args.placement) and not args.fit:
+        raise ConfigurationError("--aperture and --placement limit the fit; give --fit auto")
     if (args.delay or args.exposure) and not args.by_stamps:
         raise ConfigurationError(
             "--delay and --exposure apply to stamps only; give --by-stamps, or leave them out"
@@ -159,7 +159,9 @@ def _correct(args: argparse.Namespace) -> Facts:
             by_stamps=StampJoining(args.delay, args.exposure) if args.by_stamps else None,
             stated=sources_of(args.sources),
             accuracy=args.accuracy,
-            register=RegistrationOptions(args.fit, args.aperture, args.tolerance, args.dust)
+            register=RegistrationOptions(
+                args.fit, args.aperture, args.tolerance, args.dust, args.placement
+            )
             if args.fit
             else None,
             report=not args.no_report,

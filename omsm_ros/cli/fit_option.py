@@ -41,6 +41,20 @@ def aperture(text: str) -> Aperture:
         raise argparse.ArgumentTypeError(str(err)) from err
 
 
+def placement(text: str) -> dict[str, float]:
+    """Parse the uncertainty of x and y [m], and that of clocking [rad] if a second one follows."""
+    try:
+        lateral, *angles = [float(part) for part in text.split(",")]
+        known = dict(zip(("x", "y", "clocking"), (lateral, lateral, *angles), strict=False))
+        if len(angles) > 1 or not all(0 <= size < 1 for size in known.values()):
+            raise ValueError
+    except ValueError as err:
+        raise argparse.ArgumentTypeError(
+            f"placement is {shown(text)}, expected M or M,RAD: standard uncertainties"
+        ) from err
+    return {name: max(size, _LEAST_PLACEMENT) for name, size in known.items()}
+
+
 def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     """Add the options of a registration."""
     add(
@@ -60,6 +74,14 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
         metavar="APERTURE",
     )
 
+    add(
+        "--placement",
+        placement,
+        "standard uncertainty of x and y of the part [m], and of its clocking [rad]; what the "
+        "surface hardly determines is held with it; default: a part that is placed by hand",
+        metavar="M[,RAD]",
+    )
+
 
 def declare_tolerance(add: Arguments) -> None:
     """Add the tolerance of a registered part, and the rule for dust."""
@@ -73,6 +95,8 @@ def declare_tolerance(add: Arguments) -> None:
     add("--tolerance", TOLERANCE, "tolerance of the peak to valley of the part [m]; needs --fit")
 
 
+# Smallest standard uncertainty of a placement [m], [rad]; below an atom it is zero.
+_LEAST_PLACEMENT = 1e-12
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
 _UNITS |= {n: "" if n.startswith("conic") else "m" for n in SHAPE_PARAMETERS}
 

@@ -1,7 +1,7 @@
 """Commands for the form of a part: form, compensate, surface."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -177,17 +177,17 @@ def compensate_form(
     spiral: tuple[float, int] | None = None,
     cut: NextCut | None = None,
     previous: Path | None = None,
+    placement: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Write compensation.csv into ``out``: offsets to add to the height of the next cut.
 
-    asked, aperture: as for ``omsm form``
-    low_pass: cutoff wavelength, of which half is compensated [m]
+    asked, aperture, placement: as for form;  low_pass: cutoff, of which half is compensated [m]
     spiral: feed per turn [m] and points per turn of the next cut, for compensation.nc; None: none
     cut: for cut.nc, a complete program;  previous: compensation.csv of the cut that made this part
 
-    Raises DataError for a wavelength below the points, and where the previous cut went wrong.
+    Raises DataError for a wavelength below the points, or if the previous cut went wrong.
     """
-    form = measured.form(surface, asked, aperture)
+    form = measured.form(surface, asked, aperture, placement=placement)
     found = compensation(form.map, surface := form.registration.surface, low_pass)
     (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
     share, total = None, found.offset
@@ -198,7 +198,7 @@ def compensate_form(
     _write_offsets(out, [values[known].tolist() for values in columns])
     path = {} if spiral is None else _along(spiral_offsets(found, *spiral), out)
     if cut is not None:
-        rim = float(np.max(np.hypot(x[known], y[known])))
+        rim = float(np.max(np.hypot(x, y)[known]))
         path |= _program(CutSurface(surface, found.x, found.y, total), rim, cut, out)
     offset, spread = np.abs(found.offset[known]), found.uncertainty[known]
     sure = float(np.mean(offset > _COVERAGE * spread))
@@ -305,7 +305,15 @@ def _form(args: argparse.Namespace) -> Facts:
             refuse_cell(source, args)
         points = open_measurement(source, args.unit, args.channel)
         facts = judge_form(
-            points, surface, out, args.fit, args.aperture, filters, args.tolerance, args.dust
+            points,
+            surface,
+            out,
+            args.fit,
+            args.aperture,
+            filters,
+            args.tolerance,
+            args.dust,
+            args.placement,
         )
         if not args.no_report:
             draw_form(source, out, args.origin)
@@ -360,7 +368,16 @@ def _compensate(args: argparse.Namespace) -> Facts:
     with result_folder(args.out, (COMPENSATION, PATH, CUT)) as out:
         points = open_measurement(args.measured, args.unit, args.channel)
         facts = compensate_form(
-            points, surface, out, args.low_pass, args.fit, args.aperture, spiral, cut, args.previous
+            points,
+            surface,
+            out,
+            args.low_pass,
+            args.fit,
+            args.aperture,
+            spiral,
+            cut,
+            args.previous,
+            args.placement,
         )
     return {**facts, "out": str(args.out)}
 

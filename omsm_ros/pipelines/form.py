@@ -69,6 +69,7 @@ class MeasurementMeasuredPortions:
         aperture: Aperture | None = None,
         filters: tuple[float | None, float | None] = (None, None),
         dust: DustRule = ISOLATED,
+        placement: Mapping[str, float] | None = None,
     ) -> FormResult:
         """Return the form of the points against ``surface``."""
         return analyse_form(
@@ -81,6 +82,7 @@ class MeasurementMeasuredPortions:
             even=self.even,
             filters=filters,
             dust=dust,
+            declared=placement or {},
         )
 
 
@@ -158,6 +160,7 @@ def judge_form(
     filters: tuple[float | None, float | None] = (None, None),
     tolerance: float | None = None,
     dust: DustRule | None = None,
+    placement: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Register a measurement to its nominal ``surface``; return the content of ``form.json``.
 
@@ -169,10 +172,12 @@ def judge_form(
     tolerance: of the peak to valley of the part [m], None without one
     dust: which points far from the form are left out; None: isolated ones, which still count
         against the tolerance, because nobody has decided that they are no defects
+    placement: declared standard uncertainties of x, y and clocking [m], [rad], None if unknown
 
     Raises DataError for points that do not fit the surface or do not determine the pose asked for.
     """
-    form = measured.form(surface, asked, aperture, filters, ISOLATED if dust is None else dust)
+    rule = ISOLATED if dust is None else dust
+    form = measured.form(surface, asked, aperture, filters, rule, placement)
     facts = form_facts(form, measured)
     doubts = form.doubts(decided=dust is not None)
     facts["open"] = [{"reason": str(d.reason), "peak_to_valley": d.peak_to_valley} for d in doubts]
@@ -290,8 +295,8 @@ def _advice(form: FormResult) -> list[str]:
         advice.append(
             f"{' and '.join(dofs.held)} held at the nominal pose, because a move cannot be "
             "separated from form there; the possible offset of the part is included in every "
-            "uncertainty except those after best-fit alignment; if the part is known to sit within "
-            f"a micrometre, state the fit: --fit {others}"
+            "uncertainty except those after best-fit alignment; if it is known how well the part "
+            f"sits, state that with --placement, or hold it: --fit {others}"
         )
     return advice
 

@@ -271,6 +271,7 @@ class RegistrationOptions:
     aperture: Aperture | None = None
     tolerance: float | None = None
     dust: DustRule | None = None
+    placement: Mapping[str, float] | None = None
 
 
 def measure(
@@ -350,7 +351,7 @@ def _publish(
 
 
 # Entries of the registration that the summary keeps.
-_OF_FORM = ("pose", "deviation", "removed", "points", "open")
+_OF_FORM = ("pose", "shape", "deviation", "removed", "points", "open")
 
 
 def add_form(
@@ -361,7 +362,13 @@ def add_form(
     from omsm_ros.pipelines.form import judge_form, open_measurement
 
     facts = judge_form(
-        open_measurement(out), nominal, out, register.dofs, register.aperture, dust=register.dust
+        open_measurement(out),
+        nominal,
+        out,
+        register.dofs,
+        register.aperture,
+        dust=register.dust,
+        placement=register.placement,
     )
     summary["form"] = {name: facts[name] for name in _OF_FORM}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}

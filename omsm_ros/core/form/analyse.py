@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -216,6 +217,7 @@ def analyse_form(
     even: bool = False,
     filters: tuple[float | None, float | None] = (None, None),
     dust: DustRule = ISOLATED,
+    declared: Mapping[str, float] = MappingProxyType({}),
 ) -> FormResult:
     """Register the points and evaluate their deviations.
 
@@ -225,9 +227,8 @@ def analyse_form(
     Raises DataError for points that are too few, do not fit, or do not determine the pose.
     """
     surface, aperture = within_aperture(surface, aperture)
-    found = register(
-        surface, portions, asked, sources=sources, aperture=aperture, even=even, dust=dust
-    )
+    how = {"sources": sources, "aperture": aperture, "even": even, "dust": dust}
+    found = register(surface, portions, asked, declared=declared, **how)  # type: ignore[arg-type]
     gathered = _Gathered(surface, found, aperture)
     for portion in portions():
         for begin in range(0, len(portion.x), CHUNK):

@@ -6,8 +6,9 @@ A sphere that turns about its axis stays the same; a lateral shift of it acts li
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -56,16 +57,22 @@ class PoseParameters(NamedTuple):
     """Pose parameters that are fitted, in the order of their columns, and why others are not.
 
     refused: the surface does not determine it;  held: at its nominal value, see :func:`weakest_dof`
+    declared: standard uncertainties of the placement [m], [rad], where they are known
     """
 
     fitted: tuple[str, ...]
     refused: dict[str, Notice]
     held: dict[str, Notice]
+    declared: Mapping[str, float] = MappingProxyType({})
+
+    def range(self, name: str) -> float:
+        """Return the declared uncertainty of a parameter, else its largest plausible offset."""
+        return self.declared.get(name, typical_range(name))
 
     def without(self, name: str, reason: Notice) -> PoseParameters:
         """Return these with ``name`` held for a ``reason``."""
         left = tuple(n for n in self.fitted if n != name)
-        return PoseParameters(left, self.refused, {**self.held, name: reason})
+        return self._replace(fitted=left, held={**self.held, name: reason})
 
 
 def parse_dofs(text: str) -> tuple[str, ...]:
@@ -86,7 +93,12 @@ def parse_dofs(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> PoseParameters:
+def determined_dofs(
+    asked: Sequence[str],
+    gram: FloatArray,
+    points: int,
+    declared: Mapping[str, float] = MappingProxyType({}),
+) -> PoseParameters:
     """Return which of the pose parameters ``asked`` for the surface determines.
 
     asked: names, or "auto" for all rigid ones that are determined, alone or with "power"
@@ -101,18 +113,23 @@ def determined_dofs(asked: Sequence[str], gram: FloatArray, points: int) -> Pose
     fitted: list[str] = []
     refused: dict[str, Notice] = {}
     for name in wanted:
-        reason = _undetermined(name, fitted, gram / points, known)
+        size = declared.get(name, typical_range(name))
+        reason = _undetermined(name, fitted, gram / points, known, size)
         if reason is None:
             fitted.append(name)
         elif automatic and name not in asked:
             refused[name] = reason
         else:
             raise DataError("registration.not_determined", name=name, reason=reason)
-    return PoseParameters(tuple(fitted), refused, {})
+    return PoseParameters(tuple(fitted), refused, {}, declared)
 
 
 def weakest_dof(
-    names: Sequence[str], values: FloatArray, covariance: FloatArray, gram: FloatArray
+    dofs: PoseParameters,
+    asked: Sequence[str],
+    values: FloatArray,
+    covariance: FloatArray,
+    gram: FloatArray,
 ) -> tuple[str, Notice] | None:
     """Return the least supported move and the reason to hold it at its nominal value, or None.
 
@@ -120,7 +137,8 @@ def weakest_dof(
     prior to the posterior density at zero (Savage-Dickey ratio; J. Dickey, Ann. Math. Stat. 42,
     204).
 
-    values: of ``names`` (p,) as fitted;  covariance: of ``values`` (p, p)
+    asked: names of those that are fitted in any case
+    values: of the fitted ones (p,);  covariance: of ``values`` (p, p)
     gram: mean products of the columns (p, p)
     """
     spread = np.sqrt(np.diag(covariance))
@@ -129,15 +147,15 @@ def weakest_dof(
     # Size of the part of each column that is independent of the other columns.
     own = scale / np.sqrt(np.maximum(np.diag(inverse), 1.0))
     found = [
-        ((values[k] / spread[k]) ** 2 / 2 - np.log(typical_range(name) / spread[k]), k)
-        for k, name in enumerate(names)
-        if name in MOVES and own[k] * spread[k] > _LEAST_FORM_M
+        ((values[k] / spread[k]) ** 2 / 2 - np.log(dofs.range(name) / spread[k]), k)
+        for k, name in enumerate(dofs.fitted)
+        if name in MOVES and name not in asked and own[k] * spread[k] > _LEAST_FORM_M
     ]
     if not found or min(found)[0] > np.log(_STRONG_ODDS):
         return None
     k = min(found)[1]
-    angle = names[k] == "clocking"
-    return names[k], Notice(
+    angle = dofs.fitted[k] == "clocking"
+    return dofs.fitted[k], Notice(
         "registration.held_angle" if angle else "registration.held_length",
         uncertainty=spread[k],
         form=own[k] * spread[k],
@@ -151,12 +169,12 @@ def shape_asked(asked: Sequence[str]) -> tuple[str, ...]:
 
 
 def _undetermined(
-    name: str, before: Sequence[str], gram: FloatArray, known: Sequence[str]
+    name: str, before: Sequence[str], gram: FloatArray, known: Sequence[str], size: float
 ) -> Notice | None:
     """Return why ``name`` is not determined in a fit with those ``before`` it, None if it is."""
     places, own = [known.index(n) for n in before], known.index(name)
     alone = float(np.sqrt(gram[own, own]))
-    if alone * typical_range(name) < _LEAST_FORM_M:
+    if alone * size < _LEAST_FORM_M:
         return Notice("registration.surface_unchanged")
     scale = np.sqrt(np.diag(gram))[places]
     shared = gram[places, own] / scale / alone
@@ -164,7 +182,7 @@ def _undetermined(
     share = np.linalg.lstsq(normal, shared, rcond=1e-14)[0] if places else shared
     left = alone * np.sqrt(max(1 - float(shared @ share), 0.0))
     # A difference below 1e-6 of the column is rounding.
-    if left > 1e-6 * alone and left * typical_range(name) >= _LEAST_FORM_M:
+    if left > 1e-6 * alone and left * size >= _LEAST_FORM_M:
         return None
     same = [n for n, s in zip(before, share, strict=True) if abs(s) > 0.05]
     return Notice("registration.same_effect", others=same)
@@ -235,7 +253,7 @@ class Registration:
         """
         fitted = self.dofs.fitted
         steps = [
-            [typical_range(name), *(others[n][0] for n in fitted)]
+            [self.dofs.range(name), *(others[n][0] for n in fitted)]
             for name, others in self.correlated_moves.items()
         ]
         ways = [
@@ -343,7 +361,8 @@ class OpenUncertainty(NamedTuple):
         for name, own in zip(dofs.held, held, strict=True):
             correlated_moves = [np.linalg.norm(moves[name]) for moves in self.unknown.values()]
             found[name] = float(np.linalg.norm([own, *correlated_moves]))
-        return found | {name: typical_range(name) for name in dofs.refused}
+        found |= {name: dofs.range(name) for name in dofs.refused}
+        return {name: min(s, dofs.declared.get(name, s)) for name, s in found.items()}
 
 
 def root_of(covariance: FloatArray) -> FloatArray:

@@ -8,8 +8,9 @@ points far from the smooth form (dust) are left out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -140,6 +141,7 @@ def register(
     aperture: Aperture | None = None,
     even: bool = False,
     dust: DustRule = ISOLATED,
+    declared: Mapping[str, float] = MappingProxyType({}),
 ) -> Registration:
     """Fit the pose parameters ``asked`` for, or "auto", of a part to its nominal ``surface``.
 
@@ -147,6 +149,7 @@ def register(
     aperture: of the part, beyond which points are ignored; None for all points
     even: the points form an evenly spaced grid
     dust: which points far from the smooth form are left out
+    declared: standard uncertainties of the placement by pose parameter [m], [rad]
 
     Raises DataError for too few points, a pose parameter that the surface does not determine,
     or a fit that does not converge.
@@ -154,14 +157,14 @@ def register(
     surface, aperture = within_aperture(surface, aperture)
     chosen = selection(portions, _MOST_SELECTED)
     start = Placement(shape=_start_of_shape(surface, chosen, shape_asked(asked)))
-    dofs = _determined(surface, chosen, asked, aperture, start)
+    dofs = _determined(surface, chosen, asked, aperture, start, declared)
     try:
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     except DataError:
         # On a tilted part an undetermined rotation may seem to be determined; seat it first.
         seat = (*POSE_PARAMETERS[:3], *shape_asked(asked))
         seated = coarse_placement(surface, chosen, seat, aperture, start)
-        dofs = _determined(surface, chosen, asked, aperture, seated)
+        dofs = _determined(surface, chosen, asked, aperture, seated, declared)
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture.disc if aperture else disc_of(points.x, points.y)
@@ -191,11 +194,12 @@ def _determined(
     asked: Sequence[str],
     aperture: Aperture | None,
     at: Placement,
+    declared: Mapping[str, float],
 ) -> PoseParameters:
     """Return which pose parameters the surface determines where the part is ``at``."""
     points = inside_aperture(placed(surface, at, chosen), aperture)
     columns = dof_columns(at, points, (*POSE_PARAMETERS, *shape_asked(asked)))
-    return determined_dofs(asked, columns @ columns.T, len(points.x))
+    return determined_dofs(asked, columns @ columns.T, len(points.x), declared)
 
 
 class _PlacementState(NamedTuple):
@@ -226,7 +230,8 @@ def _useful(
     while True:
         free = len(fit.names)
         weak = weakest_dof(
-            tuple("" if n in asked else n for n in fit.names),
+            fit.dofs,
+            asked,
             np.array([stand.at.value(n) for n in fit.names]),
             stand.found.covariance[:free, :free],
             stand.sums.gram[:free, :free] / stand.sums.points,
@@ -240,6 +245,9 @@ def _useful(
         )
     held = [names.index(n) for n in fit.dofs.held]
     square = covariance[np.ix_(held, held)] + np.outer(values[held], values[held])
+    most = np.array([fit.dofs.declared.get(n, np.inf) for n in fit.dofs.held])
+    less = np.minimum(most / np.sqrt(np.diag(square)), 1.0)
+    square *= np.outer(less, less)
     return fit, stand, open_._replace(held=square)
 
 
@@ -278,7 +286,7 @@ class _PoseFit:
                 coarse_placement(
                     self.surface, few, self.names, None, rigid.moved([name], np.array([off]))
                 )
-                for off in (typical_range(name), -typical_range(name))
+                for off in (self.dofs.range(name), -self.dofs.range(name))
             ]
             found[name] = {}
             for n in self.names:
@@ -336,11 +344,12 @@ class _PoseFit:
     def expected(self, at: Placement) -> tuple[FloatArray, FloatArray]:
         """Return the values of the pose and the standard deviations of their priors, both (p,).
 
-        A larger offset in the least-squares fit widens the prior.
+        A larger offset in the least-squares fit widens the prior, unless it is declared.
         """
-        first = [abs(self.plain.value(n)) for n in self.names]
+        known = self.dofs.declared
+        first = [0.0 if n in known else abs(self.plain.value(n)) for n in self.names]
         value = np.array([at.value(n) for n in self.names])
-        return value, np.maximum([typical_range(n) for n in self.names], first)
+        return value, np.maximum([self.dofs.range(n) for n in self.names], first)
 
     def refine(self, at: Placement, chosen: PointBatch) -> _PlacementState:
         """Return the converged fit; raise DataError if there is none."""

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 
+from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.registration.register import register
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
 from omsm_ros.core.surface.nominal import OffAxisParaboloid, Sphere
 from omsm_ros.core.surface.posed import Pose, PosedSurface
 from omsm_ros.core.surface.shape_parameters import external
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex
 from omsm_ros.errors import ConfigurationError
 
 R, N = 12e-3, 2000
@@ -67,3 +69,21 @@ def test_the_radius_is_within_two_uncertainties_on_parts_with_form():
 def test_a_parameter_that_the_shape_does_not_have_is_named():
     with pytest.raises(ConfigurationError, match="conic_constant"):
         fitted(Sphere(0.1), np.zeros(N), ("auto", "conic_constant"))
+
+
+def test_a_declared_placement_is_never_exceeded_and_saves_the_astigmatism():
+    """On the off-axis paraboloid a shift of 10 µm looks like 100 nm of astigmatism."""
+    nominal, off = OffAxisParaboloid(25.4e-3, 50.8e-3), {"x": 1e-6, "y": 1e-6, "clocking": 1e-5}
+    u, v = X / R, Y / R
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        pose = Pose(**{name: float(rng.normal()) * size for name, size in off.items()})
+        height = PosedSurface(nominal, pose).height(X, Y) + 50e-9 * (u * u - v * v)
+        batch = PointBatch(X, Y, height + rng.normal(0, 3e-9, N), np.empty((0, N)))
+        form = analyse_form(nominal, lambda b=batch: [b], ("auto",), declared=off)
+        for name, size in off.items():
+            assert form.registration.uncertainty(name) <= size * (1 + 1e-9)
+        place = form.zernike.terms.index(ZernikeIndex(2, 2))
+        astigmatism = form.zernike.coefficients[place]
+        spread = form.zernike.uncertainty[place]
+        assert abs(astigmatism - 50e-9) < 3 * spread < 10e-9

@@ -133,8 +133,9 @@ def test_a_freedom_that_is_held_is_no_longer_fitted():
 
 def weak(values, spreads, effects, names=("piston", "x", "y")):
     """Return the weakest of independent pose parameters with these effects."""
+    dofs = PoseParameters(tuple(names), {}, {})
     return weakest_dof(
-        names, np.array(values), np.diag(np.square(spreads)), np.diag(np.square(effects))
+        dofs, (), np.array(values), np.diag(np.square(spreads)), np.diag(np.square(effects))
     )
 
 
@@ -170,11 +171,11 @@ def test_pistons_and_tilts_are_never_held_nor_what_costs_no_form():
 def test_what_another_freedom_does_is_not_counted_as_its_own():
     """Two columns alike but for a thousandth: only that much form tells them apart."""
     gram = 1e-6 * np.array([[1.0, 1 - 5e-7], [1 - 5e-7, 1.0]])
-    names = ("x", "y")
+    dofs = PoseParameters(("x", "y"), {}, {})
     covariance = np.diag([1e-10, 1e-10])
-    apart = weakest_dof(names, np.zeros(2), covariance, np.diag(np.diag(gram)))
+    apart = weakest_dof(dofs, (), np.zeros(2), covariance, np.diag(np.diag(gram)))
     assert apart is not None
-    assert weakest_dof(names, np.zeros(2), covariance, gram) is None
+    assert weakest_dof(dofs, (), np.zeros(2), covariance, gram) is None
 
 
 def test_rigid_freedoms_are_the_six_of_a_pose():
