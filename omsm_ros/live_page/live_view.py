@@ -321,13 +321,16 @@ class LiveView:
             nodes = [
                 {**state, "silent": now - when > _STALE_S} for when, state in self._nodes.values()
             ]
+            ended = next((n for n in nodes if _ENDED in n["values"]), None)
+            light = _traffic_light_entry(nodes, self._calibration)
             grid = self._map.grid
             return {
                 "points": self._points,
                 "left_out": self._left_out,
                 "compared": self._nominal is not None,
                 "grid": None if grid is None else _grid_entry(grid),
-                "light": _traffic_light_entry(nodes, self._calibration),
+                "light": _result_entry(ended) if ended else light,
+                "ended": ended is not None,
                 "nodes": nodes,
                 "calibration": self._calibration,
                 "series": [(when - now, *rest) for when, *rest in self._series],
@@ -359,6 +362,21 @@ def _grid_entry(grid: MapGrid) -> dict[str, float]:
     }
 
 
+_ENDED = "measurement_ended"
+"""Value in the state of a node with which a measurement has ended; other nodes may then be gone."""
+_COLOURS = {"verified": "green", "not_verified": "amber"}
+
+
+def _result_entry(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the light after a measurement: its result, or that it is being evaluated."""
+    values = state["values"]
+    if "verdict" not in values:
+        return {"colour": "amber", "word": "Evaluating", "reasons": [state["message"]]}
+    reasons = [values.get("verdict_text", ""), *values.get("verdict_next", "").split("; ")]
+    colour = _COLOURS.get(values["verdict"], "red")
+    return {"colour": colour, "word": state["message"], "reasons": [*filter(None, reasons)]}
+
+
 def _traffic_light_entry(
     nodes: list[dict[str, Any]], calibration: Mapping[str, Any]
 ) -> dict[str, Any]:
@@ -381,7 +399,10 @@ def _traffic_light_entry(
     red = worst == "ERROR" or any(n["silent"] for n in nodes) or _is_rejected(calibration)
     red = red or any(values["verdict"] != "not_verified" for values in measured)
     colour = "red" if red else "amber" if reasons else "green"
-    return {"colour": colour, "reasons": reasons[:20]}
+    word = {"green": "In order", "amber": "With reservations", "red": "Not valid"}[colour]
+    if worst == "STALE" and not red:
+        word = "Waiting for samples"
+    return {"colour": colour, "word": word, "reasons": reasons[:20]}
 
 
 def _is_rejected(calibration: Mapping[str, Any]) -> bool:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from omsm_msgs.srv import Identify
 from rclpy.node import Node
 from std_srvs.srv import Trigger
@@ -38,6 +38,7 @@ from omsm_ros.errors import (
 from omsm_ros.instruments.emulator_factory import EMULATED
 from omsm_ros.pipelines.demonstrate import Demonstration, finish_demonstration, table_of
 from omsm_ros.pipelines.progress import refresh_in_thread, tick
+from omsm_ros.report.verdict import headline, next_steps
 
 _END_TIMEOUT_S = 15.0
 
@@ -72,6 +73,11 @@ class NodeProcesses:
             self._running[label] = subprocess.Popen(
                 command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
+
+    @property
+    def running(self) -> tuple[str, ...]:
+        """Return the names of the nodes that were not ended."""
+        return tuple(self._running)
 
     def pid(self, node: str) -> int:
         """Return the process number of a running node."""
@@ -112,6 +118,7 @@ class NodeProcesses:
 
 
 _DISCOVERY_S = 0.3
+_DRAWING_S = 2.0
 _SERVICE_TIMEOUT_S = 60.0
 _STALL_TIMEOUT_S = 60.0
 _PREFIX = "/omsm/"
@@ -125,6 +132,7 @@ class DemoNode(Node):
         self._processes = processes
         self._status: dict[str, dict[str, str]] = {}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        self._publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -133,6 +141,16 @@ class DemoNode(Node):
                 "message": status.message,
                 "level": str(status.level[0]),
             }
+
+    def show(self, message: str, verdict: Mapping[str, Any] | None = None) -> None:
+        """Publish that the measurement has ended, and its verdict, for the live page."""
+        values = {"measurement_ended": "yes"}
+        if verdict is not None:
+            values |= {"verdict": verdict["code"], "verdict_text": verdict["text"]}
+            values["verdict_next"] = "; ".join(next_steps(verdict))
+        shown = [KeyValue(key=key, value=value) for key, value in values.items()]
+        status = DiagnosticStatus(name="/omsm/cell_demo", message=message, values=shown)
+        self._publisher.publish(DiagnosticArray(status=[status]))
 
     def forget(self, node: str) -> None:
         """Drop what the diagnostics of ``node`` said, as before it is started again."""
@@ -241,9 +259,9 @@ def perform(
     with stage(f"outward at twice the speed: {samples} points", samples) as progress:
         _scan(node, plan, "verifying_scan", samples, progress)
     if plan.view:
-        _until_seen()
+        node.show("both scans are recorded and are being adjusted together")
     with stage("ending the nodes"):
-        processes.end()
+        processes.end(*(name for name in processes.running if name != "viewer"))
 
 
 def _record(node: DemoNode, processes: NodeProcesses, plan: Demonstration, bag: Path) -> None:
@@ -261,10 +279,12 @@ def _record(node: DemoNode, processes: NodeProcesses, plan: Demonstration, bag: 
 
 
 def _until_seen() -> None:
-    """Keep the live page until Enter is pressed; do not wait without a terminal."""
+    """Keep the live page until Enter is pressed, or without a terminal until it is drawn."""
     if sys.stdin.isatty() and sys.stderr.isatty():
         print("the live page stays until you press Enter ", end="", file=sys.stderr, flush=True)
         sys.stdin.readline()
+    else:
+        time.sleep(_DRAWING_S)
 
 
 def _start(node: DemoNode, processes: NodeProcesses, plan: Demonstration) -> None:
@@ -365,9 +385,13 @@ def main() -> None:
         rclpy.init()
         plan.prepare()
         with NodeProcesses(plan.out / "log") as processes:
-            perform(DemoNode(processes), processes, plan, stage)
-        with stage("correcting the bag offline, comparing with the truth"):
-            summary = finish_demonstration(plan)
+            node = DemoNode(processes)
+            perform(node, processes, plan, stage)
+            with stage("correcting the bag offline, comparing with the truth"):
+                summary = finish_demonstration(plan)
+            if plan.view:
+                node.show(headline(summary["adjustment"]), summary["adjustment"]["verdict"])
+                _until_seen()
     except OmsmError as err:
         print(f"omsm demo: {one_line(err)}", file=sys.stderr)
         sys.exit(2)

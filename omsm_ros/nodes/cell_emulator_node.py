@@ -192,7 +192,7 @@ class CellEmulatorNode(ManagedNode):
         lapse = self.values["time_lapse"]
         faster = f", {lapse:g} times as fast as the machine" if lapse != 1 else ""
         words = f"playing{faster}" if self._player.playing else "waiting"
-        return StateReport(words, {"samples_played": self._player.played})
+        return StateReport(words, {"samples_played": self._player.played, "time_lapse": lapse})
 
 
 main = partial(run, CellEmulatorNode)

@@ -99,6 +99,7 @@ class DriverNode(ManagedNode):
             connected=self._publish_settings,
         )
         self._recent, self._flow = RecentIncrease(), SampleFlow()
+        self._was_silent, self._restarts, self._reset = False, 0.0, 0.0
         self._reported: dict[str, object] = {}
         if self._settings_topic:
             self._settings = publish_on(self, undo, String, self._settings_topic, LATCHED_QOS)
@@ -163,6 +164,12 @@ class DriverNode(ManagedNode):
 
     def _add_faults(self, report: StateReport, counts: dict[str, float], now: float) -> None:
         faults = {name: n for name, n in counts.items() if name.startswith(_FAULTS)}
+        # A counter that begins again after a silence was reset for another measurement.
+        risen = counts.get("restarts", 0.0) - self._restarts
+        self._reset += risen if self._was_silent and risen == 1 else 0.0
+        self._restarts += risen
+        if "restarts" in faults:
+            faults["restarts"] -= self._reset
         if seen := self._recent.update(faults, now):
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in seen.items())
             report.add(WARN, f"just now: {text}")
@@ -172,6 +179,7 @@ class DriverNode(ManagedNode):
             return
         patience = max(_SILENCE_S, _SILENCE_SAMPLES * self.values["sample_period"])
         silent = self._flow.silent(now)
+        self._was_silent = silent is not None and silent > patience
         if silent is None:
             report.add(STALE, "connected, but no sample has come yet")
         elif silent > patience:

@@ -134,8 +134,10 @@ def verifying(scenario: Scenario) -> Scenario:
 
 
 def verifying_scan_of(scenario: Scenario, disturbances: Disturbances = NOTHING) -> Recording:
-    """Return the scan of :func:`verifying`."""
-    return scan_of(verifying(scenario), disturbances)
+    """Return the scan of :func:`verifying`; C counts on from the turns of ``scenario``."""
+    found = scan_of(verifying(scenario), disturbances)
+    turned = 2 * np.pi * round(scenario.start_radius / scenario.feed_per_turn)
+    return replace(found, axes=replace(found.axes, c=found.axes.c + turned))
 
 
 @dataclass(frozen=True, slots=True)

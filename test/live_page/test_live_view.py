@@ -100,10 +100,14 @@ def test_the_light_is_green_only_if_all_is_well(clock, true_calibration):
     view.add_state("/omsm/corrector", "OK", "correcting", {})
     assert view.state()["light"]["reasons"] == ["no calibration yet"]
     view.set_calibration(true_calibration)
-    assert view.state()["light"] == {"colour": "green", "reasons": []}
+    assert view.state()["light"] == {"colour": "green", "word": "In order", "reasons": []}
     view.add_state("/omsm/driver", "WARN", "just now: lost 3", {})
     light = view.state()["light"]
-    assert light == {"colour": "amber", "reasons": ["/omsm/driver: just now: lost 3"]}
+    assert light == {
+        "colour": "amber",
+        "word": "With reservations",
+        "reasons": ["/omsm/driver: just now: lost 3"],
+    }
     view.add_state("/omsm/driver", "ERROR", "gone", {})
     assert view.state()["light"]["colour"] == "red"
 
@@ -116,6 +120,7 @@ def test_the_light_of_the_measurement_is_part_of_it(clock, true_calibration):
     view.add_state("/omsm/corrector", "OK", "correcting", said)
     assert view.state()["light"] == {
         "colour": "amber",
+        "word": "With reservations",
         "reasons": ["measurement: not verified", "measurement: next: scan"],
     }
     view.add_state("/omsm/corrector", "OK", "correcting", said | {"verdict": "contradicted"})
@@ -123,7 +128,7 @@ def test_the_light_of_the_measurement_is_part_of_it(clock, true_calibration):
     view.add_state(
         "/omsm/corrector", "OK", "correcting", {"verdict": "verified", "verdict_next": ""}
     )
-    assert view.state()["light"] == {"colour": "green", "reasons": []}
+    assert view.state()["light"] == {"colour": "green", "word": "In order", "reasons": []}
 
 
 @pytest.mark.parametrize(
@@ -218,3 +223,23 @@ def test_a_stranger_with_any_number_of_names_fills_no_memory(clock):
     assert len(state["nodes"]) == 64
     assert len(str(state)) < 64 * 10_000
     assert state["nodes"][0]["message"] == "no calibration"
+
+
+def test_after_the_measurement_the_light_is_its_result(clock, true_calibration):
+    """Nodes that have ended by then are no fault."""
+    view = LiveView(monotonic=clock)
+    view.set_calibration(true_calibration)
+    view.add_state("/omsm/corrector", "OK", "correcting", {})
+    ended = {"measurement_ended": "yes"}
+    view.add_state("/omsm/cell_demo", "OK", "being adjusted", ended)
+    clock.now += 60.0
+    assert view.state()["light"]["word"] == "Evaluating"
+    assert view.state()["light"]["colour"] == "amber"
+    found = ended | {
+        "verdict": "contradicted",
+        "verdict_text": "contradicted",
+        "verdict_next": "a; b",
+    }
+    view.add_state("/omsm/cell_demo", "OK", "PV 1 µm", found)
+    light = view.state()["light"]
+    assert light == {"colour": "red", "word": "PV 1 µm", "reasons": ["contradicted", "a", "b"]}

@@ -46,7 +46,9 @@ class Driver(SimpleNamespace):
 def driver(monkeypatch):
     now = [50.0]
     monkeypatch.setattr(driving.time, "monotonic", lambda: now[0])
-    counts = {"received": 0, "decoded": 0, "malformed": 0, "lost": 0, "losses_of_sync": 0}
+    counts = dict.fromkeys(
+        ("received", "decoded", "malformed", "lost", "losses_of_sync", "restarts"), 0
+    )
     made = Driver(
         now=now, counts=counts,
         values={"device": "six_channel", "port": "tcp://a:1", "sample_period": 1e-3,
@@ -55,6 +57,7 @@ def driver(monkeypatch):
                                 caution="", settings={"rate_hz": 1000.0}),
         _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
         _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},
+        _was_silent=False, _restarts=0.0, _reset=0.0,
         _messages=message_mapping.ros_messages(),
         _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
         _settings=Published(), _plotted=Published(), get_clock=FakeNode().get_clock,
@@ -161,3 +164,11 @@ def test_settings_are_reported_once_before_the_first_block_and_again_when_they_c
     assert order == [reported, "axes", "axes", reported | {"probe.rate_hz": 2000.0}, "axes"]
     driver._settings = None
     driver._publish_settings()
+
+
+def test_a_counter_that_is_reset_between_two_measurements_is_no_fault(driver):
+    """The same restart while samples arrive is one."""
+    driver.passes(1.0, 1000)
+    assert "no sample" in driver.passes(5.0, 0).text
+    assert driver.passes(1.0, 1000, restarts=1).text.startswith("reading at")
+    assert "just now: restarts 1" in driver.passes(1.0, 1000, restarts=1).text

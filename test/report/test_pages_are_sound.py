@@ -81,6 +81,7 @@ def report(text, calibration):
 def spectrum(text, _):
     reported = {
         "kind": text, "frequency": 1.0, "wavelength_along_path": 1.0, "amplitude": 1.0,
+        "amplitude_on_part": 1.0,
         "wavelength_along_radius": None, "significance": 4.0, "true_frequency": None,
         "true_wavelength": None, "order": text, "evidence": [text], "needs": text,
     }  # fmt: skip
@@ -91,10 +92,14 @@ def spectrum(text, _):
         "samples": {"analysed": 1}, "form": {"rms_removed": 1.0}, "sampling": [],
         "noise": {"rms": 1.0, "amplitude": 1.0}, "motion": {"outside_band_rms": None},
         "accelerometer": {"lines": [line]}, "peaks": [reported], "band_stop": None,
+        "vibration_removed": [],
     }  # fmt: skip
     counts = dict.fromkeys(KINDS, 1)
     return render_spectrum(
-        SpectrumPage({"scans": [scan], "counts": counts, "normalisation": text}, {"time": PNG})
+        SpectrumPage(
+            {"scans": [scan], "counts": counts, "normalisation": text, "exposure": None},
+            {"time": PNG},
+        )
     )
 
 

@@ -95,8 +95,10 @@ class LivePage {
     this.latest = view;
     const light = document.getElementById("light");
     light.className = `light ${view.light.colour}`;
-    light.querySelector("strong").textContent =
-      { green: "In order", amber: "With reservations", red: "Not valid" }[view.light.colour];
+    light.querySelector("strong").textContent = view.light.word;
+    const lapse = view.nodes.map((node) => Number(node.values.time_lapse)).find((one) => one > 0 && one !== 1);
+    document.getElementById("link").textContent = lapse
+      ? `live; an emulated machine in time lapse: one second here is ${lapse} s of the machine` : "live";
     list(light.querySelector("ul"), view.light.reasons);
     document.querySelector("button[data-layer='0']").textContent = view.compared ? "Deviation" : "Height";
     this.numbers(view);
@@ -105,7 +107,7 @@ class LivePage {
       ? `${calibration.id.slice(0, 12)}: ${calibration.verdict}, lag ${(1e6 * calibration.delay).toFixed(1)} µs, `
         + `up to ${calibration.valid_up_to.toFixed(1)} Hz`
       : "none yet";
-    this.tables(view.nodes);
+    this.tables(view.nodes, view.ended);
     series(document.getElementById("series"), view.series);
     document.getElementById("vibration").hidden = !view.spectrum;
     if (view.spectrum) spectrum(document.getElementById("spectrum"), view.spectrum);
@@ -117,8 +119,8 @@ class LivePage {
     const entries = [["points", view.points.toLocaleString("en").replaceAll(",", " ")]];
     if (view.left_out) entries.push(["without a place", String(view.left_out)]);
     if (last) entries.push(
-      ["dynamic error, last second", `${(1e9 * (last[2] - last[1])).toPrecision(3)} nm PV`],
-      ["standard uncertainty", `${(1e9 * last[3]).toPrecision(3)} nm`]);
+      ["dynamic error, last second", `${length(last[2] - last[1])} PV`],
+      ["standard uncertainty", length(last[3])]);
     const root = document.getElementById("numbers");
     root.replaceChildren(...entries.map(([name, value]) => {
       const item = document.createElement("div");
@@ -131,13 +133,14 @@ class LivePage {
       : "No points yet.";
   }
 
-  tables(nodes) {
+  tables(nodes, ended) {
     const rows = nodes.map((node) => {
       const row = document.createElement("tr");
-      row.className = `level-${node.silent ? "ERROR" : node.level}`;
-      const said = element("td", node.silent ? "no message for 10 s" : node.message);
+      const gone = node.silent && !ended;
+      row.className = `level-${gone ? "ERROR" : node.level}`;
+      const said = element("td", gone ? "no message for 10 s" : node.silent ? "ended" : node.message);
       said.className = "said";
-      row.append(element("th", node.name), element("td", node.silent ? "SILENT" : node.level), said);
+      row.append(element("th", node.name), element("td", gone ? "SILENT" : node.level), said);
       return row;
     });
     document.querySelector("#nodes tbody").replaceChildren(...rows);
@@ -161,6 +164,11 @@ class LivePage {
 // Whole words of a count's name: "late", not "latency_max_ms".
 const LOSSES =
   /(^|_)(lost|refused|unmatched|invalid|duplicates?|missing|late|overdue|settling|bad|slipped|beyond)(_|$)/;
+
+// A length in nm, or µm from a micrometre on.
+function length(metres) {
+  return metres < 999.5e-9 ? `${(1e9 * metres).toPrecision(3)} nm` : `${(1e6 * metres).toPrecision(3)} µm`;
+}
 
 function element(kind, content) {
   const made = document.createElement(kind);
