@@ -1,43 +1,16 @@
 """The paper's method a second time, in plain numpy, against the cloud of the package.
 
 Nothing of the core decides a number here: the coefficients of the calibration's file and the
-samples of a recording go through a bilinear filter written below.
+samples of a recording go through the bilinear filter of ``plain_method``.
 """
 
 import json
 
 import numpy as np
 import pytest
+from plain_method import bilinear, plain_height, recursion
 
 import omsm_ros as omsm
-
-
-def bilinear(ascending, period):
-    """Return numerator and denominator in q = z⁻¹, of one length, for s = 2/T (1 − q)/(1 + q)."""
-    order = max(map(len, ascending)) - 1
-    minus, plus = np.array([1.0, -1.0]) * 2 / period, np.array([1.0, 1.0])
-    made = []
-    for coefficients in ascending:
-        total = np.zeros(order + 1)
-        for power, value in enumerate(coefficients):
-            term = np.array([value])
-            for k in range(order):
-                term = np.convolve(term, minus if k < power else plus)
-            total += term
-        made.append(total)
-    b, a = made
-    return b / a[0], a / a[0]
-
-
-def recursion(b, a, x, inside=None):
-    """Return x_o[k] of Eq. 13; ``inside`` is added in the recursion, as printed."""
-    y = np.full(len(x), x[0] * np.sum(b) / np.sum(a))
-    added = np.zeros(len(x)) if inside is None else inside
-    if inside is not None:
-        y += inside[0] / np.sum(a)
-    for k in range(len(b), len(x)):
-        y[k] = b @ x[k - np.arange(len(b))] - a[1:] @ y[k - np.arange(1, len(a))] + added[k]
-    return y
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +25,7 @@ def measured(tmp_path_factory):
 def test_both_clouds_are_one(measured):
     """To 0.1 nm rms, where the package interpolates nothing and the filter here is bilinear."""
     stored, scan, points = measured
-    assert not stored["delay"]
-    b, a = bilinear((stored["numerator"], stored["denominator"]), scan.period)
-    height = recursion(b, a, scan.z) + scan.distance / stored["static_gain"]
+    height = plain_height(stored, scan.period, scan.z, scan.distance)
     off = height[points.sample] - points.height
     assert np.std(off) < 0.1e-9
     assert abs(np.mean(off)) < 1e-9

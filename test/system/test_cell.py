@@ -1,14 +1,17 @@
 """The main job in small, and what may go wrong on the wire."""
 
+import json
 import signal
 
 import numpy as np
 import pytest
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
+from plain_method import plain_height
 from std_srvs.srv import Trigger
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.errors import DeviceTimeoutError
+from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.nodes.cell_demo_node import DemoStage, perform
 from omsm_ros.pipelines import demonstrate as demonstration
@@ -33,6 +36,27 @@ def account(cell, stream):
 OTHERS = ("chrocodile", "chrocodile_packet", "confocaldt", "confocaldt_ethernet", "capancdt")
 
 
+def assert_plain_method_agrees(plan):
+    """The live cloud of the bag is that of the paper's method in plain numpy, to 0.1 nm rms."""
+    live = demonstration.live_points(plan.bag)
+    axes, distance = {}, {}
+    with bags.BagReader(plan.bag) as bag:
+        for topic, found in ((bags.AXES_TOPIC, axes), (bags.DISTANCE_TOPIC, distance)):
+            for _, block in bag.records(topic):
+                values = block.z if topic == bags.AXES_TOPIC else block.distance
+                found.update(zip(range(block.first_sample, block.end), values, strict=True))
+    count = sorted(axes)
+    assert count == list(range(count[0], count[-1] + 1))
+    z = np.array([axes[k] for k in count])
+    d = np.array([distance.get(k, np.nan) for k in count])
+    stored = json.loads(plan.calibration_file.read_text())
+    height = plain_height(stored, plan.sample_period, z, d)
+    off = height[live["sample"] - count[0]] - live["height"]
+    assert len(off) > 19_900
+    assert np.std(off) < 0.1e-9
+    assert abs(np.mean(off)) < 1e-9
+
+
 @pytest.mark.parametrize(
     "device", ["six_channel", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS)]
 )
@@ -54,6 +78,7 @@ def test_calibrate_scan_correct_and_replay(cell, device):
         assert samples["corrected"] + sum(samples["counted"].values()) == 20_000
         assert samples["corrected"] > 19_900
     assert summary["live_equals_offline"]
+    assert_plain_method_agrees(plan)
     deviation = summary["surface_deviation"]
     assert deviation["rms"] <= 1.1 * deviation["probe_noise_and_resolution"]
     for row in summary["response"]:
