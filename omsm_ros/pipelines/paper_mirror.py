@@ -114,8 +114,11 @@ def mirror(out: Path, seed: int) -> Done:
         compared("points, clear aperture of 24.57 mm", "290 011", 290_011, clear, ""),
         compared("points on the ellipse of 25.4 × 35.9 mm", "", None, len(cloud), ""),
         compared("points of the second instrument", "23 513", 23_513, _REFERENCE_POINTS, ""),
+        Compared("points over those of the second instrument", "an order of magnitude",
+                 plain(clear / _REFERENCE_POINTS, 3), plain(clear / _REFERENCE_POINTS / 10, 3)),
+        *_motion_rows(made, cloud, scenario),
     ]  # fmt: skip
-    caption = "Z path, its density, error over 25 s, and 150 points (Fig. 7)."
+    caption = "Z path, its density, path and error over 25 s, and 150 points (Fig. 7b to e)."
     figures: dict[str, tuple[str, bytes | Figure]] = {"fig7": (caption, _figure_7(made, cloud))}
     view = view_of(CloudFile(out / CLOUD).read(MOST_DRAWN), scenario.sample_period)
     drawn_maps = surface_figures(view, PAPER_MIRROR) if view is not None else {}
@@ -126,6 +129,25 @@ def mirror(out: Path, seed: int) -> Done:
                    for n, sizes, needs in explanations()], prose="needs")  # fmt: skip
     return done("The off-axis paraboloid (Fig. 7, 8)", "the dynamic error is corrected", rows,
                 {"summary": found, "clear": clear}, figures, (table,), _MAPS)  # fmt: skip
+
+
+def _motion_rows(made: Recording, cloud: np.ndarray, scenario: Scenario) -> list[Compared]:
+    """Return fundamental and harmonics of Z, and how the error follows its speed (Fig. 7)."""
+    turn, z = scenario.spindle_speed * RPM_HZ, made.axes.z
+    size = max(round(1 / turn / made.axes.sample_period), 1)
+    rows = z[: len(z) // size * size].reshape(-1, size)
+    # A ramp, as the feed makes in each turn, has all harmonics; its ends are joined first.
+    ramp = np.arange(size) / size * (rows[:, -1:] - rows[:, :1])
+    orders = np.max(np.abs(np.fft.rfft(rows - ramp, axis=1)), axis=0) * 2 / size
+    speed = np.gradient(z, made.axes.sample_period)[cloud["sample"].astype(np.int64)]
+    follows = float(np.corrcoef(cloud["dynamic_error"], speed)[0, 1])
+    return [
+        compared("fundamental of the motion", "0.5 Hz", 0.5, turn, "Hz"),
+        Compared("harmonics of Z: second, third, fourth", "up to the third",
+                 ", ".join(quantity(float(size), "m") for size in orders[2:5]), "", "amplitudes"),
+        Compared("correlation of error and speed of Z", "error correlates with the motion",
+                 f"{follows:.3f}", "", "a lag makes an error of lag times speed"),
+    ]  # fmt: skip
 
 
 def _against_reference(out: Path, scenario: Scenario, cloud: np.ndarray) -> float:
@@ -160,19 +182,27 @@ def _figure_7(made: Recording, cloud: np.ndarray) -> Figure:
     z, period = made.axes.z, made.axes.sample_period
     time = np.arange(len(z)) * period
     sample, error = cloud["sample"], cloud["dynamic_error"].astype(np.float64)
+    # Off the mirror there are no points, and the curve has gaps.
+    whole = np.full(len(z), np.nan)
+    whole[sample] = error / NANOMETRE_M
     window = (sample * period > 60) & (sample * period < 85)
     if not window.any():
         window = np.ones(len(sample), bool)
     few = np.flatnonzero(window)[:150]
-    height = cloud["height"].astype(np.float64)[few]
+    nominal = PAPER_MIRROR.height(*(cloud[n][few].astype(np.float64) for n in "xy"))
+    off = (cloud["height"][few] - nominal) / NANOMETRE_M
+    shown = slice(sample[window][0], sample[window][-1] + 1)
     low = psd(z, period)
+    near = (low[0] > 0.2) & (low[0] < 3)
     return panels(
         Panel("Path of Z", "time [s]", "mm", {"": (time, z / MILLIMETRE_M)}),
-        Panel("Its power spectral density, up to the third harmonic", "frequency [Hz]", "µm²/Hz", {
-            "": (low[0][low[0] < 3], low[1][low[0] < 3] / MICROMETRE_M**2)}, power=True),
+        Panel("Its power spectral density", "frequency [Hz]", "µm²/Hz", {
+            "": (low[0][near], low[1][near] / MICROMETRE_M**2)}, power=True),
+        Panel("Path of Z over 25 s", "time [s]", "mm", {
+            "": (time[shown], z[shown] / MILLIMETRE_M)}),
         Panel("Dynamic error over 25 s", "time [s]", "nm", {
-            "": (sample[window] * period, error[window] / NANOMETRE_M)}),
-        Panel("150 points", "time [s]", "µm", {
-            "original": (sample[few] * period, (height + error[few]) / MICROMETRE_M),
-            "corrected": (sample[few] * period, height / MICROMETRE_M)}),
+            "": (time[shown], whole[shown])}),
+        Panel("150 points, without the nominal surface", "time [s]", "nm", {
+            "original": (sample[few] * period, off + error[few] / NANOMETRE_M),
+            "corrected": (sample[few] * period, off)}),
     )  # fmt: skip
