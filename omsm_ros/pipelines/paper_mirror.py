@@ -185,7 +185,7 @@ def _figure_7(made: Recording, cloud: np.ndarray) -> Figure:
     # Off the mirror there are no points, and the curve has gaps.
     whole = np.full(len(z), np.nan)
     whole[sample] = error / NANOMETRE_M
-    window = (sample * period > 60) & (sample * period < 85)
+    window = (sample * period > 120) & (sample * period < 145)  # all of it on the mirror
     if not window.any():
         window = np.ones(len(sample), bool)
     few = np.flatnonzero(window)[:150]

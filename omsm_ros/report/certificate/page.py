@@ -41,22 +41,27 @@ from omsm_ros.units import DEGREE_RAD, MILLISECOND_S, NANOSECONDS_PER_S, PPM
 def mode_table(calibration: Calibration) -> Table:
     """Return the poles as terms of Eq. 8, and whether the band reaches them."""
     modes = known_modes(calibration.dynamics, calibration.covariance)
-    # Beyond the sampling rate a pole acts as a constant or a delay.
-    fastest = 1 / calibration.sample_period
     rows = [
         (
             f"mode {index}" if mode.residue is not None else f"real pole {index}",
-            *(
-                (measured(mode.frequency, mode.frequency_uncertainty, "Hz"), *_oscillation(mode))
-                if mode.frequency <= fastest
-                else (f"not resolved (faster than {quantity(fastest, 'Hz')})", NOTHING, NOTHING)
-            ),
+            *_resolved(mode, calibration),
             "yes" if mode.frequency <= calibration.valid_up_to else "no",
         )
         for index, mode in enumerate(modes, start=1)
     ]
     columns = ("frequency", "damping ratio", "residue [1/ms²]", "within the trusted band")
     return Table("Modes (Eq. 8)", columns, rows)
+
+
+def _resolved(mode: KnownMode, calibration: Calibration) -> tuple[str, str, str]:
+    """Return frequency, damping and residue, or that the data do not resolve a fast pole."""
+    # Beyond the sampling rate a pole acts as a constant or a delay.
+    known, fastest = calibration.valid_up_to, 1 / calibration.sample_period
+    if mode.frequency > known and mode.frequency_uncertainty >= mode.frequency:
+        fastest = known
+    if mode.frequency > fastest:
+        return f"not resolved (faster than {quantity(fastest, 'Hz')})", "unknown", "unknown"
+    return (measured(mode.frequency, mode.frequency_uncertainty, "Hz"), *_oscillation(mode))
 
 
 def _oscillation(mode: KnownMode) -> tuple[str, str]:
