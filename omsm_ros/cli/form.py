@@ -20,6 +20,7 @@ from omsm_ros.core.form.compensation import (
     path_gcode,
     spiral_offsets,
 )
+from omsm_ros.core.form.drawing import Drawing
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.limits import MachineLimits, speed_limits
 from omsm_ros.core.kinematics.planner import plan_path
@@ -47,7 +48,7 @@ from omsm_ros.quantities import (
     SPIRAL_PLACES,
     STEP,
 )
-from omsm_ros.readable import count, percent, plain, quantity
+from omsm_ros.readable import count, expanded, percent, plain, quantity
 from omsm_ros.units import DEGREE_RAD, MILLIMETRE_M, NANOMETRE_M, RPM_HZ
 
 FIGURE = "surface.png"
@@ -277,6 +278,8 @@ def _declare_form(add: Arguments) -> None:
     add.channel()
     declare_fit(add, (AUTO,))
     declare_tolerance(add)
+    add("--drawing", _drawing, "tolerances of ISO 10110-5, such as '3/0.5(0.2/0.1); RMSi < 20 nm'",
+        metavar="INDICATION")  # fmt: skip
     add.origin()
     add("--no-report", None, "write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
@@ -304,17 +307,8 @@ def _form(args: argparse.Namespace) -> Facts:
         else:
             refuse_cell(source, args)
         points = open_measurement(source, args.unit, args.channel)
-        facts = judge_form(
-            points,
-            surface,
-            out,
-            args.fit,
-            args.aperture,
-            filters,
-            args.tolerance,
-            args.dust,
-            args.placement,
-        )
+        asked = (args.fit, args.aperture, filters, args.tolerance, args.dust)
+        facts = judge_form(points, surface, out, *asked, args.placement, args.drawing)
         if not args.no_report:
             draw_form(source, out, args.origin)
             facts = {**facts, "report": REPORT}
@@ -326,8 +320,33 @@ def _show_form(facts: Facts) -> None:
     if held := facts.get("conformity"):
         verdict = [("tolerance", f"{held['verdict']}, {quantity(held['tolerance'], 'm')}")]
         verdict += [("reason", text) for text in held["reasons"]]
+    verdict += _drawing_rows(facts.get("drawing"))
     files = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
     table([*verdict, *form_rows(facts), written(files, facts["out"])])
+
+
+def _drawing(text: str) -> Drawing:
+    try:
+        return Drawing.parsed(text)
+    except ConfigurationError as err:
+        raise argparse.ArgumentTypeError(str(err)) from err
+
+
+def _drawing_rows(found: Facts | None) -> list[tuple[str, str]]:
+    if not found:
+        return []
+    spacing = found["fringe_spacing"]
+    unit = f"fringe spacings of {quantity(spacing, 'm', 4)}" if spacing else "nm"
+    rows = [("drawing", f"{found['verdict']}: {found['text']}; numbers without a unit: {unit}")]
+    for name, held in found["terms"].items():
+        if held is None:
+            rows.append((f"  {name}", "not evaluated"))
+            continue
+        value = expanded(held["value"], (held["expanded"] or 0.0) / 2, "m")
+        limit = quantity(held["tolerance"], "m", 4)
+        rows.append((f"  {name}", f"{held['verdict']}: {value}, tolerance {limit}"))
+        rows += [("", text) for text in held["reasons"]]
+    return rows
 
 
 def _declare_compensate(add: Arguments) -> None:

@@ -11,6 +11,10 @@ TEMPLATES: dict[str, str] = {
         "L-filter of {l_filter!r} m is not longer than the S-filter of {s_filter!r} m that the "
         "points allow; give a longer {opt.l_filter}, or measure more points"
     ),
+    "form.drawing": (
+        "{text!r} is no tolerance of ISO 10110-5; write it as '3/0.5(0.2/0.1)' or '3/100(50) nm', "
+        "with 'RMSi < 20 nm' or 'λ = 633 nm' after a semicolon"
+    ),
     "form.uncovered": (
         "{share:%} of the aperture has no points, and all figures are of the rest; scan it all, or "
         "state the aperture that counts with {opt.aperture}"

@@ -12,6 +12,7 @@ from omsm_ros.core.comparison.stated_errors import ComparedMeasurement, ErrorFie
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
+from omsm_ros.core.form.drawing import Drawing
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import (
@@ -161,6 +162,7 @@ def judge_form(
     tolerance: float | None = None,
     dust: DustRule | None = None,
     placement: Mapping[str, float] | None = None,
+    drawing: Drawing | None = None,
 ) -> dict[str, Any]:
     """Register a measurement to its nominal ``surface``; return the content of ``form.json``.
 
@@ -173,6 +175,7 @@ def judge_form(
     dust: which points far from the form are left out; None: isolated ones, which still count
         against the tolerance, because nobody has decided that they are no defects
     placement: declared standard uncertainties of x, y and clocking [m], [rad], None if unknown
+    drawing: tolerances of ISO 10110-5
 
     Raises DataError for points that do not fit the surface or do not determine the pose asked for.
     """
@@ -184,6 +187,8 @@ def judge_form(
     if tolerance is not None:
         found = conformity(form.deviation["peak_to_valley"], tolerance, doubts)
         facts["conformity"] = found.entry() if found else None
+    if drawing is not None:
+        facts["drawing"] = drawing.verdicts(form.deviation, doubts)
     save_json(out / FORM, facts)
     save_json(out / CURVES, _curves(form))
     write_ply(out / DEVIATION, _deviations(form))
