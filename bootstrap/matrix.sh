@@ -15,7 +15,7 @@ for version in 3.10 3.11 3.12 3.13; do
     place=out/matrix/$version
     mkdir -p "$place"
     # What is tracked, as it stands now; .venv, build and install of an earlier run stay there.
-    git ls-files -z | xargs -0 cp --parents --preserve=timestamps -t "$place" --
+    git ls-files -z | xargs -0 cp --parents --no-dereference --preserve=timestamps -t "$place" --
     echo "matrix: make $goal with Python $version in $place"
     if make -C "$place" PYTHON="$python" "$goal"; then
         tried="$tried $version"

@@ -69,17 +69,19 @@ class _OneThread:
         self._limit: Any = None
 
     def enter(self) -> None:
-        from threadpoolctl import threadpool_limits
-
+        try:
+            from threadpoolctl import threadpool_limits
+        except ImportError:  # nodes and commands ask BLAS for one thread as they start
+            threadpool_limits = None
         with self._lock:
-            if self._users == 0:
+            if self._users == 0 and threadpool_limits is not None:
                 self._limit = threadpool_limits(1, user_api="blas")
             self._users += 1
 
     def leave(self) -> None:
         with self._lock:
             self._users -= 1
-            if self._users == 0:
+            if self._users == 0 and self._limit is not None:
                 self._limit.restore_original_limits()
 
 

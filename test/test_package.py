@@ -22,10 +22,10 @@ ROSDEP = {
     "jinja2": ("jinja2", "python3-jinja2"),
     "jsonschema": ("jsonschema", "python3-jsonschema"),
     "tqdm": ("tqdm", "python3-tqdm"),
-    # rosdep has no keys for these; the README says how to install them.
-    "control": ("control", None),
-    "cobs": ("cobs", None),
-    "mcap": ("mcap", None),
+    "control": ("control", "python-control-pip"),
+    "cobs": ("cobs", "python-cobs-pip"),
+    "mcap": ("mcap", "mcap-ros2-support"),
+    # rosdep has no key; it is optional.
     "threadpoolctl": ("threadpoolctl", None),
 }
 

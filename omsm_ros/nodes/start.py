@@ -43,8 +43,8 @@ _NO_ROS = (
     "'make setup' in a checkout; the offline commands (omsm) need none"
 )
 _NO_MESSAGES = (
-    "the messages of omsm_ros are not built, or not sourced: 'colcon build --base-paths src "
-    "src/omsm_ros/msg_defs' and source install/setup.bash, or 'make setup' and '. ./env.sh'"
+    "the messages of omsm_ros are not built, or not sourced: 'colcon build' in the workspace and "
+    "source install/setup.bash, or 'make setup' and '. ./env.sh' in a checkout"
 )
 _NEEDED = {"rclpy": _NO_ROS, "omsm_msgs": _NO_MESSAGES}
 
