@@ -59,7 +59,7 @@ setup(
         LINUXCNC: os.path.relpath(ROOT / "config" / "linuxcnc"),
     },
     package_data={
-        INTERFACES: ["msg/*.msg", "srv/*.srv"],
+        INTERFACES: ["msg/*.msg", "srv/*.srv", "action/*.action"],
         LINUXCNC: ["*"],
         PACKAGE: ["**/*.html", "**/*.css", "**/*.js", "**/*.json", "**/*.yaml", "**/*.xml"],
     },
@@ -71,7 +71,7 @@ setup(
     ],
     entry_points={
         "console_scripts": [
-            *(f"{node} = {PACKAGE}.nodes.start:main" for node in (*NODES, "replay")),
+            *(f"{node} = {PACKAGE}.nodes.start:main" for node in (*NODES, "replay", "cell")),
             f"omsm = {PACKAGE}.cli:main",
         ]
     },

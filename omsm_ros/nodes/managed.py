@@ -159,6 +159,8 @@ def _descriptor(parameter: Parameter) -> ParameterDescriptor:
 
 
 NAMESPACE = "omsm"
+ARGUMENTS: dict[str, list[str]] = {}
+"""Further arguments for ROS of one of several nodes of a process, by its name."""
 # A destroyed publisher drops the messages that subscribers have not fetched yet, so wait before. In
 # short steps, since a busy computer may skip the time of a long one.
 _STEPS, _STEP_S = 20, 0.01
@@ -183,7 +185,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
 
     def __init__(self, name: str, parameters: Sequence[Parameter]) -> None:
         try:
-            super().__init__(name, namespace=NAMESPACE)
+            super().__init__(name, namespace=NAMESPACE, cli_args=ARGUMENTS.get(name))
         except (
             InvalidParameterTypeException
         ) as err:  # of a parameter of rclpy, such as use_sim_time

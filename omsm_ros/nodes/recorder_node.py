@@ -132,9 +132,8 @@ class RecorderNode(ManagedNode):
         return report
 
 
-def main() -> None:
-    """Run ``ros2 run omsm_ros recorder``; exit code 2 without space on the disk."""
-    run(RecorderNode)
+main = partial(run, RecorderNode)
+"""``ros2 run omsm_ros recorder``; exit code 2 without space on the disk."""
 
 
 if __name__ == "__main__":

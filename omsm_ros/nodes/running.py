@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -48,31 +48,36 @@ _SHUTDOWN_LOG_S = 1.0
 _PACE_S = 0.01
 
 
-def run(make_node: Callable[[], ManagedNode]) -> None:
-    """Build a node, start it and spin it until SIGINT, SIGTERM, SIGHUP or a requested shutdown.
+def run(*make_nodes: Callable[[], ManagedNode]) -> None:
+    """Build nodes, start and spin them until SIGINT, SIGTERM, SIGHUP or a requested shutdown.
 
-    Exits with one line on stderr if it cannot start or continue: 2 for bad input, 70 for an
+    Exits with one line on stderr if one cannot start or continue: 2 for bad input, 70 for an
     internal error.
     """
     node: ManagedNode | None = None
+    nodes: list[ManagedNode] = []
     try:
         with exit_on_signal_while_loading(ENDING):
             _init()
         ending = _SignalEnd()  # after rclpy, which resets the handlers
-        node = make_node()
-        node.start()
+        for make in make_nodes:
+            node = None
+            nodes.append(node := make())
+            node.start()
         freeze_garbage_collector()
     except Exception as err:
+        for each in nodes:
+            each.close()
         _give_up(node, err)
-    assert node is not None  # else it gave up
     try:
-        _spin(node, ending)
+        _spin(nodes, ending)
     finally:
-        node.close()
-        node.destroy_node()
+        for each in nodes:
+            each.close()
+            each.destroy_node()
         rclpy.try_shutdown()
         _ignore_signals()
-    if node.fatal is not None:
+    if any(each.fatal is not None for each in nodes):
         sys.exit(_BAD_INPUT)
 
 
@@ -161,15 +166,20 @@ def _ignore_signals() -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _spin(node: ManagedNode, ending: _SignalEnd) -> None:
+def _spin(nodes: Sequence[ManagedNode], ending: _SignalEnd) -> None:
     executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    for node in nodes:
+        executor.add_node(node)
     ending.wakes(lambda: executor.create_task(lambda: None))
-    while not (ending.asked.is_set() or node.fatal or node.stage is LifecycleStage.FINALIZED):
+
+    def over() -> bool:
+        return any(n.fatal or n.stage is LifecycleStage.FINALIZED for n in nodes)
+
+    while not (ending.asked.is_set() or over()):
         try:
             executor.spin_once()
         except Exception as err:
-            log_internal_error(node, err)
+            log_internal_error(nodes[0], err)
 
 
 def settings_of(text: str) -> dict[str, object]:

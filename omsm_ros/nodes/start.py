@@ -36,6 +36,7 @@ NODES = {
     **{name: f"{name}_node:main" for name in _OF_ITS_OWN},
     **{name: f"driver:{name}" for name in _DRIVERS},
     "replay": "player_node:main",
+    "cell": "cell_node:main",
 }
 """The commands, and the ``module:function`` that runs each."""
 _NO_ROS = (

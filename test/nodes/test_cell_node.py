@@ -1,0 +1,44 @@
+"""Several nodes in one process, each with its own parameters."""
+
+import sys
+
+import pytest
+
+pytest.importorskip("rclpy", reason="ROS 2 is not installed")
+
+from omsm_ros.nodes import cell_node, managed
+
+
+def started(monkeypatch, *arguments):
+    """The classes that are run, for these arguments."""
+    run = []
+    monkeypatch.setattr(managed, "ARGUMENTS", {})
+    monkeypatch.setattr(cell_node, "ARGUMENTS", managed.ARGUMENTS)
+    monkeypatch.setattr(cell_node, "run", lambda *makers: run.extend(makers))
+    monkeypatch.setattr(sys, "argv", ["cell", *arguments])
+    cell_node.main()
+    return [maker.__name__ for maker in run]
+
+
+def test_each_node_has_its_file_and_the_arguments_of_the_user_prevail(monkeypatch):
+    ros = ("--ros-args", "-r", "__ns:=/cell2")
+    nodes = started(monkeypatch, "--nodes", "corrector recorder", *ros)
+    assert nodes == ["CorrectorNode", "RecorderNode"]
+    given = managed.ARGUMENTS["corrector"]
+    assert given[:2] == ["--ros-args", "--params-file"]
+    assert given[2].endswith("config/corrector.yaml")
+    assert tuple(given[3:]) == ros
+
+
+@pytest.mark.parametrize("name", ["corector", "cell", "replay"])
+def test_a_node_that_is_none_is_refused_in_one_line(monkeypatch, capsys, name):
+    with pytest.raises(SystemExit) as ended:
+        started(monkeypatch, "--nodes", name)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_folder_without_the_file_is_named(monkeypatch, capsys, tmp_path):
+    with pytest.raises(SystemExit):
+        started(monkeypatch, "--params", str(tmp_path))
+    assert str(tmp_path) in capsys.readouterr().err
