@@ -77,6 +77,8 @@ $(VENV): $(addprefix bootstrap/,install.sh repair_wheels.py lock.txt runtime.in 
 
 $(PEERS): bootstrap/peers.txt $(PACKAGE)
 	.venv/bin/python -m pip install --quiet --constraint bootstrap/lock.txt --requirement $<
+	.venv/bin/python -m venv .venv/peers
+	.venv/peers/bin/python -m pip install --quiet prysm==0.21.1 SurfaceTopography==1.27.1 surfalize==0.19.2
 	@touch $@
 
 $(MESSAGES): $(VENV) bootstrap/build.sh colcon_defaults.yaml $(shell find msg_defs bootstrap/tf2_msgs -type f)

@@ -8,6 +8,7 @@ matrix, as prysm's ``lstsq`` solves it, and prysm itself if it is installed.
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -22,13 +23,16 @@ import numpy as np
 from benchmarks.row import Row, at_least, at_most, not_compared, shown
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.form.analyse import FormResult, analyse_form
+from omsm_ros.core.form.deviation_map import DeviationMap, GridCells
 from omsm_ros.core.form.part_figures import without_second_order
+from omsm_ros.core.form.texture import bands_of, power_density, texture
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.aspheres import Asphere, Toroid
+from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.nominal import (
     PAPER_MIRROR,
     PAPER_MIRROR_RADIUS_M,
@@ -111,7 +115,7 @@ def low_order_error(seed: int) -> ZernikeSurface:
 def rows(full: bool) -> list[Row]:
     """Poses, terms, dust, other surfaces, a measured map, and speed."""
     runs = 34 if full else 2
-    table = [*_poses(runs), *_terms(3 * runs), *_dust(3 * runs), *_surfaces(), *_map()]
+    table = [*_poses(runs), *_terms(3 * runs), *_dust(3 * runs), *_surfaces(), *_map(), *_peers()]
     return [*table, *_zernike_speed(), *_whole_process(full)]
 
 
@@ -241,6 +245,69 @@ def _map() -> list[Row]:
         off = abs(mine / NANOMETRE_M - value)
         name = f"Zeiss map without second order, {figure} off {value} nm by"
         table.append(at_most(name, off, "nm", bar))
+    return table
+
+
+# Python of the environment of the peers, which `make bench` makes.
+PEERS = Path(os.environ.get("OMSM_SURFACE_PEERS", ".venv/peers/bin/python"))
+
+
+def _made_maps() -> dict[str, tuple[FloatArray, float, float]]:
+    """Return maps (r, c) [m] with their spacings along x and y [m]: measured, and made ones."""
+    random, made = np.random.default_rng(4), {}
+    f = np.hypot(*np.meshgrid(np.fft.fftfreq(300, 0.1e-3), np.fft.fftfreq(300, 0.1e-3)))
+    for name, slope, corner in (("1/f2 of 300", 1.0, 400.0), ("1/f3 of 300", 1.5, 150.0)):
+        white = np.fft.fft2(random.normal(size=(300, 300)))
+        z = np.fft.ifft2(white / (1 + (f / corner) ** 2) ** slope * np.exp(-((f / 1500) ** 4))).real
+        made[name] = np.asarray(1e-8 * (z - z.mean()) / z.std()), 0.1e-3, 0.1e-3
+    y, x = np.mgrid[:200, :400] * 0.05e-3
+    made["waves"] = 1e-8 * np.sin(2 * np.pi * x / 2e-3 + y / 1e-3) * np.cos(y / 3e-4), 5e-5, 5e-5
+    file = MAPS / "zeiss_19-0057_vfm.asc"
+    if file.is_file() and (grid := as_grid(read_points(file))) is not None:
+        y, x = np.mgrid[-1 : 1 : grid.height.shape[0] * 1j, -1 : 1 : grid.height.shape[1] * 1j]
+        columns = np.stack([one.ravel() for one in (x**0, x, y, x * x, x * y, y * y)], axis=1)
+        fit = np.linalg.lstsq(columns, grid.height.ravel(), rcond=None)[0]
+        rest = grid.height.ravel() - columns @ fit
+        made["Zeiss"] = rest.reshape(grid.height.shape), grid.dx, grid.dy
+    return made
+
+
+def _peers() -> list[Row]:
+    """Compare texture, slopes and densities with those of three other programs."""
+    if not PEERS.is_file():
+        name = "texture off prysm, SurfaceTopography and surfalize by"
+        return [not_compared(name, "%", "<= 1", f"no environment of peers at {PEERS}")]
+    table = []
+    for name, (z, dx, dy) in _made_maps().items():
+        step = 1 / (min(z.shape) * max(dx, dy))
+        band = 3.5 * step, 12.5 * step
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "map.npz"
+            np.savez(file, z=z, dx=dx, dy=dy, band=band)
+            command = [str(PEERS), str(Path(__file__).with_name("surface_peers.py")), str(file)]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+        y, x = np.indices(z.shape) * np.reshape([dy, dx], (2, 1, 1))
+        many, none = np.ones(z.size), np.empty((0, z.size))
+        map_ = DeviationMap(
+            x=x.ravel(), y=y.ravel(), deviation=z.ravel(), area=many, effects=none, noise=0.0
+        )
+        cells = GridCells.of(map_, even=True)
+        mine = texture(cells, cells, bands_of(cells, None, 1e3))
+        ours = {n: mine[n].value for n in ("Sa", "Sq", "Sz")} | {"slope": mine["slope_rms"].value}
+        radial = power_density(cells).radial
+        inside = (radial.position >= band[0]) & (radial.position <= band[1])
+        rings = 2 * np.pi * radial.position * radial.value
+        ours["in_band"] = float(np.sum(rings[inside]) * radial.position[0])
+        for peer, found in json.loads(done.stdout.splitlines()[-1]).items():
+            for figure, value in found.items():
+                label = f"{name}: {figure} off {peer} by"
+                if figure == "error":
+                    table.append(not_compared(label, "%", "", str(value)))
+                    continue
+                # Slopes of peers are differences; windows of densities weigh the map differently.
+                bar = {"slope": 5.0, "in_band": 30.0}.get(figure, 0.01)
+                off = 100 * abs((ours[figure] or 0.0) / value - 1)
+                table.append(at_most(label, off, "%", bar, peer))
     return table
 
 

@@ -1,0 +1,60 @@
+"""Figures of one map by prysm, SurfaceTopography and surfalize, in an environment of their own.
+
+Run by ``benchmarks.form`` with the Python of that environment: ``surface_peers.py MAP.npz``. Prints
+one JSON object of Sa, Sq, Sz [m], slope [1] and mean square in a band [m²] for each peer.
+"""
+
+import json
+import sys
+import warnings
+
+import numpy as np
+
+warnings.simplefilter("ignore")
+
+
+def surfalize(z, dx, dy, band):
+    from surfalize import Surface
+
+    made = Surface(z * 1e6, dx * 1e6, dy * 1e6)
+    return {n: getattr(made, n)() * 1e-6 for n in ("Sa", "Sq", "Sz")} | {"slope": made.Sdq()}
+
+
+def topography(z, dx, dy, band):
+    from SurfaceTopography import Topography
+
+    made = Topography(z.T, (z.shape[1] * dx, z.shape[0] * dy))
+    return {"Sq": float(made.rms_height_from_area()), "slope": float(made.rms_gradient())}
+
+
+def prysm(z, dx, dy, band):
+    from prysm.interferogram import psd
+
+    fy, fx, density = _psd(psd, z, dx)
+    f = np.hypot(fx[np.newaxis], fy[:, np.newaxis])
+    inside = (f >= band[0]) & (f <= band[1])
+    cell = abs(fx[1] - fx[0]) * abs(fy[1] - fy[0])
+    return {"in_band": float(np.sum(density[inside]) * cell)}
+
+
+def _psd(psd, z, dx):
+    found = psd(z - z.mean(), dx)
+    fx, fy, density = (np.asarray(part) for part in found)
+    if fx.ndim == 2:
+        fx, fy = fx[0], fy[:, 0]
+    return fy, fx, density
+
+
+def main(path):
+    content = np.load(path)
+    given = content["z"], float(content["dx"]), float(content["dy"]), content["band"]
+    found = {}
+    for peer in (surfalize, topography, prysm):
+        try:
+            found[peer.__name__] = {n: float(v) for n, v in peer(*given).items()}
+        except Exception as err:  # a release of a peer may lack a name
+            found[peer.__name__] = {"error": f"{type(err).__name__}: {err}"}
+    print(json.dumps(found))
+
+
+main(sys.argv[1])
