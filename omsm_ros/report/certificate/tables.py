@@ -249,23 +249,8 @@ def limit_table(certificate: Certificate) -> Table:
     return Table("Limits of the verdict", (), known_rows(rows, 1))
 
 
-_ORIGINS = {
-    "machine": "machine",
-    "probe": "probe",
-    "probe_serial_number": "serial number of the probe",
-    "target": "target",
-    "operator": "operator",
-    "laboratory": "laboratory",
-    "customer": "customer",
-    "method": "method",
-    "traceability": "traceability",
-    "software": "software",
-    "made_from": "made from",
-}
-
-
 def identity_table(calibration: Calibration, source: str, version: str) -> Table:
-    """Return what the certificate is about."""
+    """Return identity and recording; the title block has machine, instruments and people."""
     origin = calibration.certificate.origin
     rows = [
         ("identity", calibration.id),
@@ -274,8 +259,8 @@ def identity_table(calibration: Calibration, source: str, version: str) -> Table
         ("recorded", date_text_of_stamp(origin.recorded_ns)),
         ("sample period", quantity(calibration.sample_period, "s", 4)),
         ("half the sampling rate", quantity(0.5 / calibration.sample_period, "Hz", 4)),
-        *((name, getattr(origin, key) or NOTHING) for key, name in _ORIGINS.items()),
-        ("temperature", quantity(origin.temperature_c, "°C", 4)),
+        ("software", origin.software or NOTHING),
+        ("made from", origin.made_from or NOTHING),
         ("omsm_ros", version or NOTHING),
     ]
     return Table("Identity", (), known_rows(rows, 1))
