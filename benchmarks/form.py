@@ -305,7 +305,7 @@ def _peers() -> list[Row]:
                     table.append(not_compared(label, "%", "", str(value)))
                     continue
                 # Slopes of peers are differences; windows of densities weigh the map differently.
-                bar = {"slope": 5.0, "in_band": 30.0}.get(figure, 0.01)
+                bar = {"slope": 1.0, "in_band": 5.0}.get(figure, 0.01)
                 off = 100 * abs((ours[figure] or 0.0) / value - 1)
                 table.append(at_most(label, off, "%", bar, peer))
     return table

@@ -225,16 +225,17 @@ class GridCells:
         )
 
     def planes(
-        self, images: FloatArray, cutoff: float
+        self, images: FloatArray, cutoffs: tuple[float, float]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return level [m] and slopes [1] along x and y, each (k, r, c), after a low-pass.
 
-        Weighted linear regression with the Gaussian of ``cutoff`` [m] (ISO 16610-28). Inside the
-        map it is the Gaussian filter of ISO 16610-61, and its slopes are the derivatives. It takes
-        the points of a cell where they are, and makes up for their mean.
+        Weighted linear regression with Gaussians of ``cutoffs`` along x and y [m] (ISO 16610-28).
+        Inside the map it is the Gaussian filter of ISO 16610-61, and its slopes are the derivatives.
+        It takes the points of a cell where they are, and makes up for their mean.
         """
         shape, width = self.present.shape, _CUTOFF_OF_MEAN * self.width
-        narrow = [float(np.sqrt((cutoff / step) ** 2 - width**2)) for step in reversed(self.steps)]
+        cells = np.array(cutoffs[::-1]) / self.steps[::-1]
+        narrow = [float(value) for value in np.sqrt(cells**2 - width**2)]
         ways = [axis for axis, size in enumerate(shape) if size > 1]
         middle = np.indices(shape) - np.array(shape)[:, np.newaxis, np.newaxis] / 2.0
         at = (middle + self.offset)[ways]
@@ -304,7 +305,7 @@ def _of_grid(x: FloatArray, y: FloatArray) -> Sides | None:
     counts = [float(np.ptp(v) / step) + 1 for v, step in zip((x, y), spacings, strict=True)]
     if min(counts) < 2 or np.prod(counts) * _LEAST_FILLED > len(x):
         return None
-    block = int(np.ceil(max(counts) / _MOST_OF_GRID))
+    block = int(np.ceil(np.sqrt(np.prod(counts)) / _MOST_OF_GRID))
     return (spacings[0] * block, spacings[1] * block), 0.5 / block
 
 

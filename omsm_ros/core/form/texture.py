@@ -178,8 +178,12 @@ def _with_noise(cells: GridCells) -> FloatArray:
     return np.concatenate([cells.mean[np.newaxis], noise])
 
 
-def _cutoffs(cells: GridCells, short: float | None) -> list[float]:
-    return [short] if short else [_LEAST_CELLS * cells.pitch * k**0.5 for k in (1, 2, 3)]
+def _cutoffs(cells: GridCells, short: float | None) -> list[tuple[float, float]]:
+    """Return cutoffs along x and y [m]: that asked for, or some of so many cells."""
+    if short:
+        return [(short, short)]
+    cutoffs = (_LEAST_CELLS * k**0.5 for k in (1, 2, 3))
+    return [(many * cells.steps[0], many * cells.steps[1]) for many in cutoffs]
 
 
 class _Waves(NamedTuple):
@@ -304,7 +308,7 @@ def power_density(cells: GridCells) -> PowerDensity:
     image = cells.mean
     if cells.width > 0:
         # The mean position of the points is not the middle of the cell.
-        _, *steep = cells.planes(image[np.newaxis], _LEAST_CELLS * cells.pitch)
+        _, *steep = cells.planes(image[np.newaxis], _cutoffs(cells, None)[0])
         steps = np.reshape(cells.steps, (2, 1, 1))
         image = image - np.sum(np.concatenate(steep) * cells.offset[::-1] * steps, axis=0)
     areal = _areal(cells, image, window) / passed
