@@ -41,6 +41,8 @@ _DRAWS, _SEED = 200, 7
 _CELLS, _HALF = (8.0, 4.0, 2.0, 1.0), 1_000
 # Standard deviations of χ² that chance does not exceed.
 _CHANCE = 3.0
+# Least variance, so that a part without noise keeps all terms [m²].
+_TINY = 1e-40
 # Points at either extreme that show the form lost there.
 _EXTREME = 100
 # Draws of the noise, which give its mean effect to a sixth of its standard deviation.
@@ -234,14 +236,22 @@ def _beyond_chance(count: int) -> float:
 
 
 def _smooth(map_: DeviationMap, disc: Aperture, noises: FloatArray) -> ZernikeFit:
-    """Return smooth terms of the deviations, of as high an order as the points allow.
+    """Return smooth terms of the deviations, of as high an order as the points show.
 
     noises: draws of the noise (d, n) [m], fitted as the effects
     """
-    orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)]
-    terms = terms_up_to(orders[0] if orders else 0)
-    points = (map_.x, map_.y, map_.deviation)
-    return fit_zernikes(*points, terms, disc, weights=map_.area, effects=noises)
+    orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)] or [0]
+    for order, lower in zip(orders, [*orders[1:], -1], strict=True):
+        points = (map_.x, map_.y, map_.deviation)
+        fit = fit_zernikes(*points, terms_up_to(order), disc, weights=map_.area, effects=noises)
+        # Orders that only follow the noise would blur the rim, where the noise of all adds up.
+        high = np.array([term.n > lower for term in fit.terms])
+        variance = np.mean(fit.effects[high] ** 2, axis=1)
+        count = len(variance)
+        chi_square = float(np.sum(fit.coefficients[high] ** 2 / np.maximum(variance, _TINY)))
+        if chi_square > count + _CHANCE * np.sqrt(2 * count):
+            break
+    return fit
 
 
 def _without_noise(

@@ -27,6 +27,8 @@ _GAP = 2
 _LONG = 4.0
 # Events of one defect differ in size by less than this factor.
 _SIMILAR = 2.0
+# A point of a defect that exceeds this multiple of what is usual among so many neighbours is dust.
+_DENSE, _AROUND = 1.5, 16
 # A point little beyond the limit is form if this share of the points around is half as far; noise
 # alone is as far at one in 160.
 _SHARE_AROUND = 0.05
@@ -102,6 +104,7 @@ class FarPoints:
                 for begin in range(0, len(form), _AT_A_TIME):
                     open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
                     form[open_] = self._like_surroundings(open_, event, rows, space)
+                form &= ~self._spikes(form, rows, space)
             else:
                 form = np.bincount(cluster)[cluster] > int(rule)
         return index[~form], form
@@ -134,6 +137,32 @@ class FarPoints:
         return np.asarray(
             decided & (count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW))
         )
+
+    def _spikes(self, form: BoolArray, rows: FloatArray, space: _Space) -> BoolArray:
+        """Return which far points (k,) of the ``form`` stand out from all around: dust on it."""
+        from scipy.spatial import cKDTree
+
+        spikes = np.zeros(len(form), bool)
+        chosen, others = np.flatnonzero(form), np.concatenate([rows, *self.near], axis=1)
+        if space.line or not len(chosen):
+            return spikes
+        size, tree = others[3], cKDTree(others[1:3].T)
+        for begin in range(0, len(chosen), _AT_A_TIME):
+            part = chosen[begin : begin + _AT_A_TIME]
+            away, near = tree.query(
+                rows[1:3, part].T, _AROUND + 1, distance_upper_bound=space.reach
+            )
+            same = (
+                np.where(np.isfinite(away[:, 1:]), np.append(size, 0.0)[near[:, 1:]], 0.0)
+                * np.sign(rows[3, part])[:, np.newaxis]
+            )
+            # The second largest, because two grains may lie side by side where points are dense.
+            full = np.isfinite(away[:, -1])
+            ranked = np.sort(same, axis=1)
+            level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * ranked[:, -1])
+            alone = np.abs(rows[3, part]) - level > self.limit
+            spikes[part] = alone & (np.abs(rows[3, part]) > _DENSE * level)
+        return spikes
 
     def space(self) -> _Space:
         """Return how far apart neighbouring tracks are."""

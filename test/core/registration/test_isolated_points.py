@@ -87,3 +87,16 @@ def test_the_ends_of_a_profile_stay():
     batch = PointBatch(x, np.zeros_like(x), height, np.empty((0, len(x))))
     found = register(Flat(), lambda: [batch], ("piston", "tilt"))
     assert found.dust.tolist() == [200]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_grain_on_a_defect_is_dust_and_the_defect_stays(seed):
+    """Five grains of 0.4 µm on a pip of 80 nm in the centre of a spiral, where all turns meet."""
+    rng = np.random.default_rng(seed)
+    x, y = spiral()
+    grains = rng.choice(np.flatnonzero(np.hypot(x, y) < 0.2e-3), 5, replace=False)
+    height = pip(x, y) + rng.normal(0, 3e-9, len(x))
+    height[grains] += 400e-9
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert set(found.dust.tolist()) == set(grains.tolist())
