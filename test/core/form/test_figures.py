@@ -200,5 +200,5 @@ def test_a_figure_from_which_errors_take_more_than_there_is_is_not_known_to_be_z
     errors = 0.5e-6 * (-1.0) ** np.arange(len(FORM))
     found = figures(map_of(FORM + errors, noise=0.5e-6))
     for name in ("pv", "robust"):
-        assert found[name].value < 0.1 * np.ptp(FORM)
+        assert found[name].uncertainty > 0.2 * np.ptp(FORM)
         assert abs(np.ptp(FORM) - found[name].value) < 3 * found[name].uncertainty
