@@ -11,9 +11,9 @@ from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.kinematics.limits import MachineLimits
-from omsm_ros.core.kinematics.motion_choice import (
+from omsm_ros.core.kinematics.limits import (
     KnownOfMachine,
+    MachineLimits,
     choose_motion,
     harmonic_orders,
     margins,

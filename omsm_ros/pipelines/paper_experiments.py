@@ -124,10 +124,8 @@ def _steps(out: Path, seed: int) -> Done:
     rows.append(compared("mode of Eq. 12 from 1 kHz data, in equivalent time", "", None,
                          mode.frequency, "Hz", str(mode.finding)))  # fmt: skip
     one = slice(size - 5, size + 30)
-    facts = {
-        "peak": peak, "settled": settled.tolist(),
-        "mode": [mode.frequency, mode.frequency_uncertainty],
-    }  # fmt: skip
+    found = [mode.frequency, mode.frequency_uncertainty]
+    facts = {"peak": peak, "settled": settled.tolist(), "mode": found}
     shown = panels(
         Panel("Displacement (Fig. 6b)", "time [s]", "µm", {
             "probe": (time, (confocal - np.mean(confocal[rest])) / MICROMETRE_M),

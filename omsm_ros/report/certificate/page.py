@@ -54,8 +54,7 @@ def mode_table(calibration: Calibration) -> Table:
 
 
 def _resolved(mode: KnownMode, calibration: Calibration) -> tuple[str, str, str]:
-    """Return frequency, damping and residue, or that the data do not resolve a fast pole."""
-    # Beyond the sampling rate a pole acts as a constant or a delay.
+    """Return frequency, damping and residue; a pole beyond the sampling rate is not resolved."""
     known, fastest = calibration.valid_up_to, 1 / calibration.sample_period
     if mode.frequency > known and mode.frequency_uncertainty >= mode.frequency:
         fastest = known

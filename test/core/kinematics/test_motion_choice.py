@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.core.kinematics.motion_choice import (
-    KnownOfMachine,
-    choose_motion,
-    harmonic_orders,
-    margins,
-)
+from omsm_ros.core.kinematics.limits import KnownOfMachine, choose_motion, harmonic_orders, margins
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 
 ORDERS = np.arange(1.0, 4.0)
