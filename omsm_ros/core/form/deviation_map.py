@@ -230,7 +230,7 @@ class GridCells:
         """Return level [m] and slopes [1] along x and y, each (k, r, c), after a low-pass.
 
         Weighted linear regression with Gaussians of ``cutoffs`` along x and y [m] (ISO 16610-28).
-        Inside the map it is the Gaussian filter of ISO 16610-61, and its slopes are the derivatives.
+        Inside the map it is the Gaussian filter of ISO 16610-61, its slopes are the derivatives.
         It takes the points of a cell where they are, and makes up for their mean.
         """
         shape, width = self.present.shape, _CUTOFF_OF_MEAN * self.width

@@ -29,6 +29,8 @@ Limits = tuple[float, float]
 # Share of the pixels within the colour range, so that outliers do not set it.
 _SHOWN_SHARE = 0.998
 _BREAK_AT_GAPS = 4
+# Length over width of a map that is still drawn to scale.
+_NARROW = 5.0
 # Left, bottom, width, height relative to the figure.
 _MAP_PLACE = (0.125, 0.13, 0.66, 0.765)
 _FULL_WIDTH = 6.1, 5.1
@@ -115,6 +117,9 @@ def _draw_map(
         vmax=high / scale,
         interpolation="nearest",
     )
+    if not 1 / _NARROW < (top - bottom) / (right - left) < _NARROW:
+        axes.set_aspect("auto")  # a strip would be a line
+        title = f"{title}, not to scale"
     axes.grid(False)
     for spine in axes.spines.values():
         spine.set_visible(False)

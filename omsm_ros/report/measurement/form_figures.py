@@ -21,6 +21,8 @@ _BELOW = 0.2
 _FULL_WIDTH, _HIGH = 6.1, 3.7
 _BELOW_BARS = 0.2
 _AREAL_PLACE, _BAR_PLACE = (0.17, 0.125, 0.6, 0.78), (0.8, 0.125, 0.025, 0.78)
+# Positions of a curve that is drawn, and steps over the usual one that interrupt it.
+_LEAST_DRAWN, _GAP = 2, 4.0
 _LINES = {"x": "along x", "y": "along y", "diagonal": "along x = y"}
 
 
@@ -28,9 +30,11 @@ def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str
     """Return PNG files by the names of the page; parts that were not computed have none."""
     made = {"zernike_terms": zernike_terms(form["zernike"])}
     profiles: Mapping[str, Any] = curves.get("profiles") or {}
-    if lines := {name: profiles[name] for name in _LINES if name in profiles}:
+    if lines := {name: profiles[name] for name in _LINES if _drawable(profiles.get(name))}:
         made["form_lines"] = line_profiles(lines)
-    if rings := {name: profiles[name] for name in ("radius", "angle") if name in profiles}:
+    if rings := {
+        name: profiles[name] for name in ("radius", "angle") if _drawable(profiles.get(name))
+    }:
         made["form_rings"] = ring_profiles(rings)
     if density := curves.get("psd"):
         made["psd_radial"] = radial_density(density["radial"])
@@ -38,6 +42,10 @@ def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str
         if "areal" in density:
             made["psd_areal"] = areal_density(density["areal"])
     return {name: style.png(figure) for name, figure in made.items()}
+
+
+def _drawable(curve: Mapping[str, Any] | None) -> bool:
+    return curve is not None and len(curve["position"]) >= _LEAST_DRAWN
 
 
 def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
@@ -149,7 +157,11 @@ def _draw(
     low, high = (value - 2 * spread) / unit, (value + 2 * spread) / unit
     if floor is not None:
         low = np.maximum(low, floor / unit)
-    place: FloatArray = position / along
+    # A line over places without points would show what nobody measured.
+    gaps = np.diff(position)
+    empty = np.flatnonzero(gaps > _GAP * np.median(gaps)) + 1
+    place: FloatArray = np.insert(position / along, empty, np.nan)
+    low, value, high = (np.insert(v, empty, np.nan) for v in (low, value, high))
     axes.fill_between(place, low, high, color=style.AFTER, alpha=0.25, linewidth=0)
     axes.plot(place, value / unit, color=style.AFTER, linewidth=1.0)
     axes.margins(x=0.01)
