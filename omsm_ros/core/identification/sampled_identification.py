@@ -21,6 +21,7 @@ import numpy as np
 from scipy import ndimage
 
 from omsm_ros.core.calibration.certificate import REJECTED
+from omsm_ros.core.estimation.impulse_response import impulse_response
 from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
 from omsm_ros.core.estimation.sampled_choice import SampledCandidate, SampledChoice, choose_sampled
 from omsm_ros.core.estimation.sampled_fit import SampledRecord, in_seconds
@@ -87,11 +88,12 @@ def identify_samples(
     sections, factor = _inflated_to_free_choice(sections, choice, period)
     blocks = _blocks(choice.chosen, period)
     frequency = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
+    missed = _missed_responses(choice.chosen, frequency * period)
     others = np.array(
         [other.response(frequency * period) for other in choice.alternatives], np.complex128
     ).reshape(-1, sections.inputs, _FREQUENCIES)
     valid = [
-        valid_range(sections, blocks, frequency, input, others[:, input])
+        valid_range(sections, blocks, frequency, input, others[:, input], missed[input])
         for input in range(sections.inputs)
     ]
     entries = _entries(choice, sections, valid)
@@ -110,6 +112,35 @@ def identify_samples(
             entries=entries,
         ),
     )
+
+
+def _independence(chosen: SampledCandidate) -> float:
+    """Return the p-value of a residual that is independent of changes of the inputs."""
+    problem = chosen.fit.problem
+    drive = np.concatenate(
+        [
+            np.gradient(np.sum(r.record.inputs / np.std(r.record.inputs, axis=0), axis=1))[r.places]
+            for r in problem.spectra
+        ]
+    )
+    return independence(chosen.fit.residual, drive)
+
+
+def _missed_responses(chosen: SampledCandidate, cycles: FloatArray) -> ComplexArray:
+    """Return what the model misses at ``cycles`` (f,) a sample, (m, f): the residual without model.
+
+    An impulse response from the inputs to the residual of the first record resolves modes that are
+    narrower than a block of lines.
+    """
+    one, fitted = chosen.fit.problem.spectra[0], chosen.fit
+    grid, used = np.zeros(len(one.record)), np.zeros(len(one.record), np.bool_)
+    grid[one.places], used[one.places] = fitted.residual[: len(one.places)], True
+    inputs = one.record.inputs - np.mean(one.record.inputs, axis=0)
+    taps = impulse_response(inputs, grid, used)
+    if taps is None:
+        return np.zeros((inputs.shape[1], len(cycles)), np.complex128)
+    turned = np.exp(-2j * np.pi * np.outer(np.arange(taps.shape[1]), cycles))
+    return np.asarray(taps @ turned, np.complex128)
 
 
 def _checked(record: SampledRecord) -> SampledRecord:
@@ -234,11 +265,13 @@ def valid_range(
     frequency: FloatArray,
     input: int,
     others: ComplexArray,
+    missed: ComplexArray,
 ) -> tuple[float, float]:
     """Return the widest range [Hz], in octaves, that the data support for one input.
 
     others: responses (a, k) of models that predict about as well; where they differ, the model is
         not known unless the data show it
+    missed: response (k,) from the input to the residual, if that follows the input
     Both ends are the lowest of ``frequency`` if there is no such range.
     """
     if not blocks:
@@ -252,11 +285,14 @@ def valid_range(
     count = np.maximum(np.sum(near, axis=1), 1)
     off = (difference > limit) & (difference > _SIGNIFICANT * spread)
     differs = near @ off / count > _MAY_DIFFER
+    own = sections.response(frequency)[input]
+    biased = (np.abs(missed) > limit * np.abs(own)).astype(np.float64)
+    nearby = round(2 * _NEAR_OCTAVES / np.log2(frequency[1] / frequency[0])) + 1
+    differs |= ndimage.uniform_filter1d(biased, nearby, mode="nearest") > _MAY_DIFFER
     agrees = near @ (difference + COVERAGE_FACTOR * spread <= limit) / count >= 1 - _MAY_DIFFER
     with np.errstate(divide="ignore"):
         shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / limit) ** 2
     excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
-    own = sections.response(frequency)[input]
     alike = np.all(np.abs(others - own) <= limit * np.abs(own), axis=0)
     inside = (_narrow(sections.band(frequency, input)) & alike) | agrees
     return _widest(frequency, inside & excited & ~differs)
@@ -278,12 +314,6 @@ def _entries(
     problem, residual = chosen.fit.problem, chosen.fit.residual
     outputs = [one.output for one in problem.spectra]
     variance = float(np.mean(np.concatenate(outputs) ** 2)) or 1.0
-    drive = np.concatenate(
-        [
-            np.gradient(np.sum(r.record.inputs / np.std(r.record.inputs, axis=0), axis=1))[r.places]
-            for r in problem.spectra
-        ]
-    )
     return {
         "delay_samples": (sections.delays / sections.period).tolist(),
         "residual_rms": float(np.sqrt(np.mean(residual**2))),
@@ -295,7 +325,7 @@ def _entries(
         },
         "impulse_response": {"comparator": choice.comparator, "model": choice.compared},
         "whiteness_p": whiteness(residual),
-        "independence_p": independence(residual, drive),
+        "independence_p": _independence(chosen),
         "poles": _poles(sections, valid),
         "continuous_error": _continuous_error(sections, valid[0]),
         "samples": {"received": sum(len(r) for r in problem.records), "compared": len(residual)},

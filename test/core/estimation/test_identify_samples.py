@@ -193,6 +193,24 @@ def test_a_ladder_of_twelve_modes_is_found_and_its_band_is_true():
     assert model.sections.is_stable
 
 
+def test_modes_that_the_order_asked_for_leaves_out_end_the_band():
+    """Ten poles, eight asked for: of the accepted band, few lines are off by more than 10 %."""
+    rng = np.random.default_rng(2)
+    poles = np.exp(2j * np.pi * np.array([0.008, 0.014, 0.022, 0.1, 0.2]) * (1 + 0.02j))
+    rise = (1 - np.abs(poles)) * rng.choice([-1, 1], 5)
+    u = rng.normal(size=1500)
+    up, down = signal.invresz(np.tile(rise, 2), np.concatenate([poles, poles.conj()]), [])
+    y = signal.lfilter(up.real, down.real, u)
+    y = y + 0.05 * np.std(y) * rng.normal(size=len(u))
+    model = identify_samples([record(u, y)], 1.0, order=8)
+    low, high = model.valid[0]
+    lines = np.linspace(low, high, 300)
+    true = signal.freqz(up.real, down.real, 2 * np.pi * lines)[1]
+    apart = np.abs(model.sections.response(lines)[0] / true - 1)
+    assert high > low
+    assert np.mean(apart > 0.1) < 0.1
+
+
 def test_poles_beyond_the_data_are_bounds():
     u, y = smooth_record()
     poles = identified(u, y, hold="band-limited", order=6).certificate["poles"]
