@@ -235,7 +235,7 @@ def load_surface(path: Path | str, fitted: Sequence[str] = ()) -> Surface:
 def _with_starts(description: Mapping[str, Any], fitted: Sequence[str]) -> Mapping[str, Any]:
     """Return the description with values for the parameters that are fitted and not stated."""
     kind = SHAPES.get(str(description.get("shape")))
-    own = [each.name for each in fields(kind)] if is_dataclass(kind) else []
+    own: list[str] = [each.name for each in fields(kind)] if is_dataclass(kind) else []
     starts = {name: _START for name in fitted if name in own and name not in description}
     return {**description, **starts}
 
