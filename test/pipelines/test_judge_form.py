@@ -169,7 +169,7 @@ def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     f, s = (np.array(psd["radial"][name]) for name in ("position", "value"))
     inside = np.sum(2 * np.pi * f * s) * (f[1] - f[0])
     assert inside == pytest.approx(psd["mean_square_in_band"], rel=1e-9, abs=0)
-    assert set(curves["profiles"]) == {"x", "y", "diagonal", "radius", "angle"}
+    assert set(curves["profiles"]) == {"x", "y", "diagonal", "radius", "angle", "edge"}
 
 
 def test_people_read_the_figures_too(folder, tmp_path, capsys):

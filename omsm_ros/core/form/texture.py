@@ -45,6 +45,8 @@ _PARTS = 3
 _HALF_WIDTH, _SPACING = 1 / 100, 1 / 100
 # The angular profile averages the outer third of the radius over two degrees.
 _OUTER, _DEGREES = 2 / 3, 2.0
+# The profile at the edge: from this share of the radius, in rings so many times narrower.
+_EDGE, _FINER_AT_EDGE = 0.9, 4
 # Widths of rings over the radius; the narrowest that the turns of the scan fill to 80 % is used.
 _RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
 
@@ -400,6 +402,7 @@ Averaging = Callable[[FloatArray], Profile]
 def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     """Return the mean deviations [m] over x, y, the diagonal, radius [m], and angle [rad].
 
+    "edge" is that over the outer tenth of the radius in narrower rings, for a roll-off.
     Uncertainties are from noise and all error sources. A profile without points is left out.
     """
     x, y = map_.x - disc.x, map_.y - disc.y
@@ -411,19 +414,23 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     width = _ring(x, y, disc.radius)
     made["radius"] = lambda d: radial_profile(x, y, d, spacing=width)
     made["angle"] = lambda d: _around(x, y, d, disc.radius)
+    if np.any(rim := np.hypot(x, y) >= _EDGE * disc.radius):
+        narrow = _ring(x[rim], y[rim], disc.radius / _FINER_AT_EDGE, disc.radius)
+        made["edge"] = lambda d: radial_profile(x[rim], y[rim], d[rim], spacing=narrow)
     found = {name: _curve(map_, average) for name, average in made.items()}
     return {name: curve for name, curve in found.items() if len(curve.position)}
 
 
-def _ring(x: FloatArray, y: FloatArray, radius: float) -> float:
+def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:
     """Return the least width of rings [m] of which most contain points."""
     reach = np.hypot(x, y)
     extent = float(reach.max() - reach.min())
-    for width in np.array(_RINGS) * radius:
+    widths = np.outer(radii, _RINGS).ravel()
+    for width in widths:
         found = radial_profile(x, y, reach, spacing=float(width))
         if len(found.position) * width >= _COVERED * extent:
             return float(width)
-    return float(_RINGS[-1] * radius)
+    return float(widths[-1])
 
 
 def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) -> Profile:

@@ -33,7 +33,9 @@ def form_figures(form: Mapping[str, Any], curves: Mapping[str, Any]) -> dict[str
     if lines := {name: profiles[name] for name in _LINES if _drawable(profiles.get(name))}:
         made["form_lines"] = line_profiles(lines)
     if rings := {
-        name: profiles[name] for name in ("radius", "angle") if _drawable(profiles.get(name))
+        name: profiles[name]
+        for name in ("radius", "edge", "angle")
+        if _drawable(profiles.get(name))
     }:
         made["form_rings"] = ring_profiles(rings)
     if density := curves.get("psd"):
@@ -84,6 +86,7 @@ def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
     made, axes = style.figure(_FULL_WIDTH, 2.7 * len(rings) + 0.4, rows=len(rings))
     kinds = {
         "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
+        "edge": (MILLIMETRE_M, "radius [mm]", "At the edge, outer tenth of the radius"),
         "angle": (DEGREE_RAD, "angle from x [°]", "Around, outer third of the radius"),
     }
     for ax, (name, curve) in zip(axes[:, 0], rings.items(), strict=True):

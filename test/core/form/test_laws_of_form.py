@@ -273,3 +273,16 @@ def test_a_profile_is_uncertain_by_its_noise_over_the_root_of_its_points_and_its
     points = np.bincount(place, minlength=180)
     expected = np.hypot(8e-9 / np.sqrt(points[points > 0]), 3e-9)
     np.testing.assert_allclose(found.uncertainty, expected)
+
+
+def test_the_profile_at_the_edge_shows_its_roll_off():
+    """A rim that falls by 80 nm over the outer 4 % of the radius."""
+    x, y = RNG.uniform(-RADIUS, RADIUS, (2, 60_000))
+    inside = np.hypot(x, y) < RADIUS
+    x, y = x[inside], y[inside]
+    fall = np.maximum(np.hypot(x, y) / RADIUS - 0.96, 0.0) / 0.04
+    edge = profiles(map_of(-80e-9 * fall**2, x=x, y=y, area=np.ones(len(x))), DISC)["edge"]
+    share = np.maximum(edge.position / RADIUS - 0.96, 0.0) / 0.04
+    assert edge.position[0] > 0.89 * RADIUS
+    np.testing.assert_allclose(edge.value, -80e-9 * share**2, atol=2e-9)
+    assert edge.value[-1] < -60e-9
