@@ -75,6 +75,10 @@ TEMPLATES: dict[str, str] = {
         "model is {residual:m} (rms) at a noise of {noise:m}: record the encoder in finer steps, "
         "and write its positions with all their digits"
     ),
+    "estimation.axis_at_rest": (
+        "axis {axis!r} does not move beyond its noise, so its response does not show; move it, or "
+        "leave it out of {opt.input}"
+    ),
     "estimation.unlike_recordings": (
         "recording {number} has another sample period, other axes or another reference sensor than "
         "the first; identify it alone"

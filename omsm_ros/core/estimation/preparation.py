@@ -72,6 +72,11 @@ def prepare(record: MotionRecord, source: str) -> Prepared:
     follow it, ConfigurationError for another source.
     """
     check_usable(record)
+    for axis, position in record.further.items():
+        noise, travel = sample_noise(position), float(np.ptp(position))
+        if travel <= max(NOISE_FACTOR * noise, 1e-12):
+            # Noise of an encoder is no motion that the probe could follow.
+            raise StepTestError("estimation.axis_at_rest", axis=axis)
     motion, axis_spikes = _bridged(_motion(record, source))
     steps = _complete_edges(find_steps(motion, record.sample_period), record)
     problem = _problem(record, motion, steps)

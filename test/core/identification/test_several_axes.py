@@ -15,7 +15,7 @@ from omsm_ros.core.estimation.preparation import joined_recordings
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.pairing import SampleRun
-from omsm_ros.errors import DataError
+from omsm_ros.errors import DataError, StepTestError
 
 PERIOD = 1e-3
 MODE, DAMPING, DELAY = 2 * np.pi * 90.0, 0.15, 0.4e-3
@@ -110,6 +110,13 @@ def test_several_recordings_give_one_model_and_name_the_one_that_differs():
     assert reservation.code == "identification.recordings_differ"
     assert "recording 3 against the others" in str(reservation)
     assert apart.low_frequency_delay_uncertainty > 20e-6
+
+
+def test_an_axis_that_only_has_noise_is_refused():
+    first = recording(0)
+    noise = np.random.default_rng(1).normal(0, 1e-9, len(first))
+    with pytest.raises(StepTestError, match="axis 'x'"):
+        identify(replace(first, further={"x": noise}))
 
 
 def test_recordings_of_other_rates_are_refused():
