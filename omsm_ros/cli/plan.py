@@ -105,7 +105,7 @@ def _plan_multisine(args: argparse.Namespace) -> Facts:
     return {
         "lines": len(plan.lines),
         "duration": plan.duration,
-        "travel": float(np.ptp(plan.z(plan.sample_period * np.arange(plan.samples)))),
+        "travel": float(np.ptp(plan.z(plan.times))),
         "files": {"csv": str(csv), "json": str(description)},
     }
 

@@ -115,9 +115,8 @@ def load_multisine(path: Path | str) -> MultisinePlan:
         read_text(path, 10 * MAX_YAML_BYTES, FileError, what), FileError, what
     )
     check_form(content, form(_MULTISINE, tuple(_MULTISINE)), FileError, what)
-    lists = {name: tuple(content.pop(name)) for name in ("lines", "amplitudes")}
     del content["schema"]
-    plan = MultisinePlan(**content, **lists)
+    plan = MultisinePlan(**content | {k: tuple(content[k]) for k in ("lines", "amplitudes")})
     rising = bool(np.all(np.diff(plan.lines) > 0)) and plan.lines[-1] < plan.period / 2
     evaluated = min(plan.periods, plan.realisations) > 1
     known = len(plan.lines) == len(plan.amplitudes) and rising and evaluated

@@ -66,7 +66,7 @@ def misunderstood(text):
 def unknown_to_ros(text):
     setup = (ROOT / "setup.py").read_text(encoding="utf-8")
     nodes = re.search(r"NODES = \((.*?)\)", setup, re.DOTALL)[1]
-    known = {*re.findall(r'"(\w+)"', nodes), "replay"}
+    known = {*re.findall(r'"(\w+)"', nodes), "replay", "cell"}
     for line in commands(text, "ros2"):
         kind, *rest = [*shlex.split(line, comments=True)[1:], "", ""]
         if kind == "run" and rest[0] == "omsm_ros" and rest[1].islower() and rest[1] not in known:

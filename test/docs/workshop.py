@@ -135,6 +135,37 @@ def shop_map(shop, path):
     path.write_text(yaml_on("docs/import.md", "lines_before_names"), encoding="utf-8")
 
 
+def columns(recording):
+    """Return a function that writes a recording as CSV, for the first maps on that page."""
+
+    def make(shop, path):
+        made = recording()
+        rows = ["t [ms];X [mm];Z [mm];C [deg];gap [µm]"]
+        axes, distance = made.axes, made.distance.distance
+        for i, (x, z, c, d) in enumerate(zip(axes.x, axes.z, axes.c, distance, strict=True)):
+            turned = np.degrees(c) % 360
+            row = f"{i}.0;{x * 1e3:.9f};{z * 1e3:.9f};{turned:.7f};{-d * 1e6:.6f}"
+            rows.append(row.replace(".", ","))
+        path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+
+    return make
+
+
+def step_test_map(shop, path):
+    path.write_text(yaml_on("docs/import.md", "# step_test.yaml"), encoding="utf-8")
+
+
+def scan_map(shop, path):
+    text = yaml_on("docs/import.md", "# step_test.yaml")
+    text = text.replace("x: {constant: 0}", 'x: {name: "X [mm]", unit: mm}')
+    text = text.replace("c: {constant: 0}", 'c: {name: "C [deg]", unit: deg}')
+    path.write_text(text, encoding="utf-8")
+
+
+def origin(shop, path):
+    path.write_text(yaml_on("docs/import.md", "drawing: "), encoding="utf-8")
+
+
 def log(shop, path):
     path.write_text("time [ms];gap [um]\n0,0;1,25\n1,0;1,50\n2,0;1,25\n", encoding="utf-8")
 
@@ -202,6 +233,14 @@ NAMES = {
     "mirror.yaml": lambda shop, path: write_nominal(path),
     "machine.yaml": sources, "result": result("scan.mcap"), "old_result": result("fast.mcap"),
     "result/cloud.ply": cloud, "recordings": recordings, "interferometer.datx": datx,
+    "step_test.csv": columns(lambda: planned_test_of(Scenario(seed=6))),
+    "scan1.csv": columns(lambda: scan_of(Scenario(start_radius=1.5e-3, part_seed=1, seed=7))),
+    "scan2.csv": columns(
+        lambda: scan_of(
+            Scenario(start_radius=1.5e-3, part_seed=1, seed=8, spindle_speed=60.0, outward=True)
+        )
+    ),
+    "step_test.yaml": step_test_map, "scan.yaml": scan_map, "origin.yaml": origin,
     "steps.csv": shop_log, "map.yaml": shop_map, "log.csv": log,
     "record.csv": motion_columns, "model.json": model, "my_cell": my_cell,
     "config/disturbances.yaml": shipped,

@@ -116,7 +116,7 @@ def _periods(record: MotionRecord, plan: MultisinePlan) -> tuple[FloatArray, Flo
     if lost > _MOST_LOST:
         raise IdentificationError("identification.multisine_lost", lost=lost, most=_MOST_LOST)
     same = abs(record.sample_period / plan.sample_period - 1) < 1e-6
-    planned = plan.z(plan.sample_period * np.arange(plan.samples))
+    planned = plan.z(plan.times)
     centred = record.z - np.mean(record.z)
     if not same or len(centred) < len(planned):
         raise IdentificationError(

@@ -315,6 +315,11 @@ class MultisinePlan:
         return self.period * (self.realisations * (self.periods + 1) + 1)
 
     @property
+    def times(self) -> FloatArray:
+        """Return the times of the samples [s]."""
+        return np.asarray(self.sample_period * np.arange(self.samples), np.float64)
+
+    @property
     def duration(self) -> float:
         """Return the duration [s]."""
         return self.samples * self.sample_period
@@ -382,7 +387,7 @@ def plan_multisine(
         tuple(shape.tolist()),
         seed,
     )
-    z = plan.z(sample_period * np.arange(plan.samples))
+    z = plan.z(plan.times)
     rate = np.diff(z) / sample_period
     sizes = np.max(np.abs(z)), np.max(np.abs(rate)), np.max(np.abs(np.diff(rate))) / sample_period
     allowed = half_range, speed, acceleration
