@@ -276,8 +276,9 @@ _SHAPE = {
 _LINE_OF_HEIGHT = form(
     dict.fromkeys(("frequency", "amplitude"), _LEVEL), ("frequency", "amplitude")
 )
-# Older recordings lack ``height_line``.
-_SCHEMA = form({**_SHAPE, "height_line": _LINE_OF_HEIGHT}, tuple(_SHAPE))
+# Older recordings lack ``height_line`` and ``height_noise``.
+_LATER = {"height_line": _LINE_OF_HEIGHT, "height_noise": {"anyOf": [_LEVEL, {"type": "null"}]}}
+_SCHEMA = form({**_SHAPE, **_LATER}, tuple(_SHAPE))
 
 
 def vibration_levels(message: Any) -> dict[str, Any]:

@@ -84,7 +84,6 @@ SOURCE_NAMES = {
     "lag_rate": "lag that depends on the speed of Z",
     "lag_c": "lag that depends on C",
     "creep": "creep of the structure",
-    "creep_slow": "slow creep of the structure (10 s and more)",
     "part_bow_speed": "bow of the part that grows with the speed",
     "unbalance": "unbalance of the spindle",
     "x_late": "late latch of X",

@@ -149,9 +149,9 @@ class CellEmulatorNode(ManagedNode):
                 f"motion {shortened(motion, 40)!r}, expected one of {[*_MOTIONS]}"
             )
         if not self.active:
-            raise OmsmError("inactive; activate it first")
+            raise OmsmError("the emulator is inactive; activate it, and call again")
         if self._player.playing:
-            raise OmsmError("a motion is running; stop it first")
+            raise OmsmError("a motion is running; wait until it has ended, or stop it")
         recording = _MOTIONS[motion](self._scenario, self._disturbances)
         self._feed = AccelerationFeed(recording, self.get_clock().now().nanoseconds)
         self._player.start(recording, self.values["time_lapse"])

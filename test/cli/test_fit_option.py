@@ -17,6 +17,7 @@ def facts():
             "y": {"value": 22e-6, "uncertainty": math.hypot(4e-6, 0.9e-3)},
             "clocking": {"value": 0.0, "uncertainty": math.radians(1)},
         },
+        "shape": {},
         "deviation": {
             "peak_to_valley": {"value": 1e-9, "uncertainty": 8e-9},
             "Ssk": {"value": -0.4, "uncertainty": 0.3},

@@ -15,6 +15,7 @@ from omsm_ros.core.calibration.verification import PathCheck
 from omsm_ros.core.comparison.agreement import ComparedTerm
 from omsm_ros.core.comparison.compare import compare_measurements_of_part
 from omsm_ros.core.comparison.stated_errors import ComparedMeasurement as Measured
+from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.ripple.density import density
 from omsm_ros.core.ripple.ripple_guard import NamedLine
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, ScanSignal
@@ -202,18 +203,25 @@ def test_errors_and_lags_of_a_free_path_are_those_of_their_bands():
     columns |= {name: rng.normal(0.1, 0.01, count) for name in ("lag_before", "lag_after")}
     check = PathCheck(frequency=frequency, rms_before=1.0, rms_after=1.0, excited=bands, **columns)
     time = np.arange(count) * 1e-3
-    over, rms, lag = experiment_figures.chirp(time, check, np.array([0.1, 0.2])).axes
+    made = SimpleNamespace(
+        axes=SimpleNamespace(sample_period=1e-3, z=time * 1e-3),
+        distance=SimpleNamespace(distance=-time * 1e-3),
+    )
+    _, over, rms, lag = experiment_figures.chirp(made, check, np.array([0.1, 0.2])).axes
+    # The motion states its frequency; the lag is that at the frequency of the Hilbert transform.
+    true = np.linspace(0.0, Chirp().end_frequency, count)
     for side in ("before", "after"):
         (line,), (angle,) = points_of(rms, side), points_of(lag, side)
         assert line.get_xdata().tolist() == angle.get_xdata().tolist() == [2.5, 7.5]
         for k, (low, high) in enumerate(bands):
             inside = [i for i, f in enumerate(frequency) if low <= f < high]
-            squares = [columns[f"error_{side}"][i] ** 2 for i in inside]
+            swept = columns[f"error_{side}"][(true >= low) & (true < high)]
+            squares = list(swept**2)
             mean = sum(columns[f"lag_{side}"][i] for i in inside) / len(inside)
             assert line.get_ydata()[k] == pytest.approx(1e9 * (sum(squares) / len(squares)) ** 0.5)
             assert angle.get_ydata()[k] == pytest.approx(np.degrees(mean))
-    (true,) = points_of(lag, "true response")
-    assert true.get_ydata() == pytest.approx(np.degrees([0.1, 0.2]))
+    (of_model,) = points_of(lag, "true response")
+    assert of_model.get_ydata() == pytest.approx(np.degrees([0.1, 0.2]))
     for side in ("before", "after"):
         (line,) = points_of(over, side)
         assert line.get_ydata() == pytest.approx(1e9 * columns[f"error_{side}"])
@@ -238,8 +246,10 @@ def studied(name="scan", count=4096, speed=0.01, seed=0, tone=None):
         radius=np.full(count, 5e-3),
         turn=sample * 5e-4,
     )
-    return SimpleNamespace(signal=signal, formless=SimpleNamespace(residual=values),
-                           coordinates={PATH: None} if speed else {})  # fmt: skip
+    return SimpleNamespace(
+        signal=signal, coordinates={PATH: None} if speed else {},
+        density=lambda axis: density(values, 1e-3 if axis == TIME else 1e-3 * speed),
+    )  # fmt: skip
 
 
 def named(kind, amplitude, **possible):

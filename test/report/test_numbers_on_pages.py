@@ -153,17 +153,18 @@ def spectrum_summary(peaks, name="scan", stop=None):
         "name": name, "duration": 12.34, "spindle_speed_rpm": 30.0, "path_length": 2.5,
         "samples": {"analysed": 12_340}, "form": {"rms_removed": 1.5e-6},
         "noise": {"rms": 3.21e-9, "amplitude": 4.56e-11}, "motion": {"outside_band_rms": None},
-        "accelerometer": None, "peaks": peaks, "band_stop": stop,
+        "accelerometer": None, "vibration_removed": [], "peaks": peaks, "band_stop": stop,
         "sampling": [{"radius": 5e-3, "distance": 1.57e-5, "shortest_wavelength": 3.14e-5}],
     }  # fmt: skip
     counts = {kind: sum(p["kind"] == kind for p in peaks) for kind in KINDS}
-    return {"scans": [scan], "counts": counts, "normalisation": "one-sided"}
+    return {"scans": [scan], "counts": counts, "normalisation": "one-sided", "exposure": None}
 
 
 def peak(kind="part", **changes):
     return {
         "kind": kind, "frequency": 123.456, "wavelength_along_path": 1.5e-5,
-        "wavelength_along_radius": 2e-3, "amplitude": 7.89e-9, "significance": 12.3,
+        "wavelength_along_radius": 2e-3, "amplitude": 7.89e-9, "amplitude_on_part": 8.1e-9,
+        "significance": 12.3,
         "true_frequency": None, "true_wavelength": None, "order": None, "evidence": ["seen"],
         "needs": None,
     } | changes  # fmt: skip
@@ -180,10 +181,13 @@ def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, signifi
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[0] == PART
     for cell, value, digits in zip(
-        cells[1:5], (frequency, wavelength, amplitude, significance), (5, 4, 3, 3), strict=True
+        cells[1:6],
+        (frequency, wavelength, amplitude, 8.1e-9, significance),
+        (5, 4, 3, 3, 3),
+        strict=True,
     ):
         assert says(cell, value, digits), cell
-    assert cells[6] == "seen"
+    assert cells[7] == "seen"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +202,7 @@ def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, signifi
 def test_what_a_line_truly_is_is_said_in_one_way(change, truly):
     page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([peak(**change)]), {})))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
-    assert cells[5] == truly
+    assert cells[6] == truly
 
 
 def test_a_line_across_the_path_has_its_radial_wavelength_and_what_it_needs():
@@ -206,7 +210,7 @@ def test_a_line_across_the_path_has_its_radial_wavelength_and_what_it_needs():
     page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([reported]), {})))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[2] == "2.000 mm"
-    assert cells[6] == "a; b; another speed"
+    assert cells[7] == "a; b; another speed"
 
 
 def test_scans_sampling_and_band_stop_are_reported_in_their_units():

@@ -20,7 +20,7 @@ def test_stop_ends_a_motion_and_another_may_start(cell):
     cell.wait("some of it", lambda: cell.operator.value("cell_emulator", "samples_played") > 500)
     refused = cell.call(Trigger, "cell_emulator/step_test")
     assert not refused.success
-    assert "stop it first" in refused.message
+    assert "wait until it has ended" in refused.message
 
     stopped = cell.call(Trigger, "cell_emulator/stop")
     assert stopped.success

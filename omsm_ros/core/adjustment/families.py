@@ -154,9 +154,7 @@ def _dynamic(r: Ranges) -> list[Family]:
         Family("lag_c", "s", 2, lambda v: v.motion_rate * np.stack(_waves(v.c, 1)), 1e-4,
                RECLOCKED),
         _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
-        _one("creep", "1", lambda v: v.motion_fading[:, 0], 1e-3, OTHER_SPEED),
-        # A step test with plateaus of half a second hardly sees it.
-        Family("creep_slow", "1", 2, lambda v: v.motion_fading[:, 1:].T, 2e-4, OTHER_SPEED),
+        _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
         Family("removed", "1", 1, lambda v: v.removed[np.newaxis], 2.0, OTHER_SPEED, named=False),
     ]  # fmt: skip
     speeds = np.abs(r.speeds)

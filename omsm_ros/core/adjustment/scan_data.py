@@ -105,8 +105,7 @@ class ScanView:
     turned: spindle angle plus clocking, from the machine frame to the part frame [rad]
     x_rate, y_rate: of the path over the part [m/s];  slope_x, slope_y: of the surface, part frame
     motion, motion_rate, motion_acceleration: of Z [m], [m/s], [m/s²]
-    motion_fading: fading means of the motion less the motion, one column for each time constant of
-        creep (n, 3) [m]
+    motion_fading: mean of the motion over the last seconds less the motion: creep [m]
     distance: that the probe would measure of a part without form error [m]
     deviation: height less nominal height [m]
     speed: of the spindle [rad/s];  index: of the scan
@@ -209,15 +208,14 @@ def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
 
 
 # Creep of guides and mounts that a step test with plateaus of half a second does not show.
-_CREEP_S = (2.0, 10.0, 40.0)
+_CREEP_S = 2.0
 
 
 def _fading(time: FloatArray, motion: FloatArray) -> FloatArray:
-    """Return means of ``motion`` that fade by the times of creep, less ``motion``, (n, 3)."""
-    steps = float(np.median(np.diff(time))) / np.array(_CREEP_S)
-    means = [signal.lfilter([step], [1, step - 1], motion, zi=[motion[0] * (1 - step)])[0]
-             for step in steps]  # fmt: skip
-    return np.stack(means, axis=1) - motion[:, np.newaxis]
+    """Return the mean of ``motion`` over the last two seconds, fading, less ``motion``."""
+    step = float(np.median(np.diff(time))) / _CREEP_S
+    start = [motion[0] * (1 - step)]
+    return np.asarray(signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)
 
 
 def _slope(time: FloatArray, values: FloatArray) -> float:

@@ -118,11 +118,12 @@ def _lines(period: float, axis: str, values: FloatArray) -> list[AccelerationLin
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VibrationLevels:
-    """Vibration averaged over the last windows, without the white noise of the sensor.
+    """Vibration averaged over the last windows.
 
     bands: (from, to) [Hz];  rms: of each axis [m/s²], one value for each band
     line: strongest of all axes: axis, frequency [Hz], amplitude [m/s²]
-    effect: rms effect on the height for each band [m]; None if unknown
+    effect: rms effect on the height for each band [m], without the white noise of the sensor; None
+        if unknown
     total_effect: of all bands [m];  windows: number averaged so far
     noise_effect: what the noise of the sensor would be in all bands, and hides [m]
     height_line: strongest line in the height: frequency [Hz], amplitude [m]
@@ -268,7 +269,7 @@ class RunningSpectrum:
             line = found if found[1] > 0 else None
         return VibrationLevels(
             bands=bands,
-            rms={axis: self._levels(axis, bands)[0] for axis in self._mean},
+            rms={axis: _by_band(spectrum, bands) for axis, spectrum in self._mean.items()},
             line=max(
                 ((axis, *_strongest(spectrum, bands)) for axis, spectrum in self._mean.items()),
                 key=lambda line: line[2],

@@ -183,7 +183,9 @@ def _of_profile(header: list[str], what: str) -> dict[str, tuple[int, float | No
             continue
         roles = [_ROLES.get(name_and_unit(name)[0]) for name in names]
         if roles[0] not in (None, "x") or roles[1] not in (None, "height"):
-            raise FileError(f"{what} has 2 columns, expected x, y and height, or x and height")
+            raise FileError(
+                f"{what} has 2 columns, expected x, y and height, or x and height; export them so"
+            )
         for name in names:
             unit = re.search(r"[\[(/_]\s*([^\s\[\](),/_]+)\s*[\])]?\s*$", name)
             if unit and unit[1] in WORDS and metres_in(unit[1]) is None:

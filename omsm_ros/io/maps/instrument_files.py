@@ -248,7 +248,7 @@ def read_foreign(
         ) from err
     notes = (f"read by SurfaceTopography as {type(reader).__name__}", channel_note(names, chosen))
     if not _holds_heights(reader.channels[chosen]):
-        raise FileError(f"{what}: {notes[1]} holds no heights")
+        raise FileError(f"{what}: {notes[1]} holds no heights; choose another")
     metres = metres_in(str(found.unit)) if found.unit else None
     if metres:
         refuse_other(units, LengthUnits(metres, metres), what)

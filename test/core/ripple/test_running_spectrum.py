@@ -112,7 +112,6 @@ def test_the_noise_of_the_sensor_is_no_vibration(seed):
     noise = random.normal(0, 0.5e-3 * np.sqrt(RATE / 2 / 45), int(4 * RATE))
     quiet = fed(noise).levels()
     assert quiet.total_effect == 0.0
-    assert quiet.rms["z"] == (0.0,) * 4
     f = np.linspace(5, 50, 1000)
     white = np.sqrt(np.trapezoid((0.5e-3) ** 2 / 45 / (2 * np.pi * f) ** 4, f))
     assert white < quiet.noise_effect < 4 * white
