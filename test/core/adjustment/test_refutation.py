@@ -71,7 +71,7 @@ def test_two_scans_refute_and_correct(kind, family, true):
 
 
 def test_what_two_causes_explain_is_in_the_uncertainty():
-    """A creep looks like a drift and like a slower creep, which would leave another form."""
+    """A creep looks like a drift, which would leave another form."""
     _, found = disturbed("creep", 2)
     widened = found.form.mean_uncertainty
     _, clean = disturbed("clean", 2)
