@@ -60,6 +60,8 @@ class Moment:
     seed: int
     period: float
     """Between the instants [s]."""
+    clocking: float = 0.0
+    """Of the part on the spindle [rad]."""
 
     @property
     def age(self) -> Array:
@@ -79,7 +81,7 @@ class Moment:
     @cached_property
     def slope(self) -> tuple[Array, Array]:
         """Return the nominal slopes along the machine's x and y at the beam."""
-        cos, sin = np.cos(self.c), np.sin(self.c)
+        cos, sin = np.cos(self.c + self.clocking), np.sin(self.c + self.clocking)
         along_x, along_y = slopes(self.nominal.height, self.x * cos, -self.x * sin)
         return along_x * cos - along_y * sin, along_x * sin + along_y * cos
 
@@ -195,7 +197,7 @@ class Machine:
 def record(machine: Machine, part: Part | Nominal, pose: Pose, path: Path, seed: int) -> Recording:
     """Run the path and return what is logged, beside the truth."""
     part = part if isinstance(part, Part) else Part(part)
-    drive = _drive(machine, part, path, seed)
+    drive = _drive(machine, part, pose, path, seed)
     n = round(path.duration * machine.sampling)
     stamps = np.arange(n) / machine.sampling
     trigger = stamps + machine.trigger_jitter * drive.rng("trigger").normal(size=n)
@@ -234,7 +236,7 @@ def _truth(part: Part, pose: Pose, x: Array, c: Array) -> dict[str, Array]:
     return {"height": height, "deviation": part.deviation(px, py), "part_x": px, "part_y": py}
 
 
-def _drive(machine: Machine, part: Part, path: Path, seed: int) -> Moment:
+def _drive(machine: Machine, part: Part, pose: Pose, path: Path, seed: int) -> Moment:
     """Integrate servo and structure on the fine grid, with the lead before the first trigger."""
     dt = 1 / (machine.sampling * path.oversampling)
     count = int(np.ceil((path.duration + LEAD_S + 0.01) / dt))
@@ -242,7 +244,7 @@ def _drive(machine: Machine, part: Part, path: Path, seed: int) -> Moment:
     x, c = path.x(t), path.c(t)
     z = machine.servo.respond(path.z(t, c), dt)
     probe = machine.structure.respond(z, dt)
-    moment = Moment(t, x, c, z, probe, path, part.nominal, part.radius, seed, dt)
+    moment = Moment(t, x, c, z, probe, path, part.nominal, part.radius, seed, dt, pose.clocking)
     for effect in machine.of("structure"):
         probe = effect(moment, probe)
     return replace(moment, probe=probe)
@@ -294,6 +296,6 @@ def _surface(machine: Machine, part: Part, pose: Pose, now: Moment) -> Array:
         x, y = x + dx, y + dy
     cos, sin = np.cos(c), np.sin(c)
     if any(machine.beam):
-        away = part.nominal.height(x * cos + y * sin, y * cos - x * sin) - now.probe
+        away = part.posed_height(x * cos + y * sin, y * cos - x * sin, pose) - now.probe
         x, y = x + machine.beam[0] * away, y + machine.beam[1] * away
     return part.posed_height(x * cos + y * sin, y * cos - x * sin, pose)

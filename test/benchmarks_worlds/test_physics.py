@@ -153,6 +153,26 @@ def test_clocking_is_right_handed():
     np.testing.assert_allclose(r.part_y, r.x * np.sin(-r.c - 0.3), atol=1e-15)
 
 
+@pytest.mark.parametrize("clocking", [0.0, 0.7])
+def test_a_slanted_beam_meets_the_same_place_where_z_follows(clocking):
+    """Aside by slope × distance, which is zero however the part is clocked."""
+    _, wrong = error(replace(IDEAL, beam=(2e-4, 2e-4)), pose=Pose(clocking=clocking))
+    assert np.max(np.abs(wrong)) < 1e-12
+
+
+@pytest.mark.parametrize("clocking", [0.0, 0.7])
+def test_an_error_by_slope_follows_the_clocked_part(clocking):
+    """The slope along X is that of the nominal surface at the place of the clocked part."""
+    seen = []
+    machine = IDEAL.plus("probe", lambda now, d: seen.append(now.slope[0]) or 0 * d)
+    path = spiral(SMALL, 1e-3, "in", clocking, 3e-4)
+    recording = scan(machine, SMALL, replace(path, duration=1.0), pose=Pose(clocking=clocking))
+    x, c = recording.x, recording.c + clocking
+    along = slopes(SMALL.nominal.height, x * np.cos(c), -x * np.sin(c))
+    expected = along[0] * np.cos(c) - along[1] * np.sin(c)
+    assert np.max(np.abs(seen[0] - expected)) < 1e-6 * np.max(np.abs(expected))
+
+
 def test_late_latch_of_z():
     """A late latch of z looks like a lag of the same time."""
     r, wrong = error(replace(IDEAL, z_late=1e-4))

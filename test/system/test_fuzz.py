@@ -87,7 +87,7 @@ CALIBRATIONS = st.fixed_dictionaries(
 FUZZ = {"database": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(20_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [40, pytest.param(20_000, marks=pytest.mark.soak)])
 def test_messages(cell, true_calibration, small_scan_blocks, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
@@ -156,7 +156,7 @@ REQUESTS = st.one_of(
 )
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(5_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [30, pytest.param(5_000, marks=pytest.mark.soak)])
 def test_requests(cell, true_calibration, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
