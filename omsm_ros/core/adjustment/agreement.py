@@ -17,7 +17,7 @@ from omsm_ros.core.adjustment.families import DIFFERS
 from omsm_ros.core.adjustment.figures import Figure, pv_and_rms
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
 # Share of adjustments with agreeing scans in which any E_n exceeds its limit.
 _BY_CHANCE = 0.005
@@ -53,18 +53,25 @@ def agreement_of(
     if blocks.scans < 2:
         return ()
     y = solution.y - solution.network.of_families(solution.values, list(solution.sizes))
-    alone = [_alone(solution, y, k, nominal, removed) for k in range(blocks.scans)]
+    part = solution.network.part
+    seen = [np.bincount(part.cell[blocks.scan == k], minlength=part.cells) > 0
+            for k in range(blocks.scans)]  # fmt: skip
+    common = np.all(seen, axis=0)
+    if not common.any():
+        common = np.any(seen, axis=0)
+    alone = [_alone(solution, y, k, nominal, removed, common) for k in range(blocks.scans)]
     return tuple(_compared(solution, k, alone) for k in range(blocks.scans))
 
 
 def _alone(
     solution: Solution, y: FloatArray, scan: int, nominal: Surface | None, removed: Sequence[str],
+    common: BoolArray,
 ) -> tuple[Figure, Figure]:  # fmt: skip
-    """Return PV and rms of the form by ``scan`` alone."""
+    """Return PV and rms of the form by ``scan`` alone, over the cells that all scans saw."""
     net = solution.network.alone(scan)
     scales = replace(solution.scales, noise=solution.scales.noise[[scan]])
     mine = solution.network.blocks.scan == scan
-    return pv_and_rms(solve(net, y[mine], scales, {}), nominal, removed)
+    return pv_and_rms(solve(net, y[mine], scales, {}), nominal, removed, common)
 
 
 def _compared(

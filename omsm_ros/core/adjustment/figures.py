@@ -19,7 +19,7 @@ from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.refutation import Doubt
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
@@ -135,10 +135,13 @@ def _change(doubt: Doubt, nominal: Surface | None, removed: Sequence[str]) -> Fl
 
 
 def pv_and_rms(
-    solution: Solution, nominal: Surface | None, removed: Sequence[str] = POSE, seed: int = 0
+    solution: Solution,
+    nominal: Surface | None,
+    removed: Sequence[str] = POSE,
+    within: BoolArray | None = None,
 ) -> tuple[Figure, Figure]:
     """Return PV and rms of the form that ``solution`` found, as :func:`form_map` does."""
-    return _Made.of(solution, nominal, removed).pv_and_rms(solution, seed)
+    return _Made.of(solution, nominal, removed, within).pv_and_rms(solution, 0)
 
 
 class Effect(NamedTuple):
@@ -195,10 +198,16 @@ class _Made:
     fit: FloatArray
 
     @classmethod
-    def of(cls, solution: Solution, nominal: Surface | None, removed: Sequence[str]) -> _Made:
-        """Return the map of ``solution``."""
+    def of(
+        cls,
+        solution: Solution,
+        nominal: Surface | None,
+        removed: Sequence[str],
+        within: BoolArray | None = None,
+    ) -> _Made:
+        """Return the map of ``solution``; of the cells ``within`` alone, if given."""
         net, scales = solution.network, solution.scales
-        places = _places(solution)
+        places = _places(solution, within)
         share = net.cell_share(net.weights(scales), scales)
         found = net.cells_of(scales, solution.residual())
         values = net.part.values(places.x, places.y)
@@ -256,11 +265,13 @@ def _rms(places: _Places, shapes: FloatArray) -> float:
     return float(np.sqrt(np.sum(places.area @ shapes**2)))
 
 
-def _places(solution: Solution) -> _Places:
+def _places(solution: Solution, within: BoolArray | None = None) -> _Places:
     """Return the centre of the blocks of every cell that was scanned, and points of the rim."""
     net = solution.network
     blocks, part = net.blocks, net.part
     number = np.bincount(part.cell, minlength=part.cells)
+    if within is not None:
+        number = np.where(within, number, 0)
     seen = np.flatnonzero(number)
     x, y = (np.bincount(part.cell, v, part.cells)[seen] / number[seen]
             for v in (blocks.x, blocks.y))  # fmt: skip

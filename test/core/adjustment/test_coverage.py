@@ -1,11 +1,14 @@
 """Stated uncertainties hold, and clean machines raise no alarm: machines drawn as declared."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from coverage import PRIORS, drawn, normalised
 from plain_world import MIRROR
 
 from omsm_ros.core.adjustment import VERIFIED, adjust
+from omsm_ros.core.adjustment.verdict import DISAGREE
 
 SEEDS, FEW_SEEDS, PITCH_M = 32, 4, 0.8e-3
 
@@ -33,6 +36,15 @@ def test_few_clean_machines_are_verified_and_covered():
     off = np.abs([row[3] for row in rows])
     assert np.mean(off <= 2) >= 0.85
     assert np.max(off) < 4.5
+
+
+def test_a_scan_without_the_rim_agrees_where_both_have_points():
+    """PV and rms of scans are compared over what all of them saw."""
+    _, (first, second) = drawn(1, 2, PITCH_M)
+    inside = np.hypot(second.x, second.y) < 8e-3
+    columns = {n: v[inside] for n, v in vars(second).items() if isinstance(v, np.ndarray)}
+    found = adjust([first, replace(second, **columns)], PRIORS, nominal=MIRROR, accuracy=25e-9)
+    assert not any(reason.code == DISAGREE for reason in found.verdict.reasons)
 
 
 @pytest.mark.soak
