@@ -114,7 +114,7 @@ def test_a_killed_reader_leaves_the_rest_to_the_next(tmp_path):
     assert len(then) > 1000
     assert np.all(np.diff(first) == 1)
     assert np.all(np.diff(then) == 1)
-    # What the dead reader had taken and not written is a gap of the count.
+    # Lines that the dead reader had taken and not written are a gap of the count.
     assert 0 < then[0] - first[-1] < 2000
     assert more.get("lost", 0) == more.get("restarts", 0) == 0
 

@@ -188,8 +188,8 @@ def test_plans_and_the_twin_know_the_elliptic_mirror(tmp_path, capsys):
     surface, folder = tmp_path / "mirror.yaml", str(tmp_path / "plan")
     text = "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
     surface.write_text(f'{text}aperture: "ellipse: {17.9605e-3 * 24.57 / 25.4}, 12.285e-3"\n')
-    told = ["plan", "scans", "--nominal", str(surface), "--radius", "0.0179605", "--out", folder]
-    assert cli.main([*told, "--json"]) == 0
+    words = ["plan", "scans", "--nominal", str(surface), "--radius", "0.0179605", "--out", folder]
+    assert cli.main([*words, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["paths"][0]["points"] == pytest.approx(290_011, abs=100)
     out = tmp_path / "twin"
@@ -197,8 +197,8 @@ def test_plans_and_the_twin_know_the_elliptic_mirror(tmp_path, capsys):
     assert "ellipse: 0.0179605, 0.0127" in (out / "mirror.yaml").read_text()
     # Without --radius the scan reaches the rim.
     out = str(tmp_path / "motion")
-    told = ["plan", "motion", "--nominal", str(surface), "--line", "680", "--marks", "15e-6"]
-    assert cli.main([*told, "--out", out, "--json"]) == 0
+    words = ["plan", "motion", "--nominal", str(surface), "--line", "680", "--marks", "15e-6"]
+    assert cli.main([*words, "--out", out, "--json"]) == 0
     motion = json.loads(capsys.readouterr().out.split("\n", 2)[-1])
     assert motion["motion"][0]["phase"] == pytest.approx(0.0, abs=1e-9)
     assert motion["motion"][1]["score"] == 1.0

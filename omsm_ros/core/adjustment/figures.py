@@ -145,7 +145,7 @@ def pv_and_rms(
 
 
 class Effect(NamedTuple):
-    """What a family may do to the form, rms over the part, k = 1 [m].
+    """Possible effect of a family on the form, rms over the part, k = 1 [m].
 
     left: by what scans and prior leave open;  free: by what the scans alone leave open if the prior
         is worth nothing, and the family may have its size ``wide``

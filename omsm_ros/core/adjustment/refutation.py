@@ -25,10 +25,10 @@ _LEAST_GAIN = 10.0
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
-# What a first cause leaves for others is the error of its model, if it is less than this share.
+# The model of a first cause is wrong by up to this share: what it leaves is no other cause.
 _MODEL_SHARE = 0.01
 # Families that explain this share of the cause may stand behind it: no model of one is exact.
-_RIVAL_SHARE, _RARE, _MOST_WIDE = 0.2, 3.0, 3.0
+_RIVAL_SHARE, _RARE, _FAR_BEYOND = 0.2, 3.0, 3.0
 # A family whose value changes by less than this share is a cause of its own.
 _UNCHANGED = 0.3
 # A lag that depends on something has an unknown mean, which is no further cause.
@@ -154,8 +154,8 @@ def _grouped(
     """Return causes and doubts; a family released because of an earlier one belongs to that one.
 
     A family that was found as large before anything was released is a cause of its own, as is the
-    same cause in another scan. What became so, or less so, by a release is what that one leaves:
-    more than a model error's share, and no single family explains what the scans show.
+    same cause in another scan. A family whose value an earlier release changed shows what that
+    release left. If that is more than the error of its model, no single family explains the scans.
     first: found value of each family before the first release;  rest: gain that is left at the end
     """
     causes: list[Refutation] = []
@@ -208,10 +208,10 @@ def _beyond(evidences: Sequence[Evidence], released: Sequence[str], least: float
 def explained(one: Evidence, best: Evidence) -> float:
     """Return the share of what ``best`` explains that family ``one`` alone would explain.
 
-    Of a declared family, against the odds that its declaration is wrong; far beyond its plausible
-    size it explains nothing.
+    A declared family counts against the odds that its declaration is wrong. Far beyond its
+    plausible size it explains nothing.
     """
-    beyond = float(np.sqrt(np.mean(one.values**2))) > _MOST_WIDE * one.family.wide
+    beyond = float(np.sqrt(np.mean(one.values**2))) > _FAR_BEYOND * one.family.wide
     if not one.family.named or base_name(one.family.name) in FREE or (one.declared and beyond):
         return 0.0
     size = one.gain if one.declared else one.chi_square - one.dof

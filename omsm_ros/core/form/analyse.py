@@ -274,7 +274,7 @@ def _figures(
         # These are as measured, with noise and systematic errors.
         "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
-        # Of a profile measured once, noise and texture are the same.
+        # A profile measured once does not tell noise from texture.
         "point_noise": UncertainValue(map_.noise if map_.noise_known else None, None),
         "rms_before_fit": UncertainValue(found.before, None),
     }

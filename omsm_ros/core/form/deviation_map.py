@@ -105,8 +105,8 @@ def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> floa
 
 # Share of repeated places that determines noise, and their size over the spacing of the points.
 _LEAST_REPEATED, _SAME_PLACE = 0.1, 1 / 50
-# Differences that no smooth form is left in. Of white noise their scatter does not grow with the
-# spacing of the points; of texture whose density falls as 1/f² it grows by √2 with every doubling.
+# Order of differences in which no smooth form is left. The scatter of white noise in them does not
+# grow with the spacing of the points; texture whose density falls as 1/f² grows by √2 an octave.
 _ORDER, _WHITE, _LEAST_WHITE = 6, 1.12, 100
 
 
@@ -300,8 +300,8 @@ def _of_grid(x: FloatArray, y: FloatArray) -> Sides | None:
     for values in (x, y):
         steps = np.diff(np.sort(values))
         # Points of one column differ by rounding, and by what the tilt of the part moves them.
-        wide = steps[steps > _LEAST_STEP * np.max(steps, initial=0.0)]
-        spacings.append(float(np.median(wide)) if len(wide) else np.inf)
+        apart = steps[steps > _LEAST_STEP * np.max(steps, initial=0.0)]
+        spacings.append(float(np.median(apart)) if len(apart) else np.inf)
     counts = [float(np.ptp(v) / step) + 1 for v, step in zip((x, y), spacings, strict=True)]
     if min(counts) < 2 or np.prod(counts) * _LEAST_FILLED > len(x):
         return None

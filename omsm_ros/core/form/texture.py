@@ -31,7 +31,7 @@ _EXTRAPOLATED = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 # Draws of the noise; and share of the subtracted noise that is uncertain, where noise and form
 # do not add as squares.
 _DRAWS, _UNSURE = 4, 0.25
-# A cutoff of so many cells is not changed by their width.
+# The width of the cells does not change a cutoff of this number of them.
 _MANY_CELLS = 12.0
 # Limits of the bands, as shares of the longest side.
 _BANDS = {"form": (np.inf, 1 / 4), "waviness": (1 / 4, 1 / 20), "finer": (1 / 20, 0.0)}
@@ -45,7 +45,7 @@ _PARTS = 3
 _HALF_WIDTH, _SPACING = 1 / 100, 1 / 100
 # The angular profile averages the outer third of the radius over two degrees.
 _OUTER, _DEGREES = 2 / 3, 2.0
-# The profile at the edge: from this share of the radius, in rings so many times narrower.
+# The profile at the edge: share of the radius where it begins; factor by which rings are narrower.
 _EDGE, _FINER_AT_EDGE = 0.9, 4
 # Widths of rings over the radius; the narrowest that the turns of the scan fill to 80 % is used.
 _RINGS, _COVERED = (1 / 50, 1 / 25, 1 / 10), 0.8
@@ -111,7 +111,7 @@ class _FilteredBand:
 
         Noise adds to the square of a size, so that its own addition is subtracted. The loss of the
         square is a smooth function of the square of the cutoff, so that the cutoffs 1, √2, √3 give
-        it at zero; so many of them are used that noise and the next step are smallest together.
+        it at zero. That number of them is used for which noise and the next step are smallest.
         Both belong to the uncertainty, with all effects and the change by every other cell alone.
 
         square: of a figure that is a size
@@ -181,7 +181,7 @@ def _with_noise(cells: GridCells) -> FloatArray:
 
 
 def _cutoffs(cells: GridCells, short: float | None) -> list[tuple[float, float]]:
-    """Return cutoffs along x and y [m]: that asked for, or some of so many cells."""
+    """Return cutoffs along x and y [m]: that asked for, or multiples of the cells."""
     if short:
         return [(short, short)]
     cutoffs = (_LEAST_CELLS * k**0.5 for k in (1, 2, 3))
@@ -301,7 +301,7 @@ def power_density(cells: GridCells) -> PowerDensity:
         np.asarray(np.fft.fftfreq(size, step), np.float64)
         for size, step in zip(cells.mean.shape, reversed(cells.steps), strict=True)
     )
-    # What the mean over a cell passes of each frequency.
+    # Share of each frequency that the mean over a cell passes.
     along, across = (
         np.sinc(v * step * cells.width)
         for v, step in zip((y, x), reversed(cells.steps), strict=True)

@@ -288,7 +288,7 @@ def plan_steps(
     )
 
 
-# Of each group of so many odd lines, one is left out to show distortion of odd degree.
+# Number of odd lines in a group; one of each is left out to show distortion of odd degree.
 _GROUP = 4
 
 

@@ -426,7 +426,7 @@ def contrasts(diagnostics: ResidualDiagnostics) -> list[Contrast]:
 def _recordings(starts: Sequence[int], samples: int) -> Iterator[tuple[str, FloatArray]]:
     """Yield 1 in one recording and -1 in the others, (n,), for each of several."""
     place = np.searchsorted(starts, np.arange(samples), side="right")
-    # Of two, the second adds nothing to the first.
+    # The second of two adds nothing to the first.
     for number in range(1, len(starts) + 1 - (len(starts) <= 2)):
         yield RECORDING.format(number), np.where(place == number, 1.0, -1.0)
 

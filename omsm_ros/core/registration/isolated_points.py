@@ -27,7 +27,7 @@ _GAP = 2
 _LONG = 4.0
 # Events of one defect differ in size by less than this factor.
 _SIMILAR = 2.0
-# A point of a defect that exceeds this multiple of what is usual among so many neighbours is dust.
+# A point of a defect is dust beyond this multiple of the usual size of this number of neighbours.
 _DENSE, _AROUND = 1.5, 16
 # A point little beyond the limit is form if this share of the points around is half as far; noise
 # alone is as far at one in 160.

@@ -257,9 +257,9 @@ class RunningSpectrum:
             pairwise([*edges, nyquist] if len(edges) < len(self.options.edges) else edges)
         )
         share = self._height_share(response)
-        effect = total = hidden = line = None
+        effect = total = noise = line = None
         if share is not None:
-            effect, hidden = self._levels(self.options.axis, bands, share)
+            effect, noise = self._levels(bands, share)
             total = float(np.linalg.norm(effect))
             spectrum = self._mean[self.options.axis]
             most = self._floor(spectrum)[0] * (1 + _NOISE_SIGMAS / self._averaged**0.5)
@@ -277,7 +277,7 @@ class RunningSpectrum:
             effect=effect,
             total_effect=total,
             windows=self._windows,
-            noise_effect=hidden,
+            noise_effect=noise,
             height_line=line,
         )
 
@@ -298,33 +298,32 @@ class RunningSpectrum:
         return min(self._windows, self.options.averages)
 
     def _levels(
-        self, axis: str, bands: Sequence[tuple[float, float]], share: FloatArray | float = 1.0
+        self, bands: Sequence[tuple[float, float]], share: FloatArray
     ) -> tuple[tuple[float, ...], float]:
-        """Return the rms by band beyond noise, and the rms of noise that may be in all bands.
+        """Return the height's rms by band beyond noise, and that of the noise in all bands [m].
 
         Each third of an octave counts that exceeds its own noise, so that noise at 5 Hz, which
         ``a/ω²`` amplifies most, hides no motion at 30 Hz.
         """
-        spectrum = self._mean[axis]
-        weight = share + np.zeros(len(spectrum.density))
+        spectrum = self._mean[self.options.axis]
         floor, sigma = self._floor(spectrum)
-        levels, hidden = [], 0.0
+        levels, total = [], 0.0
         for low, high in bands:
             parts = int(np.ceil(3 * np.log2(high / low)))
             top = high if high == bands[-1][1] else np.nextafter(high, 0)
             edges = list(pairwise([low, *np.geomspace(low, high, parts + 1)[1:-1], top]))
             seen, mean, squared = (
                 np.square(_by_band(Density(spectrum.frequency, d, spectrum.step), edges))
-                for d in (spectrum.density * weight, weight, weight**2)
+                for d in (spectrum.density * share, share, share**2)
             )
             spread = np.hypot(
                 np.sqrt(_CORRELATED * spectrum.step * squared / self._averaged), sigma * mean
             )
             noise = floor * (mean + _NOISE_SIGMAS * spread)
-            # Of a level beyond its noise only the mean of the noise is taken away.
+            # A level beyond its noise loses the mean of the noise only.
             levels.append(float(np.sqrt(np.sum(np.where(seen > noise, seen - floor * mean, 0.0)))))
-            hidden += float(np.sum(noise))
-        return tuple(levels), hidden**0.5
+            total += float(np.sum(noise))
+        return tuple(levels), total**0.5
 
     def _height_share(self, response: TransferFunction | None) -> FloatArray | None:
         """Return the square of height over acceleration by frequency, None if it is unknown."""

@@ -34,7 +34,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 # Noise alone exceeds it in one spectrum of 740.
 LEAST_SIGMA = 3.0
-# A machine shows ten to twenty lines: so many are fitted together, and further ones in groups.
+# A machine shows ten to twenty lines: this number is fitted together, further ones in groups.
 MOST_TOGETHER, MOST_LINES = 40, 400
 # Peaks below this share of the strongest may be its side lobes.
 _TAKEN_TOGETHER = 0.3

@@ -402,9 +402,8 @@ def _laboratory(calibration: Calibration) -> list[Section]:
     for one in dcc_quantities(calibration):
         unit = _UNITS[one.unit]
         value = measured(one.value, (one.expanded or 0.0) / 2, unit).partition(" ±")[0]
-        wide = quantity(one.expanded, unit, 2) if unit else plain(one.expanded, 2)
-        wide = _UNSTATED if one.expanded is None else wide
-        results.append((one.name, value, wide))
+        expanded = quantity(one.expanded, unit, 2) if unit else plain(one.expanded, 2)
+        results.append((one.name, value, _UNSTATED if one.expanded is None else expanded))
     start = quantity(validity.from_hz or 0.0, "Hz", 2)
     stated = (
         ("method", origin.method or "step test on a fixed target; transfer function from encoder "
