@@ -14,6 +14,29 @@ from omsm_ros.nodes.memory import return_free_memory
 
 PIECE, COUNT = 4000, 4000
 
+# Takes the pieces, frees all but the last, then returns what is free; the held memory after each.
+BACKLOG = """
+import ctypes
+from omsm_ros.nodes import memory
+from nodes.test_memory import COUNT, PIECE, held_kib
+
+libc = ctypes.CDLL(None)
+libc.malloc.restype = ctypes.c_void_p
+libc.free.argtypes = [ctypes.c_void_p]
+memory.return_free_memory()
+before = held_kib()
+pieces = [libc.malloc(PIECE) for _ in range(COUNT)]
+for piece in pieces:
+    ctypes.memset(piece, 1, PIECE)
+print(held_kib() - before)
+last = pieces.pop()
+for piece in pieces:
+    libc.free(piece)
+print(held_kib() - before)
+memory.return_free_memory()
+print(held_kib() - before)
+"""
+
 # Each thread takes small pieces, seven of each size, far apart, frees all, and lives on.
 BURST = """
 import ctypes, signal, sys, threading
@@ -108,23 +131,8 @@ def test_what_a_node_loaded_is_looked_through_no_more():
 
 @glibc
 def test_what_was_freed_below_a_piece_in_use_is_given_back():
-    """As a backlog is freed while younger pieces stay; 16 MB, of which the pool keeps none."""
-    libc = ctypes.CDLL(None)
-    libc.malloc.restype = ctypes.c_void_p
-    libc.free.argtypes = [ctypes.c_void_p]
-    return_free_memory()
-    before = held_kib()
-    pieces = [libc.malloc(PIECE) for _ in range(COUNT)]
-    for piece in pieces:
-        ctypes.memset(piece, 1, PIECE)
-    last = pieces.pop()
-    full = held_kib() - before
-    for piece in pieces:
-        libc.free(piece)
-    kept = held_kib() - before
-    return_free_memory()
-    left = held_kib() - before
-    libc.free(last)
+    """As a backlog is freed while younger pieces stay; 16 MB in a heap of its own."""
+    full, kept, left = map(int, said(BACKLOG))
     size = PIECE * COUNT / 1024
     assert full > 0.9 * size
     assert kept > 0.9 * size  # else there would be nothing to mend
