@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from omsm_ros.core.calibration.finding import Finding
+from omsm_ros.core.calibration.certificate import Finding
 
 RIGHT, UNKNOWN, WRONG = "right", "unknown", "wrong"
 

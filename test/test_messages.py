@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import omsm_ros
-from omsm_ros.core.calibration.finding import REJECTS, Finding
+from omsm_ros.core.calibration.certificate import REJECTS, Finding
 from omsm_ros.errors import DataError, Notice
 from omsm_ros.messages import COMMAND, NODE, PYTHON, templates, written_for
 

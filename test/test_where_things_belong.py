@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import omsm_ros
-from omsm_ros.core.calibration.finding import REJECTS, WARNING, Finding
+from omsm_ros.core.calibration.certificate import REJECTS, WARNING, Finding
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.correction.uncertainty import ErrorSources

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.calibration import SCHEMA_1, content_id
-from omsm_ros.core.calibration.finding import RESERVATION, WARNING
+from omsm_ros.core.calibration.certificate import RESERVATION, WARNING
 from omsm_ros.errors import CalibrationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 

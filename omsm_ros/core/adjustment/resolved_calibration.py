@@ -26,12 +26,14 @@ from omsm_ros.core.adjustment.self_calibration import (
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import (
     ACCEPTED,
+    REJECTS,
+    WARNING,
     Certificate,
+    Finding,
     Residual,
     Response,
     StaticGain,
 )
-from omsm_ros.core.calibration.finding import REJECTS, WARNING, Finding
 from omsm_ros.core.calibration.latency import REVERSAL, SPEEDS, Latency, latency_share_of
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, ResponseLimits
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian

@@ -19,10 +19,13 @@ from omsm_ros.core.calibration.certificate import (
     ACCEPTED,
     CERTIFICATE_SCHEMA,
     REJECTED,
+    REJECTS,
+    RESERVATION,
     RESERVED,
+    TEXT,
+    WARNING,
     Certificate,
 )
-from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, TEXT, WARNING
 from omsm_ros.core.calibration.latency import Latency, unresolved_latency
 from omsm_ros.core.calibration.plausibility import check_covariance, check_dynamics
 from omsm_ros.core.calibration.typed_json import from_json

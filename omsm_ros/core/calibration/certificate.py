@@ -10,12 +10,18 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, WARNING, Finding, of_severity
 from omsm_ros.core.calibration.intended_use import IntendedUse
 from omsm_ros.core.calibration.latency import Latency
 from omsm_ros.core.calibration.typed_json import from_json, to_json
-from omsm_ros.errors import CalibrationError
+from omsm_ros.core.lti.transfer_function import Structure
+from omsm_ros.errors import CalibrationError, text_of
 from omsm_ros.quantities import GAIN_UNCERTAINTY, UNCERTAINTY
+
+REJECTS, RESERVATION, WARNING, NOTE = "rejects", "reservation", "warning", "note"
+SEVERITIES = (REJECTS, RESERVATION, WARNING, NOTE)
+
+TEXT = "calibration.text"
+"""Code of a finding that was stored as a sentence, in files of version 1."""
 
 CERTIFICATE_SCHEMA = "omsm-certificate/2"
 REJECTED, ACCEPTED = "rejected", "accepted"
@@ -26,6 +32,38 @@ _UNDETECTED_CODES = {
     "soft mode": "calibration.undetected_mode",
     "stiffening": "calibration.undetected_stiffening",
 }
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One statement about a calibration.
+
+    code: ``room.subject``, the key of its sentence in :mod:`omsm_ros.messages`
+    severity: "rejects", "reservation" (covered by the model or by a wider band), "warning" or
+        "note"
+    values: JSON values that the sentence names, SI;  limits: what they are compared with
+
+    ``str(finding)`` is the sentence. Raises CalibrationError for another severity.
+    """
+
+    code: str
+    severity: str
+    values: Mapping[str, object] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.severity not in SEVERITIES:
+            raise CalibrationError(
+                "calibration.severity", severity=self.severity, known=", ".join(SEVERITIES)
+            )
+
+    def __str__(self) -> str:
+        return text_of(self.code, {**self.limits, **self.values})
+
+
+def of_severity(findings: Iterable[Finding], severity: str) -> tuple[Finding, ...]:
+    """Return those of ``findings`` that have ``severity``, in their order."""
+    return tuple(finding for finding in findings if finding.severity == severity)
 
 
 def _check_uncertainty(value: float | None, name: str) -> None:
@@ -78,20 +116,6 @@ class Validity:
 
     def __post_init__(self) -> None:
         _check_uncertainty(self.from_hz, "valid_from")
-
-
-@dataclass(frozen=True)
-class Structure:
-    """Number of poles and zeros, and whether there is a delay."""
-
-    poles: int
-    zeros: int
-    delay: bool
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters of the dynamics."""
-        return self.poles + self.zeros + self.delay
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,15 @@ from functools import cached_property
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, fit
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction, ascending_roots
+from omsm_ros.core.lti.transfer_function import (
+    ComplexArray,
+    Structure,
+    TransferFunction,
+    ascending_roots,
+)
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
 from omsm_ros.linear_algebra import least_squares

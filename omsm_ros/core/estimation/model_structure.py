@@ -12,39 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import polynomial
 
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Range of time constants in e-folds around the bandwidth of the motion, a factor of 9e6.
 _LOG_RANGE = 16.0
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class Structure:
-    """``zeros`` ≤ ``poles``, and whether the delay is free."""
-
-    poles: int
-    zeros: int
-    delay: bool
-
-    @property
-    def size(self) -> int:
-        """Number of free parameters."""
-        return self.poles + self.zeros + self.delay
-
-    @property
-    def pairs(self) -> int:
-        """Number of second-order sections; an odd pole has a section of its own."""
-        return self.poles // 2
-
-    def contains(self, other: Structure) -> bool:
-        """Return True if ``other`` is a smaller special case of this one."""
-        return (
-            other.size < self.size
-            and other.poles <= self.poles
-            and other.zeros <= self.zeros
-            and other.delay <= self.delay
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

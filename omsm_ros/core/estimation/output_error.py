@@ -20,10 +20,10 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import fft, linalg, ndimage
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget, Projection, descend
 from omsm_ros.core.kinematics.trajectories import s_curve
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
+from omsm_ros.core.lti.transfer_function import ComplexArray, Structure, TransferFunction
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.linear_algebra import BLOCK_VALUES, least_squares
 

@@ -17,7 +17,6 @@ import numpy as np
 from scipy import ndimage, signal
 
 from omsm_ros.core.estimation.model_order import StartingPoints
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
 from omsm_ros.core.estimation.output_error import STATIONARY_S, Fit, Problem, fit
 from omsm_ros.core.estimation.steps import (
@@ -30,6 +29,7 @@ from omsm_ros.core.estimation.steps import (
     find_steps,
     sample_noise,
 )
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.streams.blocks import SAME_PERIOD, BoolArray, FloatArray
 from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, DataError, IdentificationError, StepTestError

@@ -19,7 +19,7 @@ import numpy as np
 from scipy import fft, linalg, ndimage
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import Projection, descend
 from omsm_ros.core.estimation.parallel_sections import (
     BAND_LIMITED,
@@ -29,7 +29,7 @@ from omsm_ros.core.estimation.parallel_sections import (
     recursion,
     variable,
 )
-from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.lti.transfer_function import ComplexArray, Structure
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
 # Unit of w inside a fit, in 1/T: the middle of the range of sampled poles.

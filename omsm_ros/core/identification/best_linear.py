@@ -13,7 +13,7 @@ import numpy as np
 from scipy import signal
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.finding import NOTE, RESERVATION, Finding
+from omsm_ros.core.calibration.certificate import NOTE, RESERVATION, Finding
 from omsm_ros.core.kinematics.trajectories import MultisinePlan
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray

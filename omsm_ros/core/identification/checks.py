@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, WARNING, Finding
+from omsm_ros.core.calibration.certificate import REJECTS, RESERVATION, WARNING, Finding
 from omsm_ros.core.calibration.intended_use import IntendedUse
 from omsm_ros.core.estimation.covariance import gain_uncertainty_alone
 from omsm_ros.core.identification.covariance_terms import ReferenceLag, inter_sample_delay_bound

@@ -28,20 +28,18 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import (
     CandidateFit,
     Certificate,
+    Finding,
     GainEstimate,
     Origin,
     PartsCompared,
     Residual,
     Response,
     StaticGain,
-    Structure,
     TwoMassModel,
     Validity,
 )
-from omsm_ros.core.calibration.finding import Finding
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.calibration.latency import unresolved_latency
-from omsm_ros.core.estimation.model_order import Candidate
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit
 from omsm_ros.core.estimation.preparation import Prepared, check_axis_steps, check_gain, prepare
@@ -67,7 +65,6 @@ from omsm_ros.core.lti.frequency_response import ResponseLimits, low_frequency_d
 from omsm_ros.core.lti.modes import (
     FITTED,
     TwoMassFit,
-    finite_values,
     fit_two_mass,
     modal_remainder,
     mode_entries,
@@ -271,9 +268,9 @@ def certificate_of(
             use=evidence.use,
         ),
         latency=unresolved_latency(evidence.dynamics.low_frequency_delay),
-        structure=_structure(evidence.model.chosen),
+        structure=evidence.model.chosen.fit.structure,
         candidates=tuple(
-            CandidateFit(_structure(c), c.bic, c.fit.rms) for c in evidence.model.candidates
+            CandidateFit(c.fit.structure, c.bic, c.fit.rms) for c in evidence.model.candidates
         ),
         residual=_residual(evidence),
         response=_response(evidence, table_mass),
@@ -283,11 +280,6 @@ def certificate_of(
         consistency=tuple(_parts(contrast) for contrast in evidence.contrasts),
         noise_covariance=tuple(known.from_noise.ravel().tolist()),
     ).judged(findings)
-
-
-def _structure(candidate: Candidate) -> Structure:
-    structure = candidate.fit.structure
-    return Structure(structure.poles, structure.zeros, structure.delay)
 
 
 def _residual(evidence: IdentificationEvidence) -> Residual:
@@ -323,7 +315,7 @@ def _response(evidence: IdentificationEvidence, table_mass: float | None) -> Res
         ),
         reference_lag_s=None if reference is None else reference.value,
         reference_lag_uncertainty_s=None if reference is None else reference.uncertainty,
-        shape=finite_values(response_features(dynamics, 0.5 / problem.period)),
+        shape=response_features(dynamics, 0.5 / problem.period),
         modes=tuple(mode_entries(dynamics, known.covariance)),
         modal_remainder=modal_remainder(dynamics, known.valid_up_to),
         two_mass=two_mass_model(dynamics, known.covariance, known.valid_up_to, table_mass),

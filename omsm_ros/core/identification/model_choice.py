@@ -20,11 +20,11 @@ from omsm_ros.core.estimation.model_order import (
     identifiable,
     information,
 )
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.linear_algebra import triangle
 
 # χ² that each column must explain to be significant: four sigma.

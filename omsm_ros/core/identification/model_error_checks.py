@@ -12,8 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from omsm_ros.core.calibration.certificate import ModelError, ModelErrors
-from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, Finding
+from omsm_ros.core.calibration.certificate import (
+    REJECTS,
+    RESERVATION,
+    Finding,
+    ModelError,
+    ModelErrors,
+)
 from omsm_ros.core.estimation.covariance import parameter_covariance
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.identification.evidence import IdentificationEvidence

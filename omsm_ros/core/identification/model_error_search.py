@@ -13,12 +13,12 @@ import numpy as np
 
 from omsm_ros.core.estimation.model_order import Candidate, information
 from omsm_ros.core.estimation.model_order import choose as choose_candidate
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.noise import correct_errors_in_variables
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
     CREEP,

@@ -11,7 +11,7 @@ not determine the common scale of masses and stiffnesses, so ``m1`` must be know
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -44,25 +44,6 @@ _RACE_EVALUATIONS = 30
 
 
 @dataclass(frozen=True, slots=True)
-class ModalTerm:
-    """One term of Eq. 8: residue α/m [1/s²], undamped frequency [Hz], damping ratio."""
-
-    residue: float
-    frequency: float
-    damping: float
-
-
-def modal_sum(terms: Sequence[ModalTerm], frequency: ArrayLike) -> ComplexArray:
-    """Return the response of Eq. 8 at ``frequency`` [Hz], of the same shape; not normalised."""
-    s = np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128)
-    response = np.zeros_like(s)
-    for term in terms:
-        omega = 2 * np.pi * term.frequency
-        response = response + term.residue / (s**2 + 2 * term.damping * omega * s + omega**2)
-    return response
-
-
-@dataclass(frozen=True, slots=True)
 class KnownMode:
     """A pole or a conjugate pair, with standard uncertainties.
 
@@ -78,11 +59,16 @@ class KnownMode:
     residue: float | None
     residue_uncertainty: float | None
 
-    def term(self) -> ModalTerm | None:
-        """Return its term of Eq. 8, None for a real pole."""
-        if self.residue is None:
-            return None
-        return ModalTerm(self.residue, self.frequency, self.damping)
+
+def modal_sum(modes: Sequence[KnownMode], frequency: ArrayLike) -> ComplexArray:
+    """Return the response of Eq. 8 at ``frequency`` [Hz], of the same shape; not normalised."""
+    s = np.asarray(2j * np.pi * np.asarray(frequency, np.float64), np.complex128)
+    response = np.zeros_like(s)
+    for mode in modes:
+        if mode.residue is not None:
+            omega = 2 * np.pi * mode.frequency
+            response = response + mode.residue / (s**2 + 2 * mode.damping * omega * s + omega**2)
+    return response
 
 
 def known_modes(dynamics: TransferFunction, covariance: FloatArray) -> tuple[KnownMode, ...]:
@@ -126,12 +112,11 @@ def modal_remainder(dynamics: TransferFunction, up_to: float) -> float | None:
     """
     size = len(dynamics.numerator) + len(dynamics.denominator)
     modes = known_modes(dynamics, np.zeros((size, size)))
-    terms = [term for term in (mode.term() for mode in modes) if term is not None]
-    if not terms:
+    if all(mode.residue is None for mode in modes):
         return None
     lines = np.linspace(0.0, up_to, _LINES)
     whole = replace(dynamics, delay=0.0).normalised().response(lines)
-    return float(np.max(np.abs(whole - modal_sum(terms, lines))) / np.max(np.abs(whole)))
+    return float(np.max(np.abs(whole - modal_sum(modes, lines))) / np.max(np.abs(whole)))
 
 
 def _known(dynamics: TransferFunction, pole: complex, covariance: FloatArray) -> KnownMode:
@@ -331,45 +316,23 @@ def _starts(oscillating: tuple[float, ...], table_mass: float) -> list[FloatArra
     return starts
 
 
-@dataclass(frozen=True)
-class ResponseFeatures:
-    """Salient points of a response [Hz], NaN if there is none below the highest frequency.
+def response_features(dynamics: TransferFunction, up_to: float) -> dict[str, float | None]:
+    """Return the salient points of |G| below ``up_to`` [Hz]; None where there is none.
 
     resonance, resonance_gain: highest peak of the gain;  minimum, minimum_gain: lowest dip
     bandwidth_3db, bandwidth_1_percent: where the gain first differs from 1 by 3 dB and by 1 %
     """
-
-    resonance: float
-    resonance_gain: float
-    minimum: float
-    minimum_gain: float
-    bandwidth_3db: float
-    bandwidth_1_percent: float
-
-
-def response_features(dynamics: TransferFunction, up_to: float) -> ResponseFeatures:
-    """Return the salient points of |G| below ``up_to`` [Hz]."""
     frequency = np.geomspace(1e-3 * up_to, up_to, _SHAPE_LINES)
     gain = np.abs(dynamics.response(frequency)) / abs(dynamics.dc_gain)
-    highest, lowest = _highest_peak(np.log(gain)), _highest_peak(-np.log(gain))
-
-    def point(index: int | None) -> tuple[float, float]:
-        if index is None:
-            return float("nan"), float("nan")
-        return float(frequency[index]), float(gain[index])
-
-    def leaves(inside: float) -> float:
+    found: dict[str, float | None] = {}
+    for name, sign in (("resonance", 1), ("minimum", -1)):
+        peak = _highest_peak(sign * np.log(gain))
+        found[name] = None if peak is None else float(frequency[peak])
+        found[f"{name}_gain"] = None if peak is None else float(gain[peak])
+    for name, inside in (("3db", np.log(10 ** (3 / 20))), ("1_percent", -np.log(0.99))):
         outside = np.flatnonzero(np.abs(np.log(gain)) > inside)
-        return float(frequency[outside[0]]) if len(outside) else float("nan")
-
-    return ResponseFeatures(
-        *point(highest), *point(lowest), leaves(np.log(10 ** (3 / 20))), leaves(-np.log(0.99))
-    )
-
-
-def finite_values(read: ResponseFeatures) -> dict[str, float | None]:
-    """Return the fields of ``read`` as JSON values, None for NaN."""
-    return {name: value if np.isfinite(value) else None for name, value in asdict(read).items()}
+        found[f"bandwidth_{name}"] = float(frequency[outside[0]]) if len(outside) else None
+    return found
 
 
 def _highest_peak(values: FloatArray) -> int | None:

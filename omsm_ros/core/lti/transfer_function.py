@@ -34,6 +34,34 @@ class Mode:
     damping: float
 
 
+@dataclass(frozen=True, slots=True, order=True)
+class Structure:
+    """Number of poles and of zeros, at most as many, and whether there is a delay."""
+
+    poles: int
+    zeros: int
+    delay: bool
+
+    @property
+    def size(self) -> int:
+        """Number of free parameters."""
+        return self.poles + self.zeros + self.delay
+
+    @property
+    def pairs(self) -> int:
+        """Number of second-order sections; an odd pole has a section of its own."""
+        return self.poles // 2
+
+    def contains(self, other: Structure) -> bool:
+        """Return True if ``other`` is a smaller special case of this one."""
+        return (
+            other.size < self.size
+            and other.poles <= self.poles
+            and other.zeros <= self.zeros
+            and other.delay <= self.delay
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class TransferFunction:
     """G(s) with ascending ``numerator`` (m+1,), ``denominator`` (n+1,), m ≤ n, and ``delay`` [s].

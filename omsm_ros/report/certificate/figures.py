@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import CandidateFit, Structure
+from omsm_ros.core.calibration.certificate import CandidateFit
 from omsm_ros.core.estimation.sampled_model import FreeRun, SampledModel
 from omsm_ros.core.identification.fitted_record import (
     EdgeMean,
@@ -21,6 +21,7 @@ from omsm_ros.core.identification.fitted_record import (
     mean_at_edges,
 )
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, FrequencyResponse
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import quantity
 from omsm_ros.report import style
@@ -154,7 +155,7 @@ def order(candidates: Sequence[CandidateFit], chosen: Structure | None) -> Figur
     """Draw the residual of each candidate over its number of parameters."""
     made, grid = style.figure(6.1, 2.7)
     axes = grid[0, 0]
-    size = np.asarray([c.structure.parameters for c in candidates])
+    size = np.asarray([c.structure.size for c in candidates])
     rms = np.asarray([c.rms_m for c in candidates]) / NANOMETRE_M
     if rms.max() > 3 * rms.min() > 0:
         style.logarithmic(axes.yaxis, every=(1.0, 2.0, 5.0))

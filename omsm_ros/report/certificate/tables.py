@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import SCHEMA, Calibration
-from omsm_ros.core.calibration.certificate import CandidateFit, Certificate, Structure
+from omsm_ros.core.calibration.certificate import CandidateFit, Certificate
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.readable import (
     NOTHING,
     count,

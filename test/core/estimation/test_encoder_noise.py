@@ -5,12 +5,12 @@ import pytest
 from scipy import signal
 
 from omsm_ros.core.estimation.model_order import StartingPoints
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.noise import correct_errors_in_variables, smoothed
 from omsm_ros.core.estimation.output_error import evaluated, fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.identify import identify
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER, RAMP, STEP, READING = 1e-3, 5, 20, 9.8e-6, 10e-9

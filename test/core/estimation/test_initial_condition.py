@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.identification.model_choice import has_initial_response
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 
 PERIOD, RATE, SAMPLES, SKIPPED = 1e-3, 2 * np.pi * 50, 4000, 50
 TIME = np.arange(SAMPLES) * PERIOD

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
+from omsm_ros.core.lti.transfer_function import Structure
 
 EVERY = [Structure(n, m, d) for n in range(1, 6) for m in range(n) for d in (False, True)]
 

@@ -17,11 +17,10 @@ from omsm_ros.core.estimation.model_order import (
     information,
     structures,
 )
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.errors import IdentificationError
 from omsm_ros.twin.plant import Plant
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import Problem, close_period, fit
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 
 PERIOD = 1e-3
 RATE = 2 * np.pi * 50

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 
 PERIOD = 1e-3
 

@@ -5,8 +5,18 @@ from dataclasses import replace
 
 import pytest
 
-from omsm_ros.core.calibration.certificate import ACCEPTED, REJECTED, RESERVED, Certificate, Origin
-from omsm_ros.core.calibration.finding import NOTE, REJECTS, RESERVATION, WARNING, Finding
+from omsm_ros.core.calibration.certificate import (
+    ACCEPTED,
+    NOTE,
+    REJECTED,
+    REJECTS,
+    RESERVATION,
+    RESERVED,
+    WARNING,
+    Certificate,
+    Finding,
+    Origin,
+)
 from omsm_ros.core.calibration.intended_use import PAPER_USE
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.evidence import IdentificationEvidence

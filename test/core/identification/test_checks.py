@@ -4,7 +4,7 @@ from itertools import chain
 
 import pytest
 
-from omsm_ros.core.calibration.finding import REJECTS, RESERVATION, WARNING
+from omsm_ros.core.calibration.certificate import REJECTS, RESERVATION, WARNING
 from omsm_ros.core.calibration.intended_use import PAPER_USE, IntendedUse
 from omsm_ros.core.identification.checks import (
     accuracy,

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.finding import RESERVATION
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.calibration.certificate import RESERVATION
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import consistency
@@ -14,6 +14,7 @@ from omsm_ros.core.identification.covariance_terms import contrast_covariance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepPlan
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.residual_diagnostics import (
     HALVES,
     SIZES,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
-from omsm_ros.core.estimation.model_structure import ScaledStructure, Structure
+from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
@@ -15,7 +15,7 @@ from omsm_ros.core.identification.model_choice import choose_model
 from omsm_ros.core.identification.residual_tests import follows_beyond
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record

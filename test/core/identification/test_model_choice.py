@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.estimation.model_order import Candidate, StartingPoints, information
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import ChosenModel, keep_better, rechosen
+from omsm_ros.core.lti.transfer_function import Structure
 
 from .recorded_motions import record_of, recorded
 

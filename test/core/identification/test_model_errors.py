@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.calibration.finding import REJECTS
-from omsm_ros.core.estimation.model_structure import Structure
+from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import agreement, dynamic_gain_finding, independence
@@ -24,7 +23,7 @@ from omsm_ros.core.identification.model_error_search import (
 from omsm_ros.core.identification.residual_tests import response_difference
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
     CREEP,

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.disturbance_catalogue import CATALOGUE, SIZES
 from benchmarks.named_causes import RIGHT, UNKNOWN, WRONG, judged
-from omsm_ros.core.calibration.finding import RESERVATION, Finding
+from omsm_ros.core.calibration.certificate import RESERVATION, Finding
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from late_steps import LATE, NOISE, STEPS, TIME, late_record
 
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.model_choice import model_from_start
 from omsm_ros.core.identification.model_error_search import search_model_errors
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.families import DRIFT, PERIODIC, VIBRATION
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 

@@ -8,7 +8,6 @@ from scipy import signal, stats
 
 from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.verification import check_path
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.residual_tests import (
@@ -20,7 +19,7 @@ from omsm_ros.core.identification.residual_tests import (
 )
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
 from omsm_ros.core.lti.frequency_response import frequency_response
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.twin.plant import PAPER_EQ_12, Plant
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.calibration.finding import REJECTS
+from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import lead

@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
-from omsm_ros.core.lti.modes import (
-    FITTED,
-    TwoMass,
-    finite_values,
-    fit_two_mass,
-    oscillations,
-    response_features,
-)
+from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass, oscillations, response_features
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import DataError, IdentificationError
 from omsm_ros.twin.plant import PAPER_EQ_12
@@ -132,15 +125,15 @@ def test_one_mode_cannot_be_two_masses():
 
 def test_the_salient_points_of_eq_12():
     read = response_features(PAPER_EQ_12.normalised(), 2000.0)
-    assert read.minimum == pytest.approx(347, abs=3)
-    assert read.minimum_gain == pytest.approx(0.882 / PAPER_EQ_12.dc_gain, abs=2e-3)
-    assert read.resonance == pytest.approx(850, abs=5)
-    assert read.resonance_gain == pytest.approx(5.4 / PAPER_EQ_12.dc_gain, abs=0.1)
-    assert 80 < read.bandwidth_1_percent < 100
+    assert read["minimum"] == pytest.approx(347, abs=3)
+    assert read["minimum_gain"] == pytest.approx(0.882 / PAPER_EQ_12.dc_gain, abs=2e-3)
+    assert read["resonance"] == pytest.approx(850, abs=5)
+    assert read["resonance_gain"] == pytest.approx(5.4 / PAPER_EQ_12.dc_gain, abs=0.1)
+    assert 80 < read["bandwidth_1_percent"] < 100
 
 
 def test_below_nyquist_eq_12_has_no_resonance():
-    values = finite_values(response_features(PAPER_EQ_12.normalised(), 500.0))
+    values = response_features(PAPER_EQ_12.normalised(), 500.0)
     assert values["resonance"] is None
     assert values["minimum"] == pytest.approx(347, abs=3)
 
@@ -149,9 +142,9 @@ def test_the_dip_of_a_driven_mass_is_where_the_other_absorbs():
     """However far the gain falls beyond the modes."""
     light = TwoMass(m1=10.0, m2=2.0, k1=8e6, k2=1.6e6, c1=900.0, c2=6.0)
     read = response_features(light.collocated(), 500.0)
-    assert read.minimum == pytest.approx(np.sqrt(light.k2 / light.m2) / (2 * np.pi), rel=2e-3)
+    assert read["minimum"] == pytest.approx(np.sqrt(light.k2 / light.m2) / (2 * np.pi), rel=2e-3)
     modes = light.collocated().modes()
-    assert read.resonance == pytest.approx(modes[0].frequency, rel=0.01)
+    assert read["resonance"] == pytest.approx(modes[0].frequency, rel=0.01)
 
 
 def test_a_covariance_that_rounding_made_indefinite_is_read_all_the_same():

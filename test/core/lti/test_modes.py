@@ -8,12 +8,18 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from omsm_ros.core.lti.modes import ModalTerm, known_modes, modal_remainder, modal_sum, mode_entries
+from omsm_ros.core.lti.modes import KnownMode, known_modes, modal_remainder, modal_sum, mode_entries
 from omsm_ros.core.lti.transfer_function import TransferFunction
 
 multiply, add = np.polynomial.polynomial.polymul, np.polynomial.polynomial.polyadd
 PAIR_HZ, DAMPING, REAL_HZ = 120.0, 0.2, 900.0
-TERMS = (ModalTerm(2e4, 40.0, 0.03), ModalTerm(-5e5, 150.0, 0.02))
+
+
+def _mode(residue: float, frequency: float, damping: float) -> KnownMode:
+    return KnownMode(frequency, 0.0, damping, 0.0, residue, 0.0)
+
+
+TERMS = (_mode(2e4, 40.0, 0.03), _mode(-5e5, 150.0, 0.02))
 
 
 def section(term):
@@ -133,9 +139,9 @@ def test_the_scale_of_the_response_does_not_count(identified):
 
 def test_what_the_terms_leave_is_the_real_pole():
     """One pair and one real pole, parallel: the real pole's share of G(0) is left at 0 Hz."""
-    term, rate, share = ModalTerm(1.0, 40.0, 0.1), 2 * np.pi * 300.0, 0.1
+    term, rate, share = _mode(1.0, 40.0, 0.1), 2 * np.pi * 300.0, 0.1
     omega = 2 * np.pi * term.frequency
-    pair = ModalTerm((1 - share) * omega**2, term.frequency, term.damping)
+    pair = _mode((1 - share) * omega**2, term.frequency, term.damping)
     numerator = add(multiply([pair.residue], [1.0, 1 / rate]), share * section(term))
     both = TransferFunction.from_ascending(
         numerator, multiply(section(term), [1.0, 1 / rate]), delay=1e-3

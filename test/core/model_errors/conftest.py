@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.kinematics.trajectories import StepTest
+from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.streams.motion_record import MotionRecord
 

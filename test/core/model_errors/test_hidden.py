@@ -7,9 +7,8 @@ import pytest
 from scipy import signal, stats
 
 from omsm_ros.core.calibration.intended_use import PAPER_USE
-from omsm_ros.core.estimation.model_structure import Structure
 from omsm_ros.core.estimation.output_error import fit
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.core.model_errors.families import CREEP, MODE, STIFFENING
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM
 from omsm_ros.core.model_errors.undetected import (

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.calibration.certificate import CandidateFit, Structure
+from omsm_ros.core.calibration.certificate import CandidateFit
 from omsm_ros.core.lti.frequency_response import FrequencyResponse
-from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
 from omsm_ros.report.certificate import figures as certificate_figures
 
 
