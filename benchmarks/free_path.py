@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.against_truth import band_held
+from benchmarks.recorded import record_from_arrays
 from benchmarks.row import Row, at_most
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Chirp, Motion
@@ -77,4 +78,4 @@ def rows(full: bool) -> Iterator[Row]:
 def _recorded(seed: int, motion: Motion, plant: Plant, part: slice) -> MotionRecord:
     made = record(Cell(plant=plant, seed=seed), motion, Flat())
     whole = assemble([made.axes], [made.distance])
-    return MotionRecord.from_arrays(whole.sample_period, whole.z[part], whole.distance[part])
+    return record_from_arrays(whole.sample_period, whole.z[part], whole.distance[part])

@@ -13,6 +13,7 @@ from scipy import signal
 
 from benchmarks.against_truth import band_held, coverage, rejected
 from benchmarks.cramer_rao import response_bounds
+from benchmarks.recorded import record_from_arrays
 from benchmarks.row import Row, at_least, at_most, shown
 from benchmarks.twin_motions import respond
 from omsm_ros.core.calibration.calibration import Calibration
@@ -179,7 +180,7 @@ def coloured(runs: int) -> list[Row]:
         extra = extra + 100e-9 / 60 * np.arange(n) * clean.sample_period
         distance = clean.distance + extra + PAPER_STATIC_GAIN * played(clean.z, 40e-9)
         distance[rng.random(n) < 0.05] = np.nan
-        return MotionRecord.from_arrays(clean.sample_period, clean.z, distance)
+        return record_from_arrays(clean.sample_period, clean.z, distance)
 
     seeds = range(FIRST_COLOURED_SEED, FIRST_COLOURED_SEED + runs)
     found = monte_carlo(seeds, spoiled, Plant().dynamics)

@@ -23,10 +23,11 @@ from pathlib import Path
 
 import numpy as np
 from scipy import io as scipy_io
-from scipy import linalg
+from scipy import linalg, signal
 
 from benchmarks.row import Row, at_least, at_most, shown
 from omsm_ros import cli
+from omsm_ros.core.estimation.parallel_sections import ParallelSections
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.estimation.sampled_model import free_run
 from omsm_ros.core.identification.sampled_identification import identify_samples
@@ -85,10 +86,29 @@ def ours(command: FloatArray, seen: FloatArray, order: int, period: float) -> St
             cli.main(["identify", str(table), *(str(a) for a in arguments)])
         # A rejected model has another file name.
         (path,) = Path(folder).glob("model*.json")
-        system = load_model(path).sections.to_control()
+        a, b, c, d = _state_space(load_model(path).sections)
     # One more constant state for the operating point.
-    constant = linalg.block_diag(system.A, 1.0)
-    return constant, np.vstack([system.B, [[0.0]]]), np.hstack([system.C, [[1.0]]]), system.D
+    return linalg.block_diag(a, 1.0), np.vstack([b, [[0.0]]]), np.hstack([c, [[1.0]]]), d
+
+
+def _state_space(sections: ParallelSections) -> StateSpace:
+    """Return sections of one held input, and their delay, as one state space."""
+    parts = []
+    for (d1, d2), (b0, b1) in zip(sections.denominators, sections.numerators[0], strict=True):
+        down = np.trim_zeros([d2, d1, 1.0], "f")
+        system = signal.tf2ss([b1, b0][-len(down) :], down)
+        parts.append(signal.cont2discrete(system, sections.period, "bilinear")[:4])
+    late = round(float(sections.delays[0]) / sections.period)
+    a = linalg.block_diag(*(p[0] for p in parts), np.eye(late, k=-1))
+    b = np.concatenate([np.zeros((0, 1)), *(p[1] for p in parts)])
+    c = np.concatenate([np.zeros((1, 0)), *(p[2] for p in parts)], axis=1)
+    d = np.reshape(sections.direct + sum(p[3].item() for p in parts), (1, 1))
+    if not late:
+        return a, b, c, d
+    # The last of the delayed inputs drives the sections.
+    a[: len(b), -1:], pulse = b, np.zeros((len(a), 1))
+    pulse[len(b)] = 1.0
+    return a, pulse, np.hstack([c, np.zeros((1, late - 1)), d]), np.zeros((1, 1))
 
 
 def score(method: Method, record: Record, order: int) -> float:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 10e-9
 STEPS = StepTest()
@@ -15,4 +15,4 @@ def late_record(added, seed=1):
     """With ``added`` (n,) [m] in the readings."""
     random = np.random.default_rng(seed)
     seen = -LATE + added + random.normal(0, NOISE, len(TIME))
-    return MotionRecord.from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
+    return record_from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)

@@ -14,7 +14,6 @@ h1 = (h/T - 1)/s, h0 = h - h1.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -24,10 +23,6 @@ from omsm_ros.core.estimation.output_error import close_period
 from omsm_ros.core.lti.frequency_response import Band
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError
-
-if TYPE_CHECKING:
-    import control
 
 BAND_LIMITED, ZERO_ORDER, FIRST_ORDER = "band-limited", "zero-order", "first-order"
 HOLDS = (BAND_LIMITED, ZERO_ORDER, FIRST_ORDER)
@@ -204,59 +199,6 @@ class ParallelSections:
             up = polynomial.polyadd(up, polynomial.polymul(np.trim_zeros(section, "b"), others))
         up = np.trim_zeros(up, "b")
         return TransferFunction(up if len(up) else np.zeros(1), down, float(self.delays[input]))
-
-    def to_control(self, delay_order: int = 3) -> control.StateSpace:
-        """Return the model for python-control: sampled for a held input, else continuous.
-
-        A delay of a continuous one becomes a Padé approximant of ``delay_order``. Raises
-        ConfigurationError for a delay_order that is not positive.
-        """
-        import control  # imported here, because it takes a second to load
-
-        if delay_order < 1:
-            raise ConfigurationError("lti.delay_order", order=delay_order)
-        step = 0 if self.hold == BAND_LIMITED else self.period
-        columns = [self._column(input, step) for input in range(self.inputs)]
-        late = [self._delay(delay, step, delay_order) for delay in self.delays]
-        joined = control.append(*(c * d for c, d in zip(columns, late, strict=True)))
-        nothing = np.zeros((0, 0))
-        total = np.ones((1, self.inputs))
-        return (
-            control.ss(nothing, np.zeros((0, self.inputs)), np.zeros((1, 0)), total, step) * joined
-        )
-
-    def _column(self, input: int, step: float) -> control.StateSpace:
-        """Return the state space of one input, without its delay: blocks of one or two states."""
-        import control
-
-        size, place = self.order, 0
-        a, b, c = np.zeros((size, size)), np.zeros((size, 1)), np.zeros((1, size))
-        for (d1, d2), (b0, b1) in zip(self.denominators, self.numerators[input], strict=True):
-            states = 2 if d2 > 0 else 1
-            part = slice(place, place + states)
-            # The second state is the rate of the first over that of the pair, so both are alike.
-            rate = d2**-0.5 if d2 > 0 else 1 / d1
-            a[part, part] = [[0.0, rate], [-rate, -d1 * rate**2]] if d2 > 0 else [[-rate]]
-            b[part.stop - 1, 0] = rate
-            c[0, part] = [b0, b1 * rate][:states]
-            place = part.stop
-        d = np.full((1, 1), self.direct[input])
-        if not step:
-            return control.ss(a, b, c, d)
-        # The bilinear transform is exact, because w is one.
-        return control.ss(*signal.cont2discrete((a, b, c, d), step, "bilinear")[:4], step)
-
-    @staticmethod
-    def _delay(delay: float, step: float, order: int) -> control.StateSpace:
-        import control
-
-        samples = round(delay / step) if step else 0
-        if not step and delay:
-            # Made for a second and scaled: the polynomials of a short delay have no digits.
-            unit = control.ss(control.tf(*control.pade(1.0, order)))
-            return control.ss(unit.A / delay, unit.B / delay, unit.C, unit.D)
-        first, last = np.eye(samples, 1), np.eye(1, samples, k=max(samples - 1, 0))
-        return control.ss(np.eye(samples, k=-1), first, last, [[float(samples == 0)]], step)
 
 
 def variable(hold: str, frequency: FloatArray) -> ComplexArray:

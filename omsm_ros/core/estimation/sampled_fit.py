@@ -158,9 +158,8 @@ class SectionsFit:
     def model(self, period: float = 1.0, covariance: FloatArray | None = None) -> ParallelSections:
         """Return the fit as a model in seconds."""
         unit = RATE / period
-        pairs = self.sections[:, 1] > 0
-        ups = np.zeros((len(self.linear), len(pairs), 2))
-        ups[:, np.column_stack([np.full(len(pairs), True), pairs])] = self.linear[:, 1:]
+        ups = np.zeros((len(self.linear), *self.sections.shape))
+        ups[:, _numerator_places(self.sections)] = self.linear[:, 1:]
         return ParallelSections(
             hold=self.problem.hold,
             period=period,
@@ -217,19 +216,22 @@ class SectionsProblem:
             np.concatenate([ends[1], np.full(count, longest)]),
         )
 
-    def _drives(self, one: _Spectra, nonlinear: FloatArray, order: int) -> ComplexArray:
+    def _columns(
+        self, one: _Spectra, nonlinear: FloatArray, order: int
+    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+        """Return the delayed inputs (m, k) of a record, the basis (1 + n, k), and both in time."""
         late = self.late(nonlinear, order)[:, np.newaxis]
-        return one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
+        drives = one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
+        basis = basis_of(sections_of(nonlinear, order), one.w)
+        rows = one.in_time((drives[:, np.newaxis] * basis).reshape(-1, len(one.w)))
+        return drives, basis, rows
 
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
         sections = sections_of(nonlinear, order)
         rows, targets, frees = [], [], []
         for one in self.spectra:
-            basis = np.concatenate([np.ones((1, len(one.w))), basis_of(sections, one.w)])
-            drives = self._drives(one, nonlinear, order)
-            columns = one.in_time((drives[:, np.newaxis] * basis).reshape(-1, len(one.w)))
-            free = one.free(sections)
+            columns, free = self._columns(one, nonlinear, order)[2], one.free(sections)
             rows.append(columns - (columns @ free) @ free.T)
             targets.append(one.output - free @ (free.T @ one.output))
             frees.append(free)
@@ -244,34 +246,28 @@ class SectionsProblem:
         found = (linear / scale).reshape(self.inputs, -1)
 
         def derivative() -> FloatArray:
-            slopes = self.slopes(nonlinear, order, found, frees)
-            return np.asarray(((slopes @ every.T) @ inverse @ every - slopes).T)
+            parts = zip(self.spectra, frees, strict=True)
+            slopes = [self._slopes(*part, nonlinear, order, found) for part in parts]
+            every_slope = np.concatenate(slopes, axis=1)
+            return np.asarray(((every_slope @ every.T) @ inverse @ every - every_slope).T)
 
         return Projection(nonlinear, target - linear @ every, np.ravel(found), derivative)
 
-    def slopes(
-        self, nonlinear: FloatArray, order: int, linear: FloatArray, frees: Sequence[FloatArray]
+    def _slopes(
+        self, one: _Spectra, free: FloatArray, nonlinear: FloatArray, order: int, linear: FloatArray
     ) -> FloatArray:
-        """Return d output / d nonlinear, without what the initial states take up, (p, places)."""
-        sections, every = sections_of(nonlinear, order), []
-        for one, free in zip(self.spectra, frees, strict=True):
-            drives = self._drives(one, nonlinear, order)
-            terms = (linear[:, 1:].T @ drives) * basis_of(sections, one.w)
-            first, second, place = [], [], 0
-            for d1, d2 in sections:
-                size = 2 if d2 > 0 else 1
-                part = np.sum(terms[place : place + size], axis=0)
-                part = part * one.w / (1 + d1 * one.w + d2 * one.w**2)
-                first.append(-d1 * part)
-                second += [-d2 * part * one.w] if d2 > 0 else []
-                place += size
-            late = []
-            if self._free_delays:
-                basis = np.concatenate([np.ones((1, len(one.w))), basis_of(sections, one.w)])
-                late = list(-1j * one.angle / RATE * (linear @ basis) * drives)
-            rows = one.in_time(np.reshape([*first, *second, *late], (-1, len(one.w))))
-            every.append(rows - (rows @ free) @ free.T)
-        return np.concatenate(every, axis=1)
+        """Return d output / d nonlinear of a record (p, places), orthogonal to ``free``."""
+        drives, basis, _ = self._columns(one, nonlinear, order)
+        sections, terms = sections_of(nonlinear, order), (linear[:, 1:].T @ drives) * basis[1:]
+        firsts = np.cumsum([0, *(1 + (sections[:, 1] > 0))])[:-1]
+        parts = np.add.reduceat(terms, firsts, axis=0) if len(sections) else terms
+        parts = parts * basis[1 + firsts] * one.w
+        second = sections[:, 1] > 0
+        rows = [-sections[:, :1] * parts, -sections[second, 1:] * parts[second] * one.w]
+        if self._free_delays:
+            rows.append(-1j * one.angle / RATE * (linear @ basis) * drives)
+        found = one.in_time(np.concatenate(rows))
+        return np.asarray(found - (found @ free) @ free.T)
 
     def fit(
         self, order: int, starts: Sequence[FloatArray], evaluations: int = 40, race: int = 5
@@ -321,24 +317,20 @@ class SectionsProblem:
         single = np.full(order % 2, -np.sqrt(low * high), np.complex128)
         return np.concatenate([upper, np.conj(upper), single])
 
-    def covariance(self, fitted: SectionsFit) -> FloatArray:
-        """Return the covariance (p, p) of the parameters of ``fitted.model()``, scaled by RATE.
+    def covariance(self, fitted: SectionsFit, period: float) -> FloatArray:
+        """Return the covariance (p, p) of the parameters of ``fitted.model(period)``.
 
         It is the sandwich of the least squares in coloured noise, with the autocovariance of the
         residual of each record.
         """
-        order, size = fitted.order, fitted.linear.size
-        sections, start = fitted.sections, 0
+        order, size, start = fitted.order, fitted.linear.size, 0
         gram = np.zeros((size + len(fitted.nonlinear), size + len(fitted.nonlinear)))
         score = np.zeros_like(gram)
         for one in self.spectra:
-            free = one.free(sections)
-            basis = np.concatenate([np.ones((1, len(one.w))), basis_of(sections, one.w)])
-            drives = self._drives(one, fitted.nonlinear, order)
-            rows = one.in_time((drives[:, np.newaxis] * basis).reshape(size, -1))
-            alone = replace(self, records=[one.record])
-            by_nonlinear = alone.slopes(fitted.nonlinear, order, fitted.linear, [free])
-            rows = np.concatenate([rows - (rows @ free) @ free.T, by_nonlinear])
+            free = one.free(fitted.sections)
+            rows = self._columns(one, fitted.nonlinear, order)[2]
+            slopes = self._slopes(one, free, fitted.nonlinear, order, fitted.linear)
+            rows = np.concatenate([rows - (rows @ free) @ free.T, slopes])
             residual = fitted.residual[start : start + len(one.places)]
             start += len(one.places)
             spare = len(residual) / max(len(residual) - len(rows) - free.shape[1], 1)
@@ -348,38 +340,30 @@ class SectionsProblem:
             noise = noise_spectrum(residual * np.sqrt(spare), length)
             gram += rows @ rows.T
             score += weighted_gram(on_grid, length, noise)
-        return self._of_coefficients(fitted, _sandwich(gram, score))
-
-    def _of_coefficients(self, fitted: SectionsFit, covariance: FloatArray) -> FloatArray:
-        """Return a covariance of linear and nonlinear parameters as one of the coefficients."""
-        size, sections = fitted.linear.size, fitted.sections
-        count, inputs = len(sections), self.inputs
-        each = 1 + 2 * count
-        turn = np.zeros((inputs * (each + 1) + 2 * count, len(covariance)))
-        places = [0] + [
-            1 + 2 * i + j for i, (_, d2) in enumerate(sections) for j in range(1 + (d2 > 0))
-        ]
-        for input in range(inputs):
-            for column, place in enumerate(places):
-                turn[input * each + place, input * len(places) + column] = 1.0
-        for i, (d1, d2) in enumerate(sections):
-            turn[inputs * each + 2 * i, size + i] = d1
-            if d2 > 0:
-                turn[inputs * each + 2 * i + 1, size + count + i] = d2
-        if self._free_delays:
-            for input in range(inputs):
-                turn[-inputs + input, size + fitted.order + input] = 1.0
-        found = turn @ covariance @ turn.T
+        turn = self._coefficient_jacobian(fitted, RATE / period)
+        found = turn @ _sandwich(gram, score) @ turn.T
         return np.asarray(0.5 * (found + found.T))
 
+    def _coefficient_jacobian(self, fitted: SectionsFit, unit: float) -> FloatArray:
+        """Return d(parameters of the model)/d(linear, nonlinear); unit: of w [1/s]."""
+        size, sections, inputs = fitted.linear.size, fitted.sections, self.inputs
+        count, pairs = len(sections), int(np.sum(sections[:, 1] > 0))
+        numerators = inputs * (1 + 2 * count)
+        turn = np.zeros((numerators + 2 * count + inputs, size + len(fitted.nonlinear)))
+        scale = np.append(1.0, np.tile([1.0, 1 / unit], count))
+        kept = np.append(True, _numerator_places(sections))
+        turn[np.flatnonzero(np.tile(kept, inputs)), np.arange(size)] = np.tile(scale[kept], inputs)
+        down = np.arange(numerators, numerators + 2 * count, 2)
+        turn[down, size + np.arange(count)] = sections[:, 0] / unit
+        turn[down[:pairs] + 1, size + count + np.arange(pairs)] = sections[:pairs, 1] / unit**2
+        if self._free_delays:
+            turn[-inputs:, size + fitted.order :] = np.eye(inputs) / unit
+        return turn
 
-def in_seconds(covariance: FloatArray, inputs: int, sections: int, period: float) -> FloatArray:
-    """Return a covariance of scaled coefficients as one of those of a model in seconds."""
-    unit = RATE / period
-    each = np.concatenate([[1.0], np.tile([1.0, 1 / unit], sections)])
-    down = np.tile([1 / unit, unit**-2], sections)
-    scale = np.concatenate([np.tile(each, inputs), down, np.full(inputs, 1 / unit)])
-    return covariance * np.outer(scale, scale)
+
+def _numerator_places(sections: FloatArray) -> BoolArray:
+    """Return which of b0 and b1 each section has, (k, 2): a single pole has no b1."""
+    return np.column_stack([np.full(len(sections), True), sections[:, 1] > 0])
 
 
 def sections_of(nonlinear: FloatArray, order: int) -> FloatArray:
@@ -393,8 +377,11 @@ def sections_of(nonlinear: FloatArray, order: int) -> FloatArray:
 
 
 def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
-    """Return 1/S and w/S of each section S at ``w`` (k,), without w/S of single poles, (n, k)."""
-    rows = []
+    """Return 1, then 1/S and w/S of each section S at ``w`` (k,), (1 + n, k).
+
+    There is no w/S of a single pole.
+    """
+    rows = [np.ones_like(w)]
     for d1, d2 in sections:
         rows.append(1 / (1 + d1 * w + d2 * w * w))
         rows += [w * rows[-1]] if d2 > 0 else []

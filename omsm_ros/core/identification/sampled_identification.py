@@ -24,7 +24,7 @@ from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.estimation.impulse_response import impulse_response
 from omsm_ros.core.estimation.parallel_sections import HOLDS, ParallelSections
 from omsm_ros.core.estimation.sampled_choice import SampledCandidate, SampledChoice, choose_sampled
-from omsm_ros.core.estimation.sampled_fit import SampledRecord, in_seconds
+from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.estimation.sampled_model import (
     SampledModel,
     check_inputs,
@@ -155,9 +155,7 @@ def _checked(record: SampledRecord) -> SampledRecord:
 
 def _sections(candidate: SampledCandidate, period: float) -> ParallelSections:
     fitted = candidate.fit
-    covariance = fitted.problem.covariance(fitted)
-    count = len(fitted.sections)
-    return fitted.model(period, in_seconds(covariance, fitted.problem.inputs, count, period))
+    return fitted.model(period, fitted.problem.covariance(fitted, period))
 
 
 def _inflated_to_free_choice(

@@ -131,11 +131,6 @@ class ModelErrorFamily:
 
         return cls(name, parameters, trials, part, width)
 
-    @property
-    def columns(self) -> FloatArray:
-        """Columns of all terms, (n, terms · c)."""
-        return self.part(0, len(self.parameters))
-
     def term(self, index: int) -> ModelErrorTerm:
         """Return the term at ``index``."""
         damping = 0.0 if self.dampings is None else float(self.dampings[index])

@@ -84,37 +84,6 @@ class MotionRecord:
     def __len__(self) -> int:
         return len(self.z)
 
-    @classmethod
-    def from_arrays(
-        cls,
-        sample_period: float,
-        z: FloatArray,
-        distance: FloatArray,
-        ok: BoolArray | None = None,
-        reference: FloatArray | None = None,
-    ) -> MotionRecord:
-        """Return a record of arrays (n,); NaN in any channel marks a lost sample."""
-        z = np.asarray(z, np.float64)
-        distance = np.asarray(distance, np.float64)
-        known = np.isfinite(z)
-        usable = known & np.isfinite(distance)
-        if ok is not None:
-            usable &= ok
-        return cls(
-            sample_period=sample_period,
-            z=_filled(z, known),
-            distance=distance,
-            ok=usable,
-            reference=None if reference is None else np.asarray(reference, np.float64),
-            z_lost=None if np.all(known) else ~known,
-            counts={
-                "received": len(z),
-                "missing_axis": int(np.sum(~known)),
-                "not_ok": int(np.sum(known & ~usable)),
-                "paired": int(np.sum(usable)),
-            },
-        )
-
 
 def assemble(
     axes: Sequence[AxisBlock],

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.preparation import check_axis_steps, prepare
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError
 
 PERIOD, FINER, REST, RAMP, NOISE = 1e-3, 5, 300, 50, 10e-9
@@ -47,7 +47,7 @@ def record_of(z, step=0.0, machine=LAG, noise=NOISE, backlash=0.0):
     seen = signal.lsim(signal.TransferFunction([1.0], machine), fine, time)[1][::FINER]
     distance = 40e-6 - behind(seen, backlash) + np.random.default_rng(3).normal(0, noise, len(z))
     rounded = np.round(z / step) * step if step else z
-    return MotionRecord.from_arrays(PERIOD, rounded, distance)
+    return record_from_arrays(PERIOD, rounded, distance)
 
 
 @pytest.mark.parametrize("machine", [LAG, np.polymul(LAG, MODE)])

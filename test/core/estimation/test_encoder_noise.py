@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.model_order import StartingPoints
 from omsm_ros.core.estimation.noise import correct_errors_in_variables, smoothed
 from omsm_ros.core.estimation.output_error import evaluated, fit
@@ -11,7 +12,6 @@ from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.lti.transfer_function import Structure
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER, RAMP, STEP, READING = 1e-3, 5, 20, 9.8e-6, 10e-9
 # A lightly damped mode of 5 %, which amplifies white noise of the axis.
@@ -42,7 +42,7 @@ def record_of(moved, noise, seed=2):
     """Return readings of axis and probe for ``moved``; noise: of the encoder alone [m]."""
     rng = np.random.default_rng(seed)
     z = moved + rng.normal(0, 1, len(moved)) * noise
-    return MotionRecord.from_arrays(
+    return record_from_arrays(
         PERIOD, z, 40e-6 - seen_by_probe(moved) + rng.normal(0, READING, len(moved))
     )
 

@@ -16,7 +16,7 @@ from omsm_ros.core.estimation.sampled_choice import (
     choose_sampled,
     simplest_undominated,
 )
-from omsm_ros.core.estimation.sampled_fit import SampledRecord, SectionsProblem, in_seconds
+from omsm_ros.core.estimation.sampled_fit import SampledRecord, SectionsProblem
 from omsm_ros.core.identification.sampled_identification import (
     identify_samples,
     sampled_certificate,
@@ -87,7 +87,7 @@ def test_stated_uncertainties_hold_over_many_records(colour):
         problem = SectionsProblem(records, "zero-order", np.zeros(2, int))
         roots = 2 * (np.roots(a) - 1) / (np.roots(a) + 1) / 0.5
         fitted = problem.fit(2, [problem.nonlinear_of(roots, np.zeros(2))])
-        model = fitted.model(PERIOD, in_seconds(problem.covariance(fitted), 2, 1, PERIOD))
+        model = fitted.model(PERIOD, problem.covariance(fitted, PERIOD))
         for input, sign in ((0, 1), (1, -1)):
             error = np.log(sign * model.response(LINES)[input] / true)
             band = model.band(LINES, input)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.output_error import close_period
 from omsm_ros.core.estimation.preparation import faded_to_stationary, input_bandwidth, prepare
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError, StepTestError
 
 TIME = np.arange(round(StepTest().duration / 1e-3)) * 1e-3
@@ -18,7 +18,7 @@ def record_of(extra=0.0, gain=1.0, lost=None, seed=1):
     distance = 3e-6 - gain * STEPS + rng.normal(0, 1e-8, len(STEPS)) + extra
     if lost is not None:
         distance[lost] = np.nan
-    return MotionRecord.from_arrays(1e-3, STEPS + rng.normal(0, 4e-10, len(STEPS)), distance)
+    return record_from_arrays(1e-3, STEPS + rng.normal(0, 4e-10, len(STEPS)), distance)
 
 
 def test_single_spikes_are_taken_out_and_counted():
@@ -41,7 +41,7 @@ def test_single_positions_that_stand_apart_are_bridged(off):
     places = [700, (edge.start + edge.stop) // 2, edge.start - 3, 9000]
     wrong = record.z.copy()
     wrong[places] += off
-    found = prepare(MotionRecord.from_arrays(1e-3, wrong, record.distance), "encoder")
+    found = prepare(record_from_arrays(1e-3, wrong, record.distance), "encoder")
     assert found.axis_spikes == len(places)
     whole = prepare(record, "encoder")
     assert whole.axis_spikes == 0
@@ -55,9 +55,7 @@ def test_a_motion_of_nothing_but_pulses_is_left_as_it_is():
     z = np.zeros(5000)
     z[500::500] = 1e-5
     with pytest.raises(IdentificationError, match=r"per travel of the axis|does not change"):
-        prepare(
-            MotionRecord.from_arrays(1e-3, z, -1e-3 * z + 1e-9 * np.sin(TIME[:5000])), "encoder"
-        )
+        prepare(record_from_arrays(1e-3, z, -1e-3 * z + 1e-9 * np.sin(TIME[:5000])), "encoder")
 
 
 def test_lost_samples_are_not_used():
@@ -69,7 +67,7 @@ def test_lost_samples_are_not_used():
 def test_after_a_gap_of_the_encoder_the_response_settles_first():
     z = STEPS.copy()
     z[1000:1030] = np.nan  # the second edge
-    prepared = prepare(MotionRecord.from_arrays(1e-3, z, -STEPS + 1e-9 * np.sin(TIME)), "encoder")
+    prepared = prepare(record_from_arrays(1e-3, z, -STEPS + 1e-9 * np.sin(TIME)), "encoder")
     assert not np.any(prepared.problem.used[1000:1080])
     assert prepared.problem.used[1090]
     assert len(prepared.steps.edges) == 19
@@ -92,7 +90,7 @@ def test_content_is_counted_by_the_energy_of_the_velocity(share, expected):
 def test_a_record_beyond_a_gigabyte_is_refused_before_it_is_fitted():
     z = np.zeros(800_001)
     with pytest.raises(StepTestError, match=r"800001 samples .* 800000; record a shorter test"):
-        prepare(MotionRecord.from_arrays(1e-3, z, z), "encoder")
+        prepare(record_from_arrays(1e-3, z, z), "encoder")
 
 
 def test_the_probes_gain_must_be_plausible():
@@ -102,7 +100,7 @@ def test_the_probes_gain_must_be_plausible():
 
 
 def test_a_quantised_probe_is_not_taken_for_a_clipped_one():
-    coarse = MotionRecord.from_arrays(1e-3, STEPS, np.round(-STEPS / 1e-7) * 1e-7)
+    coarse = record_from_arrays(1e-3, STEPS, np.round(-STEPS / 1e-7) * 1e-7)
     assert prepare(coarse, "encoder").problem.used.any()
 
 
@@ -116,7 +114,7 @@ def test_a_motion_that_breaks_off_ends_at_rest_and_without_new_content():
     frequency, period, samples = 10.3, 1e-3, 20_000
     z = 20e-6 * np.sin(2 * np.pi * frequency * period * np.arange(samples) + 0.3)
     distance = np.random.default_rng(1).normal(-z, 1e-8)
-    problem = prepare(MotionRecord.from_arrays(period, z, distance), "encoder").problem
+    problem = prepare(record_from_arrays(period, z, distance), "encoder").problem
     assert not np.any(problem.used[:499])
     assert not np.any(problem.used[-499:])
     assert np.mean(problem.used) > 0.94
@@ -154,4 +152,4 @@ def test_a_motion_too_small_to_square_has_the_lowest_content() -> None:
 def test_a_distance_that_stands_still_next_to_a_sweep_is_refused():
     z = Chirp().positions(np.arange(8000) * 1e-3).z
     with pytest.raises(IdentificationError, match=r"does not change .* probe is connected"):
-        prepare(MotionRecord.from_arrays(1e-3, z, np.full(8000, 3e-6)), "encoder")
+        prepare(record_from_arrays(1e-3, z, np.full(8000, 3e-6)), "encoder")

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
 from omsm_ros.core.estimation.steps import find_steps
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, STEP_M, LAG_S = 1e-3, 50e-9, 0.34e-3
 RNG = np.random.default_rng(5)
@@ -57,7 +57,7 @@ def recorded(seed):
     height, start = 0.983 + rng.uniform(0, 0.01), rng.uniform(0, STEP_M)
     z = height * test.positions(time).z + rng.normal(0, 0.3e-9, len(time))
     seen = start + height * test.positions(time - LAG_S).z + rng.normal(0, 1e-9, len(time))
-    return MotionRecord.from_arrays(PERIOD, z, -np.round(seen / STEP_M) * STEP_M)
+    return record_from_arrays(PERIOD, z, -np.round(seen / STEP_M) * STEP_M)
 
 
 def test_plateaus_are_counted_between_edges():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.noise import motion_scatter, timing_variance
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG_S, SCATTER_S = 1e-3, 0.34e-3, 50e-6
 TEST = StepTest()
@@ -50,7 +50,7 @@ def test_a_probe_that_scatters_is_accepted_with_a_warning(seed):
     z = TEST.positions(TIME).z + rng.normal(0, 0.3e-9, len(TIME))
     when = TIME - LAG_S + rng.normal(0, SCATTER_S, len(TIME))
     seen = TEST.positions(when).z + rng.normal(0, 10e-9, len(TIME))
-    certificate = identify(MotionRecord.from_arrays(PERIOD, z, -seen)).calibration.certificate
+    certificate = identify(record_from_arrays(PERIOD, z, -seen)).calibration.certificate
     assert str(certificate.verdict).startswith("accepted with reservations")
     assert certificate.residual.timing_scatter_s == pytest.approx(SCATTER_S, rel=0.2)
     (reported,) = map(str, certificate.reservations)
@@ -80,7 +80,7 @@ def test_an_axis_that_scatters_is_named_as_the_cause():
     omega = 2 * np.pi * 62.0
     system = signal.cont2discrete(([omega**2], [1, 0.16 * omega, omega**2]), PERIOD, "foh")
     seen = signal.lfilter(system[0].ravel(), system[1], TEST.positions(TIME).z)
-    record = MotionRecord.from_arrays(PERIOD, z, -seen + rng.normal(0, 10e-9, len(TIME)))
+    record = record_from_arrays(PERIOD, z, -seen + rng.normal(0, 10e-9, len(TIME)))
     certificate = identify(record).calibration.certificate
     assert certificate.residual.axis_timing_scatter_s == pytest.approx(SCATTER_S, rel=0.2)
     reported = [*map(str, certificate.reasons), *map(str, certificate.reservations)]

@@ -4,11 +4,12 @@ from functools import lru_cache
 
 import numpy as np
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.motion_record import MotionRecord, assemble
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances
@@ -30,7 +31,7 @@ def recorded(seed=1, motion=STEPS, plant=PLANT, sample_period=1e-3, drift=0.0):
 def record_of(recording, **changed):
     seen = np.where(recording.distance.ok, recording.distance.distance, np.nan)
     arrays = {"z": recording.axes.z, "distance": seen, **changed}
-    return MotionRecord.from_arrays(recording.axes.sample_period, **arrays)
+    return record_from_arrays(recording.axes.sample_period, **arrays)
 
 
 @lru_cache(maxsize=64)

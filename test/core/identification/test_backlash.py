@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.model_errors.families import backlash_lead, through_backlash, without_noise
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER = 1e-3, 20
 LAG_S = 0.34e-3
@@ -56,7 +56,7 @@ def overshooting(seed, half_gap):
     rng = np.random.default_rng(seed)
     seen = played(follows, half_gap)[::FINER]
     encoder = z[::FINER] + rng.normal(0, 0.3e-9, len(seen))
-    return MotionRecord.from_arrays(PERIOD, encoder, -seen + rng.normal(0, 10e-9, len(seen)))
+    return record_from_arrays(PERIOD, encoder, -seen + rng.normal(0, 10e-9, len(seen)))
 
 
 @pytest.mark.soak

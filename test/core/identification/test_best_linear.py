@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.best_linear import best_linear_approximation
 from omsm_ros.core.kinematics.trajectories import plan_multisine
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import IdentificationError
 
 PERIOD = 1e-3
@@ -39,7 +39,7 @@ def recorded(plan, cubic, noise, seed):
     distance = wiener_hammerstein(z, cubic) + rng.normal(0, noise, len(z))
     distance += 3e-6 + 1e-9 * np.arange(len(z))
     padded = [np.pad(v, (700, 300), mode="edge") for v in (z, distance)]
-    return MotionRecord.from_arrays(PERIOD, *padded)
+    return record_from_arrays(PERIOD, *padded)
 
 
 def test_the_motion_stays_within_range_speed_and_acceleration_and_leaves_lines_out():

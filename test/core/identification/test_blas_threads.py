@@ -23,7 +23,8 @@ z = StepTest().positions(time).z
 seen = signal.lfilter([0.2], [1, -0.8], z) + 2e-7 * np.sin(2 * np.pi * 7.0 * time)
 seen += np.random.default_rng(3).normal(0, 1e-8, len(z))
 threads = [p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"]
-found = identify(MotionRecord.from_arrays(1e-3, z, 40e-6 - seen))
+ok = np.ones(len(z), bool)
+found = identify(MotionRecord(sample_period=1e-3, z=z, distance=40e-6 - seen, ok=ok))
 assert threads == [p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"]
 known = found.calibration
 numbers = [known.dynamics.numerator, known.dynamics.denominator, known.covariance.ravel()]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.certificate import RESERVATION
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import fit
@@ -22,7 +23,6 @@ from omsm_ros.core.model_errors.residual_diagnostics import (
     ResidualDiagnostics,
     contrasts,
 )
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG, NOISE = 1e-3, 0.7e-3, 5e-9
 SMALL, LARGE = 3e-6, 9.8e-6
@@ -42,7 +42,7 @@ def stepped(lags, gains=None, heights=HEIGHTS, seed=1):
     seen = StepPlan(late, tuple(np.multiply(heights, gains)), RISE, duration).z(time)
     random = np.random.default_rng(seed)
     z = z + random.normal(0, 0.3e-9, len(z))
-    return MotionRecord.from_arrays(PERIOD, z, -seen + random.normal(0, NOISE, len(z)))
+    return record_from_arrays(PERIOD, z, -seen + random.normal(0, NOISE, len(z)))
 
 
 def survey_of(record):
@@ -142,5 +142,8 @@ def test_what_rang_before_the_record_is_no_part_of_the_answer_to_the_motion():
     ringing = np.concatenate([fitted.driven[:2], 1e6 * np.ones(2)])
     huge = ResidualDiagnostics(problem, replace(fitted, driven=ringing), diagnostics.steps)
     quiet = ResidualDiagnostics(problem, fitted, diagnostics.steps)
-    expected = quiet.model_errors.creep().columns
-    assert huge.model_errors.creep().columns == pytest.approx(expected, rel=1e-9, abs=1e-15)
+    (expected, columns) = (
+        family.part(0, len(family.parameters))
+        for family in (quiet.model_errors.creep(), huge.model_errors.creep())
+    )
+    assert columns == pytest.approx(expected, rel=1e-9, abs=1e-15)

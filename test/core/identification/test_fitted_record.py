@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.steps import find_steps
@@ -15,7 +16,7 @@ from omsm_ros.core.identification.fitted_record import autocorrelation, fitted_r
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.motion_record import MotionRecord, assemble
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell
 from omsm_ros.twin.cell import record as recorded
@@ -56,7 +57,7 @@ def ringing():
     edges = find_steps(whole.axes.z, whole.axes.sample_period).edges
     later = slice(edges[0].stop + 40, None)
     return identify(
-        MotionRecord.from_arrays(
+        record_from_arrays(
             whole.axes.sample_period, whole.axes.z[later], whole.distance.distance[later]
         )
     )
@@ -142,9 +143,7 @@ def test_the_estimate_without_a_model_follows_the_model(fitted, identified):
 
 def test_a_short_recording_has_no_such_estimate(record):
     samples = 1500
-    short = MotionRecord.from_arrays(
-        record.sample_period, record.z[:samples], record.distance[:samples]
-    )
+    short = record_from_arrays(record.sample_period, record.z[:samples], record.distance[:samples])
     assert fitted_record(identify(short)).measured is None
 
 

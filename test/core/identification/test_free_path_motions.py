@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from benchmarks.free_path import Multisine
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.core.streams.motion_record import MotionRecord, assemble
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import IdentificationError, StepTestError
 from omsm_ros.twin.cell import Cell, record
@@ -25,7 +26,7 @@ def identified(motion, plant, part, seed):
     made = record(Cell(plant=plant, seed=seed), motion, Flat())
     whole = assemble([made.axes], [made.distance])
     return identify(
-        MotionRecord.from_arrays(whole.sample_period, whole.z[part], whole.distance[part])
+        record_from_arrays(whole.sample_period, whole.z[part], whole.distance[part])
     ).calibration
 
 
@@ -94,7 +95,7 @@ def test_a_second_frequency_tells_them_apart():
 def test_an_even_ramp_may_be_drift(seed):
     rng = np.random.default_rng(seed)
     z = rng.normal(2e-9 * np.arange(20_000), 4e-10)
-    ramp = MotionRecord.from_arrays(1e-3, z, rng.normal(-z, 1e-8))
+    ramp = record_from_arrays(1e-3, z, rng.normal(-z, 1e-8))
     assert any(
         reason in refusal(ramp) for reason in ("moves in both directions", "static gain from the")
     )
@@ -106,7 +107,7 @@ def test_too_little_left_between_the_ends_is_said(lost):
     distance = np.random.default_rng(0).normal(-z, 1e-8)
     distance[lost] = np.nan
     with pytest.raises(StepTestError, match="can be compared"):
-        identify(MotionRecord.from_arrays(1e-3, z, distance))
+        identify(record_from_arrays(1e-3, z, distance))
 
 
 def first_reasons(calibration):

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, DataError, IdentificationError, StepTestError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
@@ -96,7 +96,7 @@ class TestImperfectData:
         truth, frequency = resonance(60.0, 0.02), np.array([1.0, 15.0, 40.0])
         recording = recorded(plant=Plant(truth))
         seen = np.where(recording.distance.ok, recording.distance.distance, np.nan)
-        late = MotionRecord.from_arrays(1e-3, recording.axes.z[start:], seen[start:])
+        late = record_from_arrays(1e-3, recording.axes.z[start:], seen[start:])
         calibration = identify(late).calibration
         assert str(calibration.certificate.verdict).startswith("accepted")
         band = response_band(calibration.dynamics, calibration.covariance, frequency)
@@ -126,7 +126,7 @@ class TestRefusals:
 
     def refuse(self, error, match, z, distance, **options):
         with pytest.raises(error, match=match):
-            identify(MotionRecord.from_arrays(1e-3, z, distance), **options)
+            identify(record_from_arrays(1e-3, z, distance), **options)
 
     def test_two_samples(self):
         z, distance = self.arrays()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.model_order import StartingPoints, coarser
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
@@ -16,7 +17,7 @@ from omsm_ros.core.identification.residual_tests import follows_beyond
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
-from omsm_ros.core.streams.motion_record import MotionRecord, assemble
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.plant import Plant
@@ -69,7 +70,7 @@ def test_a_latency_that_jumps_rejects_a_long_test_too(of_mode):
     half = len(of_mode) // 2
     later = np.where(np.arange(len(of_mode)) < half, of_mode.distance, np.roll(of_mode.distance, 1))
     found = identify(
-        MotionRecord.from_arrays(of_mode.sample_period, of_mode.z, later)
+        record_from_arrays(of_mode.sample_period, of_mode.z, later)
     ).calibration.certificate
     assert found["verdict"] == "rejected"
     assert "the model misses something" in " ".join(map(str, found["reasons"]))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.output_error import Problem, fit
 from omsm_ros.core.estimation.preparation import prepare
@@ -36,7 +37,6 @@ from omsm_ros.core.model_errors.families import (
 )
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
 from omsm_ros.core.model_errors.undetected import fitted_relaxation, undetected_terms
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD, LAG = 1e-3, 0.7e-3
@@ -49,7 +49,7 @@ LATE = STEPS.positions(TIME - LAG).z
 def record_of(added=0.0, seed=1, noise=10e-9):
     random = np.random.default_rng(seed)
     seen = -(LATE + added) + random.normal(0, noise, len(TIME))
-    return MotionRecord.from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
+    return record_from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
 
 
 def searched(added=0.0, seed=1):
@@ -159,7 +159,7 @@ def test_a_light_mode_takes_the_place_of_poles_that_imitated_it():
     random = np.random.default_rng(1)
     z, distance = seen[1][::finer], 49e-6 - seen[3][::finer]
     z, distance = (v + random.normal(0, n, len(v)) for v, n in ((z, 0.5e-9), (distance, 5e-9)))
-    calibration = identify(MotionRecord.from_arrays(PERIOD, z, distance)).calibration
+    calibration = identify(record_from_arrays(PERIOD, z, distance)).calibration
     assert str(calibration.certificate.verdict).startswith("accepted")
     lines = np.array([0.5, 1.0, 1.5, 2.0])
     s = 2j * np.pi * lines

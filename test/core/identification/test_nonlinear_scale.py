@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, FINER, DWELL = 1e-3, 20, 0.75
 STEP_M, RISE_S, NOISE_M = 9.8e-6, 20e-3, 10e-9
@@ -39,7 +39,7 @@ def calibration():
     random = np.random.default_rng(4)
     noise = NOISE_M * random.normal(size=len(z))
     return identify(
-        MotionRecord.from_arrays(PERIOD, z, -40e-6 - seen - CURVATURE_M * place**3 + noise)
+        record_from_arrays(PERIOD, z, -40e-6 - seen - CURVATURE_M * place**3 + noise)
     ).calibration
 
 

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.motion_filter import MOVED, SENSITIVITIES, MotionFilter, MotionFilters
 from omsm_ros.core.estimation.preparation import joined_recordings
 from omsm_ros.core.identification.identify import identify
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.pairing import SampleRun
 from omsm_ros.errors import DataError, StepTestError
 
@@ -53,7 +53,7 @@ def recording(seed, noise=5e-9, samples=8_000, lag=DELAY):
     x = staircase(rng, samples, 2e-4, 0.62)
     c = staircase(rng, samples, 0.5, 0.81)
     distance = -1.002 * answer(z, x, c, lag) + rng.normal(0, noise, samples) + seed * 1e-6
-    record = MotionRecord.from_arrays(PERIOD, z, distance)
+    record = record_from_arrays(PERIOD, z, distance)
     return replace(record, further={"x": x, "c": c})
 
 

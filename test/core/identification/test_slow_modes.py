@@ -5,6 +5,7 @@ import pytest
 from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
@@ -13,7 +14,6 @@ from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.frequency_response import response_band
 from omsm_ros.core.model_errors.families import MODE, VIBRATION
 from omsm_ros.core.model_errors.undetected import alternative_mode_covariance
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 
 def ringing(participation, frequency, damping, late=LATE):
@@ -48,7 +48,7 @@ def test_a_mode_between_the_teeth_of_even_steps_is_no_surer_than_which_mode_it_i
     seen = -late - ringing(size, frequency, damping, late) + random.normal(0, NOISE, len(time))
     z = steps.positions(time).z + random.normal(0, 0.3e-9, len(time))
     found = search_model_errors(
-        prepare(MotionRecord.from_arrays(PERIOD, z, seen), "encoder"), model_from_start
+        prepare(record_from_arrays(PERIOD, z, seen), "encoder"), model_from_start
     )
     (mode,), (without,) = found.added_poles, found.without
     fitted = found.model.chosen.fit

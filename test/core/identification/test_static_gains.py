@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.identify import static_gains
 from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import StepTestError
 
 
@@ -18,9 +18,7 @@ def stepped(probe_gain, reference_gain=None, drift=0.0, noise=1e-8, seed=1, coun
     reference = (
         None if reference_gain is None else reference_gain * z + rng.normal(0, noise, len(z))
     )
-    return MotionRecord.from_arrays(
-        1e-3, z + rng.normal(0, 4e-10, len(z)), distance, reference=reference
-    )
+    return record_from_arrays(1e-3, z + rng.normal(0, 4e-10, len(z)), distance, reference=reference)
 
 
 def test_gain_is_found_within_its_uncertainty_under_drift():
@@ -54,4 +52,4 @@ def test_a_path_without_plateaus_has_no_static_gain():
     time = np.arange(10_000) * 1e-3
     z = Chirp().positions(time).z
     with pytest.raises(StepTestError, match="plateaus"):
-        static_gains(MotionRecord.from_arrays(1e-3, z, -z))
+        static_gains(record_from_arrays(1e-3, z, -z))

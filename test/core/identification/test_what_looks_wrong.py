@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.certificate import REJECTS
 from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.checks import lead
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import StepTest
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.errors import ConfigurationError, IdentificationError
 
 PERIOD = 1e-3
@@ -22,7 +22,7 @@ def test_a_lag_of_half_a_period_is_no_other_gain():
     lag = 60e-3
     time = np.arange(0.0, 20.0, PERIOD)
     z, seen = (20e-6 * signal.chirp(time - late, 0.5, 20.0, 15.0) for late in (0.0, lag))
-    record = MotionRecord.from_arrays(
+    record = record_from_arrays(
         PERIOD, z + rng.normal(0, 0.3e-9, len(z)), -seen + rng.normal(0, 10e-9, len(z))
     )
     found = identify(record).calibration
@@ -34,7 +34,7 @@ def test_a_lag_of_half_a_period_is_no_other_gain():
 def late_sine(limit):
     """A sine that is seen a sixth of a period late, in steps of 10 nm, up to ``limit`` [m]."""
     z, seen = (20e-6 * np.sin(2 * np.pi * 0.5 * TIME - late) for late in (0.0, 1.0))
-    return MotionRecord.from_arrays(PERIOD, z, np.round(np.minimum(-seen, limit) / 10e-9) * 10e-9)
+    return record_from_arrays(PERIOD, z, np.round(np.minimum(-seen, limit) / 10e-9) * 10e-9)
 
 
 def test_a_peak_that_is_seen_late_is_not_clipped():
@@ -49,7 +49,7 @@ def test_exchanged_channels_are_named():
     time = np.arange(0.0, test.duration, PERIOD)
     z = test.positions(time).z + rng.normal(0, 0.3e-9, len(time))
     seen = test.positions(time - lag).z + rng.normal(0, 10e-9, len(time))
-    certificate = identify(MotionRecord.from_arrays(PERIOD, seen, -z)).calibration.certificate
+    certificate = identify(record_from_arrays(PERIOD, seen, -z)).calibration.certificate
     assert certificate.verdict == "rejected"
     assert any("channels are exchanged" in reason for reason in map(str, certificate.reasons))
 
@@ -79,7 +79,7 @@ def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
     hum = sum(2e-7 * np.sin(2 * np.pi * f * time + f) for f in np.linspace(3, 480, 60))
     seen = signal.lfilter([0.2], [1, -0.8], z) + hum + rng.normal(0, 1e-8, len(z))
     budget = EvaluationBudget()
-    found = identify(MotionRecord.from_arrays(1e-3, z, 40e-6 - seen), budget=budget)
+    found = identify(record_from_arrays(1e-3, z, 40e-6 - seen), budget=budget)
     certificate = found.calibration.certificate
     assert certificate.verdict == "rejected"
     assert any("cut short" in str(text) for text in certificate.reservations)
@@ -91,6 +91,6 @@ def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
 def test_a_prior_on_a_detectable_family_is_refused(name):
     rng = np.random.default_rng(1)
     z = StepTest(count=2).positions(TIME).z
-    record = MotionRecord.from_arrays(PERIOD, z, rng.normal(-z, 10e-9))
+    record = record_from_arrays(PERIOD, z, rng.normal(-z, 10e-9))
     with pytest.raises(ConfigurationError, match="is unknown, expected one of 'creep'"):
         identify(record, settings={"priors": {name: 1e-6}})

@@ -78,7 +78,6 @@ def test_the_residue_is_that_of_partial_fractions(identified):
     pair, real = known_modes(dynamics, covariance)
     assert pair.residue == pytest.approx(-2 * np.real(residues[upper] * np.conj(poles[upper])))
     assert real.residue is None
-    assert real.term() is None
 
 
 def test_uncertainties_are_the_scatter_of_drawn_coefficients(identified):

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG, NOISE = 2e-3, 0.7e-3, 10e-9
 STEPS = StepTest(count=3, dwell=0.5, rise=40e-3)
@@ -23,7 +23,7 @@ def diagnostics(added=0.0, seed=1, lost=(), **options):
     random = np.random.default_rng(seed)
     seen = -(LATE + added) + random.normal(0, NOISE, len(TIME))
     seen[list(lost)] = np.nan
-    record = MotionRecord.from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
+    record = record_from_arrays(PERIOD, Z + random.normal(0, 0.3e-9, len(Z)), seen)
     prepared = prepare(record, "encoder")
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
     return ResidualDiagnostics(prepared.problem, late, prepared.steps, **options)

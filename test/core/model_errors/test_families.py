@@ -152,14 +152,14 @@ class TestLines:
         time = np.linspace(-1, 1, len(model_errors.problem.input))
         for family in families:
             degree = round(model_errors.duration / family.parameters[0])
-            assert (family.name, family.columns.shape[1]) == (DRIFT, degree - 1)
+            assert (family.name, family.term(0).columns.shape[1]) == (DRIFT, degree - 1)
             # With offset and tilt they make any polynomial of that degree.
-            every = np.column_stack([np.ones(len(time)), time, family.columns])
+            every = np.column_stack([np.ones(len(time)), time, family.term(0).columns])
             power = time**degree
             left = power - every @ np.linalg.lstsq(every, power, rcond=None)[0]
             assert np.max(abs(left)) < 1e-9
-            assert abs(np.trapezoid(family.columns, time, axis=0)).max() < 1e-3
-        assert [f.columns.shape[1] for f in families] == [1, 2, 3, 5, 7]
+            assert abs(np.trapezoid(family.term(0).columns, time, axis=0)).max() < 1e-3
+        assert [f.term(0).columns.shape[1] for f in families] == [1, 2, 3, 5, 7]
 
 
 class TestOfThePosition:
@@ -168,16 +168,21 @@ class TestOfThePosition:
     ):
         motion, seen = model_errors.problem.input, answer / model_errors.fitted.gain
         place = (seen - np.mean([motion.min(), motion.max()])) / (np.ptp(motion) / 2)
-        columns = model_errors.linearity().columns
+        columns = model_errors.linearity().term(0).columns
         np.testing.assert_allclose(columns, np.column_stack([place**2, place**3]), atol=1e-9)
         assert np.max(abs(columns)) == pytest.approx(1.0, abs=1e-3)
 
     def test_an_axis_at_rest_bends_nothing(self, clean):
         still = replace(clean.problem, input=np.zeros(len(clean.problem.input)))
-        assert not ModelErrorFamilies(still, clean.fitted, clean.steps).linearity().columns.any()
+        assert (
+            not ModelErrorFamilies(still, clean.fitted, clean.steps)
+            .linearity()
+            .term(0)
+            .columns.any()
+        )
 
     def test_what_stiffens_is_the_cube_of_what_the_probe_is_behind(self, model_errors, answer):
-        (column,) = model_errors.stiffening().columns.T
+        (column,) = model_errors.stiffening().term(0).columns.T
         behind = answer / model_errors.fitted.gain - model_errors.problem.input
         assert np.max(abs(column)) == pytest.approx(1.0)
         line = np.polyfit(np.cbrt(column), behind, 1)
@@ -233,7 +238,8 @@ class TestWhichFamilies:
 
     def test_friction_and_gap_have_the_size_of_a_force_and_of_a_lead(self, model_errors):
         largest = [
-            np.max(abs(family.columns)) for family in model_errors.families((FRICTION, BACKLASH))
+            np.max(abs(family.part(0, len(family.parameters))))
+            for family in model_errors.families((FRICTION, BACKLASH))
         ]
         assert largest == pytest.approx([1.0, 1.0, 1.0], rel=0.01)
 

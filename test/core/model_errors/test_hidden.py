@@ -194,6 +194,6 @@ class TestDiagnosticsOfUndetectedTerms:
 
     def test_a_stiffness_bends_coefficients_by_what_is_omitted(self, clean, undetected):
         (stiff,) = [term for term in undetected if term.family == STIFFENING]
-        column = clean.model_errors.stiffening().columns[:, 0]
+        column = clean.model_errors.stiffening().term(0).columns[:, 0]
         np.testing.assert_allclose(stiff.shift, omission_shift(clean, column))
         assert (stiff.above, stiff.lag) == (0.0, 0.0)

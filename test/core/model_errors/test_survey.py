@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.identification.covariance_terms import reference_lag
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
@@ -16,7 +17,6 @@ from omsm_ros.core.model_errors.families import (
     ModelErrorTerm,
 )
 from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, Score, ScoreTest
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 
 def judged(chi_square, degrees=2, trials=1.0):
@@ -130,7 +130,7 @@ class TestReferenceLag:
 
     def record(self, reference, z=None):
         z = self.Z if z is None else z
-        return MotionRecord.from_arrays(1e-3, z, np.zeros(len(z)), reference=reference)
+        return record_from_arrays(1e-3, z, np.zeros(len(z)), reference=reference)
 
     def test_without_a_reference_there_is_none(self):
         assert reference_lag(self.record(None)) is None

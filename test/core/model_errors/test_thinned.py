@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.estimation.steps import Steps
@@ -12,7 +13,6 @@ from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.core.model_errors.families import BACKLASH, CREEP, MODE, PERIODIC, low_pass_response
 from omsm_ros.core.model_errors.residual_diagnostics import ResidualDiagnostics
-from omsm_ros.core.streams.motion_record import MotionRecord
 
 PERIOD, LAG = 2e-3, 0.7e-3
 STEPS = StepTest(dwell=4.0, rise=40e-3)
@@ -23,7 +23,7 @@ LATE = STEPS.positions(TIME - LAG).z
 def surveyed(added=0.0):
     random = np.random.default_rng(4)
     z = STEPS.positions(TIME).z + random.normal(0, 0.3e-9, len(TIME))
-    record = MotionRecord.from_arrays(PERIOD, z, -(LATE + added) + random.normal(0, 1e-8, len(z)))
+    record = record_from_arrays(PERIOD, z, -(LATE + added) + random.normal(0, 1e-8, len(z)))
     prepared = prepare(record, "encoder")
     late = fit(prepared.problem, Structure(0, 0, True), [np.array([0.1])])
     return ResidualDiagnostics(prepared.problem, late, prepared.steps)

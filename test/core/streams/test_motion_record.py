@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, Status
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import DataError
@@ -221,7 +222,7 @@ def test_a_reference_comes_along_on_the_same_counts():
 def test_nan_in_an_array_is_a_lost_sample():
     z = np.arange(10.0)
     z[4] = np.nan
-    record = MotionRecord.from_arrays(1e-3, z, np.zeros(10))
+    record = record_from_arrays(1e-3, z, np.zeros(10))
     assert record.z[4] == 4.0
     assert record.counts["missing_axis"] == 1
     assert record.counts["paired"] == 9

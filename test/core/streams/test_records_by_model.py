@@ -5,9 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.streams.axes_at_probe import axes_at_probe
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, Status
-from omsm_ros.core.streams.motion_record import MotionRecord, assemble
+from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.errors import DataError
 
@@ -98,22 +99,22 @@ class TestByCounter:
         z = np.array([0.0, np.nan, 2.0, 3.0, 4.0])
         seen = np.array([1.0, 1.0, np.nan, 1.0, 1.0])
         ok = np.array([True, True, True, False, True])
-        record = MotionRecord.from_arrays(PERIOD, z, seen, ok, reference=z)
+        record = record_from_arrays(PERIOD, z, seen, ok, reference=z)
         np.testing.assert_array_equal(record.z, [0.0, 1.0, 2.0, 3.0, 4.0])
         np.testing.assert_array_equal(record.ok, [True, False, False, False, True])
         np.testing.assert_array_equal(record.z_lost, [False, True, False, False, False])
         assert record.counts == {"received": 5, "missing_axis": 1, "not_ok": 2, "paired": 2}
-        assert MotionRecord.from_arrays(PERIOD, np.arange(3), np.arange(3)).z_lost is None
+        assert record_from_arrays(PERIOD, np.arange(3), np.arange(3)).z_lost is None
 
     def test_an_axis_that_was_never_read_stands_at_nothing_and_nothing_is_ok(self):
-        record = MotionRecord.from_arrays(PERIOD, np.full(4, np.nan), np.zeros(4))
+        record = record_from_arrays(PERIOD, np.full(4, np.nan), np.zeros(4))
         np.testing.assert_array_equal(record.z, 0.0)
         assert not record.ok.any()
 
     @pytest.mark.parametrize("period", [0.0, -1e-3, np.nan, 11.0])
     def test_a_period_that_is_none_is_refused(self, period):
         with pytest.raises(DataError, match="record: sample_period is"):
-            MotionRecord.from_arrays(period, np.zeros(3), np.zeros(3))
+            record_from_arrays(period, np.zeros(3), np.zeros(3))
 
     def test_a_saturated_reading_is_no_reading_and_nothing_else_changes(self):
         axes = [axis_block(0, np.arange(6.0))]
