@@ -106,6 +106,10 @@ class _Spectra:
         """Return ``spectra`` (…, k) at the compared samples, (…, places)."""
         return np.asarray(fft.irfft(spectra, self.length, axis=-1)[..., self.places])
 
+    def driven(self, drives: ComplexArray, basis: ComplexArray) -> FloatArray:
+        """Return each of ``basis`` (b, k) times each of ``drives`` (m, k) in time, (mb, places)."""
+        return self.in_time((drives[:, np.newaxis] * basis).reshape(-1, len(self.w)))
+
     def free(self, sections: FloatArray) -> FloatArray:
         """Return an orthonormal basis (places, states + 1) of initial states and offset."""
         samples = len(self.record)
@@ -216,22 +220,20 @@ class SectionsProblem:
             np.concatenate([ends[1], np.full(count, longest)]),
         )
 
-    def _columns(
+    def _inputs(
         self, one: _Spectra, nonlinear: FloatArray, order: int
-    ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
-        """Return the delayed inputs (m, k) of a record, the basis (1 + n, k), and both in time."""
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return the delayed inputs of a record (m, k), and the basis (1 + n, k)."""
         late = self.late(nonlinear, order)[:, np.newaxis]
         drives = one.inputs * np.exp(-1j * one.angle * late) if np.any(late) else one.inputs
-        basis = basis_of(sections_of(nonlinear, order), one.w)
-        rows = one.in_time((drives[:, np.newaxis] * basis).reshape(-1, len(one.w)))
-        return drives, basis, rows
+        return drives, basis_of(sections_of(nonlinear, order), one.w)
 
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
         sections = sections_of(nonlinear, order)
         rows, targets, frees = [], [], []
         for one in self.spectra:
-            columns, free = self._columns(one, nonlinear, order)[2], one.free(sections)
+            columns, free = one.driven(*self._inputs(one, nonlinear, order)), one.free(sections)
             rows.append(columns - (columns @ free) @ free.T)
             targets.append(one.output - free @ (free.T @ one.output))
             frees.append(free)
@@ -257,13 +259,14 @@ class SectionsProblem:
         self, one: _Spectra, free: FloatArray, nonlinear: FloatArray, order: int, linear: FloatArray
     ) -> FloatArray:
         """Return d output / d nonlinear of a record (p, places), orthogonal to ``free``."""
-        drives, basis, _ = self._columns(one, nonlinear, order)
+        drives, basis = self._inputs(one, nonlinear, order)
         sections, terms = sections_of(nonlinear, order), (linear[:, 1:].T @ drives) * basis[1:]
         firsts = np.cumsum([0, *(1 + (sections[:, 1] > 0))])[:-1]
         parts = np.add.reduceat(terms, firsts, axis=0) if len(sections) else terms
-        parts = parts * basis[1 + firsts] * one.w
+        d1, d2 = sections.T[:, :, np.newaxis]
+        parts = parts * one.w / (1 + d1 * one.w + d2 * one.w**2)
         second = sections[:, 1] > 0
-        rows = [-sections[:, :1] * parts, -sections[second, 1:] * parts[second] * one.w]
+        rows = [-d1 * parts, -d2[second] * parts[second] * one.w]
         if self._free_delays:
             rows.append(-1j * one.angle / RATE * (linear @ basis) * drives)
         found = one.in_time(np.concatenate(rows))
@@ -328,7 +331,7 @@ class SectionsProblem:
         score = np.zeros_like(gram)
         for one in self.spectra:
             free = one.free(fitted.sections)
-            rows = self._columns(one, fitted.nonlinear, order)[2]
+            rows = one.driven(*self._inputs(one, fitted.nonlinear, order))
             slopes = self._slopes(one, free, fitted.nonlinear, order, fitted.linear)
             rows = np.concatenate([rows - (rows @ free) @ free.T, slopes])
             residual = fitted.residual[start : start + len(one.places)]
