@@ -61,6 +61,19 @@ class Cell:
     def call(self, kind, name, **fields):
         return self.operator.ask(kind, f"/omsm/{name}", kind.Request(**fields))
 
+    def caller(self, kind, name):
+        """A function that calls a service of a node that runs on, by a client that stays."""
+        client = self.operator.create_client(kind, f"/omsm/{name}")
+        self.wait(name, client.service_is_ready)
+        time.sleep(0.3)  # a server that has not found the client yet drops its answer
+
+        def call(**fields):
+            future = client.call_async(kind.Request(**fields))
+            self.wait(f"an answer of {name}", future.done)
+            return future.result()
+
+        return call
+
     def wait(self, what, done):
         self.operator.wait_until(what, done)
 
