@@ -12,10 +12,16 @@ reduces.
 model amplifies noise of the encoder that the probe did not follow. So a fit increases the damping
 of a mode, or fits backlash and scale errors to that noise. Where the axis is stationary, the mean
 of many samples has little noise.
+
+**Random walk.** Drift of a machine has more power the slower it is, and polynomials follow only
+its slowest part. What is left would look like a relaxation or a soft mode in white noise.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import comb
 
 import numpy as np
@@ -362,3 +368,100 @@ def _mean_before(values: FloatArray, noise: float) -> tuple[FloatArray, FloatArr
         count *= 2
         rests = rests[rests + 1 >= count]
     return mean, number
+
+
+# Blocks of a record: slower than two of them, a random walk exceeds white noise if it matters.
+_WALK_BLOCKS = 128
+# Log odds that are very strong evidence (Kass and Raftery 1995).
+_VERY_STRONG = 5.0
+# A direction that the fit follows by less than this is rounding.
+_FOLLOWED = 1e-6
+# Variance ratios tried of walk to white noise over a record: from not visible to nothing else.
+_WALK_RATIOS = np.geomspace(1e-2, 1e6, 97)
+
+
+@dataclass(frozen=True, eq=False)
+class RandomWalk:
+    """Restricted likelihood of a random walk in a residual (Patterson and Thompson 1971).
+
+    The means over blocks of the record are projected orthogonally to ``basis``, the columns of the
+    fit: whatever the fit has followed does not bias the estimate.
+    starts: first sample of each block;  length: of the record
+    contrasts: (b, d) of the block means;  ratios: (d,) variance of each in a random walk over that
+        in white noise
+    """
+
+    starts: IntArray
+    length: int
+    counts: FloatArray
+    contrasts: FloatArray
+    ratios: FloatArray
+
+    @classmethod
+    def of(cls, problem: Problem, basis: FloatArray) -> RandomWalk:
+        """Return the likelihood for the samples that ``problem`` compares.
+
+        basis: (k, r) orthonormal columns at those samples
+        """
+        used, size = problem.used, max(len(problem.used) // _WALK_BLOCKS, 1)
+        starts = np.concatenate([np.arange(p.start, p.stop, size) for p in problem.recordings])
+        place = np.searchsorted(starts, np.flatnonzero(used), side="right") - 1
+        counts = np.bincount(place, minlength=len(starts)).astype(np.float64)
+        kept = np.flatnonzero(counts)
+        starts, counts = starts[kept], counts[kept]
+        first = np.searchsorted(np.flatnonzero(used), starts)
+        # Unit variance of white noise: sums over the roots of the counts.
+        followed = np.add.reduceat(basis, first, axis=0) / np.sqrt(counts)[:, np.newaxis]
+        left, values, _ = np.linalg.svd(followed, full_matrices=True)
+        free = left[:, np.sum(values > _FOLLOWED) :]
+        recording = np.searchsorted(problem.starts, starts, side="right")
+        shared = np.minimum.outer(starts, starts) * np.equal.outer(recording, recording)
+        walk = shared * np.sqrt(np.outer(counts, counts))
+        ratios, directions = np.linalg.eigh(free.T @ walk @ free)
+        return cls(starts, len(used), counts, free @ directions, np.maximum(ratios, 0.0))
+
+    def shows(self, residual: FloatArray) -> bool:
+        """Return whether ``residual`` (n,), 0 where not compared, walks (Schwarz 1978)."""
+        likelihood, *_ = self._likelihood(residual, np.empty((0, len(residual))))
+        return 2 * (float(np.max(likelihood)) - likelihood[0]) > np.log(len(self.ratios))
+
+    def variance(self, residual: FloatArray, rows: FloatArray, *, replaces: bool) -> float:
+        """Return the variance per sample of the walk's increments.
+
+        residual: (n,), 0 where not compared;  rows: (c, n), fitted beside the walk
+        replaces: it is zero if ``rows`` describe the residual so much better than a walk does that
+            none is left
+        """
+        likelihood, white, explained = self._likelihood(residual, rows)
+        best, price = int(np.argmax(likelihood)), float(np.log(len(self.ratios)))
+        left = 2 * (likelihood[best] - likelihood[0])
+        odds = 0.5 * (explained[best] - left - (len(rows) - 1) * price)
+        if replaces and odds > _VERY_STRONG and left < price:
+            return 0.0
+        return float(self._tried[best] * white[best])
+
+    @cached_property
+    def _tried(self) -> FloatArray:
+        """Variance of the walk's increments over that of white noise."""
+        return np.append(0.0, _WALK_RATIOS / max(float(self.ratios[-1]), _TINY))
+
+    def _likelihood(
+        self, residual: FloatArray, rows: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return for each ratio the logarithm of the restricted likelihood, and more.
+
+        Further, the white variance, and χ² of what ``rows`` explain.
+        """
+        sums = np.add.reduceat(np.vstack([rows, residual]), self.starts, axis=1)
+        shares = (sums / np.sqrt(self.counts)) @ self.contrasts
+        variances = 1 + np.outer(self._tried, self.ratios)
+        gram = np.einsum("id,td,jd->tij", shares, 1 / variances, shares)
+        scale = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), _TINY))
+        unit = gram / (scale[:, :, np.newaxis] * scale[:, np.newaxis, :])
+        # The last diagonal element of the factor is the part that the rows do not explain.
+        factor = np.linalg.cholesky(unit + _FOLLOWED**2 * np.eye(len(shares)))
+        diagonal = np.log(scale * np.diagonal(factor, axis1=1, axis2=2))
+        degrees = len(self.ratios) - len(rows)
+        spread = 0.5 * np.sum(np.log(variances), axis=1) + np.sum(diagonal[:, :-1], axis=1)
+        white = np.exp(2 * diagonal[:, -1]) / degrees
+        return -degrees * diagonal[:, -1] - spread, white, scale[:, -1] ** 2 / white - degrees

@@ -39,7 +39,6 @@ from omsm_ros.core.model_errors.families import (
 from omsm_ros.core.model_errors.residual_diagnostics import (
     FALSE_ALARM,
     ResidualDiagnostics,
-    ScoreTest,
 )
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -143,7 +142,7 @@ def _alike(searched: SearchResult, modelled: ModelledTerm) -> list[str]:
     without = replace(problem, background=problem.background[:, kept])
     again = fit(without, fitted.structure, [fitted.nonlinear], _REFITTED)
     tested = ResidualDiagnostics(without, again, searched.prepared.steps, {*_MAY_LOOK_ALIKE})
-    own = tested.evidence(ScoreTest(modelled.term, tested.space.score(modelled.term.columns)))
+    own = tested.evidence(tested.tested(modelled.term))
     return [
         name
         for name, test in tested.best.items()

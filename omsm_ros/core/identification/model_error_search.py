@@ -106,7 +106,8 @@ def search_model_errors(
     for _ in range(_MOST_ROUNDS):
         shown = diagnostics.significant(search.refused | search.settled)
         shown = _without_modelled_lines(shown, search.modes)
-        if not shown or search.budget.stops():
+        # Without budget a nuisance term is still fitted beside the structure that was chosen.
+        if not shown or (search.budget.stops() and shown[0].term.family not in _NUISANCE_FAMILIES):
             break
         if search.add(diagnostics, shown):
             diagnostics = search.diagnostics()

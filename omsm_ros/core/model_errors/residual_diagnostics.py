@@ -19,11 +19,13 @@ from scipy import fft, stats
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
 from omsm_ros.core.estimation.model_order import ABOVE_CONTENT, ENOUGH_SAMPLES, coarser
-from omsm_ros.core.estimation.noise import scatter_in_time, uneven_rows
+from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated
 from omsm_ros.core.estimation.steps import Edge, Steps, segments
 from omsm_ros.core.model_errors.families import (
     BACKLASH,
+    CREEP,
+    DRIFT,
     FASTEST_MODE_HZ,
     FRICTION,
     PERIODIC,
@@ -134,11 +136,11 @@ class ResidualSpace:
         explained = np.einsum("gi,gij,gj->g", moment, inverse, moment)
         return np.asarray(explained / (self.fitted.sum_of_squares / self.fitted.samples))
 
-    def score(self, columns: FloatArray) -> Score:
-        """Test the term of ``columns`` (n, c), all its coefficients together."""
-        return self.judged(columns.T.copy())
+    def score(self, columns: FloatArray, family: str = "") -> Score:
+        """Test the term of ``columns`` (n, c) of ``family``, all its coefficients together."""
+        return self.judged(columns.T.copy(), family)
 
-    def judged(self, rows: FloatArray) -> Score:
+    def judged(self, rows: FloatArray, family: str = "") -> Score:
         """Test the term whose columns are ``rows`` (c, n), which are overwritten."""
         rows[:, ~self.problem.used] = 0.0
         before = _lengths(rows)
@@ -153,7 +155,11 @@ class ResidualSpace:
         rows /= unit[:, np.newaxis]
         inverse, degrees = _pseudo_inverse(rows @ rows.T, _COLLINEAR_SHARE**2)
         found = inverse @ (rows @ self._residual)
-        spread = inverse @ self._noise_of(rows, found) @ inverse.T
+        walk = 0.0
+        # Drift is what walks.
+        if self._walk is not None and family != DRIFT:
+            walk = self._walk.variance(self._residual, rows, replaces=family == CREEP)
+        spread = inverse @ self._noise_of(rows, found, walk) @ inverse.T
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
         size[free] = found / unit
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
@@ -163,8 +169,10 @@ class ResidualSpace:
     def _residual(self) -> FloatArray:
         return self.problem.on_grid(self.fitted.residual, 0.0)
 
-    def _noise_of(self, rows: FloatArray, found: FloatArray) -> FloatArray:
+    def _noise_of(self, rows: FloatArray, found: FloatArray, walk: float) -> FloatArray:
         """Return the covariance (c, c) of noise times ``rows`` (c, n).
+
+        walk: variance per sample of the increments of a random walk in it
 
         The noise is the residual without ``rows`` times ``found`` (c,).
         """
@@ -176,11 +184,20 @@ class ResidualSpace:
             length = fft.next_fast_len(samples, real=True)
             noise = smoothed_noise_spectrum(missed[part][places], places, samples, length)
             noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
+            if walk > 0:
+                rate = 2 * np.sin(np.pi * np.arange(1, len(noise)) / length)
+                noise[1:] = np.maximum(noise[1:], walk / rate**2)
             even += weighted_gram(rows[:, part], length, noise)
         if self._scatter == 0 and self.problem.shared == self.problem.input_rounding == 0:
             return even
         uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
         return np.asarray(even + uneven.T @ uneven)
+
+    @cached_property
+    def _walk(self) -> RandomWalk | None:
+        """A random walk in the residual, None where it shows none."""
+        walk = RandomWalk.of(self.problem, self._basis)
+        return walk if walk.shows(self._residual) else None
 
     @cached_property
     def _scatter(self) -> float:
@@ -287,10 +304,14 @@ class ResidualDiagnostics:
             term = self._best_of(family)
             if family.name == PERIODIC:
                 term = self._best_of(self.model_errors.periodic(term.parameter))
-            judged, before = ScoreTest(term, self.space.score(term.columns)), found.get(family.name)
+            judged, before = self.tested(term), found.get(family.name)
             if before is None or self.evidence(judged) > self.evidence(before):
                 found[family.name] = judged
         return found
+
+    def tested(self, term: ModelErrorTerm) -> ScoreTest:
+        """Return the test of ``term``."""
+        return ScoreTest(term, self.space.score(term.columns, term.family))
 
     def _best_of(self, family: ModelErrorFamily) -> ModelErrorTerm:
         if len(family.parameters) == 1:
@@ -338,7 +359,7 @@ class ResidualDiagnostics:
         """Return the tests of a relaxation of each time constant."""
         family = self.model_errors.creep()
         terms = (family.term(index) for index in range(len(family.parameters)))
-        return tuple(ScoreTest(t, self.space.score(t.columns[:, :1])) for t in terms)
+        return tuple(ScoreTest(t, self.space.score(t.columns[:, :1], CREEP)) for t in terms)
 
     @cached_property
     def independence(self) -> float:

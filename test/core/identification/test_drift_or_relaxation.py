@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from late_steps import LAG, LATE, NOISE, PERIOD, TIME, late_record
 
+from omsm_ros.core.estimation.noise import RandomWalk
 from omsm_ros.core.estimation.preparation import prepare
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.identification.model_choice import model_from_start
@@ -116,3 +117,28 @@ def test_next_to_a_relaxation_lag_and_roll_off_stay_independent():
     pole_and_zero, lag_and_roll_off = 2, 3
     structure = searched.model.chosen.fit.structure
     assert structure.size >= pole_and_zero + lag_and_roll_off
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_random_walk_is_no_relaxation_and_no_soft_mode(seed):
+    """What polynomials leave of it has more power the slower it is; it is noise, not a response."""
+    prepared = prepare(late_record(walk(4e-9, seed)), "encoder")
+    searched = search_model_errors(prepared, model_from_start)
+    assert not searched.added_poles
+    assert not searched.unmodelled
+    assert {modelled.term.family for modelled in searched.nuisance_terms} <= {DRIFT}
+
+
+def test_the_rate_of_a_random_walk_is_estimated_beside_what_the_fit_follows():
+    """Mean of 20 walks, against the rate with which they were drawn."""
+    model = search_model_errors(prepare(late_record(0.0), "encoder"), model_from_start)
+    space = model.diagnostics.space
+    walks = RandomWalk.of(space.problem, np.linalg.qr(space.problem.sensitivity(space.fitted))[0])
+    rows = np.empty((0, len(TIME)))
+    found = []
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0, NOISE, len(TIME))
+        residual = np.where(space.problem.used, walk(6e-9, seed) + noise, 0.0)
+        found.append(walks.variance(residual, rows, replaces=False))
+    assert np.mean(found) / (6e-9**2 * PERIOD) == pytest.approx(1, abs=0.2)
+    assert not walks.shows(np.where(space.problem.used, noise, 0.0))

@@ -230,18 +230,21 @@ def test_a_plateau_is_the_time_between_edges():
 
 class TestUndetectedTerms:
     def test_a_missed_relaxation_would_have_been_seen(self):
-        """The size said to be missed with 5 % is found nearly always, a third of it hardly."""
+        """The size said to be missed with 5 % is found nearly always, a third of it hardly.
+
+        Of a relaxation five times as slow as the record only the beginning is seen, as a drift.
+        """
         undetected = undetected_terms(survey_of())[0]
         assert undetected.family == CREEP
         found = [
-            CREEP
-            in [
+            {CREEP, DRIFT}
+            & {
                 j.term.family
                 for j in survey_of(crept(undetected.missed, undetected.parameter), k).significant()
-            ]
+            }
             for k in range(6)
         ]
-        assert sum(found) >= 5
+        assert sum(map(bool, found)) >= 5
 
     def test_what_is_carried_holds_estimate_and_uncertainty(self):
         for term in undetected_terms(survey_of(crept(6e-5, 1.0))):
