@@ -423,7 +423,7 @@ class RandomWalk:
     def shows(self, residual: FloatArray) -> bool:
         """Return whether ``residual`` (n,), 0 where not compared, walks (Schwarz 1978)."""
         likelihood, *_ = self._likelihood(residual, np.empty((0, len(residual))))
-        return 2 * (float(np.max(likelihood)) - likelihood[0]) > np.log(len(self.ratios))
+        return bool(2 * np.max(likelihood - likelihood[0]) > np.log(len(self.ratios)))
 
     def variance(self, residual: FloatArray, rows: FloatArray, *, replaces: bool) -> float:
         """Return the variance per sample of the walk's increments.

@@ -36,10 +36,7 @@ from omsm_ros.core.model_errors.families import (
     VIBRATION,
     ModelErrorTerm,
 )
-from omsm_ros.core.model_errors.residual_diagnostics import (
-    FALSE_ALARM,
-    ResidualDiagnostics,
-)
+from omsm_ros.core.model_errors.residual_diagnostics import FALSE_ALARM, ResidualDiagnostics
 from omsm_ros.core.streams.blocks import FloatArray
 
 # Standard uncertainty of a height over the size of an error: the rms of a sine. Backlash and
