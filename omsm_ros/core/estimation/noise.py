@@ -428,7 +428,7 @@ class RandomWalk:
     def variance(self, residual: FloatArray, rows: FloatArray, *, replaces: bool) -> float:
         """Return the variance per sample of the walk's increments.
 
-        residual: (n,), 0 where not compared;  rows: (c, n), fitted beside the walk
+        residual: (n,), 0 where not compared;  rows: (c, n), fitted together with the walk
         replaces: it is zero if ``rows`` describe the residual so much better than a walk does that
             none is left
         """

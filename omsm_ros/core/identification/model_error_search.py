@@ -106,7 +106,7 @@ def search_model_errors(
     for _ in range(_MOST_ROUNDS):
         shown = diagnostics.significant(search.refused | search.settled)
         shown = _without_modelled_lines(shown, search.modes)
-        # Without budget a nuisance term is still fitted beside the structure that was chosen.
+        # Without budget a nuisance term is still fitted to the structure that was chosen.
         if not shown or (search.budget.stops() and shown[0].term.family not in _NUISANCE_FAMILIES):
             break
         if search.add(diagnostics, shown):
