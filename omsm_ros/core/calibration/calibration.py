@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from math import hypot
 from typing import Any
@@ -25,6 +25,8 @@ from omsm_ros.core.calibration.certificate import (
     TEXT,
     WARNING,
     Certificate,
+    Residual,
+    Response,
 )
 from omsm_ros.core.calibration.latency import Latency, unresolved_latency
 from omsm_ros.core.calibration.plausibility import check_covariance, check_dynamics
@@ -311,22 +313,12 @@ _PLACES_1 = {
     "plateau_that_would_tell_s": ("undetected", "plateau_needed_s"),
     "plateau_s": ("undetected", "plateau_s"),
     **{
-        name: ("residual", name)
-        for name in (
-            "noise_m", "chi_square", "edges", "whiteness_p", "independence_p", "timing_scatter_s",
-            "axis_timing_scatter_s", "encoder_noise_m", "samples",
-        )
-    },
-    **{
-        name: ("response", name)
-        for name in (
-            "low_frequency_delay_s", "low_frequency_delay_uncertainty_s",
-            "inter_sample_delay_bound_s", "reference_lag_s", "reference_lag_uncertainty_s",
-            "shape", "modes", "modal_remainder", "two_mass",
-        )
+        one.name: (group, one.name)
+        for group, kind in (("residual", Residual), ("response", Response))
+        for one in fields(kind)
     },
     **{name: ("model_errors", name) for name in ("motion_error_m", "backlash_m", "drift_m_s")},
-}  # fmt: skip
+}
 # The calibration itself has the gain, the structure has the order, and the terms that may be
 # undetected tell which is the largest.
 _REDUNDANT_1 = {"static_gain", "order", "hidden_mostly"}

@@ -71,15 +71,6 @@ def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
     return np.asarray((weight * spectrum)[: last + 1], np.complex128)
 
 
-def motion_spectrum(motion: FloatArray, period: float, noise: float) -> ComplexArray:
-    """Return the transform (k,) of ``motion`` (n,), closed to a period, up to its last content.
-
-    noise: standard deviation of a sample of the motion [m], which is filtered out
-    """
-    closed = np.asarray(fft.rfft(close_period(motion, period)), np.complex128)
-    return denoised(closed, len(motion) * noise**2)
-
-
 # Linear columns weaker than this part of the strongest are rounding.
 _RANK_TOLERANCE = 1e-12
 # Block size of LAPACK.
@@ -143,7 +134,8 @@ class Problem:
 
     @cached_property
     def _spectrum(self) -> ComplexArray:
-        moved = motion_spectrum(self.input, self.period, self.noise)
+        closed = np.asarray(fft.rfft(close_period(self.input, self.period)), np.complex128)
+        moved = denoised(closed, len(self.input) * self.noise**2)
         # The initial-condition response, or a further axis, may be faster than the motion.
         whole = self.fits_initial_condition or len(self.further) > 0
         return np.pad(moved, (0, self.closed_length // 2 + 1 - len(moved))) if whole else moved
@@ -218,7 +210,7 @@ class Problem:
     def project(self, scaled: ScaledStructure, nonlinear: FloatArray) -> Projection:
         """Return the residual at one ψ after the linear parameters are eliminated."""
         structure, lag = scaled.structure, scaled.lag(nonlinear, self.s)
-        moved = self._moved(structure, lag)
+        moved = self._in_time(self._driven(structure, lag))
         # In the memory order of LAPACK: in that of numpy it takes five times as long.
         columns = np.concatenate([moved, self._fixed.T, self._target[np.newaxis]]).T
         size = columns.shape[1] - 1
@@ -234,10 +226,6 @@ class Problem:
             return np.asarray(basis @ (basis.T @ slopes) - slopes)
 
         return Projection(nonlinear, residual, linear, derivative)
-
-    def _moved(self, structure: Structure, lag: ComplexArray) -> FloatArray:
-        """Return the linear columns where they are compared, (terms, k)."""
-        return self._in_time(self._driven(structure, lag))
 
     def _answer(
         self, structure: Structure, lag: ComplexArray, coefficients: FloatArray

@@ -321,7 +321,7 @@ def free_run(
         )
     check_inputs(inputs)
     check_varies(output[counted], "output")
-    run = _run(model.sections, inputs - model.working_point[:-1], output, counted)
+    run, _ = _run(model.sections, inputs - model.working_point[:-1], output, counted)
     residual = np.where(counted, output - run, np.nan)
     rms = float(np.sqrt(np.mean(residual[counted] ** 2)))
     variance = float(np.var(output[counted]))
@@ -330,24 +330,21 @@ def free_run(
 
 def _run(
     sections: ParallelSections, inputs: FloatArray, output: FloatArray, used: BoolArray
-) -> FloatArray:
+) -> tuple[FloatArray, float]:
+    """Return the run whose initial state and constant fit ``output``, and the constant."""
     driven = sections.driven(inputs)
     columns = np.column_stack([*sections.decays(len(inputs)), np.ones(len(inputs))])
     # A column that has decayed where nothing is counted has no size.
     known = np.linalg.norm(columns[used], axis=0) > 0
     state = least_squares(columns[used][:, known], (output - driven)[used], 1e-13)
-    return np.asarray(driven + columns[:, known] @ state)
+    return np.asarray(driven + columns[:, known] @ state), float(state[-1])
 
 
 def stationary_output(
     sections: ParallelSections, inputs: FloatArray, output: FloatArray, used: BoolArray
 ) -> float:
     """Return the steady output at the means of ``inputs`` (n, m)."""
-    centred = inputs - np.mean(inputs, axis=0)
-    driven = sections.driven(centred)
-    columns = np.column_stack([*sections.decays(len(inputs)), np.ones(len(inputs))])
-    known = np.linalg.norm(columns[used], axis=0) > 0
-    return float(least_squares(columns[used][:, known], (output - driven)[used], 1e-13)[-1])
+    return _run(sections, inputs - np.mean(inputs, axis=0), output, used)[1]
 
 
 def check_inputs(inputs: FloatArray) -> None:

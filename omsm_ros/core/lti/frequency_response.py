@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial import polynomial
 
-from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction, slow_motion_jacobian
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.units import DEGREE_RAD
 
 
@@ -109,15 +109,7 @@ def low_frequency_delay_uncertainty(dynamics: TransferFunction, covariance: Floa
 
     covariance: (p, p), order numerator, denominator[1:], delay
     """
-    zeros, poles = len(dynamics.numerator) - 1, len(dynamics.denominator) - 1
-    gradient = np.zeros(zeros + poles + 2)
-    gradient[-1] = 1.0
-    if zeros:
-        gradient[0] = dynamics.numerator[1] / dynamics.numerator[0] ** 2
-        gradient[1] = -1 / dynamics.numerator[0]
-    if poles:
-        gradient[zeros + 1] = 1.0
-    return float(spread_along(gradient, covariance))
+    return float(spread_along(slow_motion_jacobian(dynamics)[0], covariance))
 
 
 def widening(band: Band, other: Band, apart: ComplexArray) -> float:
@@ -147,22 +139,19 @@ def trusted_up_to(band: Band, limits: ResponseLimits, other: Band | None = None)
     return float(band.frequency[outside[0] - 1]) if outside[0] else 0.0
 
 
-def is_detectable(
-    centres: FloatArray,
-    frequency: FloatArray,
-    answer: ComplexArray,
-    noise: FloatArray,
-    limits: ResponseLimits,
-) -> BoolArray:
-    """Return True where the data show a response error of ``limits`` at ``centres`` (c,) [Hz].
+def excited_up_to(
+    frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
+) -> float:
+    """Return the highest frequency [Hz] at which the data show a response error of ``limits``.
 
     frequency: (k,) [Hz], evenly spaced from 0;  answer: transform of the output of the motion, (k,)
     noise: mean square of the transform of the probe's noise, (k,)
 
-    Elsewhere the model interpolates or extrapolates, and residuals do not show its errors. Within
-    a third of an octave a deviation δ of G adds δ · answer, so that its best estimate has the
-    variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
+    It is 0 if they do not show it at any frequency. Beyond it the model extrapolates, and residuals
+    do not show its errors. Within a third of an octave a deviation δ of G adds δ · answer, so that
+    its best estimate has the variance Σ noise |answer|² / (2 (Σ |answer|²)²) in gain and in phase.
     """
+    centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
     power, allowed = np.abs(answer) ** 2, min(limits.gain, limits.phase) / COVERAGE_FACTOR
     edges = np.outer([2 ** (-1 / 6), 2 ** (1 / 6)], centres)
     first = np.searchsorted(frequency, edges[0])
@@ -171,16 +160,5 @@ def is_detectable(
     near = [slice(*ends) for ends in zip(first, last, strict=True)]
     energy = np.array([np.sum(power[part]) for part in near])
     disturbed = np.array([power[part] @ noise[part] for part in near])
-    return np.asarray(energy * allowed > np.sqrt(0.5 * disturbed), np.bool_)
-
-
-def excited_up_to(
-    frequency: FloatArray, answer: ComplexArray, noise: FloatArray, limits: ResponseLimits
-) -> float:
-    """Return the highest frequency [Hz] at which the data show a response error of ``limits``.
-
-    Arguments as for :func:`is_detectable`; 0 if they do not show it at any frequency.
-    """
-    centres = frequency[-1] * 2 ** (-np.arange(0.0, np.log2(len(frequency)), _SHOWN_STEP))
-    found = np.flatnonzero(is_detectable(centres, frequency, answer, noise, limits))
+    found = np.flatnonzero(energy * allowed > np.sqrt(0.5 * disturbed))
     return float(centres[found[0]]) if len(found) else 0.0

@@ -188,14 +188,15 @@ class _Readings:
                 usual=max(others, 1.0),
             )
         for word, (sign, end) in self._ends.items():
-            if end.piled and end.times > self._longest and others < _COARSE:
+            value, times = end.greatest
+            if end.piled and times > self._longest and others < _COARSE:
                 yield Notice(
                     "streams.clipped",
                     stream=name,
-                    readings=end.times,
+                    readings=times,
                     samples=self._samples,
                     end=word,
-                    value=sign * end.value,
+                    value=sign * value,
                 )
 
 
@@ -228,31 +229,30 @@ class _Steps:
 
 
 class _EndValues:
-    """The greatest and second greatest value, and how often each came."""
+    """The two greatest values, and how often each came."""
 
     def __init__(self) -> None:
-        self.value, self.times = -np.inf, 0
-        self._next, self._next_times = -np.inf, 0
+        self._times: dict[float, int] = {}
 
     def add(self, values: FloatArray) -> None:
         """Take more values (n,)."""
-        while len(values) and (greatest := float(np.max(values))) >= self._next:
-            times = int(np.count_nonzero(values == greatest))
-            if greatest > self.value:
-                self._next, self._next_times = self.value, self.times
-                self.value, self.times = greatest, times
-            elif greatest == self.value:
-                self.times += times
-            else:
-                again = self._next_times if greatest == self._next else 0
-                self._next, self._next_times = greatest, again + times
-                return
-            values = values[values < greatest]
+        least = min(self._times) if len(self._times) == 2 else -np.inf
+        found, times = np.unique(values[values >= least], return_counts=True)
+        for value, count in zip(found[-2:].tolist(), times[-2:].tolist(), strict=True):
+            self._times[value] = self._times.get(value, 0) + count
+        self._times = dict(sorted(self._times.items())[-2:])
+
+    @property
+    def greatest(self) -> tuple[float, int]:
+        """The greatest value, and how often it came."""
+        return max(self._times.items())
 
     @property
     def piled(self) -> bool:
         """True if the greatest value came far more often than the next one."""
-        return self.times >= _LEAST_PILED and self.times > _PILED * self._next_times
+        _, times = self.greatest
+        others = sum(self._times.values()) - times
+        return times >= _LEAST_PILED and times > _PILED * others
 
 
 def counter_skew(axes: StreamWatch, distance: StreamWatch) -> float | None:
