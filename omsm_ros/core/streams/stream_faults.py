@@ -244,8 +244,8 @@ class _EndValues:
 
     @property
     def greatest(self) -> tuple[float, int]:
-        """The greatest value, and how often it came."""
-        return max(self._times.items())
+        """The greatest value, and how often it came; NaN before the first."""
+        return max(self._times.items(), default=(np.nan, 0))
 
     @property
     def piled(self) -> bool:
