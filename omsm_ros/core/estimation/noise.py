@@ -52,26 +52,25 @@ def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatA
     Each row is the effect of one independent error of one standard deviation.
     scatter: variance of the time of a reading [s²], see :func:`scatter_in_time`
     """
-    return np.concatenate(
-        [
-            _rounding_rows(problem, columns),
-            _input_rows(problem, columns),
-            _timing_rows(problem, columns, scatter),
-        ]
-    )
-
-
-def _input_rows(problem: Problem, columns: FloatArray) -> FloatArray:
-    """Return rows of errors of a quantised encoder, one for each reading while it moves.
-
-    Where it is stationary, they are a constant or were taken out.
-    """
-    if problem.input_rounding == 0:
-        return np.zeros((0, columns.shape[1]))
-    taken = problem.errors_in_variables
-    variance = problem.input_rounding + (0.0 if taken is None else float(np.mean(taken**2)))
-    square = rate_of(problem)[problem.used] ** 2
-    return np.asarray(np.sqrt(variance) * columns[square > _STILL * np.max(square)])
+    rows, used = [np.zeros((0, columns.shape[1]))], problem.used
+    rate = rate_of(problem)[used]
+    if problem.plateau is not None and problem.shared > 0:
+        # One rounding error for each plateau, one for each reading while moving. It has the
+        # variance of its first harmonic times π²/6, which is Σ 1/k².
+        plateau = problem.plateau[used]
+        sums = np.zeros((int(np.max(problem.plateau)) + 2, columns.shape[1]))
+        np.add.at(sums, plateau + 1, columns)
+        moving = np.pi / np.sqrt(6) * columns[plateau < 0]
+        rows.append(np.sqrt(problem.shared) * np.concatenate([sums[1:], moving]))
+    if problem.input_rounding > 0:
+        # One for each reading of the encoder while it moves; where it is stationary, its errors
+        # are a constant or were taken out.
+        taken = problem.errors_in_variables
+        variance = problem.input_rounding + (0.0 if taken is None else float(np.mean(taken**2)))
+        rows.append(np.sqrt(variance) * columns[rate**2 > _STILL * np.max(rate**2)])
+    if scatter > 0:
+        rows.append(np.sqrt(scatter) * rate[:, np.newaxis] * columns)
+    return np.concatenate(rows)
 
 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
@@ -88,25 +87,6 @@ def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
 def rate_of(problem: Problem) -> FloatArray:
     """Return the rate of the motion [m/s], (n,)."""
     return np.asarray(np.gradient(problem.input, problem.period))
-
-
-def _rounding_rows(problem: Problem, columns: FloatArray) -> FloatArray:
-    """Return rows of rounding errors: one for each plateau, one for each reading while moving."""
-    if problem.plateau is None or problem.shared == 0:
-        return np.zeros((0, columns.shape[1]))
-    plateau = problem.plateau[problem.used]
-    sums = np.zeros((int(np.max(problem.plateau)) + 2, columns.shape[1]))
-    np.add.at(sums, plateau + 1, columns)
-    # Rounding has the variance of its first harmonic times π²/6, which is Σ 1/k².
-    moving = np.pi / np.sqrt(6) * columns[plateau < 0]
-    return np.asarray(np.sqrt(problem.shared) * np.concatenate([sums[1:], moving]))
-
-
-def _timing_rows(problem: Problem, columns: FloatArray, variance: float) -> FloatArray:
-    if variance == 0:
-        return np.zeros((0, columns.shape[1]))
-    rate = rate_of(problem)[problem.used, np.newaxis]
-    return np.asarray(np.sqrt(variance) * rate * columns)
 
 
 def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:

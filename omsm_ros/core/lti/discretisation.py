@@ -13,6 +13,7 @@ delay is a Lagrange interpolator of the same order. At 0 Hz
 the gain is G(0).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
@@ -115,37 +116,34 @@ def _series(zeros: ComplexArray, poles: ComplexArray) -> _StateSpace:
 
 
 def _ratios(zeros: ComplexArray, poles: ComplexArray) -> list[tuple[FloatArray, FloatArray]]:
-    real = _reals(poles)
-    by_two = [_expanded(real[i : i + 2]) for i in range(0, len(real), 2)]
-    denominators = [*_quadratics(_pairs(poles)), *by_two]
-    pairs, reals = _quadratics(_pairs(zeros)), _reals(zeros)
-    numerators = []
-    for denominator in denominators:
-        room = len(denominator) - 1
-        if room == 2 and pairs:
-            numerators.append(pairs.pop(0))
+    pairs, reals = _split(zeros)
+    found = []
+    for group in _by_two(poles):
+        if len(group) == 2 and pairs:
+            taken = pairs.pop(0)
         else:
-            taken, reals = reals[:room], reals[room:]
-            numerators.append(_expanded(taken))
-    return list(zip(numerators, denominators, strict=True))
+            taken, reals = reals[: len(group)], reals[len(group) :]
+        found.append((_expanded(taken), _expanded(group)))
+    return found
 
 
-def _pairs(roots: ComplexArray) -> ComplexArray:
-    upper = roots[roots.imag > 0]
-    return np.asarray(upper[np.argsort(abs(upper))], np.complex128)
+def _split(roots: ComplexArray) -> tuple[list[ComplexArray], ComplexArray]:
+    """Return conjugate pairs and real roots, the smallest first."""
+    ordered = roots[np.argsort(abs(roots))]
+    pairs = [np.array([root, np.conj(root)]) for root in ordered if root.imag > 0]
+    return pairs, ordered[ordered.imag == 0]
 
 
-def _reals(roots: ComplexArray) -> FloatArray:
-    real = roots[roots.imag == 0].real
-    return np.asarray(real[np.argsort(abs(real))], np.float64)
+def _by_two(roots: ComplexArray) -> list[ComplexArray]:
+    """Return conjugate pairs, then real roots by two, the last alone where there is one more."""
+    pairs, real = _split(roots)
+    return [*pairs, *(real[i : i + 2] for i in range(0, len(real), 2))]
 
 
-def _quadratics(upper: ComplexArray) -> list[FloatArray]:
-    return [np.array([abs(r) ** 2, -2 * r.real, 1.0]) for r in upper]
-
-
-def _expanded(roots: FloatArray) -> FloatArray:
-    return np.asarray(polynomial.polyfromroots(roots), np.float64)
+def _expanded(roots: ComplexArray) -> FloatArray:
+    if len(roots) == 2 and roots[0].imag:
+        return np.array([abs(roots[0]) ** 2, -2 * roots[0].real, 1.0])
+    return np.asarray(polynomial.polyfromroots(roots.real), np.float64)
 
 
 def _section(numerator: FloatArray, denominator: FloatArray) -> _StateSpace:
@@ -209,30 +207,12 @@ def second_order_sections(zeros: ComplexArray, poles: ComplexArray, gain: float)
     padded = [np.append(r, np.zeros(count - len(r))) for r in (zeros, poles)]
     remaining = list(padded[0])
     sections = []
-    for pair in sorted(
-        _root_pairs(padded[1]), key=lambda pair: max(abs(pair[0]), abs(pair[1])), reverse=True
-    ):
-        sections.append([*_monic(_nearest(pair[0], remaining)), *_monic(pair)])
+    # The larger of two real poles is the last one, as they are ordered.
+    for pair in sorted(_by_two(padded[1]), key=lambda pair: abs(pair[-1]), reverse=True):
+        sections.append([*_monic(_nearest(pair[-1], remaining)), *_monic(pair)])
     ordered = np.array(sections[::-1], np.float64)
     ordered[0, :3] *= gain
     return ordered
-
-
-def bilinear_roots(
-    zeros: ComplexArray, poles: ComplexArray, gain: float, sample_period: float
-) -> tuple[ComplexArray, ComplexArray, float]:
-    """Return zeros, poles and gain of a proper ratio mapped by ``s = 2 (z - 1) / (T (z + 1))``."""
-    rate = 2 / sample_period
-    mapped = gain * np.prod(rate - zeros) / np.prod(rate - poles)
-    at_nyquist = -np.ones(len(poles) - len(zeros))
-    digital_zeros = np.append((rate + zeros) / (rate - zeros), at_nyquist)
-    return digital_zeros, (rate + poles) / (rate - poles), float(np.real(mapped))
-
-
-def _root_pairs(roots: ComplexArray) -> list[tuple[complex, complex]]:
-    real = sorted((r for r in roots if r.imag == 0), key=abs, reverse=True)
-    conjugate = [(r, np.conj(r)) for r in roots if r.imag > 0]
-    return conjugate + list(zip(real[::2], real[1::2], strict=True))
 
 
 def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
@@ -247,7 +227,7 @@ def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
     return first, second
 
 
-def _monic(pair: tuple[complex, complex]) -> list[float]:
+def _monic(pair: Sequence[complex] | ComplexArray) -> list[float]:
     """Return the coefficients of (1 - r/z)(1 - s/z), ascending in 1/z."""
     return [1.0, float(np.real(-pair[0] - pair[1])), float(np.real(pair[0] * pair[1]))]
 
@@ -355,10 +335,14 @@ def bilinear(
     dynamics: TransferFunction, sample_period: float, poles: ComplexArray | None = None
 ) -> DigitalFilter:
     """Return the bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
+    rate = 2 / sample_period
+    zeros, roots = dynamics.zeros(), dynamics.poles() if poles is None else poles
     leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
-    roots = dynamics.poles() if poles is None else poles
-    zeros, digital, gain = bilinear_roots(dynamics.zeros(), roots, leading, sample_period)
-    return DigitalFilter(second_order_sections(zeros, digital, gain), sample_period)
+    gain = float(np.real(leading * np.prod(rate - zeros) / np.prod(rate - roots)))
+    at_nyquist = -np.ones(len(roots) - len(zeros))
+    mapped = np.append((rate + zeros) / (rate - zeros), at_nyquist)
+    sections = second_order_sections(mapped, (rate + roots) / (rate - roots), gain)
+    return DigitalFilter(sections, sample_period)
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:

@@ -173,23 +173,13 @@ def slow_motion_jacobian(dynamics: TransferFunction) -> FloatArray:
     Lag L and curvature k describe slow motion: ``ln G = -L s + k s² + …``. The derivatives
     ``∂ln G/∂n_i = s^i/N`` and ``∂ln G/∂d_i = -s^i/D`` are expanded to s².
     """
-    up = _inverse_series(dynamics.numerator)
-    down = _inverse_series(dynamics.denominator)
-    columns: list[FloatArray] = [_shifted(up, i) for i in range(len(dynamics.numerator))]
-    columns += [-_shifted(down, i) for i in range(1, len(dynamics.denominator))]
-    columns.append(np.array([0.0, -1.0, 0.0]))
-    rows = np.array([[-c[1] for c in columns], [c[2] for c in columns]], np.float64)
-    return rows
-
-
-def _inverse_series(polynomial: FloatArray) -> FloatArray:
-    """Return the series of 1/polynomial to s², (3,)."""
-    n0, n1, n2 = np.append(polynomial, np.zeros(2))[:3]
-    return np.array([1.0 / n0, -n1 / n0**2, n1**2 / n0**3 - n2 / n0**2], np.float64)
-
-
-def _shifted(series: FloatArray, powers: int) -> FloatArray:
-    return np.asarray(np.append(np.zeros(powers), series)[:3], np.float64)
+    columns: list[FloatArray] = []
+    for sign, values, first in ((1.0, dynamics.numerator, 0), (-1.0, dynamics.denominator, 1)):
+        c0, c1, c2 = np.append(values, np.zeros(2))[:3]
+        inverse = sign * np.array([1.0 / c0, -c1 / c0**2, c1**2 / c0**3 - c2 / c0**2])
+        columns += [np.append(np.zeros(i), inverse)[:3] for i in range(first, len(values))]
+    _, slope, bend = np.array([*columns, [0.0, -1.0, 0.0]]).T
+    return np.stack([-slope, bend])
 
 
 def to_control(dynamics: TransferFunction, delay_order: int = 3) -> control.TransferFunction:

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from omsm_ros.core.lti.discretisation import bilinear_roots, second_order_sections
+from omsm_ros.core.lti.discretisation import bilinear, second_order_sections
+from omsm_ros.core.lti.transfer_function import TransferFunction
 
 BACKWARD = np.exp(-1j * np.array([0.01, 0.3, 1.1, 2.0, 3.1]))
 
@@ -61,9 +62,13 @@ def test_a_gain_alone_is_one_section() -> None:
 
 
 @pytest.mark.parametrize("zeros", [[], [-30.0], [-5 + 20j, -5 - 20j]])
-def test_bilinear_roots_are_those_of_scipy(zeros: list[complex]) -> None:
-    poles = np.array([-10 + 200j, -10 - 200j, -90.0])
-    ours = bilinear_roots(np.array(zeros, complex), poles, 7.0, 1e-3)
-    theirs = signal.bilinear_zpk(zeros, poles, 7.0, 1e3)
-    for mine, other in zip(ours, theirs, strict=True):
-        assert np.allclose(mine, other, rtol=1e-12)
+def test_the_bilinear_transform_is_that_of_scipy(zeros: list[complex]) -> None:
+    poles, lines = [-10 + 200j, -10 - 200j, -90.0], np.array([0.0, 3.0, 31.0, 220.0])
+    numerator, denominator = (
+        np.real(np.atleast_1d(np.poly(roots)))[::-1] for roots in (zeros, poles)
+    )
+    dynamics = TransferFunction.from_ascending(numerator, denominator)
+    digital = signal.bilinear_zpk(zeros, poles, 1.0, 1e3)
+    theirs = signal.freqz_zpk(*digital, 2 * np.pi * lines * 1e-3)[1]
+    ours = bilinear(dynamics, 1e-3).response(lines)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-10)
