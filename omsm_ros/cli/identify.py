@@ -337,7 +337,7 @@ def _model_facts(
     save_model(path, model)
     facts = {
         **model.certificate,
-        "hold": model.hold,
+        "hold": model.sections.hold,
         "valid": [list(range) for range in model.valid],
         "model": str(path),
     }
@@ -435,7 +435,7 @@ def _declare_validate(add: Arguments) -> None:
 def _validate(args: argparse.Namespace) -> Facts:
     model = load_model(args.model)
     inputs = args.input.split(",")
-    record = record_of_table(args.record, inputs, args.output, model.sample_period)
+    record = record_of_table(args.record, inputs, args.output, model.sections.period)
     run = free_run(model, record.inputs, record.output, record.used)
     facts: Facts = {
         "model_verdict": str(model.certificate.get("verdict", "")),
@@ -446,7 +446,7 @@ def _validate(args: argparse.Namespace) -> Facts:
     with ExitStack() as both:  # if one output cannot be written, neither is kept
         if args.out is not None:
             stream = both.enter_context(atomic_file(args.out, "w"))
-            stream.write(text_of_run(record, run, model.sample_period))
+            stream.write(text_of_run(record, run, model.sections.period))
             facts["run"] = str(args.out)
         if args.report is not None:
             facts["report"] = _drawn(args.report, model, record, args.record)

@@ -234,11 +234,6 @@ class ModelError:
     size_m: float | None = None
     uncertainty_m: float | None = None
 
-    @property
-    def in_response(self) -> bool:
-        """Whether it became poles of the response; else it is a nuisance term of the fit."""
-        return self.size_m is None
-
 
 @dataclass(frozen=True, kw_only=True)
 class ModelErrors:

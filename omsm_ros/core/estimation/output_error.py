@@ -184,11 +184,6 @@ class Problem:
     def _target(self) -> FloatArray:
         return self.output[self.used]
 
-    @property
-    def compared(self) -> int:
-        """Return the number of samples that model and data are compared at."""
-        return len(self._places)
-
     @cached_property
     def _places(self) -> IntArray:
         return np.flatnonzero(self.used)
@@ -385,7 +380,7 @@ def fit(
 
     def project(nonlinear: FloatArray) -> Projection:
         if budget is not None:
-            budget.count(problem.compared, structure.poles)
+            budget.count(int(np.count_nonzero(problem.used)), structure.poles)
         return problem.project(scaled, nonlinear)
 
     best, least = None, np.inf

@@ -64,11 +64,6 @@ class ParallelSections:
         """Return the number of inputs."""
         return len(self.direct)
 
-    @property
-    def is_stable(self) -> bool:
-        """Return True if every section is stable, by the signs of its coefficients."""
-        return bool(np.all(self.denominators[:, 0] > 0) and np.all(self.denominators >= 0))
-
     def variable(self, frequency: FloatArray) -> ComplexArray:
         """Return w at ``frequency`` (f,) [Hz]."""
         cycles = np.asarray(frequency, np.float64) * self.period

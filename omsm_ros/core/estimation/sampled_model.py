@@ -47,16 +47,6 @@ class SampledModel:
     certificate: Mapping[str, object] = field(default_factory=dict)
 
     @property
-    def hold(self) -> str:
-        """Return the behaviour of the inputs between samples."""
-        return self.sections.hold
-
-    @property
-    def sample_period(self) -> float:
-        """Return the sample period [s]."""
-        return self.sections.period
-
-    @property
     def continuous(self) -> TransferFunction | None:
         """Return G(s) of the first input as polynomials; None if there is none, or many poles."""
         found = self.sections.equivalent()
@@ -251,9 +241,11 @@ def _root_of(covariance: FloatArray) -> FloatArray:
 def _check_runs(sections: ParallelSections) -> None:
     """Raise CalibrationError for sections that are unstable, too slow or too late."""
     slowest = _SLOWEST_SAMPLES * sections.period
-    slow = np.any(sections.denominators > [slowest, slowest**2])
-    if not sections.is_stable or slow:
-        raise CalibrationError("estimation.unstable", sections=sections.denominators.tolist())
+    down = sections.denominators
+    # The signs of its coefficients show whether a section is stable.
+    stable = np.all(down[:, 0] > 0) and np.all(down >= 0)
+    if not stable or np.any(down > [slowest, slowest**2]):
+        raise CalibrationError("estimation.unstable", sections=down.tolist())
     samples = sections.delays / sections.period
     whole = sections.hold == BAND_LIMITED or np.all(abs(samples - np.round(samples)) < 1e-6)
     if np.any(samples < 0) or np.any(samples > LONGEST_DELAY_SAMPLES) or not whole:

@@ -278,10 +278,12 @@ class ModelErrorFamilies:
     def _mode_frequencies(self) -> list[tuple[float, float]]:
         lowest = 2 / self.duration
         highest = min(self.problem.rate / np.pi, 0.25 / self.problem.period, FASTEST_MODE_HZ)
+        highest = max(highest, 2 * lowest)
+        span = np.log(highest / lowest)
         return [
             (frequency, damping)
             for damping in _DAMPINGS
-            for frequency in _geometric(lowest, max(highest, 2 * lowest), 2 * damping)
+            for frequency in np.geomspace(lowest, highest, int(span / (2 * damping)) + 1)
         ]
 
     def mode(self, frequency: float, damping: float) -> FloatArray:
@@ -417,10 +419,6 @@ def _vertex(power: FloatArray, peak: int) -> float:
     before, at, after = np.log(near)
     bend = before - 2 * at + after
     return peak + float(0.5 * (before - after) / bend) if bend < 0 else float(peak)
-
-
-def _geometric(low: float, high: float, step: float) -> FloatArray:
-    return np.geomspace(low, high, int(np.log(high / low) / step) + 1)
 
 
 def low_pass_response(values: FloatArray, step: float) -> FloatArray:

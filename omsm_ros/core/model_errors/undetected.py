@@ -234,12 +234,13 @@ def _undetected_terms(
     whole = term.family == CREEP or _hinted_by_data(judged)
     gain = np.concatenate([fitted.dynamics.numerator, np.zeros(len(fitted.dynamics.denominator))])
     lag = float(np.linalg.norm(remaining.imag * rms)) / use.speed_m_s
+    limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / term.trials, max(score.degrees, 1)))
     return UndetectedTerm(
         term.family,
         term.parameter,
         float(score.size[0]),
         score.uncertainty,
-        _undetected_size(judged),
+        float(limit + _POWER) * score.uncertainty,
         np.zeros_like(shift) if whole else shift,
         gain,
         np.eye(len(gain))[-1],
@@ -247,13 +248,6 @@ def _undetected_terms(
         lag * whole,
         float(np.sqrt(np.sum((np.abs(remaining) * rms) ** 2))),
     )
-
-
-def _undetected_size(judged: ScoreTest) -> float:
-    """Return the largest size that the test would have missed with 5 % probability."""
-    degrees = max(judged.score.degrees, 1)
-    limit = np.sqrt(stats.chi2.isf(FALSE_ALARM / judged.term.trials, degrees))
-    return float(limit + _POWER) * judged.score.uncertainty
 
 
 def _response_error(

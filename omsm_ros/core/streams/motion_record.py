@@ -337,11 +337,6 @@ def _covered(record: MotionRecord) -> MotionRecord:
 _MANY = 100
 
 
-def _follows(before: Block, block: Block) -> bool:
-    begun = before.newest
-    return block.first_sample >= begun[0] and not is_ahead_of_time(begun, block)
-
-
 class BlockBuffer(Generic[Probed]):
     """Blocks of one topic since its trigger counter was last reset, bounded in samples.
 
@@ -363,23 +358,25 @@ class BlockBuffer(Generic[Probed]):
         The next block has to confirm that; otherwise the one before it is dropped. If the stamp is
         a little older too, the block is a late or repeated one.
         """
-        before, doubtful, self._doubtful = self._newest(), self._doubtful, None
+        before = self._blocks[-1] if self._blocks else None
+        doubtful, self._doubtful = self._doubtful, None
         if doubtful is not None and block.first_sample == doubtful.end:
             self._forget(len(self._blocks))
             self._append(doubtful)
             self._append(block)
-        elif before is None or _follows(before, block):
-            self.forgotten += len(doubtful) if doubtful is not None else 0
+            return
+        late_ns = 0 if before is None else before.stamp_ns - block.stamp_ns
+        if before is None or (
+            block.first_sample >= before.newest[0] and not is_ahead_of_time(before.newest, block)
+        ):
             self._append(block)
-        elif 0 < before.stamp_ns - block.stamp_ns <= TIME_JUMP_S * NANOSECONDS_PER_S:
+        elif 0 < late_ns <= TIME_JUMP_S * NANOSECONDS_PER_S:
             self._doubtful = doubtful
             self._append(block, before_newest=block.first_sample < before.first_sample)
+            return
         else:
-            self.forgotten += len(doubtful) if doubtful is not None else 0
             self._doubtful = block
-
-    def _newest(self) -> Probed | None:
-        return self._blocks[-1] if self._blocks else None
+        self.forgotten += 0 if doubtful is None else len(doubtful)
 
     def _append(self, block: Probed, *, before_newest: bool = False) -> None:
         self._blocks.insert(len(self._blocks) - before_newest, block)

@@ -189,7 +189,7 @@ _SPAN_MODEL_FIGURES: dict[str, Any] = {
 
 def response(model: SampledModel) -> Figure:
     """Draw gain and phase to half the sampling rate with their 95 % band; grey: not trusted."""
-    frequency = np.geomspace(_LOWEST_SHARE, 1.0, _LINES) * 0.5 / model.sample_period
+    frequency = np.geomspace(_LOWEST_SHARE, 1.0, _LINES) * 0.5 / model.sections.period
     value, band = model.sections.response(frequency)[0], model.sections.band(frequency)
     made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
@@ -221,7 +221,7 @@ def record(model: SampledModel, inputs: FloatArray, output: FloatArray, run: Fre
     made, axes = style.figure(7.4, 6.2, rows=3, sharex=True)
     given, both, left = axes[:, 0]
     inputs = inputs.reshape(len(inputs), -1)
-    time = model.sample_period * np.arange(len(inputs))
+    time = model.sections.period * np.arange(len(inputs))
     for column in inputs.T:
         _draw(given, time, column, style.MUTED, "input")
     _draw(both, time, output, style.BEFORE, "measured")

@@ -94,9 +94,9 @@ def _headlines(page: ModelPage) -> list[Headline]:
         Headline(
             "Valid",
             "; ".join(" to ".join(quantity(end, "Hz") for end in ends) for ends in model.valid),
-            f"half the sampling rate is {quantity(0.5 / model.sample_period, 'Hz')}",
+            f"half the sampling rate is {quantity(0.5 / model.sections.period, 'Hz')}",
         ),
-        Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.hold}"),
+        Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.sections.hold}"),
     ]
 
 
@@ -135,7 +135,7 @@ def _identity(page: ModelPage) -> Table:
     rows = [
         ("schema", SCHEMA),
         ("record", page.source or NOTHING),
-        ("sample period", quantity(model.sample_period, "s", 4)),
+        ("sample period", quantity(model.sections.period, "s", 4)),
         ("working point, inputs", ", ".join(plain(x, 6) for x in model.working_point[:-1])),
         ("working point, output", plain(model.working_point[-1], 6)),
         ("omsm_ros", page.version or NOTHING),

@@ -165,7 +165,7 @@ def model_error_table(certificate: Certificate) -> Table:
             error.family,
             quantity(error.size_m, "m"),
             quantity(error.uncertainty_m, "m"),
-            "in the response" if error.in_response else "as a nuisance term",
+            "in the response" if error.size_m is None else "as a nuisance term",
         )
         for error in found.modelled
     ]

@@ -55,7 +55,7 @@ def test_all_parts_are_there(model, record):
         assert text in page, text
     assert "<b>.csv" not in page
     assert page.count("<figure>") == 3
-    assert f"input: {model.hold}" in page
+    assert f"input: {model.sections.hold}" in page
 
 
 def test_a_pole_that_the_data_do_not_resolve_has_a_bound(record):
