@@ -107,20 +107,19 @@ def calibration_set(
 
 
 def _check_alike(members: Sequence[Calibration]) -> None:
-    first = members[0]
-    for other in members[1:]:
-        for what, one, two in (
-            ("sample_period", first.sample_period, other.sample_period),
-            (
-                "polarity",
-                first.certificate.static_gain.polarity,
-                other.certificate.static_gain.polarity,
-            ),
-            ("settings", dict(first.settings), dict(other.settings)),
-        ):
-            if one != two:
+    first, *others = (
+        {
+            "sample_period": c.sample_period,
+            "polarity": c.certificate.static_gain.polarity,
+            "settings": dict(c.settings),
+        }
+        for c in members
+    )
+    for other in others:
+        for what, value in first.items():
+            if value != other[what]:
                 raise CalibrationError(
-                    "calibration.set_differs", what=what, first=repr(one), other=repr(two)
+                    "calibration.set_differs", what=what, first=repr(value), other=repr(other[what])
                 )
 
 

@@ -146,29 +146,30 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     Where the inputs are slow, the records are decimated. Samples of slow inputs are band-limited.
     """
     every = min(_decimation(record.inputs) for record in whole.records)
-    while every > 1:
-        records = [
-            _exciting_part(
-                SampledRecord(
-                    _decimated(record.inputs, every),
-                    _decimated(_filled(record), every),
-                    record.used[::every],
-                )
-            )
-            for record in whole.records
-        ]
+    while True:
+        records = [_exciting_part(_thinned(record, every)) for record in whole.records]
         try:
             most = min(most, check_records(records, order))
         except IdentificationError:
+            if every == 1:
+                # No part excites as much as the whole record.
+                return whole, 1, most
             every //= 2
-            continue
-        return SectionsProblem(records, BAND_LIMITED, 0 * whole.delays), every, most
-    parts = [_exciting_part(record) for record in whole.records]
-    try:
-        return replace(whole, records=parts), 1, min(most, check_records(parts, order))
-    except IdentificationError:
-        # No part excites as much as the whole record.
-        return whole, 1, most
+        else:
+            if every == 1:
+                return replace(whole, records=records), 1, most
+            return SectionsProblem(records, BAND_LIMITED, 0 * whole.delays), every, most
+
+
+def _thinned(record: SampledRecord, every: int) -> SampledRecord:
+    """Return one in ``every`` samples, behind a low pass."""
+    if every == 1:
+        return record
+    inputs, output = (
+        np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))
+        for values in (record.inputs, _filled(record))
+    )
+    return SampledRecord(inputs, output, record.used[::every])
 
 
 def _filled(record: SampledRecord) -> FloatArray:
@@ -444,9 +445,3 @@ def _decimation(inputs: FloatArray) -> int:
     power = np.cumsum(np.sum(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1))
     share = float(np.searchsorted(power, _CONTENT * power[-1])) / len(power)
     return max(int(1 / max(share * _ABOVE_CONTENT, 1e-3)), 1)
-
-
-def _decimated(values: FloatArray, every: int) -> FloatArray:
-    if every == 1:
-        return values
-    return np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))

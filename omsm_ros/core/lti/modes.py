@@ -88,14 +88,12 @@ def mode_entries(
     dynamics: TransferFunction, covariance: FloatArray
 ) -> list[dict[str, float | None]]:
     """Return the modes as JSON values for a certificate, with None for infinite values."""
+    units = {"frequency": "_hz", "damping": "", "residue": "_per_s2"}
     return [
         {
-            "frequency_hz": mode.frequency,
-            "frequency_uncertainty_hz": _finite(mode.frequency_uncertainty),
-            "damping": mode.damping,
-            "damping_uncertainty": _finite(mode.damping_uncertainty),
-            "residue_per_s2": _finite(mode.residue),
-            "residue_uncertainty_per_s2": _finite(mode.residue_uncertainty),
+            f"{name}{kind}{unit}": _finite(getattr(mode, f"{name}{kind}"))
+            for name, unit in units.items()
+            for kind in ("", "_uncertainty")
         }
         for mode in known_modes(dynamics, covariance)
     ]

@@ -185,25 +185,22 @@ def _worst_relaxation(
         ]
     worst = max(relaxations, key=lambda term: term.effect * term.carried)
     slower = _UNSEEN * found
-    latest = max(
-        (_lag_beyond_noise(term, use) for term in relaxations),
-        key=lambda term: term.lag * term.size,
-    )
+    # Many relaxations lag, and noise would mask a part of each: it counts what exceeds the noise.
+    lags = [
+        replace(
+            term,
+            size=float(np.sqrt(max(term.size**2 - term.uncertainty**2, 0.0))),
+            uncertainty=0.0,
+            above=0.0,
+            effect=term.lag * use.speed_m_s,
+        )
+        for term in relaxations
+    ]
+    latest = max(lags, key=lambda term: term.lag * term.size)
     other = [latest] if latest.lag * latest.size > worst.lag * worst.carried else []
     if worst.above > 0 and worst.carried * worst.above < slower:
         worst = replace(worst, size=0.0, uncertainty=slower / worst.above)
     return [worst, *other]
-
-
-def _lag_beyond_noise(term: UndetectedTerm, use: IntendedUse) -> UndetectedTerm:
-    """Return the lag alone of ``term``, for its size in excess of noise.
-
-    Many relaxations lag, and noise would mask a part of each; those that the data suggest are
-    included.
-    """
-    excess = float(np.sqrt(max(term.size**2 - term.uncertainty**2, 0.0)))
-    effect = term.lag * use.speed_m_s
-    return replace(term, size=excess, uncertainty=0.0, above=0.0, effect=effect)
 
 
 def fitted_relaxation(dynamics: TransferFunction) -> float:

@@ -168,24 +168,14 @@ class RunQueue:
         return run
 
     def hold(self, samples: int) -> SampleRun:
-        """Remove the oldest ``samples`` of the head, which have partners; settle or refuse them."""
+        """Remove the oldest ``samples`` of the head, which have partners; then settle them."""
         self.held += samples
         return self._cut(samples)
 
-    def settle(self, run: SampleRun, partner_reasons: NDArray[np.uint8]) -> None:
+    def settle(self, run: SampleRun, partner_reasons: NDArray[np.uint8] | np.uint8) -> None:
         """Count a run that was held; its partners have the reasons ``partner_reasons`` (n,)."""
         self.held -= len(run)
-        if run.reasons.any() or partner_reasons.any():
-            self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
-        else:
-            self._tally.count(RejectionReason.NONE, len(run))
-
-    def refuse(self, run: SampleRun) -> None:
-        """Count a run that was held as slipped."""
-        self.held -= len(run)
-        self._tally.count_each(
-            np.where(run.reasons, run.reasons, np.uint8(RejectionReason.SLIPPED))
-        )
+        self._tally.count_each(np.where(run.reasons, run.reasons, partner_reasons))
 
     def limit(self, samples: int) -> None:
         """Drop the oldest as overdue until no more than ``samples`` wait."""
@@ -275,8 +265,8 @@ class Pairing:
                 self._held.appendleft((a.part(stop, len(a)), d.part(stop, len(d))))
                 a, d = a.part(0, stop), d.part(0, stop)
             if slipped:
-                self.axes.refuse(a)
-                self.distance.refuse(d)
+                self.axes.settle(a, np.uint8(RejectionReason.SLIPPED))
+                self.distance.settle(d, np.uint8(RejectionReason.SLIPPED))
             else:
                 self.axes.settle(a, d.reasons)
                 self.distance.settle(d, a.reasons)

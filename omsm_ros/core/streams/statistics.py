@@ -98,12 +98,8 @@ class RunningScatter:
 
     def _running(self, sizes: FloatArray) -> FloatArray:
         """Return the running mean before ``sizes`` (n,) and after each of them, (n + 1,)."""
-        sums = [self._faded(sizes, 0)]
-        if 1.0 + self._decay * self._sums[1] == self._sums[1]:
-            # After 50 000 samples the sum of weights no longer changes in floating point.
-            return np.asarray(sums[0] / self._sums[1], np.float64)
-        sums.append(self._faded(np.ones(len(sizes)), 1))
-        return np.asarray(sums[0] / np.maximum(sums[1], np.finfo(np.float64).tiny), np.float64)
+        total, weight = self._faded(sizes, 0), self._faded(np.ones(len(sizes)), 1)
+        return np.asarray(total / np.maximum(weight, np.finfo(np.float64).tiny), np.float64)
 
     def _faded(self, values: FloatArray, k: int) -> FloatArray:
         """Return the k-th decaying sum before ``values`` (n,) and after each of them, (n + 1,)."""
