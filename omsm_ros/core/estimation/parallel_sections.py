@@ -92,19 +92,16 @@ class ParallelSections:
         up = self.numerators[input]
         part = (up[:, :1] + up[:, 1:] * w) * basis
         value = self.response(frequency)[input]
-        size = len(self.denominators)
-        jacobian = np.zeros((self.inputs, 1 + 2 * size, len(w)), np.complex128)
-        jacobian[input, 0] = late
-        jacobian[input, 1::2], jacobian[input, 2::2] = late * basis, late * basis * w
-        poles = np.stack([-late * part * basis * w, -late * part * basis * w * w], axis=1)
-        delays = np.zeros((self.inputs, len(w)), np.complex128)
-        delays[input] = -1j * omega * value
-        every = np.concatenate(
-            [jacobian.reshape(-1, len(w)), poles.reshape(-1, len(w)), delays]
-        ) / np.where(value == 0, np.finfo(float).tiny, value)
+        each = 1 + 2 * len(self.denominators)
+        jacobian = np.zeros((self.inputs * (each + 1) + each - 1, len(w)), np.complex128)
+        ups, downs = jacobian[input * each :][:each], jacobian[self.inputs * each :][: each - 1]
+        ups[0], ups[1::2], ups[2::2] = late, late * basis, late * basis * w
+        downs[::2], downs[1::2] = -late * part * basis * w, -late * part * basis * w * w
+        jacobian[input - self.inputs] = -1j * omega * value
+        jacobian /= np.where(value == 0, np.finfo(float).tiny, value)
         gain, phase = (
             np.sqrt(np.maximum(np.einsum("pk,pq,qk->k", j, self.covariance, j), 0.0))
-            for j in (every.real, every.imag)
+            for j in (jacobian.real, jacobian.imag)
         )
         return Band(frequency, gain, phase)
 

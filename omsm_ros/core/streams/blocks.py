@@ -326,13 +326,9 @@ def _continues(first: B, length: int, block: B) -> bool:
     if block.first_sample != first.first_sample + length or block.sample_period != period:
         return False
     off_ns = block.stamp_ns - first.stamp_ns - length * period * NANOSECONDS_PER_S
-    return abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S and _nonempty_channels(
-        first
-    ) == _nonempty_channels(block)
-
-
-def _nonempty_channels(block: B) -> tuple[str, ...]:
-    return tuple(name for name in _channels(block) if len(getattr(block, name)))
+    close = abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S
+    one, other = ([bool(len(getattr(b, c))) for c in _channels(b)] for b in (first, block))
+    return close and one == other
 
 
 def _channels(block: B) -> tuple[str, ...]:
