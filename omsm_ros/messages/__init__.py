@@ -21,7 +21,7 @@ of Python or how :mod:`omsm_ros.readable` writes the number:
 | ``{source:words}`` | name with spaces instead of underscores |
 | ``{opt.dwell}`` | ``--dwell``, ``parameter 'dwell'`` or ``'dwell'``, for the audience |
 
-To add a message, add its code and template to the dictionary of its room in this package.
+To add a message, add its code and template to the catalogue of its room in this package.
 """
 
 import importlib
@@ -71,6 +71,21 @@ def templates() -> Mapping[str, str]:
         if twice := found.keys() & mapping.keys():
             raise ValueError(f"messages: codes {sorted(twice)} stand in two rooms")
         found |= mapping
+    return found
+
+
+def catalogue(text: str) -> dict[str, str]:
+    """Return the templates by code of lines ``code: template``.
+
+    An indented line continues the template before it; lines that begin with # are comments.
+    """
+    found: dict[str, str] = {}
+    code = ""
+    for line in text.splitlines():
+        if line.startswith(" "):
+            found[code] += f" {line.strip()}"
+        elif line and not line.startswith("#"):
+            code, _, found[code] = line.partition(": ")
     return found
 
 

@@ -1,63 +1,43 @@
 """Sentences about an adjustment of scans: its verdict, its reasons, and names of sources."""
 
-TEMPLATES = {
-    "verdict.verified": "verified by {scans:count} scans",
-    "verdict.except": "{text}, except for {number} sources as declared or assumed",
-    "verdict.rests_on": (
-        "not shown by these scans, counted as declared or assumed: {names} (in all {value:m/2} of "
-        "the heights, k = 1)"
-    ),
-    "verdict.not_verified": "not verified",
-    "verdict.contradicted": "contradicted by the scans",
-    "verdict.too_uncertain": "uncertainty too large",
-    "verdict.invalid": "measurement not valid",
-    "verdict.rejected": "the calibration was rejected; identify again",
-    "verdict.refuted": (
-        "{names}: found {value:plain/2} standard deviations from the declared value; check the "
-        "declaration, or accept the found value with omsm adjust --accept"
-    ),
-    "verdict.undeclared_effect": (
-        "{names}: significant, and not declared; the found value is in the uncertainty. Look for "
-        "its cause, or accept it with omsm adjust --accept"
-    ),
-    "verdict.unidentified": (
-        "the scans show an error ({value:plain/2} standard deviations) that no single source "
-        "explains: look for what changed between step test and scans, and scan again"
-    ),
-    "verdict.scans_disagree": (
-        "scan {names} differs from the others by E_n = {value:plain/2}, at most {limit:plain/1} is "
-        "expected; look for what changed between the scans"
-    ),
-    "verdict.wrong_sign": (
-        "scan {names}: the deviation follows the removed dynamic error ({value:plain/2} of it), "
-        "as with a wrong sign of the probe; check the polarity of step test and scan"
-    ),
-    "verdict.not_redundant": (
-        "one speed and direction cannot show an error of the dynamics, a lag or a drift"
-    ),
-    "verdict.not_evaluated": (
-        "not evaluated, and not shown by these scans: {names} (may change the heights by "
-        "{value:m/2}); {remedy}, or declare it with its evaluation"
-    ),
-    "verdict.declared_only": (
-        "declared without an evaluation, and not shown by these scans: {names} (may change the "
-        "heights by {value:m/2}); {remedy}, or evaluate it from a recording"
-    ),
-    "verdict.uncertainty": (
-        "expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked for"
-    ),
-    "verdict.add_other_speed": "scan the part again at twice the speed, from the centre outward",
-    "verdict.add_other_direction": "scan the part again with the spindle reversed",
-    "verdict.add_reclocked": (
-        "turn the part on the chuck by 80°, and scan it again at twice the speed"
-    ),
-    "verdict.add_repeated_track": "scan the part again in the same way",
-    "verdict.add_beyond_centre": (
-        "scan the part again at twice the speed, from beyond the centre outward"
-    ),
-    "verdict.add_other_stand_off": "scan the part again at another stand-off of the probe",
-    "verdict.add_reference_artefact": "measure a reference artefact",
-}
+from omsm_ros.messages import catalogue
+
+TEMPLATES = catalogue("""
+verdict.verified: verified by {scans:count} scans
+verdict.except: {text}, except for {number} sources as declared or assumed
+verdict.rests_on: not shown by these scans, counted as declared or assumed: {names} (in all
+    {value:m/2} of the heights, k = 1)
+verdict.not_verified: not verified
+verdict.contradicted: contradicted by the scans
+verdict.too_uncertain: uncertainty too large
+verdict.invalid: measurement not valid
+verdict.rejected: the calibration was rejected; identify again
+verdict.refuted: {names}: found {value:plain/2} standard deviations from the declared value; check
+    the declaration, or accept the found value with omsm adjust --accept
+verdict.undeclared_effect: {names}: significant, and not declared; the found value is in the
+    uncertainty. Look for its cause, or accept it with omsm adjust --accept
+verdict.unidentified: the scans show an error ({value:plain/2} standard deviations) that no single
+    source explains: look for what changed between step test and scans, and scan again
+verdict.scans_disagree: scan {names} differs from the others by E_n = {value:plain/2}, at most
+    {limit:plain/1} is expected; look for what changed between the scans
+verdict.wrong_sign: scan {names}: the deviation follows the removed dynamic error ({value:plain/2}
+    of it), as with a wrong sign of the probe; check the polarity of step test and scan
+verdict.not_redundant: one speed and direction cannot show an error of the dynamics, a lag or a
+    drift
+verdict.not_evaluated: not evaluated, and not shown by these scans: {names} (may change the heights
+    by {value:m/2}); {remedy}, or declare it with its evaluation
+verdict.declared_only: declared without an evaluation, and not shown by these scans: {names} (may
+    change the heights by {value:m/2}); {remedy}, or evaluate it from a recording
+verdict.uncertainty: expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked
+    for
+verdict.add_other_speed: scan the part again at twice the speed, from the centre outward
+verdict.add_other_direction: scan the part again with the spindle reversed
+verdict.add_reclocked: turn the part on the chuck by 80°, and scan it again at twice the speed
+verdict.add_repeated_track: scan the part again in the same way
+verdict.add_beyond_centre: scan the part again at twice the speed, from beyond the centre outward
+verdict.add_other_stand_off: scan the part again at another stand-off of the probe
+verdict.add_reference_artefact: measure a reference artefact
+""")
 
 SOURCE_NAMES = {
     "probe_noise": "noise of a reading",
