@@ -116,19 +116,12 @@ class StreamInput:
     def _note(self, block: Block, arrival: Arrival) -> None:
         """Keep the stamps of the new samples of ``block``."""
         begins, period_ns = arrival.first + arrival.skip, _period_ns(block)
-        if not len(block.parts):
-            first = block.first_sample + self._offset
-            late = max(begins - first, 0)
-            if late < len(block):
-                stamp_ns = block.stamp_ns + round(late * period_ns)
-                self.stamps.add(arrival.session, first + late, stamp_ns)
-            return
-        firsts, stamps = block.parts.T
+        firsts, stamps = block.stamps.T
         firsts = firsts + self._offset
         new = np.append(firsts[1:], block.end + self._offset) > begins
         skipped = np.maximum(begins - firsts[new], 0)
         stamps = stamps[new] + np.rint(skipped * period_ns).astype(np.int64)
-        self.stamps.extend(arrival.session, firsts[new] + skipped, stamps)
+        self.stamps.extend(arrival.session, (firsts[new] + skipped).tolist(), stamps.tolist())
 
     def end(self) -> None:
         """Begin a new session with the next block."""

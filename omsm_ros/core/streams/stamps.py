@@ -6,10 +6,10 @@ session gives the time of every sample. Its slope shows a stated sample period t
 
 from __future__ import annotations
 
-from array import array
-from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 
@@ -160,77 +160,36 @@ class StampLine:
     """Stamps of the blocks of one stream, in the order of sessions and counts, as a queue."""
 
     def __init__(self) -> None:
-        # Rows before ``_head`` are done. Arrays, because a bag brings thousands at once.
-        self._sessions, self._counts, self._stamps = array("q"), array("q"), array("q")
-        self._head = 0
+        # Session, first count and stamp of each block to come, and of the current one.
+        self._coming: deque[tuple[int, int, int]] = deque()
         self._current: tuple[int, int, int] | None = None
 
-    def add(self, session: int, count: int, stamp_ns: int) -> None:
-        """Append the newest block's session, first count and stamp."""
-        self._clear()
-        self._sessions.append(session)
-        self._counts.append(count)
-        self._stamps.append(stamp_ns)
-
-    def extend(self, session: int, counts: IntArray, stamps: IntArray) -> None:
-        """Append first counts and stamps of the newest blocks of a session, each (n,)."""
-        self._clear()
-        self._sessions.extend(array("q", [session]) * len(counts))
-        self._counts.frombytes(np.ascontiguousarray(counts, np.int64).tobytes())
-        self._stamps.frombytes(np.ascontiguousarray(stamps, np.int64).tobytes())
-
-    def _clear(self) -> None:
-        for column in (self._sessions, self._counts, self._stamps):
-            del column[: self._head]
-        self._head = 0
-
-    def __len__(self) -> int:
-        return len(self._counts) - self._head
+    def extend(self, session: int, counts: Iterable[int], stamps: Iterable[int]) -> None:
+        """Append first counts and stamps [ns] of the newest blocks of a session."""
+        self._coming.extend(zip(repeat(session), counts, stamps))
 
     def advance(self, session: int, count: int) -> bool:
         """Move to the block that holds ``count``; return whether it begins there."""
-        before = self._head
-        while self._head < len(self._counts) and self._next() <= (session, count):
-            self._head += 1
-        if self._head == before:
-            return False
-        self._current = self._row(self._head - 1)
-        return self._current[:2] == (session, count)
-
-    def skip(self, blocks: int) -> None:
-        """Move on by ``blocks`` blocks."""
-        if blocks:
-            self._head += blocks
-            self._current = self._row(self._head - 1)
-
-    def coming(self, session: int, end: int) -> tuple[IntArray, IntArray] | None:
-        """Return first counts below ``end`` and stamps of a session's next blocks, each (1 + n,).
-
-        The first row is the current block; None where the session has none.
-        """
-        if self._current is None or self._current[0] != session:
-            return None
-        until = bisect_right(self._sessions, session, self._head)
-        place = slice(self._head, bisect_left(self._counts, end, self._head, until))
-        _, count, stamp = self._current
-        counts, stamps = self._counts[place], self._stamps[place]
-        return np.concatenate([[count], counts]), np.concatenate([[stamp], stamps])
+        moved = False
+        while self._coming and self._coming[0][:2] <= (session, count):
+            self._current, moved = self._coming.popleft(), True
+        return moved and self._current is not None and self._current[:2] == (session, count)
 
     def step_to(self, session: int, count: int, period_ns: float) -> float:
         """Return how much later the next block is stamped than the current one shows [ns].
 
         0 unless it begins at ``count``.
         """
-        if self._current is None or not len(self) or self._next() != (session, count):
+        if self._current is None or not self._coming or self._coming[0][:2] != (session, count):
             return 0.0
         begun, before, stamp = self._current
-        step = self._stamps[self._head] - stamp - (count - before) * period_ns
+        step = self._coming[0][2] - stamp - (count - before) * period_ns
         return step if begun == session else 0.0
 
     def next_in(self, session: int, end: int) -> int:
         """Return the count at which the next block begins, at most ``end``."""
-        if len(self) and self._sessions[self._head] == session:
-            return min(self._counts[self._head], end)
+        if self._coming and self._coming[0][0] == session:
+            return min(self._coming[0][1], end)
         return end
 
     def stamp_of(self, session: int, count: int, period_ns: float) -> float | None:
@@ -251,43 +210,6 @@ class StampLine:
         if here is None or there is None or (here[0], there[0]) != sessions:
             return None
         return here[2] - there[2] + (there[1] - here[1]) * period_ns
-
-    def _next(self) -> tuple[int, int]:
-        return self._sessions[self._head], self._counts[self._head]
-
-    def _row(self, at: int) -> tuple[int, int, int]:
-        return self._sessions[at], self._counts[at], self._stamps[at]
-
-
-def upcoming_stamps(
-    lines: Sequence[StampLine], sessions: tuple[int, int], end: int, period_ns: float
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return the rows of :class:`StampHistory` (n, 5) for the next blocks of two streams.
-
-    There is a row for each count below ``end`` at which a block begins. The second array (n, 2) has
-    the steps of the stamps of each stream there [ns], see ``step_to``. None where a stream has no
-    stamp yet. The values are those of :class:`StampLine` to the last bit.
-    """
-    one, other = (line.coming(s, end) for line, s in zip(lines, sessions, strict=True))
-    if one is None or other is None:
-        return None
-    counts = np.union1d(one[0][1:], other[0][1:])
-    (first, stamp, step), (other_first, other_stamp, other_step) = (
-        _at(counts, *blocks, period_ns) for blocks in (one, other)
-    )
-    skew = stamp - other_stamp + (other_first - first) * period_ns
-    time = stamp + (counts - first) * period_ns
-    columns = [counts, skew, first == counts, other_first == counts, time]
-    return np.stack(columns, axis=1, dtype=np.float64), np.stack([step, other_step], axis=1)
-
-
-def _at(
-    counts: IntArray, firsts: IntArray, stamps: IntArray, period_ns: float
-) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return count and stamp of the blocks that hold ``counts`` (n,), and their steps there."""
-    steps = np.concatenate([[0.0], np.diff(stamps) - np.diff(firsts) * period_ns])
-    block = np.searchsorted(firsts, counts, "right") - 1
-    return firsts[block], stamps[block], np.where(firsts[block] == counts, steps[block], 0.0)
 
 
 # Stamps that advance faster or slower than the counts by more than this factor were made in time
@@ -311,15 +233,13 @@ class StampHistory:
         """The rows held (n, 5), in their order."""
         return self._room[max(self._held - self._most, 0) : self._held]
 
-    def add(self, rows: FloatArray) -> None:
-        """Append rows, (n, 5)."""
-        rows = rows[-self._most :]
-        if self._held + len(rows) > len(self._room):
-            kept = self.rows.copy()
-            self._held = len(kept)
-            self._room[: self._held] = kept
-        self._room[self._held : self._held + len(rows)] = rows
-        self._held += len(rows)
+    def add(self, *row: float) -> None:
+        """Append a row of five values."""
+        if self._held == len(self._room):
+            self._room[: self._most] = self.rows
+            self._held = self._most
+        self._room[self._held] = row
+        self._held += 1
 
     def after(self, count: float) -> FloatArray:
         """Return the rows beyond a count."""

@@ -33,7 +33,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.streams.stamps import PAUSE_NS, StampHistory, StampLine, upcoming_stamps
+from omsm_ros.core.streams.stamps import PAUSE_NS, StampHistory, StampLine
 from omsm_ros.core.streams.statistics import median, spread_about_median
 from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
@@ -91,8 +91,6 @@ EQUAL_COUNTS = CommonTrigger()
 
 # Two stamps of one trigger by one driver differ by rounding only [ns].
 _SAME_NS = 2.0
-# Number of stamps from which vectorised processing is faster.
-_MANY = 16
 # Time after which pairs are released without a first verdict, where blocks are too long [s].
 _MOST_WAIT_S = 10.0
 
@@ -208,9 +206,6 @@ class TriggerSlipDetector:
         for line, session in zip(self._lines, sessions, strict=True):
             line.advance(session, first - 1)
         while (count := self._next(end)) < end:
-            if (last := self._skip_unremarkable(end, period_ns)) is not None:
-                yield self._agreed_until(last, period_ns), False
-                continue
             pairs = zip(self._lines, sessions, strict=True)
             if self._common or any(
                 line.step_to(s, count, period_ns) >= PAUSE_NS for line, s in pairs
@@ -227,42 +222,6 @@ class TriggerSlipDetector:
         stamped = all(line.stamp_of(s, first, period_ns) is not None for line, s in pairs)
         if self._common or self._state.samples or not stamped:
             yield end, bool(self._state.samples)
-
-    def _skip_unremarkable(self, end: int, period_ns: float) -> int | None:
-        """Take the next stamps up to the first that is off, as :meth:`_observe` takes each.
-
-        Return the count of the last one; None if the next has to be observed alone. A bag brings
-        thousands at once, nearly all of which agree.
-        """
-        if self._starting or self._odd or self._state.samples or sum(map(len, self._lines)) < _MANY:
-            return None
-        stride = self._stride(period_ns)
-        until = math.ceil((self._judged // _STEP_VERDICTS + 1) * _STEP_VERDICTS * stride)
-        ahead = upcoming_stamps(self._lines, self.sessions, min(end, until), period_ns)
-        if ahead is None:
-            return None
-        self._period_ns = period_ns
-        rows, steps = ahead
-        size = abs(rows[:, 1])
-        apart = (abs(steps) >= np.minimum(self._least_steps, PAUSE_NS)).any(axis=1)
-        apart |= (size >= self._off_ns()) | (self._common & (size > _SAME_NS))
-        rows = rows[: int(np.argmax(apart)) if apart.any() else None]
-        if not len(rows):
-            return None
-        strides = rows[:, 0] // self._stride(period_ns)
-        begins = np.flatnonzero(np.diff(strides, prepend=self._judged))
-        if len(begins):
-            self._judged = int(strides[-1])
-            self._since = rows[begins[-1], 0] - _SPAN_S * NANOSECONDS_PER_S / period_ns
-            self._wander.extend(rows[begins, 1].tolist())
-        self._seen.add(rows)
-        for stream, line in enumerate(self._lines):
-            begun = np.flatnonzero(rows[:, 2 + stream])
-            if len(begun):
-                line.skip(len(begun))
-                self._stamps[stream] += len(begun)
-                self._shown[stream] = self._begun_at[stream] = int(rows[begun[-1], 0])
-        return int(rows[-1, 0])
 
     def end(self) -> bool:
         """Return whether the pairs that still wait slipped, as far as their stamps show."""
@@ -307,7 +266,8 @@ class TriggerSlipDetector:
             return
         self._period_ns, per_s = period_ns, NANOSECONDS_PER_S / period_ns
         self._note_step(count, steps)
-        self._note(count, skew, begun)
+        off = abs(skew) >= self._steady() * period_ns
+        self._note(count, skew, begun, off)
         stride = int(count // self._stride(period_ns))
         judged, self._judged = self._judged, stride
         early_days = count - self._start < _FIRST_S * per_s
@@ -320,19 +280,20 @@ class TriggerSlipDetector:
             if stride // _STEP_VERDICTS != judged // _STEP_VERDICTS:
                 self._set_least_steps()
         time = axes.stamp_of(a, count, period_ns) or 0.0
-        self._seen.add(np.array([[count, skew, *begun, time]]))
-        self._odd |= self._is_off(skew) and not early_days
+        self._seen.add(count, skew, *begun, time)
+        self._odd |= off and not early_days
 
-    def _note(self, count: int, skew: float, begun: tuple[bool, bool]) -> None:
+    def _note(self, count: int, skew: float, begun: tuple[bool, bool], off: bool) -> None:
         """Keep the skew of one stamp for the streams whose blocks have ``begun`` there."""
         first = not any(self._stamps)
         self._common = abs(skew) <= _SAME_NS and (first or self._common)
-        for stream in np.flatnonzero(begun):
-            self._stamps[stream] += 1
-            self._begun_at[stream] = count
-            if not self._is_off(skew):
-                self._shown[stream] = count
-        if self._is_off(skew):
+        for stream in (0, 1):
+            if begun[stream]:
+                self._stamps[stream] += 1
+                self._begun_at[stream] = count
+                if not off:
+                    self._shown[stream] = count
+        if off:
             self._odd_at = count
 
     def _note_step(self, count: int, steps: tuple[float, float]) -> None:
@@ -364,13 +325,6 @@ class TriggerSlipDetector:
                 usual = _USUAL_STEPS * float(np.quantile(abs(steps), _USUAL_SHARE))
                 least = _STEP_PERIODS * self._period_ns
                 self._least_steps[stream] = least if usual < least else math.inf
-
-    def _off_ns(self) -> float:
-        """Return the skew that is off [ns]."""
-        return self._steady() * self._period_ns
-
-    def _is_off(self, skew: float) -> bool:
-        return abs(skew) >= self._off_ns()
 
     @staticmethod
     def _stride(period_ns: float) -> float:

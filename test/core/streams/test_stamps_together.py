@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.streams import trigger_slips
 from omsm_ros.core.streams.blocks import AxisBlock, joined, uninterrupted
-from omsm_ros.core.streams.stamps import PAUSE_NS, StampHistory, StampLine, upcoming_stamps
-from omsm_ros.core.streams.trigger_slips import CommonTrigger
+from omsm_ros.core.streams.stamps import StampHistory
 
 from .test_slips import Device, join, without
 
@@ -104,51 +102,9 @@ def test_pairs_and_accounts_are_those_of_blocks_one_by_one(name: str) -> None:
     assert (each.slipped > 10_000) is (name == "slip")
 
 
-@pytest.mark.parametrize("name", ["one driver", "two drivers", "lost", "pause"])
-def test_few_stamps_are_looked_at_by_themselves(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[int] = []
-    observe = trigger_slips.TriggerSlipDetector._observe
-
-    def counted(watch: trigger_slips.TriggerSlipDetector, count: int, period_ns: float) -> None:
-        seen.append(count)
-        observe(watch, count, period_ns)
-
-    monkeypatch.setattr(trigger_slips.TriggerSlipDetector, "_observe", counted)
-    axes, probe = RECORDINGS[name]()
-    join(as_a_bag_gives_them(axes), as_a_bag_gives_them(probe), CommonTrigger())
-    # At most 400 of 1537: those of the first two seconds, and a few where streams are cut.
-    assert len(seen) < 400
-
-
-def test_stamps_ahead_are_those_that_the_lines_tell_one_by_one() -> None:
-    random = np.random.default_rng(5)
-    lines, single = (StampLine(), StampLine()), (StampLine(), StampLine())
-    for line, other in zip(lines, single, strict=True):
-        counts = np.cumsum(random.integers(1, 120, 300))
-        stamps = 1_700_000_000 * 10**9 + counts * 1_000_000 + random.integers(-(10**5), 10**5, 300)
-        stamps[150:] += 10**9
-        line.extend(0, counts, stamps)
-        for count, stamp in zip(counts.tolist(), stamps.tolist(), strict=True):
-            other.add(0, count, stamp)
-        for each in (line, other):
-            each.advance(0, 200)
-    ahead = upcoming_stamps(lines, (0, 0), 9000, 1e6)
-    assert ahead is not None
-    rows, steps = ahead
-    assert np.sum(steps >= PAUSE_NS) == 2
-    axes, distance = single
-    for (count, skew, *begun, time), step in zip(rows.tolist(), steps.tolist(), strict=True):
-        assert min(line.next_in(0, 9000) for line in single) == count
-        assert [line.step_to(0, int(count), 1e6) for line in single] == step
-        assert [line.advance(0, int(count)) for line in single] == begun
-        assert axes.stamp_difference(distance, (0, 0), 1e6) == skew
-        assert axes.stamp_of(0, int(count), 1e6) == time
-    assert min(line.next_in(0, 9000) for line in single) == 9000
-
-
 def test_a_history_holds_the_last_rows_in_their_order() -> None:
     history, rows = StampHistory(10), np.arange(500.0).reshape(100, 5)
-    for start, stop in ((0, 3), (3, 4), (4, 18), (18, 60), (60, 61), (61, 75), (75, 99), (99, 100)):
-        history.add(rows[start:stop])
-        assert np.array_equal(history.rows, rows[max(stop - 10, 0) : stop])
+    for end, row in enumerate(rows, start=1):
+        history.add(*row)
+        assert np.array_equal(history.rows, rows[max(end - 10, 0) : end])
     assert np.array_equal(history.after(rows[95, 0]), rows[96:])
