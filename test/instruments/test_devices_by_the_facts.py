@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import DeviceError, NoSamplesError
 from omsm_ros.instruments.chrocodile.device import ChrocodileSettings, RefusedError
 from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
@@ -433,3 +434,36 @@ def test_an_intensity_taken_for_a_distance_is_refused() -> None:
     device.open()
     with pytest.raises(NoSamplesError, match="order"):
         device.poll(0.0)
+
+
+def test_peaks_before_and_behind_the_range_are_told_from_no_peak() -> None:
+    """Codes 04, 05 and 06 of the last byte of a confocalDT's distance over Ethernet."""
+    rows = [(0x7FFFFF04, 0), (0x7FFFFF05, 0), (0x7FFFFF06, 0), (50_000, 700)]
+    frames = [wires.little(distance, 4) + wires.little(light, 4) for distance, light in rows]
+    kind = wires.little(1 << 15 | 1 << 18 | 1 << 19, 4) + bytes(4)
+    device = ConfocalDtEthernetDevice(Script(wires.block(kind, 0, frames)), ConfocalDtSettings())
+    device.open()
+    pairs = [*device.poll(0.0), *device.close()]
+    (distance,) = (pair.distance for pair in pairs)
+    beyond = Status.OUT_OF_RANGE
+    assert distance.status.tolist() == [Status.NO_TARGET, beyond, beyond, Status.OK]
+    assert np.isnan(distance.distance).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize(("modulus", "warned"), [(4, True), (2**16, False)])
+def test_a_small_counter_without_time_is_warned_of(modulus: int, warned: bool) -> None:
+    """The loss of all samples of one turn of a counter shows in nothing that came."""
+
+    numbers = np.delete(np.arange(7000), slice(3050, 3054))
+    lines = [b"%d %d\n" % (n % modulus, n) for n in numbers]
+    portions = [b"".join(lines[i : i + 100]) for i in range(0, len(lines), 100)]
+    now = [0.0]
+    settings = CsvSettings(columns=("sequence", "distance"), modulus=modulus)
+    device = CsvStreamDevice(
+        Script(*portions), settings, lambda: round(now[0] * 1e9), lambda: now[0]
+    )
+    device.open()
+    for now[0] in 0.1 * np.arange(len(portions)):
+        device.poll(0.0)
+    assert device.statistics.lost == (0 if warned else 4)
+    assert ("no loss of 4 samples or a multiple" in device.caution) == warned

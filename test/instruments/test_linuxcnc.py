@@ -1,9 +1,15 @@
 """Lines of HAL's sampler: resolution, restarts and overruns."""
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+import yaml
+
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.linuxcnc.device import make
 from omsm_ros.instruments.parameters import defaults
+from omsm_ros.instruments.scaling import AXES
 
 from .scripted_stream import Script
 
@@ -50,6 +56,16 @@ def test_the_probe_has_no_target_where_the_program_does_not_measure():
 def test_stated_scales_are_kept():
     (pair,), _ = read([line(1, x=1.0) + line(2, x=1.0)], **{"x.counts_per_unit": 1 / 0.0254})
     np.testing.assert_allclose(pair.axes.x, 0.0254)
+
+
+def test_the_scale_of_an_encoder_is_refused():
+    """``config/axis_driver.yaml`` has one: millimetres would be taken for counts."""
+    text = (Path(__file__).parents[2] / "config/axis_driver.yaml").read_text()
+    (node,) = yaml.safe_load(text).values()
+    stated = node["ros__parameters"]
+    given = {f"{axis}.{name}": value for axis in AXES for name, value in stated[axis].items()}
+    with pytest.raises(ConfigurationError, match="mm, inch or degrees: leave it out"):
+        read([], columns=stated["columns"], **given)
 
 
 def test_another_period_than_linuxcnc_states_is_not_delivered():

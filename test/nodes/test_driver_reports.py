@@ -57,7 +57,7 @@ def driver(monkeypatch):
                                 caution="", settings={"rate_hz": 1000.0}),
         _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
         _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},
-        _was_silent=False, _restarts=0.0, _reset=0.0,
+        _silent_since=None, _restarts=0.0, _reset=0.0,
         _messages=message_mapping.ros_messages(),
         _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
         _settings=Published(), _plotted=Published(), get_clock=FakeNode().get_clock,
@@ -171,4 +171,21 @@ def test_a_counter_that_is_reset_between_two_measurements_is_no_fault(driver):
     driver.passes(1.0, 1000)
     assert "no sample" in driver.passes(5.0, 0).text
     assert driver.passes(1.0, 1000, restarts=1).text.startswith("reading at")
+    assert "just now: restarts 1" in driver.passes(1.0, 1000, restarts=1).text
+
+
+def test_two_restarts_after_a_silence_are_a_fault(driver):
+    driver.passes(1.0, 1000)
+    driver.passes(5.0, 0)
+    assert "just now: restarts 2" in driver.passes(1.0, 1000, restarts=2).text
+
+
+@pytest.mark.parametrize("comes_back_while_silent", [True, False])
+def test_a_restart_of_a_device_that_was_set_up_again_is_a_fault(driver, comes_back_while_silent):
+    """As one that lost power, and with it its settings."""
+    driver.passes(1.0, 1000)
+    driver.passes(5.0, 0)
+    driver._reader.connections += 1
+    if comes_back_while_silent:
+        driver.passes(1.0, 0)
     assert "just now: restarts 1" in driver.passes(1.0, 1000, restarts=1).text

@@ -6,6 +6,7 @@ LinuxCNC states itself. ``overrun`` on a line of its own is counted; the samples
 missing numbers, too.
 """
 
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.parameters import USUAL_COLUMNS, NowNs, Values
 from omsm_ros.instruments.scaling import AXES
 from omsm_ros.instruments.six_channel.device import CsvStreamDevice, make_text
@@ -16,15 +17,27 @@ COLUMNS = "sequence device_time x y z b c status distance"
 """Columns of ``config/linuxcnc/cell.hal``."""
 # HAL's numbers have 53 bits: a picometre of a millimetre, and 17 prad of a degree, are resolved.
 _PARTS = 10**9
+# A tenth of the smallest unit that LinuxCNC has [1/m, 1/rad]; counts of an encoder are smaller.
+_MOST_PER_UNIT = 1e4
 # Units of LinuxCNC where the machine is metric.
 _COUNTS_PER_UNIT = {axis: 1 / (DEGREE_RAD if axis in "bc" else MILLIMETRE_M) for axis in AXES}
 
 
 def make(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice:
-    """Return the device that ``values`` describe; millimetres and degrees where they state none."""
+    """Return the device that ``values`` describe; millimetres and degrees where they state none.
+
+    Raises ConfigurationError for a scale that is that of an encoder.
+    """
     given = dict(values)
     if given["columns"] == USUAL_COLUMNS:
         given["columns"] = COLUMNS
     for axis, usual in _COUNTS_PER_UNIT.items():
-        given[f"{axis}.counts_per_unit"] = given[f"{axis}.counts_per_unit"] or usual
+        stated = given[f"{axis}.counts_per_unit"]
+        if stated > _MOST_PER_UNIT:
+            raise ConfigurationError(
+                f"'{axis}.counts_per_unit' {stated:g} is that of an encoder, but LinuxCNC sends "
+                "positions in mm, inch or degrees: leave it out for mm and degrees; for counts "
+                "take device six_channel_text"
+            )
+        given[f"{axis}.counts_per_unit"] = stated or usual
     return make_text(given, transport, now_ns, _PARTS)
