@@ -232,6 +232,13 @@ class LocalQuadratic:
         )
 
     @property
+    def surrounds_a_place(self) -> bool:
+        """Whether any place can have enough cells within the radius of its fit."""
+        # Nine cells within a radius of a place lie within two radii of each of the nine.
+        least = self._tree.query(self._tree.data, k=[_LEAST_NEIGHBOURS])[0].min()
+        return bool(least <= 2 * RADIUS_CELLS * self.cell)
+
+    @property
     def scatter(self) -> float:
         """Robust standard deviation of a point about the surface between its neighbours [m].
 
@@ -382,6 +389,8 @@ def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> 
     empty = HeightGrid(height=np.zeros(shape), x0=x0, y0=y0, dx=side, dy=side)
     x, y = (part.ravel() for part in np.meshgrid(empty.x, empty.y))
     surface = LocalQuadratic(points, side)
+    if spacing and not surface.surrounds_a_place:  # a fine grid of nothing takes long to visit
+        raise DataError("comparison.empty_map", spacing=side)
     height = surface.at(x, y).value.reshape(shape)
     if not np.any(np.isfinite(height)):
         raise DataError("comparison.empty_map", spacing=side)
