@@ -3,7 +3,6 @@
 import subprocess
 import sys
 
-import control
 import numpy as np
 import pytest
 
@@ -80,6 +79,8 @@ def test_corrected_heights_are_those_of_the_surface(points):
 
 
 def test_a_control_system_goes_out_and_back(identified):
+    import control  # takes a second to load
+
     system = identified.to_control()
     frequency = np.array([0.5, 2.0, 10.0])
     np.testing.assert_allclose(

@@ -18,8 +18,13 @@ CORE = Path(omsm_ros.__file__).parent / "core"
 ROOMS = {path.name for path in CORE.iterdir() if path.is_dir()}
 
 
-def stated() -> Iterator[tuple[str, set[str] | None]]:
-    """Yield each code in the core with the names of its values; None if they are not literal."""
+@pytest.fixture(scope="module")
+def stated() -> list[tuple[str, set[str] | None]]:
+    """Return each code in the core with the names of its values; None if they are not literal."""
+    return list(_stated())
+
+
+def _stated() -> Iterator[tuple[str, set[str] | None]]:
     for path in sorted(CORE.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call) or not node.args:
@@ -49,18 +54,17 @@ def fields(template: str) -> set[str]:
     return {name.partition(".")[0].partition("[")[0] for name in found} - {"opt"}
 
 
-STATED = list(stated())
-
-
-def test_every_code_has_a_sentence() -> None:
-    codes = {code for code, _ in STATED}
+def test_every_code_has_a_sentence(stated: list[tuple[str, set[str] | None]]) -> None:
+    codes = {code for code, _ in stated}
     assert len(codes) > 80
     assert codes <= set(templates())
 
 
-@pytest.mark.parametrize(("code", "values"), [(c, v) for c, v in STATED if v is not None])
-def test_a_sentence_uses_values_that_are_given(code: str, values: set[str]) -> None:
-    assert fields(templates()[code]) <= values
+def test_a_sentence_uses_values_that_are_given(stated: list[tuple[str, set[str] | None]]) -> None:
+    known = [(code, values) for code, values in stated if values is not None]
+    assert len(known) > 80
+    for code, values in known:
+        assert fields(templates()[code]) <= values, code
 
 
 def literals() -> set[str]:

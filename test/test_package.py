@@ -62,11 +62,10 @@ def imported(folder):
             yield from (name.split(".")[0] for name in names)
 
 
-NEEDED = {*imported("omsm_ros"), *imported("launch")} - {
-    *sys.stdlib_module_names,
-    *OPTIONAL,
-    "omsm_ros",
-}
+@pytest.fixture(scope="module")
+def needed():
+    own = {*sys.stdlib_module_names, *OPTIONAL, "omsm_ros"}
+    return {*imported("omsm_ros"), *imported("launch")} - own
 
 
 @pytest.mark.parametrize("folder", [ROOT, ROOT / "msg_defs"], ids=["omsm_ros", "omsm_msgs"])
@@ -77,10 +76,10 @@ def test_the_manifest_is_valid(folder):
     assert package.version == omsm_ros.__version__
 
 
-def test_the_manifest_names_all_that_is_imported_and_nothing_else():
+def test_the_manifest_names_all_that_is_imported_and_nothing_else(needed):
     declared = {dependency.name for dependency in parsed(ROOT).exec_depends}
-    needed = {ROSDEP[name][1] if name in ROSDEP else name for name in NEEDED}
-    assert declared == needed - {None}
+    keys = {ROSDEP[name][1] if name in ROSDEP else name for name in needed}
+    assert declared == keys - {None}
 
 
 def test_what_is_built_against_is_also_there_at_run_time():
@@ -89,10 +88,10 @@ def test_what_is_built_against_is_also_there_at_run_time():
     assert built <= {dependency.name for dependency in package.exec_depends}
 
 
-def test_pip_installs_what_is_imported_and_not_ros():
+def test_pip_installs_what_is_imported_and_not_ros(needed):
     lines = (ROOT / "bootstrap" / "runtime.in").read_text(encoding="utf-8").splitlines()
     listed = {line.split(">")[0].split("<")[0].split("=")[0].strip() for line in lines if line}
-    assert listed == {ROSDEP[name][0] for name in NEEDED if name in ROSDEP}
+    assert listed == {ROSDEP[name][0] for name in needed if name in ROSDEP}
 
 
 def test_the_readme_says_what_rosdep_cannot_install():

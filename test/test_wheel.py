@@ -59,7 +59,7 @@ def run(installed, *arguments):
     )
     return subprocess.run(
         [sys.executable, "-I", "-c", program],
-        cwd=installed, capture_output=True, text=True, timeout=50, check=False,
+        cwd=installed, capture_output=True, text=True, timeout=200, check=False,
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ def test_a_command_that_is_asked_to_end_leaves_no_unfinished_file(tmp_path, aske
     )
     done = subprocess.run(
         [sys.executable, "-c", block, str(tmp_path / "plan")],
-        capture_output=True, text=True, timeout=50,
+        capture_output=True, text=True, timeout=200,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (-getattr(signal, asked), "")
     assert done.stderr == "omsm: interrupted; no unfinished file was left\n"
@@ -46,7 +46,7 @@ def test_what_is_ignored_stays_ignored(tmp_path):
         "sys.exit(main(['plan', 'steps', '--out', sys.argv[1]]))\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", block, str(tmp_path / "plan")], capture_output=True, timeout=50
+        [sys.executable, "-c", block, str(tmp_path / "plan")], capture_output=True, timeout=200
     )
     assert done.returncode == 0
     assert any((tmp_path / "plan").iterdir())

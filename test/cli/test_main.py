@@ -194,7 +194,9 @@ def test_commands_work_without_ros(folder):
         "from omsm_ros.cli import main\n"
         f"sys.exit(main(['inspect', {str(folder / 'scan.mcap')!r}, '--json']))\n"
     )
-    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, timeout=50)
+    done = subprocess.run(
+        [sys.executable, "-c", block], capture_output=True, text=True, timeout=200
+    )
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["topics"]
 
@@ -217,7 +219,7 @@ def test_only_what_is_asked_for_is_loaded(word, modules):
     )
     done = subprocess.run(
         [sys.executable, "-c", block, word, *(["--help"] if modules else [])],
-        capture_output=True, text=True, timeout=50, check=True,
+        capture_output=True, text=True, timeout=200, check=True,
     )  # fmt: skip
     loaded = set(json.loads(done.stderr))
     ours = {f"omsm_ros.cli.{word.module}" for word in WORDS.values()}
@@ -241,7 +243,9 @@ def test_ctrl_c_while_a_command_loads_is_one_line(loading):
         "from omsm_ros.cli import main\n"
         "sys.exit(main(['inspect', 'none.mcap']))\n"
     )
-    done = subprocess.run([sys.executable, "-c", block], capture_output=True, text=True, timeout=50)
+    done = subprocess.run(
+        [sys.executable, "-c", block], capture_output=True, text=True, timeout=200
+    )
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr == "omsm: interrupted; no unfinished file was left\n"
 

@@ -3,6 +3,7 @@
 Sybil extracts blocks, too, but no commands in the text, and its blocks do not share a shell.
 """
 
+import functools
 import re
 import textwrap
 from dataclasses import dataclass
@@ -116,6 +117,11 @@ def filled_in(command):
     return " ".join(words)
 
 
+@functools.cache
+def parser_of_word(word):
+    return parser_of([word])
+
+
 def is_name(command):
     """Return whether code in the text only names a command or an option, and is not to be run."""
     program, word, *rest = command.split()
@@ -124,7 +130,7 @@ def is_name(command):
     if program != "omsm" or word not in WORDS:
         return False
     try:
-        parser_of([word]).parse_args(filled_in(command).split(" > ")[0].split()[1:])
+        parser_of_word(word).parse_args(filled_in(command).split(" > ")[0].split()[1:])
     except OmsmError:
         options = [r for r in rest if r.startswith("--")]
         return len(rest) <= 3 and len(options) <= 1

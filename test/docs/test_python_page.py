@@ -67,7 +67,6 @@ def test_the_page_runs_from_top_to_bottom(tmp_path, monkeypatch):
     assert names["figure"].axes
 
 
-@pytest.mark.timeout(120)
 def test_twelve_tasks_are_done_in_ten_lines_each(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pandas", reason="one task makes a table")
     monkeypatch.chdir(tmp_path)
@@ -99,7 +98,6 @@ QUICK = ("textures-and-vibration", "python-control", "own-csv")
 NOTEBOOKS = sorted(path.stem for path in (ROOT / "docs/notebooks").glob("*.md"))
 
 
-@pytest.mark.timeout(120)
 @pytest.mark.parametrize(
     "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.soak) for n in NOTEBOOKS]
 )

@@ -91,7 +91,7 @@ def ask_process(case: Case, folder: Path) -> Answer:
         capture_output=True,
         encoding="utf-8",
         errors="backslashreplace",
-        timeout=50,
+        timeout=200,
         preexec_fn=_only_a_gigabyte,
     )
     seconds = _seconds_of_children() - start

@@ -60,7 +60,6 @@ def page():
         browser.close()
 
 
-@pytest.mark.timeout(120)
 def test_points_are_drawn_counted_and_reported_again_after_a_restart(page):
     view = LiveView()
     first = LiveServer(view, render("Cell 1"), "127.0.0.1", 0)

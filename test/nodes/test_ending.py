@@ -31,6 +31,6 @@ sys.exit(0 if ending.asked.wait(5) else 3)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_while_its_hearing_is_set_up_is_not_lost(number: signal.Signals) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", EAGER, str(int(number))], capture_output=True, text=True, timeout=30
+        [sys.executable, "-c", EAGER, str(int(number))], capture_output=True, text=True, timeout=200
     )
     assert done.returncode == 0, done.stderr

@@ -36,7 +36,7 @@ import precompensate
 import start
 
 REAL = pytest.mark.skipif(bool(start.missing()), reason=start.missing())
-pytestmark = [pytest.mark.xdist_group("linuxcnc"), pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.xdist_group("linuxcnc")]
 
 
 def counters(bag):

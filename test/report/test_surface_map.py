@@ -109,7 +109,7 @@ def test_a_browser_draws_it_from_a_file(tmp_path):
             f"--user-data-dir={tmp_path / 'profile'}", "--window-size=900,1200",
             f"--screenshot={tmp_path / 'page.png'}", (tmp_path / "page.html").as_uri(),
         ],
-        capture_output=True, timeout=50, check=False,
+        capture_output=True, timeout=200, check=False,
     )  # fmt: skip
     picture = imread(tmp_path / "page.png")[..., :3]
     # The ends of the palette are on the map and on its bar.
@@ -131,7 +131,7 @@ def test_a_page_that_is_printed_as_soon_as_it_has_loaded_has_its_map(tmp_path):
             f"--user-data-dir={tmp_path / 'profile'}", "--no-pdf-header-footer",
             f"--print-to-pdf={tmp_path / 'page.pdf'}", (tmp_path / "page.html").as_uri(),
         ],
-        capture_output=True, timeout=50, check=False,
+        capture_output=True, timeout=200, check=False,
     )  # fmt: skip
     printed = (tmp_path / "page.pdf").read_bytes()
     widths = [int(width) for width in re.findall(rb"/Width (\d+)", printed)]

@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections import Counter
 
 import pytest
 from own_domain import own_domain
@@ -22,12 +23,10 @@ def ros():
 class Cell:
     """Starts nodes, looks at their diagnostics, calls their services."""
 
-    def __init__(self, folder, processes):
-        from omsm_ros.nodes.cell_demo_node import DemoNode
-
+    def __init__(self, folder, processes, operator):
         self.folder, self.link = folder, str(folder / "port")
-        self.processes = processes
-        self.operator = DemoNode(processes)
+        self.processes, self.operator = processes, operator
+        self._callers = {}
 
     def start_emulator(self, **parameters):
         given = {"link": self.link, "time_lapse": 20.0, "start_radius": 1e-3, "seed": 3}
@@ -59,15 +58,21 @@ class Cell:
         )
 
     def call(self, kind, name, **fields):
-        return self.operator.ask(kind, f"/omsm/{name}", kind.Request(**fields))
+        """The answer of a service, by a client that stays for further calls."""
+        if name not in self._callers:
+            self._callers[name] = self.caller(kind, name)
+        return self._callers[name](**fields)
 
     def caller(self, kind, name):
         """A function that calls a service of a node that runs on, by a client that stays."""
-        client = self.operator.create_client(kind, f"/omsm/{name}")
-        self.wait(name, client.service_is_ready)
-        time.sleep(0.3)  # a server that has not found the client yet drops its answer
+        client, known = self.operator.create_client(kind, f"/omsm/{name}"), False
 
         def call(**fields):
+            nonlocal known
+            if not (known and client.service_is_ready()):
+                self.wait(name, client.service_is_ready)
+                time.sleep(0.3)  # a server that has not found the client yet drops its answer
+                known = True
             future = client.call_async(kind.Request(**fields))
             self.wait(f"an answer of {name}", future.done)
             return future.result()
@@ -96,12 +101,17 @@ class Cell:
         return seen
 
     def settle(self, node, key):
-        """Wait until a count has stood still for a while and return it."""
-        last, since = -1, time.monotonic()
-        while time.monotonic() - since < 2.5:
-            rclpy.spin_once(self.operator, timeout_sec=0.1)
-            if (now := self.operator.value(node, key)) != last:
-                last, since = now, time.monotonic()
+        """Wait until a count has stood still for some reports of the node, and return it."""
+        last, since, first = None, 0.0, 0
+
+        def still():
+            nonlocal last, since, first
+            count, reports = self.operator.value(node, key), self.operator.reports[node]
+            if count != last:
+                last, since, first = count, time.monotonic(), reports
+            return time.monotonic() - since > 0.8 and reports - first > 2
+
+        self.wait(f"{key} to stand still", still)
         return last
 
     def closed_account(self, stream):
@@ -119,13 +129,61 @@ class Cell:
         return received
 
 
+@pytest.fixture(scope="session")
+def node_server(ros):
+    from system.forked_nodes import NodeServer
+
+    with NodeServer() as server:
+        yield server
+
+
 @pytest.fixture
-def cell(tmp_path, monkeypatch):
-    """All that is started ends with the test; it is started in the test's folder."""
+def cell(tmp_path, monkeypatch, request):
+    """All that is started ends with the test; it is started in the test's folder.
+
+    The nodes are forks of one process, in soak tests processes of their own.
+    """
     monkeypatch.chdir(tmp_path)
+    from system.forked_nodes import ForkedNodes
+
+    if request.node.get_closest_marker("soak"):
+        yield from cell_of_commands(tmp_path)
+        return
+    with ForkedNodes(tmp_path / "log", request.getfixturevalue("node_server")) as processes:
+        yield from cell_of(processes, tmp_path)
+
+
+@pytest.fixture
+def whole_cell(tmp_path, monkeypatch):
+    """A cell whose nodes are processes of their own, as users start them."""
+    monkeypatch.chdir(tmp_path)
+    yield from cell_of_commands(tmp_path)
+
+
+def cell_of_commands(folder):
     from omsm_ros.nodes.cell_demo_node import NodeProcesses
 
-    with NodeProcesses(tmp_path / "log") as processes:
-        made = Cell(tmp_path, processes)
-        yield made
-        made.operator.destroy_node()
+    with NodeProcesses(folder / "log") as processes:
+        yield from cell_of(processes, folder)
+
+
+def cell_of(processes, folder):
+    operator = operator_of(processes)
+    yield Cell(folder, processes, operator)
+    operator.destroy_node()
+
+
+def operator_of(processes):
+    """A node that looks at diagnostics, and counts the reports of each node."""
+    from omsm_ros.nodes.cell_demo_node import DemoNode
+
+    class Operator(DemoNode):
+        def __init__(self):
+            self.reports = Counter()
+            super().__init__(processes)
+
+        def _on_diagnostics(self, message):
+            super()._on_diagnostics(message)
+            self.reports.update(status.name.removeprefix("/omsm/") for status in message.status)
+
+    return Operator()

@@ -6,8 +6,6 @@ from omsm_msgs.msg import AccelerationBlock
 
 from omsm_ros.io import message_mapping
 
-pytestmark = pytest.mark.timeout(120)
-
 
 def test_a_line_of_vibration_arrives_with_its_size(cell):
     from omsm_ros.nodes.topics import SAMPLES_QOS

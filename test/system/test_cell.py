@@ -16,8 +16,6 @@ from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.nodes.cell_demo_node import DemoStage, perform
 from omsm_ros.pipelines import demonstrate as demonstration
 
-pytestmark = pytest.mark.timeout(120)
-
 
 def account(cell, stream):
     """Return the corrector's counts of a stream: received, corrected, pending, others."""
@@ -60,7 +58,8 @@ def assert_plain_method_agrees(plan):
 @pytest.mark.parametrize(
     "device", ["six_channel", *(pytest.param(name, marks=pytest.mark.soak) for name in OTHERS)]
 )
-def test_calibrate_scan_correct_and_replay(cell, device):
+def test_calibrate_scan_correct_and_replay(whole_cell, device):
+    cell = whole_cell
     plan = demonstration.Demonstration(
         cell.folder / "demo",
         seed=2,

@@ -18,8 +18,6 @@ from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.nodes.topics import LATCHED_QOS
 from omsm_ros.twin.cell import blocks_of
 
-pytestmark = pytest.mark.timeout(120)
-
 PERIOD, COUNT = 1e-3, 600
 
 

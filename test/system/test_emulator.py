@@ -9,8 +9,6 @@ from std_srvs.srv import Trigger
 
 from omsm_ros.nodes.topics import SAMPLES_QOS
 
-pytestmark = pytest.mark.timeout(120)
-
 
 def test_stop_ends_a_motion_and_another_may_start(cell):
     cell.start_emulator(time_lapse=1.0)
@@ -64,7 +62,7 @@ def test_a_file_of_disturbances_that_cannot_be_is_one_line(tmp_path):
     file.write_text("probe: {latency: 1e-3}\n")
     command = [sys.executable, "-m", "omsm_ros.nodes.start", "cell_emulator", "--ros-args"]
     ended = subprocess.run(
-        [*command, "-p", f"disturbances:={file}"], capture_output=True, text=True, timeout=60
+        [*command, "-p", f"disturbances:={file}"], capture_output=True, text=True, timeout=200
     )
     assert ended.returncode == 2
     (line,) = ended.stderr.strip().splitlines()

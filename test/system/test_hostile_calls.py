@@ -164,7 +164,7 @@ def test_a_wrong_parameter_is_one_line_and_exit_2(node, parameter, named):
         [sys.executable, "-m", f"omsm_ros.nodes.{node}_node", "--ros-args", "-p", parameter],
         capture_output=True,
         text=True,
-        timeout=50,
+        timeout=200,
     )
     assert done.returncode == 2, done.stderr
     line = done.stderr.strip().splitlines()[-1]

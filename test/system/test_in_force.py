@@ -10,8 +10,6 @@ from omsm_msgs.srv import LoadCalibration
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, LATCHED_QOS
 
-pytestmark = pytest.mark.timeout(180)
-
 
 class Listener:
     """A late subscriber, which gets the latched messages."""

@@ -12,8 +12,6 @@ from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.twin.cell import blocks_of
 
-pytestmark = pytest.mark.timeout(180)
-
 SCAN = 20_000
 LAPSE = 2.0  # ten seconds: longer than a node needs to start again
 

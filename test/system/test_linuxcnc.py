@@ -17,7 +17,7 @@ LINUXCNC = Path(__file__).parents[2] / "config" / "linuxcnc"
 sys.path.insert(0, str(LINUXCNC))
 import start  # noqa: E402
 
-pytestmark = [pytest.mark.soak, pytest.mark.timeout(180), pytest.mark.xdist_group("linuxcnc")]
+pytestmark = [pytest.mark.soak, pytest.mark.xdist_group("linuxcnc")]
 FROM, TO = 7031, 7032
 PROBE = {
     "device": "six_channel_text",

@@ -23,8 +23,6 @@ from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS
 from omsm_ros.pipelines.correct import correct_bag
 from omsm_ros.pipelines.demonstrate import same_points
 
-pytestmark = pytest.mark.timeout(120)
-
 BLOCKS = 30  # three seconds
 
 

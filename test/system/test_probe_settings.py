@@ -16,7 +16,7 @@ from omsm_ros.pipelines import demonstrate as demonstration
 from omsm_ros.pipelines.correct import CorrectedScan
 from omsm_ros.pipelines.recording import Recording
 
-pytestmark = [pytest.mark.timeout(180), pytest.mark.soak]
+pytestmark = pytest.mark.soak
 
 
 class Bench:

@@ -14,8 +14,6 @@ from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
-pytestmark = pytest.mark.timeout(120)
-
 # The reference reads a little more than the encoder: the paper's Eq. 3 splits the gain there.
 SCALE = 1.0004
 

@@ -10,8 +10,6 @@ from omsm_msgs.msg import Calibration as CalibrationMessage
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS
 
-pytestmark = pytest.mark.timeout(120)
-
 
 @pytest.mark.parametrize("simulated", [False, True])
 def test_calibration_of_tomorrow_is_published_once(cell, true_calibration, simulated):

@@ -14,8 +14,6 @@ from omsm_ros.instruments.emulator_factory import emulated
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import save_calibration
 
-pytestmark = pytest.mark.timeout(120)
-
 OK, WARN, ERROR, STALE = (
     str(level[0])
     for level in (

@@ -9,8 +9,6 @@ from std_srvs.srv import Trigger
 from omsm_ros.core.streams.blocks import AccelerationBlock
 from omsm_ros.io import bags, message_mapping
 
-pytestmark = pytest.mark.timeout(120)
-
 
 def values(cell):
     """Texts of the diagnostics; 0 before the first."""

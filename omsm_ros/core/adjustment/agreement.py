@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import special
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import DIFFERS
@@ -77,6 +76,8 @@ def _alone(
 def _compared(
     solution: Solution, scan: int, alone: Sequence[tuple[Figure, Figure]]
 ) -> ScanAgreement:
+    from scipy import special  # takes long to load
+
     one = alone[scan]
     others = [a for k, a in enumerate(alone) if k != scan]
     name = f"{DIFFERS}@{scan}"

@@ -9,7 +9,6 @@ all others are fitted, ``χ² = sᵀ I⁻¹ s`` (Rao 1948).
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.sources import Family
@@ -58,6 +57,8 @@ class Evidence:
     @property
     def deviate(self) -> float:
         """As many standard deviations as χ² is rare; large ones by their square root."""
+        from scipy import special  # takes long to load
+
         if not self.dof:
             return 0.0
         log_tail = _log_tail(self.chi_square, self.dof)
@@ -65,6 +66,8 @@ class Evidence:
 
 
 def _log_tail(chi_square: float, dof: int) -> float:
+    from scipy import special
+
     tail = special.gammaincc(dof / 2, chi_square / 2)
     if tail > 1e-290:
         return float(np.log(tail))

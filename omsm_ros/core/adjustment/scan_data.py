@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
@@ -193,6 +192,8 @@ def view_of(scan: ScanData, index: int, begin: float, nominal: Surface) -> ScanV
 
 def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
     """Return the derivative of ``order`` by time, run by run between gaps."""
+    from scipy import signal  # takes half a second to load
+
     period = float(np.median(np.diff(time)))
     edges = np.flatnonzero(np.diff(time) > 1.5 * period) + 1
     made = np.empty(len(values))
@@ -213,6 +214,8 @@ _CREEP_S = 2.0
 
 def _fading(time: FloatArray, motion: FloatArray) -> FloatArray:
     """Return the mean of ``motion`` over the last two seconds, fading, less ``motion``."""
+    from scipy import signal
+
     step = float(np.median(np.diff(time))) / _CREEP_S
     start = [motion[0] * (1 - step)]
     return np.asarray(signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)

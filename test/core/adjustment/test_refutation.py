@@ -1,5 +1,7 @@
 """Wrong declarations are named by what the scans show, with the size that the machine has."""
 
+import functools
+
 import numpy as np
 import pytest
 from coverage import PRIORS, drawn, normalised
@@ -35,8 +37,10 @@ TWO_SCANS = [
 ]
 
 
-def disturbed(kind, scans, seed=0):
-    machine, made = drawn(seed, scans, **KINDS[kind])
+@functools.cache
+def disturbed(kind, scans):
+    """A machine with one error, and its scans adjusted."""
+    machine, made = drawn(0, scans, **KINDS[kind])
     return machine, adjust(made, PRIORS, nominal=MIRROR, accuracy=25e-9)
 
 
