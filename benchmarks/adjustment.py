@@ -113,8 +113,8 @@ def scan_data(
     )
 
 
-def declared_of(world: World, calibration: Calibration) -> tuple[tuple[Source, ...], float]:
-    """Return the priors that shop and calibration state, and the declared latency [s]."""
+def declared_of(world: World) -> tuple[tuple[Source, ...], float]:
+    """Return the priors that the shop states, and the declared latency [s]."""
     stated = world.declared()
     own = {"source", "value", "how", "reason", "distribution"}
     sources = [
@@ -124,19 +124,19 @@ def declared_of(world: World, calibration: Calibration) -> tuple[tuple[Source, .
         )
         for row in stated["sources"]
     ]
-    priors = priors_of(MachineSources(tuple(sources)), float(stated["abbe_arm"]), calibration)
+    priors = priors_of(MachineSources(tuple(sources)), float(stated["abbe_arm"]))
     return priors, float(stated["latency"])
 
 
 def adjusted(world: World, plan: Sequence[tuple[float, str, float]]) -> Adjustment:
     """Return the adjustment of the scans ``plan`` of a world, as its shop would make it."""
     calibration = calibrated(world)
-    priors, latency = declared_of(world, calibration)
+    priors, latency = declared_of(world)
     data, begin = [], 0.0
     for (_, _, clocking), made in zip(plan, world.scans(plan), strict=True):
         data.append(scan_data(made, calibration, latency, begin, clocking))
         begin = data[-1].time[-1] + 20.0
-    return adjust(data, priors, nominal=PAPER_MIRROR, removed=REMOVED)
+    return adjust(data, priors, calibration=calibration, nominal=PAPER_MIRROR, removed=REMOVED)
 
 
 def true_figures(world: World) -> tuple[float, float]:

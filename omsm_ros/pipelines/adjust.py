@@ -23,14 +23,12 @@ from omsm_ros.core.adjustment import (
 )
 from omsm_ros.core.adjustment.adjust import corrected_heights
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
 from omsm_ros.core.streams.blocks import Account, AxisBlock
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io.files import REPORT, save_json, save_text
@@ -45,8 +43,6 @@ from omsm_ros.readable import number
 from omsm_ros.units import RPM_RAD_S
 
 SCHEMA = "omsm-adjustment/1"
-INVALID = "invalid"
-"""Verdict code of heights that a rejected calibration corrected."""
 ADJUSTMENT, ADJUSTED_CLOUD = "adjustment.json", "adjusted.ply"
 # Between two scans whose stamps do not say how far they lie apart, as the part is approached anew.
 _PAUSE_S = 20.0
@@ -135,17 +131,10 @@ _RENAMED = {"probe_noise": "noise"}
 NOT_ADJUSTED = ("probe_resolution", "encoder_noise", "encoder_resolution", "discretisation")
 
 
-# Where the gain's growth with the square of the frequency is read from its covariance [Hz].
-_CURVATURE_HZ = 10.0
-
-
-def priors_of(
-    stated: MachineSources, abbe_arm: float = 0.0, calibration: Calibration | None = None
-) -> tuple[Source, ...]:
+def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ...]:
     """Return the declared sources as priors of the adjustment, but zeros and ``NOT_ADJUSTED``.
 
     abbe_arm: over which pitch acts, unless it is stated with its own [m]
-    calibration: its uncertainty of the lag adds to the declared change; None: it is exact
     """
     found: dict[str, Source] = {}
     for source in stated.stated:
@@ -156,21 +145,7 @@ def priors_of(
         before = found.get(prior.name, replace(prior, uncertainty=0.0))
         size = float(np.hypot(before.uncertainty, prior.uncertainty))
         found[prior.name] = replace(prior, uncertainty=size)
-    if calibration is not None:
-        lag, curvature = _of_dynamics(calibration)
-        if change := found.get("lag_change"):
-            size = float(np.hypot(change.uncertainty, lag))
-            found["lag_change"] = replace(change, uncertainty=size)
-        found["lag_curvature"] = Source("lag_curvature", curvature, evaluated=True)
     return tuple(found.values())
-
-
-def _of_dynamics(calibration: Calibration) -> tuple[float, float]:
-    """Return the standard uncertainties of the lag [s] and of the gain over ω² [s²]."""
-    gain, _ = relative_response_jacobian(calibration.dynamics, np.array([_CURVATURE_HZ]))
-    spread = float(spread_along(gain[0], calibration.covariance))
-    curvature = spread / (2 * np.pi * _CURVATURE_HZ) ** 2
-    return calibration.low_frequency_delay_uncertainty, curvature
 
 
 def _prior(source: StatedSource, abbe_arm: float) -> Source:
@@ -200,7 +175,7 @@ def adjust_bags(
 ) -> tuple[Adjustment, list[AdjustedScan]]:
     """Return ``bags``, scans of one part, adjusted together, and the scans as they were read.
 
-    nominal: surface of the part in the frame of the workpiece; None: a polynomial
+    nominal: of the part in the frame of the workpiece; None: a polynomial
     stated: declared sources, the priors;  accepted: found values that somebody has accepted
     clockings: of the part on the chuck in each scan [rad];  clampings: their numbers
     accuracy: asked for, k = 2 [m]
@@ -212,28 +187,28 @@ def adjust_bags(
             raise ConfigurationError(
                 f"{len(given)} values of {name} for {len(bags)} scans; give one for each scan"
             )
-    scans = on_one_clock(
-        [
-            read_scan(
-                bag,
-                calibration,
-                options or CorrectionOptions(),
-                clocking=clockings[k] if clockings else 0.0,
-                clamping=clampings[k] if clampings else 0,
-                admission=admission,
-                progress=progress,
-            )
-            for k, bag in enumerate(bags)
-        ]
-    )
-    found = adjust(
+    options = options or CorrectionOptions()
+    scans = [
+        read_scan(
+            bag,
+            calibration,
+            options,
+            clocking=clockings[k] if clockings else 0.0,
+            clamping=clampings[k] if clampings else 0,
+            admission=admission,
+            progress=progress,
+        )
+        for k, bag in enumerate(bags)
+    ]
+    scans = on_one_clock(scans)
+    return adjust(
         [scan.data for scan in scans],
-        priors_of(stated, options.geometry.abbe_arm if options else 0.0, calibration),
+        priors_of(stated, options.geometry.abbe_arm),
+        calibration=calibration,
         nominal=nominal,
         accuracy=accuracy,
         accepted=accepted,
-    )
-    return found, scans
+    ), scans  # fmt: skip
 
 
 def write_adjustment(
@@ -275,7 +250,7 @@ def adjustment_facts(
     facts: dict[str, Any] = {
         "schema": SCHEMA,
         "calibration": calibration.id,
-        "verdict": verdict_entry(found.verdict, calibration, len(scans), doubts),
+        "verdict": verdict_entry(found.verdict, len(scans), doubts),
         "figures": figures_entry(found.form),
         "scans": [_scan_entry(scan) for scan in scans],
         "sources": [_source_entry(source) for source in found.sources],
@@ -351,9 +326,7 @@ def _source_entry(source: SourceFinding) -> dict[str, Any]:
     }
 
 
-def verdict_entry(
-    verdict: Verdict, calibration: Calibration, scans: int = 1, doubts: Iterable[str] = ()
-) -> dict[str, Any]:
+def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) -> dict[str, Any]:
     """Return a verdict as JSON values: code, text, reasons, and the scan to add that helps most.
 
     doubts: sentences about the recordings, with which nothing is verified
@@ -362,9 +335,6 @@ def verdict_entry(
     against = [{"code": "recording", "text": text} for text in doubts]
     if against and code == VERIFIED:
         code = NOT_VERIFIED
-    if calibration.certificate.verdict == REJECTED:
-        code = INVALID
-        against = [{"code": INVALID, "text": sentence("verdict.rejected", {})}, *against]
     entry: dict[str, Any] = {
         "code": code,
         "text": sentence(f"verdict.{code}", {"scans": scans}),

@@ -143,14 +143,15 @@ def add_verdict(
     doubts = [*done.faults, *map(str, _losses(done))]
     if scan is None or scan.turns < _LEAST_TURNS:
         systematic = summary["budget"]["systematic"]
-        verdict = untested_verdict(2 * systematic, judgement.accuracy)
+        verdict = untested_verdict(2 * systematic, judgement.accuracy, calibration)
         if form is not None:
             summary["figures"] = _registered_figures(form)
     else:
         nominal = judgement.options.surface
         found = adjust(
             [scan],
-            priors_of(judgement.stated, judgement.options.geometry.abbe_arm, calibration),
+            priors_of(judgement.stated, judgement.options.geometry.abbe_arm),
+            calibration=calibration,
             nominal=nominal if form is None or nominal is None else _posed(nominal, form),
             accuracy=judgement.accuracy,
             removed=POSE if form is None else _aligned(form["removed"]),
@@ -161,7 +162,7 @@ def add_verdict(
     if tolerance is not None and (figures := summary.get("figures")):
         pv = Figure(*figures["peak_to_valley"].values())
         summary["conformity"] = conformity_entry(pv, tolerance, (form or {}).get("open", ()))
-    summary["verdict"] = verdict_entry(verdict, calibration, doubts=doubts)
+    summary["verdict"] = verdict_entry(verdict, doubts=doubts)
 
 
 def _within(scan: ScanData, aperture: Aperture) -> ScanData | None:
@@ -173,12 +174,13 @@ def _within(scan: ScanData, aperture: Aperture) -> ScanData | None:
         return None
 
 
-def untested_verdict(expanded: float, accuracy: float | None) -> Verdict:
+def untested_verdict(expanded: float, accuracy: float | None, calibration: Calibration) -> Verdict:
     """Return the verdict on heights of one scan that was not adjusted.
 
     expanded: uncertainty of the heights, k = 2 [m];  accuracy: asked for [m], None: none
     """
-    return verdict_of((), (), (), False, expanded, accuracy, (OTHER_SPEED, float("nan")))
+    return verdict_of((), (), (), False, expanded, accuracy, (OTHER_SPEED, float("nan")),
+                      calibration)  # fmt: skip
 
 
 # Degrees of freedom that an adjustment can remove; all of a pose, but no power.
@@ -221,8 +223,8 @@ def live_verdict(
     expanded = 2 * sum(size**2 for size in shared) ** 0.5
     noise = excess_noise(corrector.budget)
     doubts = [*([str(noise)] if noise else []), *_without_slopes(corrector, stated)]
-    verdict = untested_verdict(expanded, accuracy)
-    return verdict_entry(verdict, calibration, doubts=doubts) | {"uncertainty": expanded}
+    verdict = untested_verdict(expanded, accuracy, calibration)
+    return verdict_entry(verdict, doubts=doubts) | {"uncertainty": expanded}
 
 
 def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[str]:

@@ -36,7 +36,7 @@ from omsm_ros.core.adjustment.refutation import (
     start_scales,
 )
 from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, fitted_surface, view_of
-from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes
+from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes, with_dynamics
 from omsm_ros.core.adjustment.verdict import (
     Verdict,
     not_evaluated,
@@ -46,6 +46,7 @@ from omsm_ros.core.adjustment.verdict import (
     rests_on,
     verdict_of,
 )
+from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import DataError
@@ -129,6 +130,7 @@ def adjust(
     scans: Sequence[ScanData],
     priors: Sequence[Source] = (),
     *,
+    calibration: Calibration | None = None,
     nominal: Surface | None = None,
     accuracy: float | None = None,
     removed: Sequence[str] = POSE,
@@ -143,6 +145,9 @@ def adjust(
         direction.
     priors
         Declared sources. Families without one take part by their default, or once they show.
+    calibration
+        That corrected the heights: its uncertainty is a prior of the lag, and what a rejected one
+        corrected is not valid. None: an exact one.
     nominal
         Surface in the part frame; None: a polynomial of degree 8 through the first scan, of which
         the form error then is the deviation.
@@ -164,12 +169,15 @@ def adjust(
     if not scans:
         raise DataError("no scan to adjust; give one or more scans of one part")
     surface: Surface = fitted_surface(scans[0]) if nominal is None else nominal
-    return _adjusted(scans, priors, surface, accuracy, removed, accepted)
+    if calibration is not None:
+        priors = with_dynamics(priors, calibration)
+    return _adjusted(scans, priors, calibration, surface, accuracy, removed, accepted)
 
 
 def _adjusted(
     scans: Sequence[ScanData],
     priors: Sequence[Source],
+    calibration: Calibration | None,
     surface: Surface,
     accuracy: float | None,
     removed: Sequence[str],
@@ -201,6 +209,7 @@ def _adjusted(
         2 * form.pv.uncertainty,
         accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed)[:2],
+        calibration,
     )
     return Adjustment(
         form=form,

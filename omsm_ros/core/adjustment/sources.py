@@ -1,11 +1,13 @@
 """Sources of error: columns with one cause, and what is declared of them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from omsm_ros.core.adjustment.scan_data import ScanView
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.lti.frequency_response import relative_response_jacobian, spread_along
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 
@@ -85,3 +87,21 @@ def prior_sizes(families: Sequence[Family], priors: Sequence[Source]) -> dict[st
         if size is not None:
             sizes[family.name] = size
     return sizes
+
+
+# Where the gain's growth with the square of the frequency is read from its covariance [Hz].
+_CURVATURE_HZ = 10.0
+
+
+def with_dynamics(priors: Sequence[Source], calibration: Calibration) -> tuple[Source, ...]:
+    """Return ``priors``, the uncertainty of ``calibration`` added to those of lag and curvature."""
+    gain, _ = relative_response_jacobian(calibration.dynamics, np.array([_CURVATURE_HZ]))
+    spread = float(spread_along(gain[0], calibration.covariance))
+    lag = calibration.low_frequency_delay_uncertainty
+    curvature = spread / (2 * np.pi * _CURVATURE_HZ) ** 2
+    changed = (
+        replace(p, uncertainty=float(np.hypot(p.uncertainty, lag)))
+        if p.name == "lag_change" else p
+        for p in priors
+    )  # fmt: skip
+    return *changed, Source("lag_curvature", curvature, evaluated=True)

@@ -13,9 +13,11 @@ from omsm_ros.core.adjustment.figures import NO_EFFECT, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.sources import FREE, Family, Source, base_name
+from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import REJECTED
 
 VERIFIED, NOT_VERIFIED = "verified", "not_verified"
-CONTRADICTED, TOO_UNCERTAIN = "contradicted", "too_uncertain"
+CONTRADICTED, TOO_UNCERTAIN, INVALID = "contradicted", "too_uncertain", "invalid"
 
 # Reasons.
 REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
@@ -170,22 +172,29 @@ def verdict_of(
     expanded: float,
     accuracy: float | None,
     addition: tuple[str, float] | None,
+    calibration: Calibration | None = None,
 ) -> Verdict:
     """Return the verdict.
 
     open_sources: what is neither shown nor declared;  resting: what rests on declarations alone
     expanded: uncertainty (k = 2) of PV [m];  accuracy: asked for [m], None: none
     addition: code of the scan to add and the standard uncertainty that is reached [m]
+    calibration: that corrected the heights; where it was rejected they are not valid
     """
     add, reached = ("", float("nan")) if addition is None else (addition[0], 2 * addition[1])
     reasons = [*contradictions, *open_sources]
+    rejected = calibration is not None and calibration.certificate.verdict == REJECTED
+    if rejected:
+        reasons.insert(0, Reason(REJECTED))
     if not is_redundant:
         reasons.append(Reason(NOT_REDUNDANT))
     too_large = accuracy is not None and not expanded <= accuracy
     if too_large:
         limit = float("nan") if accuracy is None else accuracy
         reasons.append(Reason(UNCERTAINTY, (), expanded, limit))
-    if contradictions:
+    if rejected:
+        code = INVALID
+    elif contradictions:
         code = CONTRADICTED
     elif too_large or not np.isfinite(expanded):
         code = TOO_UNCERTAIN

@@ -1,5 +1,7 @@
 """Scans adjusted together against the truth of the machine that made them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from coverage import CLOCKING_RAD, LAG_S, PRIORS, drawn, normalised, true_form
@@ -14,6 +16,8 @@ from omsm_ros.core.adjustment import (
     adjust,
     corrected_heights,
 )
+from omsm_ros.core.adjustment.verdict import INVALID
+from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError, DataError
 
@@ -94,6 +98,16 @@ def test_accuracy_beyond_reach_is_too_uncertain(table):
     reason = found.verdict.reasons[-1]
     assert reason.code == "uncertainty"
     assert reason.value == pytest.approx(2 * found.form.pv.uncertainty)
+
+
+def test_what_a_rejected_calibration_corrected_is_not_valid(table, true_calibration):
+    """Two scans that agree verify nothing where the step test was rejected."""
+    _, scans, _ = table
+    certificate = replace(true_calibration.certificate, verdict=REJECTED)
+    rejected = replace(true_calibration, certificate=certificate)
+    found = adjust(scans[:2], PRIORS, calibration=rejected, nominal=MIRROR, accuracy=25e-9)
+    assert found.verdict.code == INVALID
+    assert found.verdict.reasons[0].code == REJECTED
 
 
 def test_what_is_only_declared_does_not_turn_green(table):
