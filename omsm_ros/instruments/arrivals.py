@@ -5,7 +5,9 @@ robustly, since some arrivals are very late, and over a window, since crystals c
 temperature.
 """
 
+import math
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -176,7 +178,7 @@ def _line(
 
 # Span of arrivals that decides whether triggers were missed: it lasts for the first [s] and holds
 # the second number of arrivals, or lasts for the third; and the longest wait for a decision.
-_DECISION_S, _ARRIVALS, _LONG_DECISION_S, _LONGEST_S = 0.2, 8, 0.6, 0.8
+_DECISION_S, _ARRIVALS, _LONG_DECISION_S, _LONGEST_S = 0.2, 12, 0.6, 0.8
 _LEAST_ARRIVALS = 3
 # Spans whose earliest arrivals are the reference; how many it needs, and how many show a drift.
 _SPANS, _LEAST_SPANS, _DRIFT_SPANS = 15, 4, 8
@@ -207,7 +209,8 @@ class MissedTriggerDetector:
         self._earliest: deque[tuple[float, float, int]] = deque(maxlen=_SPANS)
         self._off: list[tuple[float, float]] = []  # arrival and excess of those that are off [s]
         self._dropped = False
-        self._since = self._expected = self._drift = 0.0
+        self._expected: float | None = None  # lateness of the earliest at ``_since`` [s]
+        self._since = self._drift = 0.0
         self._limit, self.seen_from = _LATE_PERIODS * self._period, 1
 
     def missed(self, due: float, arrival: float) -> int | None:
@@ -217,9 +220,12 @@ class MissedTriggerDetector:
         A negative number is of triggers that were counted in excess.
         """
         late = arrival - due
+        if self._expected is None:
+            self._accept(arrival, late)
+            return 0
         excess = late - self._expected - self._drift * (arrival - self._since)
         early = bool(self._off) and self._off[0][1] < 0
-        if len(self._earliest) < _LEAST_SPANS or (abs(excess) <= self._limit and not early):
+        if abs(excess) <= self._limit and not early:
             self._accept(arrival, late)
             return 0
         if excess < -self._limit and not early:
@@ -243,7 +249,8 @@ class MissedTriggerDetector:
             return 0
         recent = [excess for _, excess in self._off][-max(_ARRIVALS, len(self._off) // 2) :]
         half = (len(recent) + 1) // 2
-        if abs(min(recent[:half]) - min(recent[half:])) > self._limit:
+        earlier, later = (self._triggers(part) for part in (recent[:half], recent[half:]))
+        if earlier != later:
             if waited < _LONGEST_S:
                 return None
             if len(self._off) > _ARRIVALS // 2 and not self._dropped:
@@ -253,7 +260,11 @@ class MissedTriggerDetector:
             return 0
         self._off.clear()
         self._dropped = False
-        return round(min(recent) / self._period)
+        return later
+
+    def _triggers(self, excess: Sequence[float]) -> int:
+        """Return the triggers that the earliest arrival shows; its age may add most of another."""
+        return math.floor(min(excess) / self._period + 1 - _LATE_PERIODS)
 
     def _accept(self, arrival: float, late: float) -> None:
         self._off.clear()

@@ -367,7 +367,7 @@ def test_axes_without_time_are_doubtful_until_arrivals_show_their_rate(
     period: float, said: str
 ) -> None:
     portions = [b"%d 0 0 0 0 0\n" % n for n in range(8000)]
-    now, step = 0.0, 10
+    now, step = 5000.0, 10
     portions = [b"".join(portions[i : i + step]) for i in range(0, 8000, step)]
     device = CsvStreamDevice(
         Script(*portions), CsvSettings(columns=("sequence", *AXES)), lambda: round(now * 1e9)

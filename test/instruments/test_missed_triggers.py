@@ -27,6 +27,7 @@ from omsm_ros.instruments.six_channel.protocol import ENCODED_SIZE, FRAME, encod
 # `OMSM_MISSED_TRIGGERS=200` tries as many.
 CASES = int(os.environ.get("OMSM_MISSED_TRIGGERS", "3"))
 PERIOD, SECONDS = 1e-3, 7.0
+UPTIME_S = 123_456.0  # of the host, from which its monotonic clock counts
 EPOCH_NS = 1_700_000_000 * 10**9
 COLUMNS = ("sequence", "x", "y", "z", "b", "c")
 
@@ -88,10 +89,13 @@ def run(seed: int, missed: int) -> Outcome:
     block = int(random.choice([20, 50, 100]))
     common: dict[str, Any] = {"sample_period": PERIOD, "block_size": block}
     first = CsvStreamDevice(
-        wires[0], CsvSettings(columns=COLUMNS, **common), wires[0].clock_ns, lambda: wires[0].now
+        wires[0],
+        CsvSettings(columns=COLUMNS, **common),
+        wires[0].clock_ns,
+        lambda: UPTIME_S + wires[0].now,
     )
     second = GenericStreamDevice(
-        wires[1], StreamSettings(**common), wires[1].clock_ns, lambda: wires[1].now
+        wires[1], StreamSettings(**common), wires[1].clock_ns, lambda: UPTIME_S + wires[1].now
     )
     return followed(wires, (first, second), at, float(taken[at]))
 
@@ -155,7 +159,7 @@ def test_late_arrivals_alone_are_no_missed_triggers() -> None:
     """A host that is busy for a while delays arrivals by chance, but never all of them."""
     random, detector = np.random.default_rng(1), MissedTriggerDetector(PERIOD)
     due = np.arange(1, 3000) * 0.01
-    arrivals = due + random.exponential(2e-3, len(due)) * (random.random(len(due)) < 0.7)
+    arrivals = UPTIME_S + due + random.exponential(2e-3, len(due)) * (random.random(len(due)) < 0.7)
     verdicts = [detector.missed(d, float(a)) for d, a in zip(due, arrivals, strict=True)]
     assert not any(verdicts)
     assert detector.seen_from == 1
@@ -164,5 +168,5 @@ def test_late_arrivals_alone_are_no_missed_triggers() -> None:
 def test_what_the_arrivals_cannot_show_is_stated() -> None:
     random, detector = np.random.default_rng(2), MissedTriggerDetector(PERIOD)
     for due in np.arange(1, 1000) * 0.01:
-        detector.missed(float(due), float(due + random.uniform(0, 0.05)))
+        detector.missed(float(due), UPTIME_S + float(due + random.uniform(0, 0.05)))
     assert detector.seen_from > 3
