@@ -11,12 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.offline import save_paper_calibration
 from benchmarks.row import Row, at_least, at_most
-from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.io import message_mapping
-from omsm_ros.io.calibration_file import save_calibration
-from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
 
 # One turn of the spindle at 30 rpm: the blocks of a turn are published over and over.
 TURN_S = 2.0
@@ -38,26 +36,6 @@ def _turn(rate: float, size: int) -> list[tuple[AxisBlock, DistanceBlock]]:
     return blocks
 
 
-def _calibration(path: Path, rate: float) -> None:
-    dynamics = Plant().dynamics
-    p = len(dynamics.numerator) + len(dynamics.denominator)
-    covariance = np.diag(
-        np.r_[0.0, (1e-3 * np.r_[dynamics.numerator[1:], dynamics.denominator[1:]]) ** 2, 0.0]
-    )
-    assert covariance.shape == (p, p)
-    save_calibration(
-        path,
-        Calibration(
-            dynamics=dynamics,
-            static_gain=PAPER_STATIC_GAIN,
-            sample_period=1 / rate,
-            valid_up_to=100.0,
-            covariance=covariance,
-            certificate={"verdict": "accepted", "noise_m": 1e-8},
-        ),
-    )
-
-
 def feed(rate: float, size: int, duration: float) -> dict[str, float]:
     """Feed the corrector for ``duration`` [s] and return what its diagnostics say at the end."""
     import rclpy
@@ -69,7 +47,7 @@ def feed(rate: float, size: int, duration: float) -> dict[str, float]:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     folder = Path(tempfile.mkdtemp())
-    _calibration(folder / "cal.json", rate)
+    save_paper_calibration(folder / "cal.json", rate)
     messages = message_mapping.ros_messages()
     turn = [
         (message_mapping.block_message(messages, a), message_mapping.block_message(messages, d))

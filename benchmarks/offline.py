@@ -18,6 +18,7 @@ from scipy import signal
 
 from benchmarks.row import Row, at_least, at_most, shown
 from omsm_ros.core.calibration.calibration import Calibration
+from omsm_ros.core.calibration.certificate import Certificate, Residual, StaticGain
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
@@ -99,8 +100,8 @@ def _distance(first: int, distance: FloatArray) -> DistanceBlock:
     )
 
 
-def save_paper_calibration(path: Path) -> None:
-    """The paper's response, known to a thousandth."""
+def save_paper_calibration(path: Path, rate: float = 1e3) -> None:
+    """Save the paper's response at ``rate`` [Hz], known to a thousandth."""
     coefficients = np.r_[PAPER_DYNAMICS.numerator, PAPER_DYNAMICS.denominator[1:], 0.0]
     variance = (1e-3 * coefficients) ** 2
     variance[0] = 0.0
@@ -109,10 +110,14 @@ def save_paper_calibration(path: Path) -> None:
         Calibration(
             dynamics=PAPER_DYNAMICS,
             static_gain=PAPER_STATIC_GAIN,
-            sample_period=1e-3,
+            sample_period=1 / rate,
             valid_up_to=100.0,
             covariance=np.diag(variance),
-            certificate={"verdict": "accepted", "polarity": 1},
+            certificate=Certificate(
+                verdict="accepted",
+                residual=Residual(noise_m=1e-8),
+                static_gain=StaticGain(polarity=1),
+            ),
         ),
     )
 

@@ -13,11 +13,13 @@ from certified import certified_by
 
 from benchmarks.against_truth import band_held, coverage
 from benchmarks.cramer_rao import response_bounds
+from benchmarks.offline import save_paper_calibration
 from benchmarks.parts import PARTS, measure
 from benchmarks.parts import __file__ as parts_file
 from benchmarks.row import at_least, at_most, between, shown
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.lti.transfer_function import TransferFunction
+from omsm_ros.io.calibration_file import load_calibration
 
 PERIOD, NOISE, GAIN = 1e-3, 1e-8, 0.99
 TRUTH = TransferFunction.from_ascending([1.0, 1e-3], [1.0, 3e-3, 1e-5])
@@ -141,3 +143,10 @@ def test_every_part_has_rows(part):
     tree = ast.parse(Path(parts_file).with_name(f"{part}.py").read_text(encoding="utf-8"))
     (rows,) = [n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == "rows"]
     assert [argument.arg for argument in rows.args.args] == ["full"]
+
+
+def test_the_calibration_of_live_and_offline_figures_can_be_used(tmp_path):
+    save_paper_calibration(tmp_path / "cal.json", rate=70e3)
+    found = load_calibration(tmp_path / "cal.json")
+    assert found.sample_period == pytest.approx(1 / 70e3)
+    assert found.certificate.accepted

@@ -40,9 +40,9 @@ from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, publish_o
 from omsm_ros.quantities import Parameter
 from omsm_ros.units import NANOSECONDS_PER_S
 
-# A tenth of a queue; what the receive buffer of a socket holds on a usual Linux, beyond which it
-# drops messages, and they are sent again later.
-_MOST_OPEN, _MOST_OPEN_BYTES = 200, 128 * 1024
+# A tenth of a queue; two thirds of the receive buffer of a socket on a usual Linux, which is twice
+# net.core.rmem_max. Beyond it, the system drops messages, and they are sent again later.
+_MOST_OPEN, _MOST_OPEN_BYTES = 200, 256 * 1024
 # A service just discovered may drop a request, or its node is busy [s].
 _RETRY_S = 2.0
 # A subscriber without an answer, and messages not processed, for this time are not waited for; the

@@ -181,7 +181,7 @@ class _Grid:
         axes, stream = StreamInput(), StreamInput(trigger.counter_offset)
         pairing = Pairing(axes, stream, trigger)
         for run in self.runs:
-            axes.stamps.extend(run.session, [run.first], [run.stamp_ns])
+            axes.stamps.add(run.session, run.first, run.stamp_ns)
             pairing.axes.push(run)
         for run in _runs(blocks, _reading, stream):
             pairing.distance.push(run)

@@ -116,12 +116,13 @@ class StreamInput:
     def _note(self, block: Block, arrival: Arrival) -> None:
         """Keep the stamps of the new samples of ``block``."""
         begins, period_ns = arrival.first + arrival.skip, _period_ns(block)
-        firsts, stamps = block.stamps.T
-        firsts = firsts + self._offset
-        new = np.append(firsts[1:], block.end + self._offset) > begins
-        skipped = np.maximum(begins - firsts[new], 0)
-        stamps = stamps[new] + np.rint(skipped * period_ns).astype(np.int64)
-        self.stamps.extend(arrival.session, (firsts[new] + skipped).tolist(), stamps.tolist())
+        rows = block.stamps.tolist()
+        ends = [*(first for first, _ in rows[1:]), block.end]
+        for (first, stamp), end in zip(rows, ends, strict=True):
+            if end + self._offset > begins:
+                late = max(begins - first - self._offset, 0)
+                count, stamp = first + late + self._offset, stamp + round(late * period_ns)
+                self.stamps.add(arrival.session, count, stamp)
 
     def end(self) -> None:
         """Begin a new session with the next block."""

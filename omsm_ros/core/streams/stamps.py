@@ -7,9 +7,8 @@ session gives the time of every sample. Its slope shows a stated sample period t
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
@@ -164,9 +163,9 @@ class StampLine:
         self._coming: deque[tuple[int, int, int]] = deque()
         self._current: tuple[int, int, int] | None = None
 
-    def extend(self, session: int, counts: Iterable[int], stamps: Iterable[int]) -> None:
-        """Append first counts and stamps [ns] of the newest blocks of a session."""
-        self._coming.extend(zip(repeat(session), counts, stamps))
+    def add(self, session: int, count: int, stamp_ns: int) -> None:
+        """Append the newest block's session, first count and stamp."""
+        self._coming.append((session, count, stamp_ns))
 
     def advance(self, session: int, count: int) -> bool:
         """Move to the block that holds ``count``; return whether it begins there."""
