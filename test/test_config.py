@@ -71,6 +71,7 @@ def test_every_value_of_the_yaml_will_do(node):
     """Ranges and types: what is shipped must not be refused; what must be given is given."""
     content = yaml.safe_load((ROOT / "config" / f"{node}.yaml").read_text())["/**"]
     values = dict(_flat_items(content["ros__parameters"]))
+    assert set(values) >= {parameter.name for parameter in _parameters(node)} > set()
     for parameter in _parameters(node):
         parameter.checked(values[parameter.name])
 

@@ -31,10 +31,15 @@ def test_what_a_page_points_at_exists(page):
     assert not missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_a_heading_that_is_pointed_at_exists(page):
-    text = page.read_text(encoding="utf-8")
-    for target, anchor in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", text):
+def test_a_heading_that_is_pointed_at_exists():
+    links = [
+        (page, *link)
+        for page in PAGES
+        for link in re.findall(r"\]\(([^)#\s]*)#([^)]+)\)", page.read_text(encoding="utf-8"))
+        if "://" not in link[0]
+    ]
+    assert links
+    for page, target, anchor in links:
         other = (page.parent / target) if target else page
         headings = re.findall(r"^#+ (.+)$", other.read_text(encoding="utf-8"), re.MULTILINE)
         anchors = {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}

@@ -25,12 +25,16 @@ def test_each_package_has_a_changelog_that_catkin_reads(folder):
 
 
 def test_actions_are_pinned():
-    for file in (ROOT / ".github" / "workflows").glob("*.yml"):
-        for use in re.findall(r"uses: (\S+)", file.read_text(encoding="utf-8")):
-            assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", use), use
+    files = (ROOT / ".github" / "workflows").glob("*.yml")
+    uses = [use for file in files for use in re.findall(r"uses: (\S+)", file.read_text("utf-8"))]
+    assert uses
+    for use in uses:
+        assert re.fullmatch(r"[\w/-]+@[0-9a-f]{40}", use), use
 
 
 def test_the_declaration_of_quality_names_files_that_exist():
     text = (ROOT / "QUALITY_DECLARATION.md").read_text(encoding="utf-8")
-    for name in re.findall(r"\]\(([^)h][^)]*)\)", text) + re.findall(r"`(test/[^`]*)`", text):
+    names = re.findall(r"\]\(([^)h][^)]*)\)", text) + re.findall(r"`(test/[^`]*)`", text)
+    assert names
+    for name in names:
         assert (ROOT / name).exists(), name

@@ -188,5 +188,6 @@ def test_a_selection_without_distance_counter_or_encoders_is_refused():
 def test_the_mean_of_a_counter_that_wraps_is_half_of_the_way(start, travel):
     """In whole numbers of any length, and wrapped at the end only."""
     found = counts_of(records(np.full((1, 5), start), np.full((1, 5), travel)), "mean", range(5))
+    assert found[0].size == 5
     for count in found[0].tolist():
         assert (count - (start + travel // 2)) % ENCODER_RANGE == 0

@@ -171,6 +171,7 @@ def test_lost_bytes_invent_nothing(place: int, lost: int) -> None:
     place = min(place, len(sent) - 1)
     found = decoded(sent[:place] + sent[place + lost :])
     whole = {b.frames.tobytes() for b in (block(5 * i, 5) for i in range(5))}
+    assert len(found) >= 3  # at most two of five blocks are hurt
     assert all(b.frames.tobytes() in whole for b in found)
 
 

@@ -75,6 +75,7 @@ def test_the_sampling_is_that_of_table_1(result):
 
 def test_every_sample_is_accounted_for_and_no_calibration_is_no_band(result):
     _, facts = result
+    assert facts["scans"]
     for one in facts["scans"]:
         assert one["samples"]["received"] == one["samples"]["analysed"] <= 10_000
         assert one["motion"]["outside_band_rms"] is None

@@ -215,6 +215,7 @@ def test_columns_are_the_derivatives_of_the_heights_by_the_parameters() -> None:
         return rows.heights(surface[MODEL.basis.terms(interval)])
 
     own = MODEL.own(1)
+    assert len(PARTS) >= 4
     for part in PARTS[2:4]:
         x, _ = MODEL.columns(part, PLACE, surface)
         mine = MODEL.scan[part.points] == 1

@@ -80,6 +80,7 @@ def test_a_response_that_is_trusted_everywhere_leaves_nothing_beyond() -> None:
 def test_the_residual_is_in_proportion_to_the_motion(factor: float) -> None:
     z = sine(3.0) + 0.1 * sine(90.0)
     plain, larger = (Residual(calibration(), PERIOD).variances(x) for x in (z, factor * z))
+    assert np.size(plain) > 0
     for one, other in zip(plain, larger, strict=True):
         np.testing.assert_allclose(other, factor**2 * one, rtol=1e-6, atol=1e-24)
 

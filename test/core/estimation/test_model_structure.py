@@ -45,6 +45,7 @@ def test_the_gradient_is_that_of_finite_differences(structure):
     shape = random_shape(scaled, 7)
     s = 1j * np.geomspace(0.01, 10, 15)
     lag, relative = scaled.lag(shape, s), scaled.lag_slopes(shape, s)
+    assert len(relative) == len(shape) == scaled.nonlinear_size
     for k in range(len(shape)):
         step = np.zeros_like(shape)
         step[k] = 1e-6
@@ -65,6 +66,7 @@ def test_the_jacobian_of_the_coefficients_is_that_of_finite_differences(structur
 
     vector = np.concatenate([numerator[1:], shape])
     jacobian = scaled.coefficient_jacobian(shape)
+    assert jacobian.shape[1] == len(vector) > 0
     for k in range(len(vector)):
         step = np.zeros_like(vector)
         step[k] = 1e-6

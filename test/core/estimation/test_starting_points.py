@@ -62,7 +62,9 @@ def test_every_start_has_the_nonlinear_of_its_structure_and_is_stable():
     points = points_for(resonance(60.0, 0.1))
     for structure in (Structure(4, 3, True), Structure(3, 2, False), Structure(0, 0, True)):
         scaled = ScaledStructure(structure, points.problem.rate)
-        for shape in points.of(structure, []):
+        starts = points.of(structure, [])
+        assert len(starts) > 0
+        for shape in starts:
             assert len(shape) == scaled.nonlinear_size
             assert scaled.transfer_function(shape, np.ones(1)).is_stable
 

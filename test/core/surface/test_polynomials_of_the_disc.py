@@ -104,6 +104,7 @@ def test_in_the_middle_only_the_symmetric_terms_are_and_they_alternate():
 def test_high_orders_are_as_good_as_scipys_jacobi_polynomials(order):
     """No factorial, so no digit is lost where their sum would lose all."""
     terms = [t for t in terms_up_to(order, order - 1) if t.m >= 0]
+    assert len(terms) == order + 1
     found = zernike_values(X, Y, terms)
     for (n, m), row in zip(terms, found, strict=True):
         jacobi = special.eval_jacobi((n - m) // 2, 0, m, 2 * RADIUS**2 - 1)
@@ -167,6 +168,7 @@ def test_the_mean_square_slope_of_the_outermost_terms_is_their_order():
     """r^n cos nθ is harmonic, so that the mean of |∇Z|² is ∮ Z ∂Z/∂r over π, which is n."""
     x, y, weight = disc_rule(16)
     terms = [t for t in terms_up_to(8) if t.n == abs(t.m) and t.n]
+    assert len(terms) == 16
     along_x, along_y = zernike_slopes(x, y, terms)
     for (n, _), dx, dy in zip(terms, along_x, along_y, strict=True):
         assert (dx**2 + dy**2) @ weight == pytest.approx(n)

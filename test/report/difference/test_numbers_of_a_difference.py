@@ -75,6 +75,8 @@ def test_within_is_the_share_of_places_whose_e_n_is_below_one(written):
 
 
 def test_each_e_n_is_the_difference_over_its_expanded_uncertainty(written):
+    assert written[2]["e_n"]
+    assert written[2]["zernike"]["terms"]
     for name, number in written[2]["e_n"].items():
         quotient = (number["a"] - number["b"]) / number["expanded"]
         # Each figure less what noise adds to it, of both nearly the same.
