@@ -30,7 +30,7 @@ ripple.exposure_declared: exposure {seconds:s/4}, as declared
 ripple.exposure_not_resolved: exposure < {longest:s/2} (k = 2), not resolved: the amplitudes do not
     fall with speed beyond their noise, or they allow several exposures; scan at further speeds
 ripple.vibration_removed: {frequency:Hz/6}, in the heights at {apparent:Hz/5}: {amplitude:m/3} ±
-    {uncertainty:m/2} removed in its phase; at most {left:m/2} is left near it, noise included
+    {uncertainty:m/2} removed in its phase; at most {left:m/2} (k = 2) is left near it
 ripple.vibration_not_in_heights: {frequency:Hz/6}: the heights do not follow it at {apparent:Hz/5}
     beyond their noise of {uncertainty:m/2}; nothing removed
 ripple.vibration_like_form: {frequency:Hz/6}: in the heights it is at {apparent:Hz/5}, among the

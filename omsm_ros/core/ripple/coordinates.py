@@ -23,7 +23,7 @@ _BETA = np.pi * np.sqrt((_WIDTH / _OVERSAMPLING * (_OVERSAMPLING - 0.5)) ** 2 - 
 # lose 60 % of its power.
 OVERSAMPLING = 2
 # Coordinates that differ by less than this part of a wave are proportional.
-_SAME_WAVES = 0.05
+_SAME_WAVES = 0.01
 # Frequencies over an uneven coordinate: 8 MB.
 _MOST_FREQUENCIES = 2**19
 # Fewer waves are form or drift.

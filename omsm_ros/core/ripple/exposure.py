@@ -19,7 +19,7 @@ from omsm_ros.errors import ConfigurationError, Notice
 
 # An exposure is as long as a few readings if the probe averages, and it is searched no further.
 _MOST_PERIODS = 4.0
-_STEPS = 4000
+_STEPS, _FINE_STEPS = 4000, 1001
 # Rise of χ² at the limits of k = 1, and the least one that excludes another exposure.
 _ONE_SIGMA, _EXCLUDES = 1.0, 9.0
 # Share of an amplitude below which it is not undone, as near a zero of sinc.
@@ -117,31 +117,38 @@ def estimate_exposure(textures: Sequence[PassingTexture], period: float) -> Expo
     if not used:
         return None
     trial = np.linspace(0.0, _MOST_PERIODS * period, _STEPS)
-    misfit = np.sum([_misfit(texture, trial) for texture in used], axis=0)
+    misfit = _misfit(used, trial)
     best = int(np.argmin(misfit))
     spare = sum(len(t.amplitude) - 1 for t in used) - 1
     reduced = float(misfit[best] / spare) if spare > 0 else None
-    rise = (misfit - misfit[best]) / max(reduced or 1.0, 1.0)
-    inside = np.flatnonzero(rise <= _ONE_SIGMA)
+    unit = max(reduced or 1.0, 1.0)
+    rise = (misfit - misfit[best]) / unit
     # A second minimum that the amplitudes do not exclude makes the estimate ambiguous.
     possible = np.flatnonzero(rise < _EXCLUDES)
     one_range = bool(np.all(np.diff(possible) == 1))
+    ends = trial[np.flatnonzero(rise <= _ONE_SIGMA)[[0, -1]]] + np.array([-1, 1]) * trial[1]
+    fine = np.linspace(max(ends[0], 0.0), ends[1], _FINE_STEPS)
+    near = _misfit(used, fine)
+    inside = fine[near - near.min() <= _ONE_SIGMA * unit]
     return Exposure(
-        seconds=float(trial[best]),
-        uncertainty=float(max(np.ptp(trial[inside]), trial[1]) / 2),
-        longest=float(trial[np.flatnonzero(rise <= 4 * _ONE_SIGMA)[-1]]),
+        seconds=float(fine[np.argmin(near)]),
+        uncertainty=float(np.ptp(inside)) / 2,
+        longest=float(trial[np.flatnonzero(rise <= 4 * _ONE_SIGMA)[-1]] + trial[1]),
         resolved=bool(one_range and rise[0] >= _EXCLUDES and possible[-1] < _STEPS - 1),
         reduced_chi_squared=reduced,
     )
 
 
-def _misfit(texture: PassingTexture, trial: FloatArray) -> FloatArray:
-    """Return χ² (k,) at each ``trial`` (k,) [s], with the best amplitude on the part."""
-    share = np.array([[exposure_share(p, t) for t in trial] for p in texture.passing])
-    weight = 1 / texture.uncertainty[:, np.newaxis] ** 2
-    wanted = texture.amplitude[:, np.newaxis]
-    on_part = np.sum(weight * share * wanted, axis=0) / np.sum(weight * share**2, axis=0)
-    return np.asarray(np.sum(weight * (wanted - on_part * share) ** 2, axis=0))
+def _misfit(textures: Sequence[PassingTexture], trial: FloatArray) -> FloatArray:
+    """Return χ² (k,) at each ``trial`` (k,) [s], with the best amplitudes on the part."""
+    total = np.zeros(len(trial))
+    for texture in textures:
+        share = np.array([[exposure_share(p, t) for t in trial] for p in texture.passing])
+        weight = 1 / texture.uncertainty[:, np.newaxis] ** 2
+        wanted = texture.amplitude[:, np.newaxis]
+        on_part = np.sum(weight * share * wanted, axis=0) / np.sum(weight * share**2, axis=0)
+        total += np.sum(weight * (wanted - on_part * share) ** 2, axis=0)
+    return total
 
 
 def wavelength_of(row: NamedLine) -> float | None:

@@ -27,21 +27,32 @@ RADIUS, WAVES = 6e-3, 2371
 RATE = 1000.0
 
 
-def circle(rpm, seconds=4.0, exposure=0.0, noise=2e-9, seed=1, added=0.0, marks=11e-9):
-    """Return a signal of marks, each reading the mean of 200 instants of its exposure."""
+def circle(rpm, seconds=4.0, exposure=0.0, noise=2e-9, seed=1, added=0.0, marks=11e-9, wander=0.0):
+    """Return a signal of marks, each reading the mean of 200 instants of its exposure.
+
+    wander: amplitude of the spindle's angle beside its steady turning [rad]
+    """
     time = np.arange(int(seconds * RATE)) / RATE
     within = (np.arange(200) + 0.5) / 200 * exposure - exposure
-    phase = 2 * np.pi * WAVES * rpm / 60 * (time[:, np.newaxis] + within)
+
+    def angle(at):
+        return 2 * np.pi * rpm / 60 * at + wander * np.sin(2 * np.pi * 1.3 * at)
+
+    phase = WAVES * angle(time[:, np.newaxis] + within)
     height = 2**0.5 * marks * np.mean(np.cos(phase), axis=1)
     height = height + np.random.default_rng(seed).normal(0, noise, len(time)) + added
     sample = np.arange(len(time))
-    axes = (sample, np.full(len(time), RADIUS), np.zeros(len(time)), 2 * np.pi * rpm / 60 * time)
+    axes = (sample, np.full(len(time), RADIUS), np.zeros(len(time)), angle(time))
     return scan_signal(f"{rpm} rpm", 1 / RATE, (sample, height), axes)
 
 
-@pytest.mark.parametrize("exposure", [0.4e-3, 1e-3])
-def test_the_exposure_is_found_and_undone(exposure):
-    signals = [circle(rpm, exposure=exposure, seed=k) for k, rpm in enumerate((1.875, 15.0, 30.0))]
+@pytest.mark.parametrize(("exposure", "wander"), [(0.4e-3, 0.0), (0.4e-3, 1e-4), (1e-3, 0.0)])
+def test_the_exposure_is_found_and_undone(exposure, wander):
+    """A spindle that wanders by a twentieth of a wave would cost 2 % of an amplitude over time."""
+    signals = [
+        circle(rpm, exposure=exposure, seed=k, wander=wander)
+        for k, rpm in enumerate((1.875, 15.0, 30.0))
+    ]
     studied = analyse_scans([(signal, None) for signal in signals])
     pairs = list(zip(studied, name_lines(studied), strict=True))
     found = estimate_exposure(passing_textures(pairs), 1e-3)
@@ -57,6 +68,21 @@ def test_the_exposure_is_found_and_undone(exposure):
         )
         assert on_part == pytest.approx(2**0.5 * 11e-9, abs=4 * sigma)
         assert sigma < 0.6e-9
+
+
+def test_the_uncertainty_of_the_exposure_is_that_of_the_amplitudes():
+    """σ of a ratio of amplitudes over the slope of sinc, also finer than the first search."""
+    fast, true, sigma = 1200.0, 0.5e-3, 1e-12
+    share = np.sinc(fast * true)
+    texture = PassingTexture(
+        [np.array([1e-3]), np.array([fast])], 1e-8 * np.array([1.0, share]), np.full(2, sigma)
+    )
+    found = estimate_exposure([texture], 1e-3)
+    slope = (np.cos(np.pi * fast * true) - share) / true
+    assert found.seconds == pytest.approx(true, abs=2 * found.uncertainty)
+    expected = 1e-4 * np.hypot(1, share) / abs(slope)
+    assert found.uncertainty == pytest.approx(expected, rel=0.05)
+    assert expected < 0.1e-6
 
 
 def test_amplitudes_that_do_not_fall_give_a_limit_only():
@@ -144,10 +170,31 @@ def test_the_aliased_vibration_is_removed_and_the_marks_stay(wander, ppm, late):
     assert after == pytest.approx(before, rel=0.01)
 
 
+def test_a_modulated_vibration_is_one_line():
+    """Sidebands at three resolutions, as of a spindle, are removed with their line."""
+    time = np.arange(20_000) / RATE
+    wave = (1 + 0.3 * np.cos(2 * np.pi * 0.15 * time)) * shaken(time, 709.6, 4e-9, fast=1 + 6e-5)
+    signal = circle(15.0, seconds=20.0, added=wave)
+    at = np.arange(200_000) / 1e4
+    seen = (1 + 0.3 * np.cos(2 * np.pi * 0.15 * at)) * shaken(at, 709.6, 4e-9)
+    z = -((2 * np.pi * 709.6) ** 2) * seen + np.random.default_rng(3).normal(0, 2e-3, len(at))
+    zero = np.zeros(len(at))
+    block = AccelerationBlock(stamp_ns=0, first_sample=0, sample_period=1e-4, x=zero, y=zero, z=z)
+    _, found = cleaned(signal, [block])
+    (done,) = (one for one in found if one.outcome == REMOVED)
+    assert done.amplitude == pytest.approx(4e-9 * (1 + 0.3**2 / 2) ** 0.5, abs=3 * done.uncertainty)
+    left = wave - done.removed
+    assert np.std(left) < 0.1e-9
+    assert 2 * abs(np.mean(left * np.exp(2j * np.pi * 290.357 * time))) < done.left
+
+
 def test_nothing_is_removed_where_there_is_no_line():
-    """Neither with a quiet accelerometer, nor with one whose line the heights do not have."""
+    """Neither with a quiet accelerometer, nor with one whose line the heights do not have.
+
+    592.4 Hz has its alias 0.35 Hz beside the image of the marks, at 407.25 Hz.
+    """
     signal = circle(15.0, exposure=1e-3)
-    for blocks in (recorded(680.0, 0.0), recorded(743.21, 12e-9)):
+    for blocks in (recorded(680.0, 0.0), recorded(743.21, 12e-9), recorded(592.4, 12e-9)):
         _, found = cleaned(signal, blocks)
         assert [one for one in found if one.outcome == REMOVED] == []
         assert all(not len(one.removed) for one in found)
