@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from omsm_ros.core.estimation.noise import reading_step
 from omsm_ros.core.estimation.steps import Edge, find_steps
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.streams.blocks import FloatArray
@@ -89,6 +90,8 @@ def fast_mode(record: MotionRecord) -> FastMode:
 
 def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
     place, encoder, probe, half, noise = [], [], [], [], []
+    # Rounding is an error of the encoder also where its readings at rest are all equal.
+    rounding = reading_step(record.z) / np.sqrt(12)
     for edge in edges:
         level = slice(edge.start + _LEVEL.start, edge.start + _LEVEL.stop)
         u = (record.z - np.mean(record.z[level])) / edge.height
@@ -99,7 +102,7 @@ def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
         place.append(samples)
         encoder.append(u[samples])
         probe.append(np.where(record.ok[samples], y[samples], np.nan))
-        noise.append((np.std(u[level]), np.nanstd(y[level])))
+        noise.append((np.hypot(np.std(u[level]), rounding / edge.height), np.nanstd(y[level])))
     of_encoder, of_probe = np.sqrt(np.mean(np.square(noise), axis=0))
     return _Edges(
         np.array(place, np.float64), np.array(encoder), np.array(probe),

@@ -39,7 +39,10 @@ def test_the_closed_form_starts_at_rest():
     assert mode_step(t) == pytest.approx([0.0, 0.0, 1.0], abs=1e-6)
 
 
-def step_test(dither=1.0, response=mode_step, axis=axis_step, edges=20, dwell=100, seed=4):
+def step_test(
+    dither=1.0, response=mode_step, axis=axis_step, edges=20, dwell=100, seed=4, rounded=False
+):
+    """A step test; ``rounded``: an encoder without noise in whole nanometres."""
     random = np.random.default_rng(seed)
     time = np.arange((edges + 1) * dwell) * 1e-3
     z, seen = np.zeros(len(time)), np.zeros(len(time))
@@ -50,14 +53,15 @@ def step_test(dither=1.0, response=mode_step, axis=axis_step, edges=20, dwell=10
         seen += height * response(since)
     return MotionRecord(
         sample_period=1e-3,
-        z=z + random.normal(0, 0.4e-9, len(z)),
+        z=np.round(z, 9) if rounded else z + random.normal(0, 0.4e-9, len(z)),
         distance=-seen + random.normal(0, 10e-9, len(z)),
         ok=np.ones(len(z), bool),
     )
 
 
-def test_sharp_edges_show_the_mode_at_804_hz():
-    found = fast_mode(step_test())
+@pytest.mark.parametrize("rounded", [False, True])
+def test_sharp_edges_show_the_mode_at_804_hz(rounded):
+    found = fast_mode(step_test(rounded=rounded))
     assert found.finding.code == "estimation.fast_mode"
     assert found.frequency == pytest.approx(804.0, abs=4 * found.frequency_uncertainty)
     assert found.damping == pytest.approx(0.19, abs=4 * found.damping_uncertainty)
