@@ -150,8 +150,13 @@ class Step:
 
 
 def steps_of(solution: Solution, scan: int) -> list[Step]:
-    """Return the largest step of the height and of the angle, where they stand out."""
-    found = [_height_step(solution, scan), _angle_step(solution, scan)]
+    """Return the largest step of the height and of the angle, where they stand out.
+
+    The angle is compared from turn to turn, so a scan within one turn shows no step of it.
+    """
+    found = [_height_step(solution, scan)]
+    if np.any(solution.network.blocks.turn[solution.network.blocks.scan == scan]):
+        found.append(_angle_step(solution, scan))
     return [step for step in found if step.deviate > _STEP_LIMIT]
 
 
