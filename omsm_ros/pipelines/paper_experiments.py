@@ -136,9 +136,9 @@ def _steps(out: Path, seed: int) -> Done:
             "reference": (time[one], capacitive[one] / MICROMETRE_M),
             "error": (time[one], error[one] / MICROMETRE_M)}),
         Panel("Gain of Eq. 12 (Fig. 6d)", "frequency [Hz]", "gain", {
-            "": (_GRID_HZ, np.abs(PAPER_DYNAMICS.response(_GRID_HZ)))}, power=True),
+            "": (_GRID_HZ, np.abs(PAPER_DYNAMICS.response(_GRID_HZ)))}, log="x"),
         Panel("Phase of Eq. 12 (Fig. 6d)", "frequency [Hz]", "degrees", {
-            "": (_GRID_HZ, np.angle(PAPER_DYNAMICS.response(_GRID_HZ), deg=True))}),
+            "": (_GRID_HZ, np.angle(PAPER_DYNAMICS.response(_GRID_HZ), deg=True))}, log="x"),
     )  # fmt: skip
     caption = "Static gain and lag together, as the paper shows them."
     title, summary = "Ten steps up and down (Fig. 6)", f"{quantity(peak, 'm')} at an edge"
@@ -283,6 +283,7 @@ def _texture_rows(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> 
                  found["finding"] if found else "the marks are in fewer than two scans"),
         compared("F4: rms of the marks on the part, exposure and spot undone", "11 nm", 11e-9,
                  (marks["amplitude_on_part"] or float("nan")) / 2**0.5, "m", "F1 is printed"),
+        Compared("working distance", "1.4 mm", "", "", "no number here depends on it"),
         Compared("lateral resolution", "1.8 µm", "1.8 µm", "1",
                  f"as a disc it lowers waves of 15 µm by {100 * lowered:.1f} %, of 5 µm by "
                  f"{100 * (1 - spot_share(5e-6, SPOT_M)):.0f} %, at every speed"),
@@ -356,10 +357,10 @@ def _figure_11(made: Mapping[str, Recording], scans: Sequence[SpectrumOfScan]) -
         Panel("Speed of Z (a, b)", "time [s]", "mm/s",
               {n: (time[n], speed[n] / MILLIMETRE_M) for n in names}),
         *(Panel(f"Acceleration of {n} ({at})", "frequency [Hz]", "(m/s²)²/Hz",
-                {"": psd(blocks[n].z, blocks[n].sample_period)}, power=True)
+                {"": psd(blocks[n].z, blocks[n].sample_period)}, log="xy")
           for n, at in zip(names, "cd", strict=True)),
         *(Panel(f"Probe of {n} ({at})", "frequency [Hz]", "nm²/Hz",
-                {"": psd(heights[n] / NANOMETRE_M, 1e-3)}, power=True)
+                {"": psd(heights[n] / NANOMETRE_M, 1e-3)}, log="xy")
           for n, at in zip(names, "ef", strict=True)),
     )  # fmt: skip
 

@@ -197,7 +197,7 @@ def _figure_7(made: Recording, cloud: np.ndarray) -> Figure:
     return panels(
         Panel("Path of Z", "time [s]", "mm", {"": (time, z / MILLIMETRE_M)}),
         Panel("Its power spectral density", "frequency [Hz]", "µm²/Hz", {
-            "": (low[0][near], low[1][near] / MICROMETRE_M**2)}, power=True),
+            "": (low[0][near], low[1][near] / MICROMETRE_M**2)}, log="xy"),
         Panel("Path of Z over 25 s", "time [s]", "mm", {
             "": (time[shown], z[shown] / MILLIMETRE_M)}),
         Panel("Dynamic error over 25 s", "time [s]", "nm", {

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from omsm_ros.core.ripple.density import density
@@ -71,14 +72,18 @@ def done(
     return Done(facts, rows, fill_study(page))
 
 
+# Ratio of the ends of a logarithmic axis below which powers of ten alone are too few numbers.
+_NARROW = 30.0
+
+
 class Panel(NamedTuple):
-    """One panel of a figure: curves (x, y) by name; ``power``: logarithmic, a spectral density."""
+    """One panel of a figure: curves (x, y) by name; ``log``: logarithmic axes, "", "x" or "xy"."""
 
     title: str
     x: str
     y: str
     curves: Mapping[str, tuple[FloatArray, FloatArray]]
-    power: bool = False
+    log: str = ""
 
 
 def panels(*shown: Panel) -> Figure:
@@ -88,9 +93,11 @@ def panels(*shown: Panel) -> Figure:
     for ax, panel in zip(axes[:, 0], shown, strict=True):
         for (name, (x, y)), colour in zip(panel.curves.items(), colours, strict=False):
             ax.plot(x, y, linewidth=0.8, color=colour, label=name)
-        if panel.power:
-            style.logarithmic(ax.xaxis)
-            style.logarithmic(ax.yaxis)
+        for k, name in enumerate(panel.log):
+            values = np.concatenate([curve[k] for curve in panel.curves.values()])
+            narrow = np.max(values) < _NARROW * np.min(values)
+            axis = getattr(ax, f"{name}axis")
+            style.logarithmic(axis, every=(1.0, 2.0, 5.0) if narrow else (1.0,))
         style.label(ax, x=panel.x, y=panel.y, title=panel.title)
         if len(panel.curves) > 1:
             style.legend_above(ax)
