@@ -80,7 +80,7 @@ def remove_vibrations(
     heights = scan.formless.residual
     found: list[RemovedVibration] = []
     bands: list[tuple[float, float]] = []
-    beside, clock = _other_lines(scan), None
+    others, clock = _other_lines(scan), None
     left = {axis: np.concatenate([getattr(block, axis) for block in run]) for axis in "xyz"}
     for line in scan.acceleration_lines.lines:
         seen = float(aliased_frequency(line.frequency, scan.signal.rate))
@@ -97,7 +97,7 @@ def remove_vibrations(
         motion = np.interp(time, taken, envelope, 0.0, 0.0)
         motion = -motion * np.exp(2j * np.pi * line.frequency * time) / (
             2 * np.pi * line.frequency) ** 2  # fmt: skip
-        one = _fitted(scan, time, heights, beside, motion, line.frequency, clock)
+        one = _fitted(scan, time, heights, others, motion, line.frequency, clock)
         if one.outcome == REMOVED:
             heights, clock = heights - one.removed, one.clock_ppm
         found.append(one)
@@ -154,17 +154,17 @@ def _envelope(time: FloatArray, values: FloatArray, frequency: float) -> tuple[C
 
 
 def _fitted(
-    scan: StudiedScan, time: FloatArray, heights: FloatArray, beside: FloatArray,
+    scan: StudiedScan, time: FloatArray, heights: FloatArray, others: FloatArray,
     motion: ComplexArray, frequency: float, clock: float | None,
 ) -> RemovedVibration:  # fmt: skip
     """Return what of ``heights`` (n,) follows ``motion`` (n,) [m] at a clock nearly the same.
 
-    beside: other lines of the heights (n,) [m];  clock: known from another line [ppm], or None
+    others: other lines of the heights (n,) [m];  clock: known from another line [ppm], or None
     """
     seen = float(aliased_frequency(frequency, scan.signal.rate))
     size = float(np.sqrt(np.mean(np.abs(motion) ** 2)))
     middle = time - time.mean()
-    fitted = heights - beside
+    fitted = heights - others
     shift, tried = _clock_shift(fitted * np.conj(motion), middle, frequency, clock)
     turned = motion * np.exp(2j * np.pi * shift * middle)
     columns = np.column_stack([turned.real, -turned.imag])
