@@ -28,6 +28,7 @@ import os
 import re
 import resource
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 _sentence: Callable[[str, Mapping[str, Any]], str] | None = None
@@ -133,6 +134,17 @@ class NoSamplesError(DeviceError):
 
     Connecting anew may help, but shows nothing by itself: only samples do.
     """
+
+
+@contextmanager
+def named_errors(
+    error: type[OmsmError], what: str, caught: type[OmsmError] = OmsmError
+) -> Iterator[None]:
+    """Raise ``error``, whose text begins with ``what``, for an error ``caught`` within."""
+    try:
+        yield
+    except caught as err:
+        raise error(f"{what}: {err}") from err
 
 
 DEBUG = "OMSM_DEBUG"

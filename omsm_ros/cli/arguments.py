@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
-from omsm_ros.errors import ConfigurationError, FileError, one_line, shortened
+from omsm_ros.errors import ConfigurationError, OmsmError, one_line, shortened
 from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import read_text
+from omsm_ros.io.files import load_object
 from omsm_ros.io.topics import TOPIC_TYPES, AnyBag, CellBag, relative
 from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, Quantity, shown
-from omsm_ros.units import LengthUnits, units_of
+from omsm_ros.units import units_of
 
 _LONGEST_MESSAGE = 480
 TABLE_SUFFIX = ".csv"
@@ -52,12 +52,21 @@ def number(quantity: Quantity) -> Callable[[str], Any]:
             value: object = int(text) if quantity.whole and len(text) <= 20 else float(text)
         except ValueError:
             value = text
-        try:
-            return quantity.checked(value, ConfigurationError)
-        except ConfigurationError as err:
-            raise argparse.ArgumentTypeError(str(err)) from err
+        return quantity.checked(value, ConfigurationError)
 
     return read
+
+
+def _as_argument(read: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Return ``read`` as the type of an argument: argparse prints the texts of our errors."""
+
+    def typed(text: str) -> Any:
+        try:
+            return read(text)
+        except OmsmError as err:
+            raise argparse.ArgumentTypeError(str(err)) from err
+
+    return typed
 
 
 _MAX_YAML_BYTES = 65_536
@@ -65,13 +74,9 @@ _MAX_YAML_BYTES = 65_536
 
 def json_object(text: str) -> dict[str, object]:
     """Parse an argument as a JSON object, or read it from a file of YAML."""
-    try:
-        if text.endswith((".yaml", ".yml")):
-            content = read_text(text, _MAX_YAML_BYTES, FileError, "description")
-            return json_and_yaml.mapping_of(content, FileError, f"description {text!r}")
-        return json_and_yaml.object_of(text, ConfigurationError, shown(text))
-    except (ConfigurationError, FileError) as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
+    if text.endswith((".yaml", ".yml")):
+        return load_object(text, "description", _MAX_YAML_BYTES, yaml=True)
+    return json_and_yaml.object_of(text, ConfigurationError, shown(text))
 
 
 PART_ENTRIES = ("title", "part", "drawing")
@@ -86,9 +91,7 @@ def _origin(text: str) -> dict[str, object]:
     """Parse the title block of a report or certificate; one file serves all commands."""
     found = json_object(text)
     if unknown := sorted(set(found) - set(_ORIGINS)):
-        raise argparse.ArgumentTypeError(
-            f"{unknown!r}: unknown entries, expected {', '.join(_ORIGINS)}"
-        )
+        raise ConfigurationError(f"{unknown!r}: unknown entries, expected {', '.join(_ORIGINS)}")
     return found
 
 
@@ -96,7 +99,7 @@ def _topics(text: str) -> dict[str, str]:
     known = {relative(topic): topic for topic in TOPIC_TYPES}
     found = dict(part.partition("=")[::2] for part in text.split(","))
     if wrong := [name for name, topic in found.items() if name not in known or not topic]:
-        raise argparse.ArgumentTypeError(f"{wrong!r}: expected NAME=/TOPIC with one of {[*known]}")
+        raise ConfigurationError(f"{wrong!r}: expected NAME=/TOPIC with one of {[*known]}")
     return {known[name]: topic for name, topic in found.items()}
 
 
@@ -129,14 +132,6 @@ def trigger_of(args: argparse.Namespace) -> CommonTrigger:
     return CommonTrigger(counter_offset=args.counter_offset, stamp_tolerance=args.stamp_tolerance)
 
 
-def _unit(text: str) -> LengthUnits:
-    """Parse the units of a file that does not state them."""
-    try:
-        return units_of(text)
-    except FileError as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
-
-
 class Arguments:
     """Declares the arguments of a command: each call adds one, each method some that are shared."""
 
@@ -154,7 +149,8 @@ class Arguments:
         elif isinstance(kind, str):
             more |= {"type": Path, "metavar": kind}
         else:
-            more["type"] = number(kind) if isinstance(kind, Quantity) else kind
+            read = number(kind) if isinstance(kind, Quantity) else kind
+            more["type"] = _as_argument(read) if kind not in (int, str, Path) else kind
         self._parser.add_argument(name, help=text, **more)
 
     def group(self, title: str) -> Arguments:
@@ -202,7 +198,7 @@ class Arguments:
 
     def unit(self) -> None:
         """Add the unit of files that do not state it."""
-        self("--unit", _unit, "unit of files that do not state it, such as mm, or mm,nm",
+        self("--unit", units_of, "unit of files that do not state it, such as mm, or mm,nm",
              metavar="UNIT[,HEIGHT_UNIT]")  # fmt: skip
 
     def channel(self) -> None:

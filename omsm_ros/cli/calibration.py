@@ -27,7 +27,7 @@ from omsm_ros.core.calibration.repeatability import (
     compare_calibrations,
     repeatability,
 )
-from omsm_ros.errors import CalibrationError
+from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.pipelines.verify_calibration import established_offset, path_check_of
 from omsm_ros.quantities import POSITION, TABLE_ANGLE, shown
@@ -143,7 +143,7 @@ def _placed(text: str) -> tuple[Path, str, float]:
     """Parse CAL.json@x=0.01 into path, axis and position of a calibration."""
     found = _PLACED.fullmatch(text)
     if found is None:
-        raise argparse.ArgumentTypeError(
+        raise ConfigurationError(
             f"{shown(text)} states no position, expected such as CAL.json@x=0.01 (x, z or b)"
         )
     kind = TABLE_ANGLE if found["axis"] == "b" else POSITION

@@ -19,18 +19,18 @@ from omsm_ros import __version__
 from omsm_ros.cli.arguments import ADDRESS, Arguments
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io import bags, json_and_yaml
+from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.files import (
     REPORT,
     SUMMARY,
     exception_text,
+    load_object,
     make_folder,
-    read_text,
     save_json,
     save_text,
 )
-from omsm_ros.io.json_and_yaml import check_form, ranged
+from omsm_ros.io.json_and_yaml import ranged
 from omsm_ros.io.results import read_summary
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import PROCESSES, STAMP, shown
@@ -151,9 +151,7 @@ def load_campaign(out: Path) -> list[Entry]:
     path = out / STATE
     if not path.exists():
         return []
-    text = read_text(path, _MAX_STATE_BYTES, FileError, "campaign")
-    content = json_and_yaml.object_of(text, FileError, f"campaign {str(path)!r}")
-    check_form(content, _STATE_FORM, FileError, f"campaign {str(path)!r}")
+    content = load_object(path, "campaign", _MAX_STATE_BYTES, _STATE_FORM)
     known = Entry.__dataclass_fields__
     return [Entry(**{k: v for k, v in e.items() if k in known}) for e in content["entries"]]
 

@@ -19,9 +19,9 @@ from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING
 
-from omsm_ros import __version__, quantities
+from omsm_ros import __version__
 from omsm_ros.cli import INTERRUPTED, INTERRUPTION, interruptible
-from omsm_ros.cli.arguments import Arguments, OneLineParser, number
+from omsm_ros.cli.arguments import Arguments, OneLineParser
 from omsm_ros.cli.command import say, say_lines, table, written
 from omsm_ros.cli.words import TASKS, WORDS
 from omsm_ros.errors import (
@@ -37,7 +37,7 @@ from omsm_ros.errors import (
 from omsm_ros.io import json_and_yaml
 from omsm_ros.messages import COMMAND, written_for
 from omsm_ros.pipelines.progress import refresh_in_thread, tick
-from omsm_ros.quantities import shown
+from omsm_ros.quantities import SEED, TIME_LAPSE, shown
 
 if TYPE_CHECKING:
     from omsm_ros.cli.command import CliCommand, Facts
@@ -242,12 +242,11 @@ def _declare(word: str, sub: argparse.ArgumentParser) -> None:
 
 def _declare_demo(add: Arguments) -> None:
     add("--out", "DIR", default=Path("out/demo"))
-    lapse, seed = number(quantities.TIME_LAPSE), number(quantities.SEED)
-    add("--time-lapse", lapse, "speed relative to real time; 20 if the device allows")
+    add("--time-lapse", TIME_LAPSE, "speed relative to real time; 20 if the device allows")
     add("--device", str, "model of the emulated probe", default="six_channel")
     add("--disturbances", str, "errors of the emulated machine", metavar="FILE")
     add("--view", None, "show the scan in a browser")
-    add("--seed", seed, "seed of the twin's noise", default=1)
+    add("--seed", SEED, "seed of the twin's noise", default=1)
     add(
         "--experiment",
         str,

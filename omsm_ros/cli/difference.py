@@ -5,8 +5,8 @@ from pathlib import Path
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, table, written
-from omsm_ros.cli.fit_option import dofs
 from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, ordered_dofs
+from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import DIFFERENCE, REPORT
@@ -25,10 +25,7 @@ def _dof_argument(text: str) -> tuple[str, ...]:
     """Parse the degrees of freedom in which the second measurement is moved onto the first."""
     if text == "auto":
         return tuple(name for name in MATCHING_PARAMETERS if name != "power")
-    try:
-        return ordered_dofs(tuple(filter(None, text.split(","))))
-    except ConfigurationError as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
+    return ordered_dofs(tuple(filter(None, text.split(","))))
 
 
 def _declare_difference(add: Arguments) -> None:
@@ -46,7 +43,7 @@ def _declare_difference(add: Arguments) -> None:
     add("--nominal", "SURFACE.yaml", "surface to subtract from both first")
     add(
         "--register",
-        dofs,
+        parse_dofs,
         "register each to the nominal surface first, as 'omsm form' does: 'auto', or of "
         "piston,tip,tilt,x,y,clocking,power",
         metavar="PARAMETERS",

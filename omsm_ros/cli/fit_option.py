@@ -1,24 +1,14 @@
 """Options of a registration and rows of its result, for form, correct and difference."""
 
-import argparse
-
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.isolated_points import DustRule
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.shape_parameters import SHAPE_PARAMETERS
-from omsm_ros.errors import ConfigurationError, SurfaceError
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER, TOLERANCE, shown
 from omsm_ros.readable import count, measured
-
-
-def dofs(text: str) -> tuple[str, ...]:
-    """Parse 'auto' or the degrees of freedom of a pose."""
-    try:
-        return parse_dofs(text)
-    except ConfigurationError as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
 
 
 def dust_rule(text: str) -> DustRule:
@@ -27,18 +17,10 @@ def dust_rule(text: str) -> DustRule:
         return text  # type: ignore[return-value]
     try:
         return int(COUNTER.checked(int(text), ConfigurationError, "dust"))
-    except (ValueError, ConfigurationError) as err:
-        raise argparse.ArgumentTypeError(
+    except ValueError as err:
+        raise ConfigurationError(
             f"dust is {shown(text)}, expected none, isolated or a number of points"
         ) from err
-
-
-def aperture(text: str) -> Aperture:
-    """Parse an aperture such as R[,X,Y] or ellipse:A,B[,X,Y] [m]."""
-    try:
-        return Aperture.parse(text)
-    except SurfaceError as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
 
 
 def placement(text: str) -> dict[str, float]:
@@ -49,7 +31,7 @@ def placement(text: str) -> dict[str, float]:
         if len(angles) > 1 or not all(0 <= size < 1 for size in known.values()):
             raise ValueError
     except ValueError as err:
-        raise argparse.ArgumentTypeError(
+        raise ConfigurationError(
             f"placement is {shown(text)}, expected M or M,RAD: standard uncertainties"
         ) from err
     return {name: max(size, _LEAST_PLACEMENT) for name, size in known.items()}
@@ -59,7 +41,7 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     """Add the options of a registration."""
     add(
         "--fit",
-        dofs,
+        parse_dofs,
         "pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power; and unknown "
         "parameters of the shape: radius, radius_x, radius_y, conic, 'focal length', …",
         default=default,
@@ -67,7 +49,7 @@ def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     )
     add(
         "--aperture",
-        aperture,
+        Aperture.parse,
         "area of the part to evaluate [m]: R, annulus:R,INNER, ellipse:A,B or rectangle:A,B (half "
         "lengths along x and y), each with ,X,Y of its middle if that is not the origin, or "
         "polygon:X,Y,X,Y…; default: that of the nominal surface, else around all points",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.cli.arguments import Arguments, cell_of, number, refuse_cell
+from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
 from omsm_ros.core.form.compensation import (
@@ -278,8 +278,8 @@ def _declare_form(add: Arguments) -> None:
     add.channel()
     declare_fit(add, (AUTO,))
     declare_tolerance(add)
-    add("--drawing", _drawing, "tolerances of ISO 10110-5, such as '3/0.5(0.2/0.1); RMSi < 20 nm'",
-        metavar="INDICATION")  # fmt: skip
+    add("--drawing", Drawing.parsed, metavar="INDICATION",
+        text="tolerances of ISO 10110-5, such as '3/0.5(0.2/0.1); RMSi < 20 nm'")  # fmt: skip
     add.origin()
     add("--no-report", None, "write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
@@ -323,13 +323,6 @@ def _show_form(facts: Facts) -> None:
     verdict += _drawing_rows(facts.get("drawing"))
     files = [FORM, CURVES, DEVIATION, *([facts["report"]] if "report" in facts else [])]
     table([*verdict, *form_rows(facts), written(files, facts["out"])])
-
-
-def _drawing(text: str) -> Drawing:
-    try:
-        return Drawing.parsed(text)
-    except ConfigurationError as err:
-        raise argparse.ArgumentTypeError(str(err)) from err
 
 
 def _drawing_rows(found: Facts | None) -> list[tuple[str, str]]:
@@ -427,10 +420,9 @@ def _declare_surface(add: Arguments) -> None:
         choices=("show",),
     )
     add("surface", "SURFACE.yaml")
-    radius, speed = number(STEP), number(SPEED)
-    add("--radius", radius, "radius of the disc [m]", required=True)
+    add("--radius", STEP, "radius of the disc [m]", required=True)
     add("--feed", FEED, "feed per turn of the spiral [m]", default=1e-4)
-    add("--rpm", speed, "spindle speed [rpm]", default=30.0)
+    add("--rpm", SPEED, "spindle speed [rpm]", default=30.0)
     add("--limits", "LIMITS.yaml", "machine limits, as of 'omsm predict'")
     add(
         "--probe-angle",

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.cli.arguments import Arguments, cell_of, json_object, number
+from omsm_ros.cli.arguments import Arguments, cell_of, json_object
 from omsm_ros.cli.command import (
     CliCommand,
     Facts,
@@ -193,9 +193,8 @@ def _show_reversal(facts: Facts) -> None:
 
 def _declare_latency(add: Arguments) -> None:
     add("calibration", "CAL.json")
-    delay, spread = number(LAG), number(TIME_UNCERTAINTY)
-    add("--delay", delay, "latency of the probe [s]", required=True)
-    add("--uncertainty", spread, "its standard uncertainty, k = 1 [s]", required=True)
+    add("--delay", LAG, "latency of the probe [s]", required=True)
+    add("--uncertainty", TIME_UNCERTAINTY, "its standard uncertainty, k = 1 [s]", required=True)
     add("--reason", str, "source of these figures", required=True)
     add("--out", "CAL.json", required=True)
 

@@ -14,7 +14,7 @@ from omsm_ros.core.calibration.calibration_set import (
     SET_SCHEMA_1,
     set_from_content,
 )
-from omsm_ros.errors import CalibrationError, FileError
+from omsm_ros.errors import CalibrationError, FileError, named_errors
 from omsm_ros.io import json_and_yaml
 from omsm_ros.io.files import exception_text, read_text, save_json, temporary_sibling
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
@@ -94,10 +94,8 @@ def calibration_of(content: dict[str, Any], what: str) -> Calibration:
     """
     is_set = content.get("schema") in (SET_SCHEMA, SET_SCHEMA_1)
     check_form(content, _SET_FORM if is_set else _FORM, CalibrationError, what)
-    try:
+    with named_errors(CalibrationError, what, CalibrationError):
         return _set_of(content) if is_set else _calibration_of(content)
-    except CalibrationError as err:
-        raise CalibrationError(f"{what}: {err}") from err
 
 
 def _calibration_of(content: dict[str, Any]) -> Calibration:

@@ -1,11 +1,16 @@
-"""Reads descriptions of machine and part: geometry, limits, pitch, motion, sources, surface."""
+"""Reads descriptions of machine, part and twin: geometry, limits, sources, surface and others.
+
+The schema of a description is derived from the fields of the record that is made of it.
+"""
+
+from __future__ import annotations
 
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -20,28 +25,72 @@ from omsm_ros.core.surface.aperture import Aperture, BoundedSurface
 from omsm_ros.core.surface.height_grid import GridSurface, as_grid
 from omsm_ros.core.surface.nominal import SHAPES
 from omsm_ros.core.surface.posed import Pose, PosedSurface
-from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceError
-from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import read_text, save_text
+from omsm_ros.errors import ConfigurationError, DataError, FileError, SurfaceError, named_errors
+from omsm_ros.io.files import load_object, read_text, save_text
 from omsm_ros.io.json_and_yaml import NUMBER, as_number, check_form, form
 from omsm_ros.io.tables.text_table import load_columns
 from omsm_ros.quantities import PITCH, POSITION, SAMPLE_PERIOD, TIME, shown
 
+if TYPE_CHECKING:  # commands other than those of the twin do not load it
+    from omsm_ros.twin.disturbances import Disturbances
+
 MAX_YAML_BYTES = 100_000
+# More than the lines or harmonics of any machine; each costs time at each sample.
+_MOST_ITEMS = 100
 
 _T = TypeVar("_T")
 
 
 def load_geometry(path: Path | str) -> Geometry:
     """Read ``GEOMETRY.yaml``: position and direction of the probe, in metres and slopes."""
-    values = _read_mapping(path, "geometry")
-    return _made(Geometry, values, f"geometry {str(path)!r}")
+    return _load(Geometry, path, "geometry")
 
 
 def load_limits(path: Path | str) -> MachineLimits:
     """Read ``LIMITS.yaml``: limits of servo, probe, spindle and axes, units in the names."""
-    values = _read_mapping(path, "limits")
-    return _made(MachineLimits, values, f"limits {str(path)!r}")
+    return _load(MachineLimits, path, "limits")
+
+
+def load_disturbances(path: Path | str) -> Disturbances:
+    """Read ``DISTURBANCES.yaml``, the errors of the twin; a record left out is switched off."""
+    from omsm_ros.twin.disturbances import Disturbances
+
+    return _load(Disturbances, path, "disturbances")
+
+
+def _load(kind: type[_T], path: Path | str, what: str) -> _T:
+    """Read a record of numbers, and of records of them; FileError for another name or value."""
+    content = load_object(path, what, MAX_YAML_BYTES, _schema_of(kind), yaml=True)
+    with named_errors(FileError, f"{what} {str(path)!r}", ConfigurationError):
+        return _made(kind, content)  # type: ignore[no-any-return]
+
+
+def _schema_of(kind: Any) -> Mapping[str, Any]:
+    """Return the JSON schema of a field's type: record, row of records, number, any or none."""
+    kind = _present(kind)
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return form({f.name: _schema_of(hints[f.name]) for f in fields(kind)}, _required(kind))
+    if get_origin(kind) is tuple:
+        items = _schema_of(get_args(kind)[0])
+        return {"type": "array", "items": items, "maxItems": _MOST_ITEMS}
+    return _INTEGER if kind is int else NUMBER
+
+
+def _required(kind: Any) -> list[str]:
+    known = (each for each in fields(kind) if each.init)
+    return [f.name for f in known if f.default is MISSING and f.default_factory is MISSING]
+
+
+def _made(kind: Any, content: Any) -> Any:
+    kind = _present(kind)
+    if is_dataclass(kind):
+        make: Any = kind
+        hints = get_type_hints(kind)
+        return make(**{name: _made(hints[name], value) for name, value in content.items()})
+    if get_origin(kind) is tuple:
+        return tuple(_made(get_args(kind)[0], item) for item in content)
+    return kind(content)
 
 
 def load_pitch(path: Path | str) -> PitchCurve:
@@ -50,30 +99,13 @@ def load_pitch(path: Path | str) -> PitchCurve:
     what = f"pitch {str(path)!r}"
     POSITION.checked_all(z, FileError, f"{what}: z_m")
     PITCH.checked_all(angle, FileError, f"{what}: pitch_rad")
-    try:
+    with named_errors(FileError, what, ConfigurationError):
         return PitchCurve(z, angle)
-    except ConfigurationError as err:
-        raise FileError(f"{what}: {err}") from err
 
 
 def save_geometry(path: Path | str, geometry: Geometry) -> None:
     """Write ``GEOMETRY.yaml``."""
     save_text(path, yaml.safe_dump(asdict(geometry), sort_keys=False))
-
-
-def _made(kind: Callable[..., _T], values: Mapping[str, Any], what: str) -> _T:
-    parameters = fields(kind)  # type: ignore[arg-type]
-    required = [field.name for field in parameters if field.default is MISSING]
-    check_form(values, form({p.name: NUMBER for p in parameters}, required), FileError, what)
-    try:
-        return kind(**values)
-    except ConfigurationError as err:
-        raise FileError(f"{what}: {err}") from err
-
-
-def _read_mapping(path: Path | str, what: str) -> dict[str, Any]:
-    text = read_text(path, MAX_YAML_BYTES, FileError, what)
-    return json_and_yaml.mapping_of(text, FileError, f"{what} {str(path)!r}")
 
 
 def load_motion(path: Path | str) -> tuple[FloatArray, float]:
@@ -111,10 +143,8 @@ _MOST_MULTISINE_SAMPLES = 1_000_000
 def load_multisine(path: Path | str) -> MultisinePlan:
     """Read ``multisine.json``; raise FileError if it is malformed or longer than a recording."""
     what = f"multisine {str(path)!r}"
-    content = json_and_yaml.object_of(
-        read_text(path, 10 * MAX_YAML_BYTES, FileError, what), FileError, what
-    )
-    check_form(content, form(_MULTISINE, tuple(_MULTISINE)), FileError, what)
+    schema = form(_MULTISINE, tuple(_MULTISINE))
+    content = load_object(path, "multisine", 10 * MAX_YAML_BYTES, schema)
     del content["schema"]
     plan = MultisinePlan(**content | {k: tuple(content[k]) for k in ("lines", "amplitudes")})
     rising = bool(np.all(np.diff(plan.lines) > 0)) and plan.lines[-1] < plan.period / 2
@@ -134,7 +164,6 @@ def load_multisine(path: Path | str) -> MultisinePlan:
 #      how: evaluated, reason: ball and capacitive sensor}
 
 SCHEMA = "omsm-sources/1"
-MAX_BYTES = 100_000
 _MOST_SOURCES = 200
 _TEXT = {"type": "string"}
 _OWN = {"source": _TEXT, "value": NUMBER, "unit": _TEXT, "how": _TEXT, "reason": _TEXT}
@@ -154,15 +183,9 @@ _FORM = form(
 
 def load_sources(path: Path | str) -> MachineSources:
     """Read ``SOURCES.yaml``; FileError, which names the source and the error."""
-    what = f"sources {str(path)!r}"
-    content = json_and_yaml.mapping_of(
-        read_text(path, MAX_BYTES, FileError, "sources"), FileError, what
-    )
-    check_form(content, _FORM, FileError, what)
-    try:
+    content = load_object(path, "sources", MAX_YAML_BYTES, _FORM, yaml=True)
+    with named_errors(FileError, f"sources {str(path)!r}", ConfigurationError):
         return MachineSources(tuple(_stated(item) for item in content["sources"]))
-    except ConfigurationError as err:
-        raise FileError(f"{what}: {err}") from err
 
 
 def add_sources(path: Path, found: Sequence[Mapping[str, object]]) -> None:
@@ -173,9 +196,9 @@ def add_sources(path: Path, found: Sequence[Mapping[str, object]]) -> None:
     head, kept = "", []
     if path.exists():
         load_sources(path)
-        text = read_text(path, MAX_BYTES, FileError, "sources")
+        text = read_text(path, MAX_YAML_BYTES, FileError, "sources")
         head = "".join(takewhile(lambda line: line[0] in "#\n", text.splitlines(keepends=True)))
-        kept = json_and_yaml.mapping_of(text, FileError, f"sources {str(path)!r}")["sources"]
+        kept = load_object(path, "sources", MAX_YAML_BYTES, yaml=True)["sources"]
     new = {(item["source"], item.get("per_turn")) for item in found}
     kept = [item for item in kept if (item["source"], item.get("per_turn")) not in new]
     lines = [
@@ -219,9 +242,8 @@ def load_surface(path: Path | str, fitted: Sequence[str] = ()) -> Surface:
     """
     if str(path) in SHAPES:
         return surface_of(_with_starts({"shape": str(path)}, fitted), f"surface {str(path)!r}")
-    text = read_text(path, MAX_YAML_BYTES, SurfaceError, "surface")
     what = f"surface {str(path)!r}"
-    description = json_and_yaml.mapping_of(text, SurfaceError, what)
+    description = load_object(path, "surface", MAX_YAML_BYTES, error=SurfaceError, yaml=True)
     shapes, frames = _extent(description)
     if shapes > MOST_SHAPES or frames > MOST_FRAMES:
         raise SurfaceError(
@@ -277,7 +299,7 @@ def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
 
     schema = form({"file": {"type": "string"}, "unit": {"type": "string"}}, ("file",))
     check_form(values, schema, SurfaceError, what)
-    try:
+    with named_errors(SurfaceError, what):
         units = units_of(values["unit"]) if "unit" in values else None
         grid = as_grid(read_points(folder / values["file"], units))
         if grid is None:
@@ -286,21 +308,16 @@ def _grid(values: Mapping[str, Any], what: str, folder: Path) -> Surface:
                 "'omsm export --spacing'"
             )
         return GridSurface(grid)
-    except (FileError, DataError) as err:
-        raise SurfaceError(f"{what}: {err}") from err
 
 
 def _record(kind: Any, values: Mapping[str, Any], what: str, folder: Path | None) -> Any:
     known = [each for each in fields(kind) if each.init]
     hints = get_type_hints(kind)
-    required = [each.name for each in known if each.default is MISSING]
-    schema = form({each.name: _schema(hints[each.name]) for each in known}, required)
+    schema = form({each.name: _schema(hints[each.name]) for each in known}, _required(kind))
     check_form(values, schema, SurfaceError, what)
     made = {n: _value(hints[n], v, f"{what}: {n}", folder) for n, v in values.items()}
-    try:
+    with named_errors(SurfaceError, what):
         return kind(**made)
-    except (ConfigurationError, SurfaceError) as err:
-        raise SurfaceError(f"{what}: {err}") from err
 
 
 def _schema(hint: Any) -> Mapping[str, Any]:

@@ -48,6 +48,38 @@ def read_text(path: Path | str, limit: int, error: type[FileError], what: str) -
     )
 
 
+def load_object(
+    path: Path | str,
+    what: str,
+    limit: int,
+    schema: Mapping[str, Any] | None = None,
+    error: type[FileError] = FileError,
+    yaml: bool = False,
+) -> dict[str, Any]:
+    """Return the object in a JSON file, or in a YAML file if ``yaml``.
+
+    Raises ``error``, which calls the file ``what``, if it is missing, has more than ``limit``
+    bytes, or does not follow ``schema``.
+    """
+    text = read_text(path, limit, error, what)
+    read = json_and_yaml.mapping_of if yaml else json_and_yaml.object_of
+    content = read(text, error, f"{what} {str(path)!r}")
+    if schema is not None:
+        json_and_yaml.check_form(content, schema, error, f"{what} {str(path)!r}")
+    return content
+
+
+@contextmanager
+def library_errors(what: str, remedy: str) -> Iterator[None]:
+    """Raise FileError for any of the many exceptions that libraries raise on a damaged file."""
+    try:
+        yield
+    except FileError:
+        raise
+    except Exception as err:
+        raise FileError(f"{what} cannot be read: {exception_text(err)}; {remedy}") from err
+
+
 def open_regular(path: Path | str, error: type[FileError], what: str) -> IO[bytes]:
     """Open a regular file for reading; raise ``error`` for a folder, device, pipe, or none."""
     try:

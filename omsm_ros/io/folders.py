@@ -4,13 +4,12 @@ import fcntl
 import os
 import shutil
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.io import json_and_yaml
 from omsm_ros.io.files import (
     CLOUD,
     CURVES,
@@ -23,8 +22,8 @@ from omsm_ros.io.files import (
     SUMMARY,
     SYSTEMATIC,
     exception_text,
+    load_object,
     make_folder,
-    read_text,
     temporary_sibling,
 )
 
@@ -127,10 +126,9 @@ def _refuse_foreign(target: Path, names: Sequence[str]) -> None:
         )
 
 
-def read_result(path: Path, what: str) -> dict[str, Any]:
-    """Return the object of a JSON file, ``what``; FileError if missing, too large or no object."""
-    text = read_text(path, MAX_RESULT_BYTES, FileError, what)
-    return json_and_yaml.object_of(text, FileError, f"{what} {str(path)!r}")
+def read_result(path: Path, what: str, schema: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the object of a JSON file, ``what``; FileError if missing, too large or of no form."""
+    return load_object(path, what, MAX_RESULT_BYTES, schema)
 
 
 _MODE = 0o700

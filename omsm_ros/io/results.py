@@ -23,7 +23,6 @@ from omsm_ros.io.json_and_yaml import (
     NUMBER_OR_NULL,
     TEXT,
     TEXTS,
-    check_form,
     each,
     group,
     or_none,
@@ -207,8 +206,7 @@ def read_summary(path: Path) -> dict[str, Any]:
     Files of schema 1 have former names of sources. Raises FileError if it is missing, too large,
     no JSON, or has values of other types than ``omsm correct`` writes.
     """
-    summary = read_result(path, "summary")
-    check_form(summary, _FORM, FileError, f"summary {str(path)!r}")
+    summary = read_result(path, "summary", _FORM)
     for source in (summary.get("budget") or {}).get("sources", []):
         source["source"] = FORMER_NAMES.get(source["source"], source["source"])
     return summary
@@ -260,8 +258,7 @@ def read_form(path: Path) -> dict[str, Any]:
     Raises FileError if it is missing, too large, no JSON, or has values of other types than a
     registration writes.
     """
-    form, what = read_result(path, "form"), f"form {str(path)!r}"
-    check_form(form, _FORM_SCHEMA, FileError, what)
+    form, what = read_result(path, "form", _FORM_SCHEMA), f"form {str(path)!r}"
     removed = form.get("removed", {})
     for source, shares in removed.get("pose_uncertainty", {}).items():
         for name in removed.get("fitted", ()):
@@ -274,8 +271,7 @@ def read_form(path: Path) -> dict[str, Any]:
 
 def read_curves(path: Path) -> dict[str, Any]:
     """Return ``curves.json``: profiles [m], densities [m⁴]; FileError as :func:`read_form`."""
-    curves, what = read_result(path, "curves"), f"curves {str(path)!r}"
-    check_form(curves, _CURVES, FileError, what)
+    curves, what = read_result(path, "curves", _CURVES), f"curves {str(path)!r}"
     density = curves.get("psd") or {}
     parts = {n: density[n] for n in ("radial", "azimuthal") if n in density}
     for name, curve in (curves.get("profiles", {}) | parts).items():

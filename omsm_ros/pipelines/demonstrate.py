@@ -21,7 +21,7 @@ from omsm_ros.errors import OmsmError, printable
 from omsm_ros.instruments.emulator_factory import emulated
 from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration
-from omsm_ros.io.disturbance_file import load_disturbances
+from omsm_ros.io.descriptions import load_disturbances
 from omsm_ros.io.files import (
     CLOUD,
     DEVIATION,

@@ -15,10 +15,9 @@ from omsm_ros.core.estimation.sampled_model import SCHEMA, SCHEMA_1, FreeRun, Sa
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import Identification
 from omsm_ros.core.streams.motion_record import MotionRecord
-from omsm_ros.errors import CalibrationError, DataError, FileError
-from omsm_ros.io import json_and_yaml
+from omsm_ros.errors import CalibrationError, DataError, FileError, named_errors
 from omsm_ros.io.descriptions import load_motion
-from omsm_ros.io.files import read_text, save_bytes, save_json
+from omsm_ros.io.files import load_object, save_bytes, save_json
 from omsm_ros.io.folders import result_folder
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.io.tables.text_table import PLAIN, TextTable, load_columns
@@ -222,11 +221,8 @@ def save_model(path: Path | str, model: SampledModel) -> None:
 def load_model(path: Path | str) -> SampledModel:
     """Read ``MODEL.json``; CalibrationError if malformed or not to be computed with."""
     what = f"model {str(path)!r}"
-    text = read_text(path, _MAX_BYTES, CalibrationError, "model")
-    content = json_and_yaml.object_of(text, CalibrationError, what)
+    content = load_object(path, "model", _MAX_BYTES, error=CalibrationError)
     old = content.get("schema") == SCHEMA_1
     check_form(content, _FORM_1 if old else _FORM, CalibrationError, what)
-    try:
+    with named_errors(CalibrationError, what, CalibrationError):
         return SampledModel.from_content(content)
-    except CalibrationError as err:
-        raise CalibrationError(f"{what}: {err}") from err

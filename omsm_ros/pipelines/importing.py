@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from omsm_ros.core.streams.imported_columns import (
     period_of,
     share_trigger,
 )
-from omsm_ros.errors import DataError, FileError
+from omsm_ros.errors import DataError, FileError, named_errors
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import atomic_bag
 from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
@@ -198,15 +198,6 @@ def _check_counted(streams: Sequence[_Stream]) -> None:
         )
 
 
-@contextmanager
-def _named_in_errors(file: str) -> Iterator[None]:
-    """Name the file in a DataError."""
-    try:
-        yield
-    except DataError as err:
-        raise DataError(f"{file}: {err}") from err
-
-
 class _Stream:
     """Files of the same columns, one after the other, with one row counter."""
 
@@ -217,7 +208,7 @@ class _Stream:
         self.counted = bool({*COUNTING} & {*channels})
         self.counter = RowCounter(sources[0].found.file, mapped, "time" in channels, self.triggered)
         first = sources[0].first()
-        with _named_in_errors(sources[0].found.file):
+        with named_errors(DataError, sources[0].found.file, DataError):
             self.begins, self.period = self.counter.begin(first)
 
     def blocks(self) -> Iterator[AxisBlock | DistanceBlock]:
@@ -305,7 +296,7 @@ class _Source:
         """Yield the file's blocks; ``counter`` continues from the file before."""
         found = self.found
         for piece in self._pieces():
-            with _named_in_errors(found.file):
+            with named_errors(DataError, found.file, DataError):
                 rows = counter.count(piece)
             skipped = np.diff(rows.counter, prepend=self._number(rows)) - 1
             self._last = int(rows.counter[-1])

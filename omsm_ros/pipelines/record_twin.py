@@ -14,7 +14,7 @@ from omsm_ros.core.surface.nominal import (
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.io.disturbance_file import load_disturbances
+from omsm_ros.io.descriptions import load_disturbances
 from omsm_ros.io.files import save_text
 from omsm_ros.readable import count, quantity
 from omsm_ros.twin.cell import Recording, blocks_of, pieces

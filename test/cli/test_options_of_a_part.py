@@ -1,12 +1,12 @@
 """Effects of the options of ``omsm form`` and ``compensate``, against closed forms."""
 
-import argparse
 import json
 
 import numpy as np
 import pytest
 
 from omsm_ros import cli
+from omsm_ros.errors import ConfigurationError
 
 RADIUS, POINTS = 10e-3, 30_000
 COARSE_M, FINE_M = 2e-3, 0.5e-3
@@ -106,5 +106,5 @@ def test_the_title_block_stands_on_the_page_and_an_unknown_entry_is_named(tmp_pa
     assert "<h1>First cut</h1>" in page
     assert "<dt>part</dt><dd>S80-07</dd>" in page
     assert "<dt>temperature</dt><dd>20.1" in page
-    with pytest.raises(argparse.ArgumentTypeError, match="'pert'"):
+    with pytest.raises(ConfigurationError, match="'pert'"):
         _origin('{"pert": "S80-07"}')

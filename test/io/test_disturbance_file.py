@@ -10,7 +10,7 @@ from written_disturbances import write_disturbances
 import omsm_ros
 from benchmarks.disturbance_catalogue import CATALOGUE, together
 from omsm_ros.errors import FileError
-from omsm_ros.io.disturbance_file import load_disturbances
+from omsm_ros.io.descriptions import load_disturbances
 from omsm_ros.twin.disturbances import NOTHING
 
 SHIPPED = Path(omsm_ros.__file__).resolve().parent.parent / "config" / "disturbances.yaml"

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import atomic_file, open_regular, read_text
+from omsm_ros.io.files import atomic_file, load_object, open_regular
 from omsm_ros.io.tables.text_table import rows_in
 from omsm_ros.quantities import MAP_POINTS
 from omsm_ros.units import (
@@ -340,8 +339,7 @@ def has_dabam_header(path: Path) -> bool:
 
 
 def _header(path: Path) -> dict[str, Any]:
-    text = read_text(path, _MAX_HEADER_BYTES, FileError, "header")
-    return json_and_yaml.object_of(text, FileError, f"header {str(path)!r}")
+    return load_object(path, "header", _MAX_HEADER_BYTES)
 
 
 def load_dabam(path: Path) -> DabamProfile:

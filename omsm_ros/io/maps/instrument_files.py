@@ -15,7 +15,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, exception_text, open_regular
+from omsm_ros.io.files import atomic_file, exception_text, library_errors, open_regular
 from omsm_ros.io.optional_libraries import import_optional, walk_in_subprocess
 from omsm_ros.quantities import MAP_POINTS, shown
 from omsm_ros.units import LengthUnits, metres_in, needed, refuse_other
@@ -60,18 +60,11 @@ def read_hdf5(path: Path, channel: str | None = None) -> MeasuredPoints:
     h5py = import_optional("h5py", what)
     with open_regular(path, FileError, "HDF5 file") as stream:
         walk_in_subprocess(path, what)
-        try:
-            with h5py.File(stream, "r") as content:
-                if content.attrs.get("schema") == SCHEMA and channel is None:
-                    return _table(content, what)
-                if _DATX_SURFACES in content:
-                    return _datx(h5py, content, channel, what)
-        except FileError:
-            raise
-        except Exception as err:  # the library raises many kinds
-            raise FileError(
-                f"{what} cannot be read: {exception_text(err)}; write it again"
-            ) from err
+        with library_errors(what, "write it again"), h5py.File(stream, "r") as content:
+            if content.attrs.get("schema") == SCHEMA and channel is None:
+                return _table(content, what)
+            if _DATX_SURFACES in content:
+                return _datx(h5py, content, channel, what)
     raise FileError(f"{what} is neither a table of ours nor a .datx of Zygo; convert it to xyz")
 
 

@@ -16,7 +16,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, exception_text, open_regular
+from omsm_ros.io.files import atomic_file, library_errors, open_regular
 from omsm_ros.io.maps.instrument_files import channel_note, chosen_channel
 from omsm_ros.io.optional_libraries import import_optional
 from omsm_ros.quantities import MAP_POINTS
@@ -44,25 +44,20 @@ def read_x3p(path: Path, channel: str | None = None) -> MeasuredPoints:
     """
     what = f"x3p file {str(path)!r}"
     x3pio = import_optional("x3pio", what)
-    with open_regular(path, FileError, "x3p file") as stream:
-        try:
-            with zipfile.ZipFile(stream) as archive:
-                size = sum(member.file_size for member in archive.infolist())
-                if size > MAX_UNPACKED_BYTES:
-                    raise FileError(
-                        f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read; "
-                        "thin it"
-                    )
-                known = _with_known_revision(archive)
-            stream.seek(0)
-            content = x3pio.read(known or stream)
-            names = [f"layer {k}" for k in range(len(content.layers))]
-            chosen = chosen_channel(names, channel, 0, what)
-            place = _places(x3pio, content, chosen)
-        except FileError:
-            raise
-        except Exception as err:  # the libraries raise many kinds
-            raise FileError(f"{what} cannot be read: {exception_text(err)}; save it again") from err
+    with open_regular(path, FileError, "x3p file") as stream, library_errors(what, "save it again"):
+        with zipfile.ZipFile(stream) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+            if size > MAX_UNPACKED_BYTES:
+                raise FileError(
+                    f"{what} unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are read; "
+                    "thin it"
+                )
+            known = _with_known_revision(archive)
+        stream.seek(0)
+        content = x3pio.read(known or stream)
+        names = [f"layer {k}" for k in range(len(content.layers))]
+        chosen = chosen_channel(names, channel, 0, what)
+        place = _places(x3pio, content, chosen)
     notes = (channel_note(names, chosen),) if len(names) > 1 else ()
     return measured(place[:, 0], place[:, 1], place[:, 2], notes=notes)
 

@@ -25,7 +25,7 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import exception_text, open_regular
+from omsm_ros.io.files import library_errors, open_regular
 from omsm_ros.io.optional_libraries import walk_in_subprocess
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -54,6 +54,7 @@ _MAX_WHOLE_BYTES = 4_000_000_000
 # No recording has a compression ratio of 100; a large file with more was made to fill memory.
 _MAX_PACKED, _ALWAYS_UNPACKED_BYTES = 100, 100_000_000
 _MAX_COLUMNS = 1000
+_AGAIN = "write it again, or as CSV"
 
 _MATLAB_PACKED = 15  # miCOMPRESSED of "MAT-File Format"
 _INDEXED = re.compile(r"(.*)\[(\d{1,4})\]")
@@ -72,14 +73,8 @@ class ArrayTable(ForeignTable):
             size = stream.seek(0, io.SEEK_END)
         if size > _MAX_WHOLE_BYTES and read != self._hdf5:
             raise FileError(f"{self} has {size} bytes, at most {_MAX_WHOLE_BYTES}; split it")
-        try:
+        with library_errors(str(self), _AGAIN):
             self._arrays = dict(_flat("", read()))
-        except FileError:
-            raise
-        except Exception as err:  # the libraries raise many kinds
-            raise FileError(
-                f"{self} cannot be read: {exception_text(err)}; write it again, or as CSV"
-            ) from err
         for name, array in self._arrays.items():
             self._name(name, array)
 
@@ -266,10 +261,8 @@ class TdmsTable(ForeignTable):
             logger.handlers[:] = [_Refusal()]
         with ExitStack() as opening:
             stream = opening.enter_context(open_regular(path, FileError, "table"))
-            try:
+            with library_errors(str(self), _AGAIN):
                 self._take(opening.enter_context(TdmsFile.open(stream)))
-            except Exception as err:  # the library raises many kinds
-                raise self._damaged(err) from err
             self._opened = opening.pop_all()
 
     def _take(self, file: Any) -> None:
@@ -298,16 +291,8 @@ class TdmsTable(ForeignTable):
                     "their rows do not belong together: write them on one clock"
                 )
             if key == _PERIOD and values:
-                (self.sample_period,) = (self._period(value) for value in values)
-
-    def _period(self, stated: object) -> float:
-        try:
-            return float(stated)  # type: ignore[arg-type]
-        except (TypeError, ValueError) as err:
-            raise self._damaged(err) from err
-
-    def _damaged(self, err: Exception) -> FileError:
-        return FileError(f"{self} cannot be read: {exception_text(err)}; write it again, or as CSV")
+                with library_errors(str(self), _AGAIN):
+                    (self.sample_period,) = map(float, values)
 
     def _pieces(
         self, names: Sequence[str], dates: frozenset[str]
@@ -319,10 +304,8 @@ class TdmsTable(ForeignTable):
             yield {name: self._slice(name, low, name in dates) for name in names}
 
     def _slice(self, name: str, low: int, dated: bool) -> FloatArray:
-        try:
+        with library_errors(str(self), _AGAIN):
             values: Any = self._channels[name][low : low + PIECE_ROWS]
-        except Exception as err:
-            raise self._damaged(err) from err
         if dated != (values.dtype.kind == "M"):
             holds = "numbers" if dated else "dates"
             raise FileError(

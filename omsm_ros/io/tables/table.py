@@ -10,10 +10,9 @@ from typing import Any
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.imported_columns import CHANNELS, Column, ColumnMap
-from omsm_ros.errors import DataError, FileError
-from omsm_ros.io import json_and_yaml
-from omsm_ros.io.files import read_text
-from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
+from omsm_ros.errors import DataError, FileError, named_errors
+from omsm_ros.io.files import load_object
+from omsm_ros.io.json_and_yaml import NUMBER, form
 from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.units import COUNT, DATE, UNITS
 
@@ -150,19 +149,15 @@ _MAP = form(
 def load_column_map(path: Path | str) -> tuple[ColumnMap, TableForm]:
     """Read ``MAP.yaml``; FileError if it is ambiguous, such as without a unit."""
     what = f"map {str(path)!r}"
-    text = read_text(path, _MAX_BYTES, FileError, "map")
-    content = json_and_yaml.mapping_of(text, FileError, what)
-    check_form(content, _MAP, FileError, what)
+    content = load_object(path, "map", _MAX_BYTES, _MAP, yaml=True)
     invalid = content.get("invalid", ())
-    try:
+    with named_errors(FileError, what, DataError):
         mapped = ColumnMap(
             {c: _column(c, given) for c, given in content["columns"].items()},
             content.get("sample_period"),
             float(content.get("start", 0.0)),
             tuple(float(value) for value in invalid if not isinstance(value, str)),
         )
-    except DataError as err:
-        raise FileError(f"{what}: {err}") from err
     written = TableForm(
         content.get("delimiter", ","),
         content.get("decimal", "."),
