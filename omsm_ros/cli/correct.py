@@ -16,7 +16,7 @@ from omsm_ros.cli.arguments import (
     trigger_of,
 )
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
-from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
+from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
 from omsm_ros.core.correction.predict import DEFAULT_BUDGET_M, predict_error
@@ -38,7 +38,7 @@ from omsm_ros.io.descriptions import (
 from omsm_ros.io.folders import MEASUREMENT_FILES, result_folder
 from omsm_ros.pipelines.correct import Admission, StampJoining
 from omsm_ros.pipelines.history import record_in_catalogue
-from omsm_ros.pipelines.measure import RegistrationOptions, measure
+from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
 from omsm_ros.readable import measured, percent, plain, quantity, rounded_down
@@ -159,11 +159,7 @@ def _correct(args: argparse.Namespace) -> Facts:
             by_stamps=StampJoining(args.delay, args.exposure) if args.by_stamps else None,
             stated=sources_of(args.sources),
             accuracy=args.accuracy,
-            register=RegistrationOptions(
-                args.fit, args.aperture, args.tolerance, args.dust, args.placement
-            )
-            if args.fit
-            else None,
+            register=registration_of(args) if args.fit else None,
             report=not args.no_report,
             origin=args.origin,
             progress=progress,

@@ -1,5 +1,10 @@
 """Options of a registration and rows of its result, for form, correct and difference."""
 
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.isolated_points import DustRule
@@ -9,6 +14,9 @@ from omsm_ros.core.surface.shape_parameters import SHAPE_PARAMETERS
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER, TOLERANCE, shown
 from omsm_ros.readable import count, measured
+
+if TYPE_CHECKING:
+    from omsm_ros.pipelines.form import RegistrationOptions
 
 
 def dust_rule(text: str) -> DustRule:
@@ -77,6 +85,17 @@ def declare_tolerance(add: Arguments) -> None:
     add("--tolerance", TOLERANCE, "tolerance of the peak to valley of the part [m]; needs --fit")
 
 
+def registration_of(args: argparse.Namespace) -> RegistrationOptions:
+    """Return the options of a registration, with None for those that a command does not have."""
+    # Here, because most corrections do not register.
+    from omsm_ros.pipelines.form import RegistrationOptions
+
+    given = {name: getattr(args, name, None) for name in _OTHERS}
+    filters = getattr(args, "s_filter", None), getattr(args, "l_filter", None)
+    return RegistrationOptions(args.fit, filters=filters, **given)
+
+
+_OTHERS = ("aperture", "tolerance", "dust", "placement", "drawing")
 # Smallest standard uncertainty of a placement [m], [rad]; below an atom it is zero.
 _LEAST_PLACEMENT = 1e-12
 _UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}

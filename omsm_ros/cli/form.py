@@ -1,7 +1,6 @@
 """Commands for the form of a part: form, compensate, surface."""
 
 import argparse
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
 from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
-from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows
+from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.form.compensation import (
     CutSurface,
     ToolPath,
@@ -28,7 +27,6 @@ from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.registration.pose_parameters import AUTO
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.height_grid import gradient_of
 from omsm_ros.errors import ConfigurationError, DataError, FileError
 from omsm_ros.io.calibration_file import load_calibration
@@ -36,8 +34,13 @@ from omsm_ros.io.descriptions import load_limits, load_surface
 from omsm_ros.io.files import CURVES, DEVIATION, FORM, REPORT, save_bytes, save_text
 from omsm_ros.io.folders import FORM_FILES, MEASUREMENT_FILES, result_folder
 from omsm_ros.io.gcode_file import path_gcode as program_of
-from omsm_ros.pipelines.form import MeasurementMeasuredPortions as OpenedMeasurement
-from omsm_ros.pipelines.form import draw_form, judge_form, open_measurement
+from omsm_ros.pipelines.form import (
+    OpenedMeasurement,
+    RegistrationOptions,
+    draw_form,
+    judge_form,
+    open_measurement,
+)
 from omsm_ros.quantities import (
     FEED,
     LENGTH,
@@ -173,22 +176,20 @@ def compensate_form(
     surface: Surface,
     out: Path,
     low_pass: float,
-    asked: Sequence[str],
-    aperture: Aperture | None = None,
+    how: RegistrationOptions,
     spiral: tuple[float, int] | None = None,
     cut: NextCut | None = None,
     previous: Path | None = None,
-    placement: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
     """Write compensation.csv into ``out``: offsets to add to the height of the next cut.
 
-    asked, aperture, placement: as for form;  low_pass: cutoff, of which half is compensated [m]
+    low_pass: cutoff, of which half is compensated [m]
     spiral: feed per turn [m] and points per turn of the next cut, for compensation.nc; None: none
     cut: for cut.nc, a complete program;  previous: compensation.csv of the cut that made this part
 
     Raises DataError for a wavelength below the points, or if the previous cut went wrong.
     """
-    form = measured.form(surface, asked, aperture, placement=placement)
+    form = measured.form(surface, how)
     found = compensation(form.map, surface := form.registration.surface, low_pass)
     (x, y), known = np.meshgrid(found.x, found.y), np.isfinite(found.offset)
     share, total = None, found.offset
@@ -292,7 +293,7 @@ def _declare_form(add: Arguments) -> None:
 
 
 def _form(args: argparse.Namespace) -> Facts:
-    surface, filters = load_surface(args.nominal, args.fit), (args.s_filter, args.l_filter)
+    surface = load_surface(args.nominal, args.fit)
     with result_folder(args.out, MEASUREMENT_FILES if args.calibration else FORM_FILES) as out:
         source = args.measured
         if args.calibration:
@@ -307,8 +308,7 @@ def _form(args: argparse.Namespace) -> Facts:
         else:
             refuse_cell(source, args)
         points = open_measurement(source, args.unit, args.channel)
-        asked = (args.fit, args.aperture, filters, args.tolerance, args.dust)
-        facts = judge_form(points, surface, out, *asked, args.placement, args.drawing)
+        facts = judge_form(points, surface, out, registration_of(args))
         if not args.no_report:
             draw_form(source, out, args.origin)
             facts = {**facts, "report": REPORT}
@@ -379,17 +379,9 @@ def _compensate(args: argparse.Namespace) -> Facts:
         cut = NextCut(args.spiral, args.rpm, args.tool_radius)
     with result_folder(args.out, (COMPENSATION, PATH, CUT)) as out:
         points = open_measurement(args.measured, args.unit, args.channel)
+        how = registration_of(args)
         facts = compensate_form(
-            points,
-            surface,
-            out,
-            args.low_pass,
-            args.fit,
-            args.aperture,
-            spiral,
-            cut,
-            args.previous,
-            args.placement,
+            points, surface, out, args.low_pass, how, spiral, cut, args.previous
         )
     return {**facts, "out": str(args.out)}
 

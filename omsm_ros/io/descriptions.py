@@ -90,7 +90,7 @@ def _made(kind: Any, content: Any) -> Any:
         return make(**{name: _made(hints[name], value) for name, value in content.items()})
     if get_origin(kind) is tuple:
         return tuple(_made(get_args(kind)[0], item) for item in content)
-    return kind(content)
+    return int(content) if kind is int else content  # a number as it is written, for messages
 
 
 def load_pitch(path: Path | str) -> PitchCurve:

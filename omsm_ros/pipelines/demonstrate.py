@@ -43,6 +43,7 @@ from omsm_ros.pipelines.adjust import (
     write_adjustment,
 )
 from omsm_ros.pipelines.correct import correct_bag
+from omsm_ros.pipelines.form import RegistrationOptions
 from omsm_ros.pipelines.measure import Judgement, with_sources
 from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
@@ -243,7 +244,7 @@ def _tcp_link() -> str:
 
 RESPONSE_FREQUENCIES_HZ = (0.5, 1.0, 1.5, 15.0)
 TITLE = "Paraboloid mirror measured on the emulated cell"
-_REGISTERING = measurement.RegistrationOptions(("piston", "tip", "tilt"))
+_REGISTERING = RegistrationOptions(("piston", "tip", "tilt"))
 
 
 def finish_demonstration(plan: Demonstration) -> dict[str, Any]:

@@ -38,13 +38,33 @@ from omsm_ros.io.results import CloudFile, load_fields, read_summary
 from omsm_ros.readable import quantity
 from omsm_ros.units import NOT_USED, LengthUnits
 
-# Points of a measurement in portions, with what its systematic errors do to them.
-
 _PORTION = 131_072
 
 
 @dataclass(frozen=True)
-class MeasurementMeasuredPortions:
+class RegistrationOptions:
+    """How a part is registered to its nominal surface, and what its form is held against.
+
+    dofs: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
+    tolerance: of the peak to valley of the part [m], None without one
+    dust: which points far from the form are left out; None: isolated ones, which still count
+        against the tolerance, because nobody has decided that they are no defects
+    placement: declared standard uncertainties of x, y and clocking [m], [rad], None if unknown
+    filters: wavelengths of the S- and the L-filter [m], None for those that the points allow
+    drawing: tolerances of ISO 10110-5
+    """
+
+    dofs: Sequence[str]
+    aperture: Aperture | None = None
+    tolerance: float | None = None
+    dust: DustRule | None = None
+    placement: Mapping[str, float] | None = None
+    filters: tuple[float | None, float | None] = (None, None)
+    drawing: Drawing | None = None
+
+
+@dataclass(frozen=True)
+class OpenedMeasurement:
     """Points of a measurement, read in batches with the effects of its systematic errors.
 
     portions: yields all points from the start;  sources: names of the systematic errors
@@ -63,33 +83,25 @@ class MeasurementMeasuredPortions:
     bounds: tuple[str, ...] = ()
     missing: int = 0
 
-    def form(
-        self,
-        surface: Surface,
-        asked: Sequence[str],
-        aperture: Aperture | None = None,
-        filters: tuple[float | None, float | None] = (None, None),
-        dust: DustRule = ISOLATED,
-        placement: Mapping[str, float] | None = None,
-    ) -> FormResult:
+    def form(self, surface: Surface, how: RegistrationOptions) -> FormResult:
         """Return the form of the points against ``surface``."""
         return analyse_form(
             surface,
             self.portions,
-            asked,
+            how.dofs,
             sources=self.sources,
             bounds=self.bounds,
-            aperture=aperture,
+            aperture=how.aperture,
             even=self.even,
-            filters=filters,
-            dust=dust,
-            declared=placement or {},
+            filters=how.filters,
+            dust=ISOLATED if how.dust is None else how.dust,
+            declared=how.placement or {},
         )
 
 
 def open_measurement(
     path: Path, units: LengthUnits | None = None, channel: str | None = None
-) -> MeasurementMeasuredPortions:
+) -> OpenedMeasurement:
     """Open a result folder, an own cloud, or a map or cloud of any other format.
 
     Own clouds are read in bounded memory, with the systematic fields in the same folder.
@@ -107,15 +119,15 @@ def open_measurement(
     except FileError:
         points = without_duplicates(read_points(file, units, channel))
         gridded = as_grid(points) is not None
-        return MeasurementMeasuredPortions(
+        return OpenedMeasurement(
             lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
         )
     notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
     fields_path = file.with_name(SYSTEMATIC)
     fields = load_fields(fields_path) if fields_path.is_file() else None
     if fields is None:
-        return MeasurementMeasuredPortions(lambda: _portions(cloud, None), (), False, notes)
-    return MeasurementMeasuredPortions(
+        return OpenedMeasurement(lambda: _portions(cloud, None), (), False, notes)
+    return OpenedMeasurement(
         lambda: _portions(cloud, fields), fields.names, True, notes, bounds=fields.bounds
     )
 
@@ -153,45 +165,28 @@ _NO_SYSTEMATIC = (
 
 
 def judge_form(
-    measured: MeasurementMeasuredPortions,
-    surface: Surface,
-    out: Path,
-    asked: Sequence[str],
-    aperture: Aperture | None = None,
-    filters: tuple[float | None, float | None] = (None, None),
-    tolerance: float | None = None,
-    dust: DustRule | None = None,
-    placement: Mapping[str, float] | None = None,
-    drawing: Drawing | None = None,
+    measured: OpenedMeasurement, surface: Surface, out: Path, how: RegistrationOptions
 ) -> dict[str, Any]:
     """Register a measurement to its nominal ``surface``; return the content of ``form.json``.
 
     Writes into ``out`` form.json, curves.json (profiles and power spectral densities) and
     deviation.ply: deviation along the normal over the part's x and y.
 
-    asked: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
-    filters: wavelengths of the S- and the L-filter [m], None for those that the points allow
-    tolerance: of the peak to valley of the part [m], None without one
-    dust: which points far from the form are left out; None: isolated ones, which still count
-        against the tolerance, because nobody has decided that they are no defects
-    placement: declared standard uncertainties of x, y and clocking [m], [rad], None if unknown
-    drawing: tolerances of ISO 10110-5
-
     Raises DataError for points that do not fit the surface or do not determine the pose asked for.
     """
-    rule = ISOLATED if dust is None else dust
-    form = measured.form(surface, asked, aperture, filters, rule, placement)
+    form = measured.form(surface, how)
     facts = form_facts(form, measured)
-    doubts = form.doubts(decided=dust is not None)
+    doubts = form.doubts(decided=how.dust is not None)
     facts["open"] = [{"reason": str(d.reason), "peak_to_valley": d.peak_to_valley} for d in doubts]
-    if tolerance is not None:
-        found = conformity(form.deviation["peak_to_valley"], tolerance, doubts)
+    if how.tolerance is not None:
+        found = conformity(form.deviation["peak_to_valley"], how.tolerance, doubts)
         facts["conformity"] = found.entry() if found else None
-    if drawing is not None:
-        facts["drawing"] = drawing.verdicts(form.deviation, doubts)
+    if how.drawing is not None:
+        facts["drawing"] = how.drawing.verdicts(form.deviation, doubts)
     save_json(out / FORM, facts)
     save_json(out / CURVES, _curves(form))
-    write_ply(out / DEVIATION, _deviations(form))
+    columns = [form.map.x, form.map.y, form.map.deviation]
+    write_ply(out / DEVIATION, np.rec.fromarrays(columns, formats="<f8,<f8,<f8", names="x,y,z"))
     return facts
 
 
@@ -210,13 +205,7 @@ def draw_form(measured: Path, out: Path, origin: Mapping[str, Any] = MappingProx
     publish_form(out, f"Form of {measured.resolve().name}", summary, origin)
 
 
-def _deviations(form: FormResult) -> np.ndarray[Any, np.dtype[np.void]]:
-    table = np.empty(len(form.map), [(name, "<f8") for name in "xyz"])
-    table["x"], table["y"], table["z"] = form.map.x, form.map.y, form.map.deviation
-    return table
-
-
-def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[str, Any]:
+def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:
     """Return the content of ``form.json``; lengths in metres, angles in radians."""
     found = form.registration
     placement = found.placement
@@ -262,7 +251,7 @@ def form_facts(form: FormResult, measured: MeasurementMeasuredPortions) -> dict[
     }
 
 
-def _notes(form: FormResult, measured: MeasurementMeasuredPortions) -> list[str]:
+def _notes(form: FormResult, measured: OpenedMeasurement) -> list[str]:
     noise = [] if form.map.noise_known else [_NO_NOISE.format(quantity(form.map.noise, "m"))]
     doubts = (str(d.reason) for d in form.doubts(decided=True))
     return [*measured.notes, *_mismatch_text(form), *_advice(form), *noise, *doubts]

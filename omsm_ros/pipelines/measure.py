@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
@@ -35,7 +35,6 @@ from omsm_ros.core.correction.systematic import resolves_per_turn_waves, scan_fi
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.lti.discretisation import discretisation_error, discretise
-from omsm_ros.core.registration.isolated_points import DustRule
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture, within_aperture
 from omsm_ros.core.surface.deviation import mismatch
@@ -51,7 +50,7 @@ from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
 
 if TYPE_CHECKING:
-    from omsm_ros.pipelines.correct import Correction
+    from omsm_ros.pipelines.form import RegistrationOptions
 
 
 # With a smaller share of corrected samples the map may miss defects of the surface.
@@ -260,22 +259,6 @@ def _losses(done: Correction) -> Iterator[str | Notice]:
             )
 
 
-@dataclass(frozen=True)
-class RegistrationOptions:
-    """Options of the registration to the nominal surface.
-
-    dofs: degrees of freedom to fit, or "auto";  aperture: of the part, None for all points
-    tolerance: of the peak to valley of the part [m], None without one
-    dust: which points far from the form are left out, see :func:`judge_form`
-    """
-
-    dofs: Sequence[str]
-    aperture: Aperture | None = None
-    tolerance: float | None = None
-    dust: DustRule | None = None
-    placement: Mapping[str, float] | None = None
-
-
 def measure(
     bag: AnyBag,
     calibration: Calibration,
@@ -359,19 +342,11 @@ _OF_FORM = ("pose", "shape", "deviation", "removed", "points", "open")
 def add_form(
     out: Path, summary: dict[str, Any], nominal: Surface, register: RegistrationOptions
 ) -> None:
-    """Register the cloud in ``out``, and add the result to ``summary``."""
+    """Register the cloud in ``out``, and add the result to ``summary``, without conformity."""
     # Imported on demand, because most corrections do not register.
     from omsm_ros.pipelines.form import judge_form, open_measurement
 
-    facts = judge_form(
-        open_measurement(out),
-        nominal,
-        out,
-        register.dofs,
-        register.aperture,
-        dust=register.dust,
-        placement=register.placement,
-    )
+    facts = judge_form(open_measurement(out), nominal, out, replace(register, tolerance=None))
     summary["form"] = {name: facts[name] for name in _OF_FORM}
     summary["files"] |= {"form": FORM, "deviation": DEVIATION}
 

@@ -18,7 +18,8 @@ from page_tables import PageTables, says
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import BagWriter
-from omsm_ros.pipelines.measure import RegistrationOptions, measure
+from omsm_ros.pipelines.form import RegistrationOptions
+from omsm_ros.pipelines.measure import measure
 
 FOCAL, AWAY = 0.0254, 0.0508
 
