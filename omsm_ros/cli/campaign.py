@@ -1,7 +1,6 @@
 """The command batch: correct a folder of recordings."""
 
 import argparse
-import fcntl
 import hashlib
 import os
 import signal
@@ -9,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from omsm_ros.io.files import (
     save_json,
     save_text,
 )
+from omsm_ros.io.folders import locked_folder
 from omsm_ros.io.json_and_yaml import ranged
 from omsm_ros.io.results import read_summary
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -262,23 +262,19 @@ def _save(out: Path, entries: dict[str, Entry]) -> None:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     """Lock the folder, so that two campaigns never write into it."""
-    try:
-        make_folder(out)
-        lock = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as err:
-        raise FileError(
-            f"cannot write into {str(out)!r}: {exception_text(err)}; give another folder"
-        ) from err
-    try:
+    with ExitStack() as locked:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            make_folder(out)
+            locked.enter_context(locked_folder(out, wait=False))
         except BlockingIOError as err:
             raise FileError(
                 f"another campaign writes into {str(out)!r}; wait until it has ended"
             ) from err
+        except OSError as err:
+            raise FileError(
+                f"cannot write into {str(out)!r}: {exception_text(err)}; give another folder"
+            ) from err
         yield
-    finally:
-        os.close(lock)
 
 
 @contextmanager

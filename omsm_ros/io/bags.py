@@ -36,7 +36,7 @@ from omsm_ros.io.bag_checks import (
     check_kind,
     unpacked_message,
 )
-from omsm_ros.io.message_mapping import typestore, vibration_levels
+from omsm_ros.io.message_mapping import CHANNELS, typestore, vibration_levels
 from omsm_ros.io.topics import (
     ACCELERATION_TOPIC,
     AXES_TOPIC,
@@ -54,12 +54,6 @@ from omsm_ros.io.topics import (
 )
 from omsm_ros.quantities import shown
 from omsm_ros.units import NANOSECONDS_PER_S
-
-CHANNELS: dict[type, tuple[tuple[str, type], ...]] = {
-    AxisBlock: tuple((name, np.float64) for name in "xyzbc"),
-    DistanceBlock: (("distance", np.float64), ("intensity", np.float32), ("status", np.uint8)),
-}
-"""The sequences of each message that makes a block, in their order on the wire."""
 
 _LITTLE_ENDIAN = b"\x00\x01"
 _ENCAPSULATION_BYTES = 4  # before the first field; alignment is relative to their end
@@ -111,14 +105,14 @@ def long_blocks(kind: type, messages: Sequence[bytes]) -> Iterator[Any] | None:
         layout.sequence("frame", np.uint8)
         layout.add("first_sample", np.uint64)
         layout.add("sample_period", np.float64)
-        for name, channel in CHANNELS[kind]:
+        for name, channel in CHANNELS[kind].items():
             layout.sequence(name, channel)
         table = np.frombuffer(b"".join(messages), layout.dtype())
     except struct_error:
         return None
     alike = all((table[name] == table[name][0]).all() for name in layout.lengths)
     # Intensity and status may be empty; the sequences before them may not.
-    needed = [name for name, channel in CHANNELS[kind] if channel is np.float64]
+    needed = [name for name, channel in CHANNELS[kind].items() if channel is np.float64]
     alike &= messages[0][:2] == _LITTLE_ENDIAN and all(name in layout.fields for name in needed)
     return _runs(kind, table) if alike else None
 
@@ -127,7 +121,7 @@ def _runs(kind: type, table: NDArray[np.void]) -> Iterator[Any]:
     """Yield a block for each run of rows with consecutive counts and times and one period."""
     first, period = table["first_sample"], table["sample_period"]
     stamp = table["sec"].astype(np.int64) * NANOSECONDS_PER_S + table["nanosec"]
-    present = [(name, c) for name, c in CHANNELS[kind] if name in (table.dtype.names or ())]
+    present = [(name, c) for name, c in CHANNELS[kind].items() if name in (table.dtype.names or ())]
     samples = np.uint64(table[present[0][0]].shape[1])
     follows = (first[1:] == first[:-1] + samples) & (period[1:] == period[:-1])
     follows &= stamp[1:] >= stamp[:-1]
@@ -300,25 +294,23 @@ class BagReader:
 
     def probe_settings(self) -> list[dict[str, object]]:
         """Return each state of the settings that the probe's driver reported."""
-        if not self.count([PROBE_TOPIC]):
-            return []
         found: list[dict[str, object]] = []
-        for _, reported in self.records(PROBE_TOPIC):
+        for reported in self._values(PROBE_TOPIC):
             if reported not in found:
                 found.append(reported)
         return found
 
     def vibration(self) -> list[dict[str, Any]]:
         """Return the levels that the vibration monitor reported, in their order."""
-        if not self.count([VIBRATION_TOPIC]):
-            return []
-        return [levels for _, levels in self.records(VIBRATION_TOPIC)]
+        return self._values(VIBRATION_TOPIC)
 
     def temperatures(self) -> FloatArray:
         """Return the readings of the temperature (n,) [°C], in their order; NaN = invalid."""
-        if not self.count([TEMPERATURE_TOPIC]):
-            return np.empty(0)
-        return np.array([value for _, value in self.records(TEMPERATURE_TOPIC)])
+        return np.array(self._values(TEMPERATURE_TOPIC), np.float64)
+
+    def _values(self, topic: str) -> list[Any]:
+        """Return the records of a topic that need not be there."""
+        return [record for _, record in self.records(topic)] if self.count([topic]) else []
 
     def blocks(self, *topics: str) -> Iterator[tuple[int, str, Any]]:
         """Yield ``(messages read, topic, block)`` of block topics, short blocks joined.

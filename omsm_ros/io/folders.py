@@ -104,14 +104,21 @@ def _move_into_place(staged: Path, target: Path, names: Sequence[str]) -> None:
             raise FileExistsError(
                 None, f"{part.name!r} is there and no result; give another folder"
             )
-    lock = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # one writer at a time
+    with locked_folder(target):
         _refuse_foreign(target, names)
         for name in reversed(names):
             (target / name).unlink(missing_ok=True)
         for part in sorted(staged.iterdir(), key=lambda part: part.name == names[-1]):
             part.replace(target / part.name)
+
+
+@contextmanager
+def locked_folder(path: Path, wait: bool = True) -> Iterator[None]:
+    """Lock a folder for one writer at a time; without ``wait`` BlockingIOError if it is locked."""
+    lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        yield
     finally:
         os.close(lock)
 

@@ -36,12 +36,12 @@ MAX_JSON_CHARACTERS = 2_000_000
 _SET = "calibration_set"
 
 T = TypeVar("T", AxisBlock, DistanceBlock, AccelerationBlock)
-# Channels of each kind of block, with their types.
-_CHANNELS: dict[Any, dict[str, Any]] = {
+CHANNELS: dict[Any, dict[str, Any]] = {
     AxisBlock: dict.fromkeys("xyzbc", np.float64),
     DistanceBlock: {"distance": np.float64, "intensity": np.float32, "status": np.uint8},
     AccelerationBlock: dict.fromkeys("xyz", np.float64),
 }
+"""The sequences of the message of each kind of block, in their order on the wire."""
 _POINT_FIELD_TYPES = {"<f4": 7, "<f8": 8, "<u4": 6}  # sensor_msgs/PointField constants
 _PLACES: Mapping[str, Any] = POINT_DTYPE.fields or {}
 # Name, offset [bytes], type and count of each field of a point.
@@ -90,7 +90,7 @@ def stamp_of(message: Any) -> int:
 
 def block_of(kind: type[T], message: Any) -> T:
     """Return the record of a message of blocks; DataError if its channels do not fit."""
-    channels = {name: np.asarray(getattr(message, name), t) for name, t in _CHANNELS[kind].items()}
+    channels = {name: np.asarray(getattr(message, name), t) for name, t in CHANNELS[kind].items()}
     return kind(
         stamp_ns=stamp_of(message),
         first_sample=int(message.first_sample),
@@ -197,7 +197,7 @@ def block_message(messages: Messages, block: Block, frame: str | None = None) ->
     kind = type(block)
     if frame is None:
         frame = "machine" if kind is AxisBlock else "probe"
-    channels = {n: messages.sequence(getattr(block, n), t) for n, t in _CHANNELS[kind].items()}
+    channels = {n: messages.sequence(getattr(block, n), t) for n, t in CHANNELS[kind].items()}
     return messages.make(
         kind.__name__,
         header=header(messages, block.stamp_ns, frame),

@@ -5,7 +5,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -328,7 +328,7 @@ class LiveView:
                 "points": self._points,
                 "left_out": self._left_out,
                 "compared": self._nominal is not None,
-                "grid": None if grid is None else _grid_entry(grid),
+                "grid": None if grid is None else asdict(grid),
                 "light": _result_entry(ended) if ended else light,
                 "ended": ended is not None,
                 "nodes": nodes,
@@ -350,16 +350,6 @@ class LiveView:
         cuts = np.unique(np.linspace(0, len(total), _SPECTRUM_LINES, endpoint=False).astype(int))
         peaks = np.maximum.reduceat(total, cuts)
         return {"frequency": found[0].frequency[cuts].tolist(), "amplitude": peaks.tolist()}
-
-
-def _grid_entry(grid: MapGrid) -> dict[str, float]:
-    return {
-        "left": grid.left,
-        "bottom": grid.bottom,
-        "pitch": grid.pitch,
-        "cells": grid.cells,
-        "generation": grid.generation,
-    }
 
 
 _ENDED = "measurement_ended"
@@ -396,17 +386,14 @@ def _traffic_light_entry(
     for values in measured:
         reasons.append(f"measurement: {values.get('verdict_text', '')}")
         reasons += [f"measurement: {why}" for why in values.get("verdict_next", "").split("; ")]
-    red = worst == "ERROR" or any(n["silent"] for n in nodes) or _is_rejected(calibration)
+    red = worst == "ERROR" or any(n["silent"] for n in nodes)
+    red = red or calibration.get("verdict") == REJECTED
     red = red or any(values["verdict"] != "not_verified" for values in measured)
     colour = "red" if red else "amber" if reasons else "green"
     word = {"green": "In order", "amber": "With reservations", "red": "Not valid"}[colour]
     if worst == "STALE" and not red:
         word = "Waiting for samples"
     return {"colour": colour, "word": word, "reasons": reasons[:20]}
-
-
-def _is_rejected(calibration: Mapping[str, Any]) -> bool:
-    return bool(calibration.get("verdict") == REJECTED)
 
 
 def _against(calibration: Mapping[str, Any]) -> str:

@@ -29,7 +29,7 @@ from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.streams.blocks import Account, AxisBlock
+from omsm_ros.core.streams.blocks import Account
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io.files import REPORT, save_json, save_text
 from omsm_ros.io.results import PlyWriter
@@ -80,23 +80,20 @@ def read_scan(
     clocking: angle by which the part is turned on the chuck [rad];  clamping: its number
     Raises BagError for a bag without a surface point.
     """
-    axes: list[AxisBlock] = []
-    parts: list[SurfacePoints] = []
-    admission = admission or Admission()
     with Recording(bag, progress) as recording:
-        scan = CorrectedScan(recording, calibration, options, admission=admission)
-        for block, points in scan.steps():
-            if isinstance(block, AxisBlock):
-                axes.append(block)
-            if points is not None and len(points):
-                parts.append(points)
-        account, period, began = scan.account, scan.sample_period, scan.recorded_ns
-        doubts = tuple(map(str, scan.reasons))
-    if not parts:
+        how = admission or Admission()
+        scan = CorrectedScan(recording, calibration, options, admission=how)
+        axes, parts = scan.read()
+    if not any(map(len, parts)):
         raise BagError(f"{str(bag)!r} gives no surface point; look at it with 'omsm inspect'")
-    data, made = scan_data(axes, parts, period, clocking, clamping)
+    data, made = scan_data(axes, parts, scan.sample_period, clocking, clamping)
     return AdjustedScan(
-        bag=str(bag), data=data, points=made, account=account, began_ns=began, doubts=doubts
+        bag=str(bag),
+        data=data,
+        points=made,
+        account=scan.account,
+        began_ns=scan.recorded_ns,
+        doubts=tuple(map(str, scan.reasons)),
     )
 
 

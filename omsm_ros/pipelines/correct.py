@@ -134,6 +134,12 @@ class CorrectedScan:
         yield None, self._corrector.finish()
         self._check_complete()
 
+    def read(self) -> tuple[list[AxisBlock], list[SurfacePoints]]:
+        """Return all blocks of the axes and all points; BagError as :meth:`steps`."""
+        blocks, parts = zip(*self.steps(), strict=True)
+        axes = [block for block in blocks if isinstance(block, AxisBlock)]
+        return axes, [points for points in parts if points is not None]
+
     @property
     def account(self) -> Account:
         """Account of every sample read so far."""

@@ -11,7 +11,6 @@ import numpy as np
 from omsm_ros.core.comparison.agreement import (
     COVERAGE_FACTOR,
     FIGURES,
-    ComparedFigure,
     ComparisonAgreement,
     figures_of,
 )
@@ -158,6 +157,7 @@ def write_difference(out: Path, found: Comparison, facts: dict[str, Any]) -> Non
 def facts_of(found: Comparison) -> dict[str, Any]:
     """Return the content of ``difference.json``: lengths in metres, angles in radians."""
     matched, agreement = found.matched, found.agreement
+    figures = agreement.figures if agreement is not None else figures_of(matched)
     return {
         "schema": "omsm-difference/1",
         "verdict": found.verdict.verdict,
@@ -167,7 +167,9 @@ def facts_of(found: Comparison) -> dict[str, Any]:
         "b": _side(found.sides[1]),
         "difference": {
             **{name: float(figure(matched.difference)) for name, figure in FIGURES.items()},
-            "uncertainty": None if agreement is None else _rms(agreement.uncertainty),
+            "uncertainty": None
+            if agreement is None
+            else float(np.sqrt(np.mean(agreement.uncertainty**2))),
             "places": len(matched.x),
             "shared_area": found.shared,
         },
@@ -177,7 +179,7 @@ def facts_of(found: Comparison) -> dict[str, Any]:
             "not_determined": {name: str(why) for name, why in matched.refused.items()},
         },
         "resampling": {"method": _METHOD, "spacing": matched.grid.dx},
-        "e_n": _numbers(agreement.figures if agreement is not None else figures_of(matched)),
+        "e_n": {name: asdict(number) for name, number in figures.items()},
         "zernike": _terms(agreement),
         "within": None if agreement is None else agreement.within,
         "probability": None if agreement is None else agreement.probability,
@@ -192,10 +194,6 @@ def _side(side: SideSummary) -> dict[str, Any]:
     return {"file": entry.pop("name"), **entry}
 
 
-def _numbers(figures: dict[str, ComparedFigure]) -> dict[str, Any]:
-    return {name: asdict(number) for name, number in figures.items()}
-
-
 def _terms(agreement: ComparisonAgreement | None) -> dict[str, Any] | None:
     if agreement is None:
         return None
@@ -206,7 +204,3 @@ def _terms(agreement: ComparisonAgreement | None) -> dict[str, Any] | None:
         "aperture": {"radius": radius, "x": x, "y": y},
         "terms": [asdict(term) for term in agreement.terms],
     }
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -36,8 +36,12 @@ from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.spectrum import SpectrumOptions, cleaned_points, spectra_of, summary_of
 from omsm_ros.readable import date_text, quantity
 from omsm_ros.report import style
-from omsm_ros.report.measurement.figures import levelled, registered_map, surface_figures
-from omsm_ros.report.measurement.form_figures import form_figures
+from omsm_ros.report.measurement.figures import (
+    form_figures,
+    levelled,
+    registered_map,
+    surface_figures,
+)
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.measurement.surface_map import CloudView, EmbeddedMap, Layer, embedded
 from omsm_ros.report.response_figures import bode
@@ -160,11 +164,11 @@ def publish_spectra(
                     _write_density(folder / name.format(k), scan.studied.density(coordinate), units)
         if report:
             # Imported on demand, because loading the figures takes longer than the analysis.
-            from omsm_ros.report.spectrum import SpectrumPage, drawn, render
+            from omsm_ros.report.spectrum import drawn, render
 
             valid = options.calibration.valid_up_to if options.calibration else None
             figures = drawn([(s.studied, s.named, s.read.motion) for s in scans], valid)
-            save_text(folder / REPORT, render(SpectrumPage(summary, figures)))
+            save_text(folder / REPORT, render(summary, figures))
             files["report"] = REPORT
         summary["files"] = files
         save_json(folder / SPECTRUM, summary)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -40,15 +39,14 @@ class Recording:
     def __init__(self, path: AnyBag, progress: Progress = no_progress) -> None:
         self.path, self.bag = path, bags.BagReader(path)
         self._progress = progress
-        self._stack = ExitStack()
 
     def __enter__(self) -> Recording:
-        self._stack.enter_context(self.bag)
+        self.bag.__enter__()
         self.recorded_ns = self.bag.recorded_ns
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
+    def __exit__(self, *error: object) -> None:
+        self.bag.__exit__(*error)
 
     def holds(self, topic: str) -> bool:
         """Return True if there are messages on ``topic``."""

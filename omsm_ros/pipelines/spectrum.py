@@ -40,7 +40,7 @@ from omsm_ros.core.ripple.scan_signal import (
 )
 from omsm_ros.core.ripple.source_hypotheses import KINDS, UNDECIDED, StudiedScan
 from omsm_ros.core.ripple.vibration_removal import REMOVED, RemovedVibration, remove_vibrations
-from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, FloatArray
+from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.topics import AnyBag
@@ -157,17 +157,11 @@ def _names(paths: Sequence[AnyBag]) -> list[str]:
 
 
 def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> ReadScan:
-    axes: list[AxisBlock] = []
-    parts: list[SurfacePoints] = []
     how = CorrectionOptions(polarity=options.polarity, accept_other_rate=options.admission.override)
     with Recording(path, progress) as recording:
         calibration = options.calibration or unit_calibration(recording.sample_period())
         scan = CorrectedScan(recording, calibration, how, admission=options.admission)
-        for block, points in scan.steps():
-            if isinstance(block, AxisBlock):
-                axes.append(block)
-            if points is not None:
-                parts.append(points)
+        axes, parts = scan.read()
         account, period = scan.account.as_dict(), scan.sample_period
         shaken = _acceleration(recording)
     every = join_points(parts)

@@ -15,7 +15,7 @@ from omsm_ros.readable import NOTHING, count, figure, percent, plain, probabilit
 from omsm_ros.report import style
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, Layer, embedded, policy_of, script
 from omsm_ros.report.page_parts import Headline, fill, picture
-from omsm_ros.report.tables import Table
+from omsm_ros.report.tables import POSE_UNITS, Table
 from omsm_ros.report.verdict import PageVerdict
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
@@ -239,15 +239,12 @@ def _sides(facts: Mapping[str, Any]) -> Table:
     return Table("Both measurements, uncertainties k = 1", ("A", "B"), rows)
 
 
-_UNITS = {"piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad"}
-
-
 def _matching(facts: Mapping[str, Any]) -> Table:
     moved = facts["registration"]["moved"]
     rows = [
         (
             f"B moved in {name}",
-            quantity(value, _UNITS[name]) if name in _UNITS else f"{plain(value)} 1/m",
+            f"{plain(value)} 1/m" if name == "power" else quantity(value, POSE_UNITS[name]),
         )
         for name, value in moved.items()
     ]

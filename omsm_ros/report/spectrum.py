@@ -1,7 +1,6 @@
 """The report of ``omsm spectrum``: figures and page."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -160,14 +159,6 @@ CAPTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class SpectrumPage:
-    """summary: content of ``spectrum.json``;  figures: PNG files by names of :data:`CAPTIONS`"""
-
-    summary: Mapping[str, Any]
-    figures: Mapping[str, bytes]
-
-
 def drawn(
     scans: Sequence[tuple[StudiedScan, Sequence[NamedLine], Density]], valid_up_to: float | None
 ) -> dict[str, bytes]:
@@ -183,9 +174,8 @@ def drawn(
     return {name: style.png(figure) for name, figure in made.items() if figure is not None}
 
 
-def render(page: SpectrumPage) -> str:
-    """Return the page as HTML."""
-    summary = page.summary
+def render(summary: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
+    """Return the page of ``spectrum.json`` as HTML; figures: PNG files, as in :data:`CAPTIONS`."""
     scans = summary["scans"]
     return fill_study(
         StudyPage(
@@ -199,7 +189,7 @@ def render(page: SpectrumPage) -> str:
                 Section("Removed", tables=(_stop_table(scans), _vibration_table(scans))),
             ),
             captions=CAPTIONS,
-            figures=page.figures,
+            figures=figures,
             footer=str(summary["normalisation"]),
         )
     )

@@ -9,6 +9,10 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.readable import NOTHING, count, measured, plain, quantity
 
 _OPEN = "not evaluated"
+POSE_UNITS = {
+    "piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad",
+    "power": "1/m",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,6 @@ from omsm_ros.core.ripple import source_hypotheses
 from omsm_ros.core.ripple.source_hypotheses import KINDS, PART
 from omsm_ros.report.experiments import compared, done
 from omsm_ros.report.measurement.page import Report, render
-from omsm_ros.report.spectrum import SpectrumPage
 from omsm_ros.report.spectrum import render as render_spectrum
 
 # Any value from picometres to metres, and unknown ones.
@@ -177,7 +176,7 @@ def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, signifi
         PART, frequency=frequency, wavelength_along_path=wavelength, amplitude=amplitude,
         significance=significance,
     )  # fmt: skip
-    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([reported]), {})))
+    page = PageTables(render_spectrum(spectrum_summary([reported]), {}))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[0] == PART
     for cell, value, digits in zip(
@@ -200,14 +199,14 @@ def test_a_line_is_where_its_file_says(frequency, wavelength, amplitude, signifi
     ],
 )
 def test_what_a_line_truly_is_is_said_in_one_way(change, truly):
-    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([peak(**change)]), {})))
+    page = PageTables(render_spectrum(spectrum_summary([peak(**change)]), {}))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[6] == truly
 
 
 def test_a_line_across_the_path_has_its_radial_wavelength_and_what_it_needs():
     reported = peak(wavelength_along_path=None, needs="another speed", evidence=["a", "b"])
-    page = PageTables(render_spectrum(SpectrumPage(spectrum_summary([reported]), {})))
+    page = PageTables(render_spectrum(spectrum_summary([reported]), {}))
     (cells,) = (t["rows"][0] for t in page.tables if t["title"] == "scan")
     assert cells[2] == "2.000 mm"
     assert cells[7] == "a; b; another speed"
@@ -222,7 +221,7 @@ def test_scans_sampling_and_band_stop_are_reported_in_their_units():
         "significance": 44.0,
     }  # fmt: skip
     summary["scans"][0]["accelerometer"] = {"lines": [acceleration_lines]}
-    page = PageTables(render_spectrum(SpectrumPage(summary, {})))
+    page = PageTables(render_spectrum(summary, {}))
     (scans,) = (t for t in page.tables if "duration" in t["columns"])
     (row,) = scans["rows"]
     wanted = (12_340, 12.34, 30.0, 2.5, 1.5e-6, 3.21e-9, 4.56e-11, None)
@@ -251,7 +250,7 @@ def test_the_verdict_counts_the_lines(peaks, level, word):
     reported = [
         peak(k, needs="one more scan" if k == source_hypotheses.UNDECIDED else None) for k in kinds
     ]
-    html = render_spectrum(SpectrumPage(spectrum_summary(reported), {}))
+    html = render_spectrum(spectrum_summary(reported), {})
     assert f'class="verdict {level}"' in html
     assert word in html
     items = PageTables(html).items

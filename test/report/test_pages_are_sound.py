@@ -28,7 +28,6 @@ from omsm_ros.report.measurement.page import CAPTIONS, Report
 from omsm_ros.report.measurement.page import render as render_report
 from omsm_ros.report.measurement.surface_map import Layer, embedded
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study
-from omsm_ros.report.spectrum import SpectrumPage
 from omsm_ros.report.spectrum import render as render_spectrum
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
@@ -96,10 +95,7 @@ def spectrum(text, _):
     }  # fmt: skip
     counts = dict.fromkeys(KINDS, 1)
     return render_spectrum(
-        SpectrumPage(
-            {"scans": [scan], "counts": counts, "normalisation": text, "exposure": None},
-            {"time": PNG},
-        )
+        {"scans": [scan], "counts": counts, "normalisation": text, "exposure": None}, {"time": PNG}
     )
 
 

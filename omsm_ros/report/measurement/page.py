@@ -20,7 +20,7 @@ from omsm_ros.readable import (
 from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
 from omsm_ros.report.page_parts import Headline, check_places, fill, picture, title_block
-from omsm_ros.report.tables import Table, part
+from omsm_ros.report.tables import POSE_UNITS, Table, part
 from omsm_ros.report.verdict import PageVerdict, covered, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
@@ -32,10 +32,6 @@ _CONFORMITY = {
     "fails": ("bad", "The part exceeds its tolerance"),
     "cannot tell": ("care", "Conformity not decided: tolerance"),
 }
-_POSE_UNITS = {
-    "piston": "m", "x": "m", "y": "m", "tip": "rad", "tilt": "rad", "clocking": "rad",
-    "power": "1/m",
-}  # fmt: skip
 
 
 def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> PageVerdict | None:
@@ -146,7 +142,7 @@ def removed_table(form: Mapping[str, Any]) -> Table:
         return Table(title, columns, [])
     fitted = []
     for name in part(form, "removed", "fitted") or ():
-        pose, unit = part(form, "pose", name), _POSE_UNITS.get(name, "")
+        pose, unit = part(form, "pose", name), POSE_UNITS.get(name, "")
         if pose is None:
             pose = part(form, "shape", name) or {}
             unit = "" if name.startswith("conic") else "m"
@@ -182,7 +178,7 @@ def correlated_moves(form: Mapping[str, Any], name: str) -> str:
         return ""
     sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
     moves = {n: v for n, v in sizes.items() if v and n in form["pose"]}
-    stated = [f"{n} ± {quantity(v, _POSE_UNITS.get(n, ''), 2)}" for n, v in moves.items()]
+    stated = [f"{n} ± {quantity(v, POSE_UNITS.get(n, ''), 2)}" for n, v in moves.items()]
     if len(stated) < 2:
         return ""
     own, *others = stated

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from omsm_ros.report.measurement import form_figures
+from omsm_ros.report.measurement import figures as form_figures
 from omsm_ros.report.measurement.page import CAPTIONS, Report, render
 
 ZERNIKE = [
