@@ -34,7 +34,6 @@ from omsm_ros.io.files import (
 )
 from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines import measure as measurement
-from omsm_ros.pipelines import publish as publication
 from omsm_ros.pipelines.adjust import (
     ADJUSTED_CLOUD,
     ADJUSTMENT,
@@ -45,10 +44,9 @@ from omsm_ros.pipelines.adjust import (
 from omsm_ros.pipelines.correct import correct_bag
 from omsm_ros.pipelines.form import RegistrationOptions
 from omsm_ros.pipelines.measure import Judgement, with_sources
+from omsm_ros.pipelines.publish import publish_scan
 from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
-from omsm_ros.report import response_figures, style
-from omsm_ros.report.measurement.figures import surface_figures
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth
 from omsm_ros.twin.disturbances import NOTHING, Disturbances, TrueResponse
@@ -255,8 +253,7 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
         plan.bag, calibration, plan.out / CLOUD, options=options, nominal=PAPER_MIRROR
     )
     cloud = CloudFile(plan.out / CLOUD).read()
-    view = publication.view_of(cloud, plan.sample_period)
-    if view is None:
+    if not len(cloud):
         raise OmsmError(f"no point could be corrected: {done.account!r}; see {plan.out / 'log'}")
     recording = scan_of(plan.scenario, plan.disturbances)
     step_test = planned_test_of(plan.scenario, plan.disturbances)
@@ -272,10 +269,7 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     live = live_points(plan.bag)
     summary["live_equals_offline"] = same_points(live, cloud)
     summary["live_points"] = len(live)
-    figures = surface_figures(view, PAPER_MIRROR)
-    figures["bode"] = style.png(response_figures.bode(calibration, true, plan.sample_period))
-    surface = publication.map_of(view, PAPER_MIRROR, plan.out)
-    publication.publish(plan.out, TITLE, summary, calibration, figures, surface)
+    publish_scan(plan.out, TITLE, summary, calibration, PAPER_MIRROR, cloud, true)
     (plan.out / REPORT).replace(plan.out / SCAN_REPORT)
     summary["adjustment"] = _adjusted(plan, calibration)
     summary["files"] |= {"report": REPORT, "adjustment": ADJUSTMENT, "adjusted": ADJUSTED_CLOUD}

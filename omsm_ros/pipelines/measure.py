@@ -306,7 +306,11 @@ def measure(
         summary["files"]["report"] = REPORT
     save_json(out / SUMMARY, summary)
     if report:
-        _publish(bag, out, done, summary, calibration, nominal)
+        # Imported on demand, because loading the figures takes longer than correcting a scan.
+        from omsm_ros.pipelines.publish import publish_scan
+
+        title = str(summary["settings"].get("title", f"Surface of {bag.name}"))
+        publish_scan(out, title, summary, calibration, nominal, done.points)
     return summary
 
 
@@ -315,24 +319,6 @@ def _mismatch_text(done: Correction, nominal: Surface | None) -> list[str]:
         return []
     x, y = (done.points[name].astype(np.float64) for name in "xy")
     return [*map(str, mismatch(x, y, done.points["height"], nominal))]
-
-
-def _publish(
-    bag: Path,
-    out: Path,
-    done: Correction,
-    summary: dict[str, Any],
-    calibration: Calibration,
-    nominal: Surface | None,
-) -> None:
-    # Imported on demand, because loading the figures takes longer than correcting a scan.
-    from omsm_ros.pipelines.publish import figures_of, map_of, publish, view_of
-
-    view = view_of(done.points, done.sample_period)
-    figures = figures_of(view, calibration, nominal, done.sample_period)
-    surface = map_of(view, nominal, out)
-    title = str(summary["settings"].get("title", f"Surface of {bag.name}"))
-    publish(out, title, summary, calibration, figures, surface)
 
 
 # Entries of the registration that the summary keeps.

@@ -44,15 +44,7 @@ from omsm_ros.report.measurement.figures import (
 )
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.measurement.surface_map import CloudView, EmbeddedMap, Layer, embedded
-from omsm_ros.report.response_figures import bode
-
-
-def figures_of(
-    view: CloudView | None, calibration: Calibration, nominal: Surface | None, sample_period: float
-) -> dict[str, bytes]:
-    """Return the figures of a cloud as PNG files, by name."""
-    figures = surface_figures(view, nominal) if view is not None else {}
-    return figures | {"bode": style.png(bode(calibration, None, sample_period))}
+from omsm_ros.report.response_figures import HasResponse, bode
 
 
 def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
@@ -90,6 +82,27 @@ def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> Embedd
             layers.append(Layer(f"{name}, piston removed", view.x, view.y, level, unit))
     spread = Layer("uncertainty, k = 1", view.x, view.y, view.uncertainty, "nm", symmetric=False)
     return embedded([*layers, spread])
+
+
+def publish_scan(
+    out: Path,
+    title: str,
+    summary: Mapping[str, Any],
+    calibration: Calibration,
+    nominal: Surface | None,
+    cloud: NDArray[np.void],
+    true: HasResponse | None = None,
+) -> None:
+    """Write ``report.html`` of a corrected scan, with figures and map of its ``cloud``.
+
+    true: response of the twin, None if unknown
+    """
+    # Differs from the calibration's after an override; summaries of old versions lack it.
+    period = summary.get("sample_period", calibration.sample_period)
+    view = view_of(cloud, period)
+    figures = surface_figures(view, nominal) if view is not None else {}
+    figures["bode"] = style.png(bode(calibration, true, period))
+    publish(out, title, summary, calibration, figures, map_of(view, nominal, out))
 
 
 def publish(
@@ -215,23 +228,21 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
         raise ConfigurationError(
             f"{str(result)!r} was corrected with a nominal surface; give the same one (--nominal)"
         )
-    # Differs from the calibration's after an override; summaries of old versions lack it.
-    period = summary.get("sample_period", calibration.sample_period)
-    view = view_of(CloudFile(result / CLOUD).read(MOST_DRAWN), period)
+    cloud = CloudFile(result / CLOUD).read(MOST_DRAWN)
     if nominal is not None and "deviation" in summary:
-        _check_nominal(view, nominal, summary["deviation"]["corrected"]["rms"])
-    figures = figures_of(view, calibration, nominal, period)
+        _check_nominal(cloud, nominal, summary["deviation"]["corrected"]["rms"])
     title = f"Surface of {Path(str(summary.get('bag', result))).name}"
-    publish(result, title, summary, calibration, figures, map_of(view, nominal, result))
+    publish_scan(result, title, summary, calibration, nominal, cloud)
     return result / REPORT
 
 
-def _check_nominal(view: CloudView | None, nominal: Surface, rms: float) -> None:
+def _check_nominal(cloud: NDArray[np.void], nominal: Surface, rms: float) -> None:
     """Raise ConfigurationError unless the cloud deviates from ``nominal`` by ``rms`` [m]."""
-    if view is None:
+    if not len(cloud):
         return
+    x, y, height = (cloud[name].astype(np.float64) for name in ("x", "y", "height"))
     found = RunningStatistics()
-    found.add(view.x, view.y, deviation(view.x, view.y, view.height, nominal))
+    found.add(x, y, deviation(x, y, height, nominal))
     here = found.statistics().rms
     if abs(here - rms) > _SAME_RMS * max(here, rms):
         raise ConfigurationError(
