@@ -24,7 +24,7 @@ from omsm_ros.core.calibration.calibration import Calibration, excess_latency_te
 from omsm_ros.core.calibration.latency import declared_latency, latency_summary
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
-from omsm_ros.pipelines.study_scans import SelfCalibrationOptions, reversal_of, self_calibration_of
+from omsm_ros.pipelines.study_scans import reversal_of, self_calibration_of
 from omsm_ros.quantities import (
     ANGLE_UNCERTAINTY,
     GAIN,
@@ -73,17 +73,11 @@ def _declare_selfcal(add: Arguments) -> None:
 
 def _selfcal(args: argparse.Namespace) -> Facts:
     step_test = load_calibration(args.calibration) if args.calibration else None
-    options = SelfCalibrationOptions(
-        harmonics=args.harmonics,
-        clocking=args.clocking,
-        polarity=args.polarity,
-        static_gain=args.static_gain,
-        gain_uncertainty=args.gain_uncertainty,
-        settings=args.settings,
-    )
+    names = ("harmonics", "clocking", "polarity", "static_gain", "gain_uncertainty", "settings")
+    options = {name: getattr(args, name) for name in names}
     with progress_bar("reading", args.json) as progress:
         bags = [cell_of(path, args) for path in args.scans]
-        found, made, accounts = self_calibration_of(bags, step_test, options, progress)
+        found, made, accounts = self_calibration_of(bags, step_test, progress, **options)
     path = _kept(args.out, made)
     return {
         **_resolved_facts(made),

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from omsm_ros.core.adjustment.resolved_calibration import (
     Reversal,
@@ -14,13 +14,7 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     without_step_test,
 )
 from omsm_ros.core.adjustment.scan_reader import ScanColumns, ScanReader
-from omsm_ros.core.adjustment.self_calibration import (
-    DEFAULT_CLOCKING_RAD,
-    DEFAULT_HARMONICS,
-    UNINFORMATIVE_GAIN,
-    SelfCalibration,
-    self_calibrate,
-)
+from omsm_ros.core.adjustment.self_calibration import SelfCalibration, self_calibrate
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.kinematics.kinematics import Geometry
@@ -50,47 +44,38 @@ def reversal_of(
     return reversal(scans, calibration), accounts
 
 
-@dataclass(frozen=True, kw_only=True)
-class SelfCalibrationOptions:
-    """Options of a self-calibration on the part.
-
-    harmonics: highest harmonic of the surface in a turn
-    clocking: standard uncertainty of C between the scans [rad], 10 if the part was re-mounted
-    polarity, static_gain, gain_uncertainty, settings: of the probe, used without a step test;
-        the uncertainty is relative to the gain
-    """
-
-    harmonics: int = DEFAULT_HARMONICS
-    clocking: float = DEFAULT_CLOCKING_RAD
-    polarity: int = 1
-    static_gain: float = 1.0
-    gain_uncertainty: float = UNINFORMATIVE_GAIN
-    settings: Mapping[str, object] = field(default_factory=dict)
-
-
 def self_calibration_of(
     bag_paths: Sequence[AnyBag],
     step_test: Calibration | None,
-    options: SelfCalibrationOptions,
     progress: Progress = no_progress,
+    *,
+    harmonics: int,
+    clocking: float,
+    polarity: int,
+    static_gain: float,
+    gain_uncertainty: float,
+    settings: Mapping[str, object],
 ) -> tuple[SelfCalibration, Calibration, list[Account]]:
     """Estimate the dynamics from scans of one part; return the estimate and a calibration.
 
     step_test: from the same machine; None uses the scans alone
+    harmonics: highest harmonic of the surface in a turn
+    clocking: standard uncertainty of C between the scans [rad], 10 if the part was re-mounted
+    polarity, static_gain, gain_uncertainty, settings: of the probe, used without a step test;
+        the uncertainty is relative to the gain
     Also return the account of the samples of each scan.
     """
     with ExitStack() as opened:
         recordings = [opened.enter_context(Recording(path, progress)) for path in bag_paths]
         period = recordings[0].sample_period()
-        base = step_test or unit_calibration(period, options.static_gain)
-        how = replace(_UNCORRECTED_LAG, polarity=options.polarity)
+        base = step_test or unit_calibration(period, static_gain)
+        how = replace(_UNCORRECTED_LAG, polarity=polarity)
         scans, accounts = _read_scans(recordings, base, how)
-    prior = after_step_test(base) if step_test else without_step_test(options.gain_uncertainty)
-    found = self_calibrate(scans, replace(prior, clocking=options.clocking), options.harmonics)
+    prior = after_step_test(base) if step_test else without_step_test(gain_uncertainty)
+    found = self_calibrate(scans, replace(prior, clocking=clocking), harmonics)
     if step_test:
         return found, resolved(step_test, found), accounts
-    alone = from_scans_alone(found, period, options.static_gain, options.settings)
-    return found, alone, accounts
+    return found, from_scans_alone(found, period, static_gain, settings), accounts
 
 
 def _read_scans(
