@@ -308,7 +308,7 @@ _LEAST_SHARE = 1e-9
 _BELOW = 0.2
 _WIDE, _HIGH = 6.1, 3.7
 _BELOW_BARS = 0.2
-_AREAL_PLACE, _BAR_PLACE = (0.17, 0.125, 0.6, 0.78), (0.8, 0.125, 0.025, 0.78)
+_AREAL_PLACE, _AREAL_BAR_PLACE = (0.17, 0.125, 0.6, 0.78), (0.8, 0.125, 0.025, 0.78)
 # Positions of a curve that is drawn, and steps over the usual one that interrupt it.
 _LEAST_DRAWN, _GAP = 2, 4.0
 _FORM_LINES = {"x": "along x", "y": "along y", "diagonal": "along x = y"}
@@ -429,7 +429,7 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     )
     ax.set_aspect("equal")
     ax.set_position(_AREAL_PLACE)
-    bar = made.colorbar(shown, cax=made.add_axes(_BAR_PLACE))
+    bar = made.colorbar(shown, cax=made.add_axes(_AREAL_BAR_PLACE))
     bar.ax.tick_params(labelsize=style.TEXT_PT)
     style.label(ax, x="f_x [1/mm]", y="f_y [1/mm]", title="Areal density [nm² mm²]")
     return made
