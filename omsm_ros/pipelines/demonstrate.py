@@ -269,7 +269,7 @@ def finish_demonstration(plan: Demonstration) -> dict[str, Any]:
     live = live_points(plan.bag)
     summary["live_equals_offline"] = same_points(live, cloud)
     summary["live_points"] = len(live)
-    publish_scan(plan.out, TITLE, summary, calibration, PAPER_MIRROR, cloud, true)
+    publish_scan(plan.out, summary, calibration, PAPER_MIRROR, cloud, TITLE, true)
     (plan.out / REPORT).replace(plan.out / SCAN_REPORT)
     summary["adjustment"] = _adjusted(plan, calibration)
     summary["files"] |= {"report": REPORT, "adjustment": ADJUSTMENT, "adjusted": ADJUSTED_CLOUD}

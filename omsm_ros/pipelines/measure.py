@@ -300,17 +300,14 @@ def measure(
         if register is not None and nominal is not None:
             add_form(out, summary, nominal, register)
         add_verdict(summary, done, calibration, judgement, register)
-    if origin:
-        summary["origin"] = dict(origin)
+    summary |= {"origin": dict(origin)} if origin else {}
     if report:
         summary["files"]["report"] = REPORT
-    save_json(out / SUMMARY, summary)
-    if report:
         # Imported on demand, because loading the figures takes longer than correcting a scan.
         from omsm_ros.pipelines.publish import publish_scan
 
-        title = str(summary["settings"].get("title", f"Surface of {bag.name}"))
-        publish_scan(out, title, summary, calibration, nominal, done.points)
+        publish_scan(out, summary, calibration, nominal, done.points)
+    save_json(out / SUMMARY, summary)
     return summary
 
 

@@ -86,17 +86,20 @@ def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> Embedd
 
 def publish_scan(
     out: Path,
-    title: str,
     summary: Mapping[str, Any],
     calibration: Calibration,
     nominal: Surface | None,
     cloud: NDArray[np.void],
+    title: str = "",
     true: HasResponse | None = None,
 ) -> None:
     """Write ``report.html`` of a corrected scan, with figures and map of its ``cloud``.
 
+    title: empty for that in the settings, or the name of the bag
     true: response of the twin, None if unknown
     """
+    named = (summary.get("settings") or {}).get("title")
+    title = title or str(named or f"Surface of {Path(str(summary.get('bag', out))).name}")
     # Differs from the calibration's after an override; summaries of old versions lack it.
     period = summary.get("sample_period", calibration.sample_period)
     view = view_of(cloud, period)
@@ -231,8 +234,7 @@ def report_again(result: Path, calibration: Calibration, nominal: Surface | None
     cloud = CloudFile(result / CLOUD).read(MOST_DRAWN)
     if nominal is not None and "deviation" in summary:
         _check_nominal(cloud, nominal, summary["deviation"]["corrected"]["rms"])
-    title = f"Surface of {Path(str(summary.get('bag', result))).name}"
-    publish_scan(result, title, summary, calibration, nominal, cloud)
+    publish_scan(result, summary, calibration, nominal, cloud)
     return result / REPORT
 
 
