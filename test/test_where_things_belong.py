@@ -200,11 +200,9 @@ print(json.dumps({
 def test_an_offline_command_is_added_in_cli(tmp_path):
     """A module with COMMANDS, and a row of its word: help, --json and exit status follow."""
     run = changed_copy(
-        tmp_path,
-        "cli/words.py",
-        ('"begin": {\n', '"begin": {\n        "weigh": Word("weighing", "what it weighs"),\n'),
+        tmp_path, "cli/words.py", ('"begin": """\n', '"begin": """\nweigh: what it weighs\n')
     )
-    (tmp_path / "omsm_ros" / "cli" / "weighing.py").write_text(
+    (tmp_path / "omsm_ros" / "cli" / "weigh.py").write_text(
         "from omsm_ros.cli.command import CliCommand\n"
         "def declare(add):\n    add('grams', float)\n"
         "COMMANDS = [CliCommand('weigh', declare,\n"
