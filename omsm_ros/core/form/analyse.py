@@ -18,12 +18,12 @@ from omsm_ros.core.form.deviation_map import (
     repeated_noise,
     root_mean_square,
 )
+from omsm_ros.core.form.part_extents import extents_of_part, extents_of_parts
 from omsm_ros.core.form.part_figures import (
     POWER,
     SYMMETRIC,
     asymmetric,
     best_fit,
-    extents_of_part,
     rms_of_part,
     without_form,
     without_power,
@@ -106,14 +106,12 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     """Return the terms of ISO 10110-5 for deviations along the normal of the surface, each [m].
 
     A (sagitta deviation) is the peak to valley of the power fitted together with piston and
-    tilts; B (irregularity) the peak to valley of the rest; C that of its rotationally symmetric
-    part. RMSt is the rms without piston and tilts, RMSi also without power,
-    and RMSa the rms of the asymmetric rest.
+    tilts; C that of the rotationally symmetric part of the rest. RMSt is the rms without piston
+    and tilts, RMSi also without power, and RMSa the rms of the asymmetric rest.
     """
     irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
     return {
         "iso10110_A": _sagitta(map_, fit),
-        "iso10110_B": extents_of_part(irregular, fit.disc)[0],
         "iso10110_C": extents_of_part(_symmetric(map_, fit.disc), fit.disc)[0],
         "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
         "iso10110_RMSi": rms_of_part(irregular),
@@ -234,17 +232,19 @@ def analyse_form(
         for begin in range(0, len(portion.x), CHUNK):
             gathered.add(PointBatch(*(v[..., begin : begin + CHUNK] for v in portion)))
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
-    map_ = gathered.map(found, even, [*[n for n, s in enumerate(sources) if s in bounds], *held])
+    x, y = gathered.places
+    uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
+    area = area_weights(x, y, even=even, outline=outline)
+    bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
+    map_ = gathered.map(found, area, bounded)
     zernike = _terms(map_, found)
-    outline = aperture or found.disc
-    uncovered, outline = best_covered(map_.x, map_.y, found.spacing, outline, aperture is None)
     cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)
     return FormResult(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=_figures(map_, gathered, found)
+        deviation=_figures(map_, gathered, found, None if even else outline)
         | optical_terms(map_, zernike)
         | _textures(map_, cells, bands, found, even),
         zernike=zernike,
@@ -258,19 +258,22 @@ def analyse_form(
 
 
 def _figures(
-    map_: DeviationMap, gathered: _Gathered, found: Registration
+    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture | None
 ) -> dict[str, UncertainValue]:
-    rest = without_second_order(map_)
-    whole, robust = extents_of_part(map_, found.disc)
-    fitted = best_fit(map_)
+    fitted, rest = best_fit(map_), without_second_order(map_)
+    maps = [map_, fitted, rest, without_power(map_, found.disc)]
+    extents = extents_of_parts(maps, found.disc, outline, found.spacing)
+    whole, robust, _ = extents[0]
     return {
+        # Irregularity: the peak to valley without piston, tilts and power.
+        "iso10110_B": extents[3][0],
         "peak_to_valley": whole,
         "robust_peak_to_valley": robust,
-        "rms": rms_of_part(map_),
-        "peak_to_valley_best_fit": extents_of_part(fitted, found.disc)[0],
-        "rms_best_fit": rms_of_part(fitted),
-        "peak_to_valley_without_second_order": extents_of_part(rest, found.disc)[0],
-        "rms_without_second_order": rms_of_part(rest),
+        "rms": rms_of_part(map_, extents[0][2]),
+        "peak_to_valley_best_fit": extents[1][0],
+        "rms_best_fit": rms_of_part(fitted, extents[1][2]),
+        "peak_to_valley_without_second_order": extents[2][0],
+        "rms_without_second_order": rms_of_part(rest, extents[2][2]),
         # These are as measured, with noise and systematic errors.
         "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
@@ -352,20 +355,25 @@ class _Gathered:
         """Largest minus smallest deviation of all points [m]."""
         return float(self._most - self._least)
 
-    def map(self, found: Registration, even: bool, bounds: Sequence[int]) -> DeviationMap:
-        """Return the collected deviations; raise DataError if there are none.
+    @property
+    def places(self) -> FloatArray:
+        """Places (2, n) [m] of the collected points; raises DataError if there are none."""
+        if not self.counts["used"]:
+            raise DataError("form.no_usable_point", counts=self.counts)
+        return np.ascontiguousarray(self._kept.rows()[:, :2].T)
+
+    def map(self, found: Registration, area: FloatArray, bounds: Sequence[int]) -> DeviationMap:
+        """Return the collected deviations of points with ``area`` (n,).
 
         bounds: indices of the sources of which only an upper bound is known
         """
-        if not self.counts["used"]:
-            raise DataError("form.no_usable_point", counts=self.counts)
         rows = np.ascontiguousarray(self._kept.rows().T)
         noise, known = self._point_noise(rows, found.noise)
         return DeviationMap(
             x=rows[0],
             y=rows[1],
             deviation=rows[2],
-            area=area_weights(rows[0], rows[1], even=even),
+            area=area,
             effects=rows[3:],
             noise=noise,
             noise_known=known,

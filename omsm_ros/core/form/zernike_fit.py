@@ -101,11 +101,13 @@ def fit_zernikes(
     *,
     weights: FloatArray | None = None,
     effects: FloatArray | None = None,
+    condition: float = _WORST_CONDITION,
 ) -> ZernikeFit:
     """Fit ``terms`` to ``deviation`` [m] at x, y [m] of the part, each (n,), by least squares.
 
     weights: area of each point (n,), None for equal weights
     effects: of errors on the deviations (e, n) [m], fitted in the same way
+    condition: largest condition number of the terms; with a larger one the highest are left out
 
     The covariance includes errors that are correlated over a pass of the path. Raises DataError
     for fewer than two points a term, or points that determine no term.
@@ -120,7 +122,7 @@ def fit_zernikes(
     more = np.empty((0, len(x))) if effects is None else effects
     values = np.concatenate([deviation[np.newaxis], more])
     gram, right = _normal_equations(x, y, values, terms, disc, weights)
-    kept = _separable(gram, terms)
+    kept = _separable(gram, terms, condition)
     gram, right = gram[np.ix_(kept, kept)], right[kept]
     used = tuple(terms[k] for k in kept)
     scale = 1 / np.sqrt(np.diag(gram))
@@ -159,7 +161,7 @@ def _normal_equations(
     return gram, right
 
 
-def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex]) -> list[int]:
+def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex], condition: float) -> list[int]:
     """Return the indices of the terms up to the highest order that is well conditioned."""
     for order in range(max(t.n for t in terms), -1, -1):
         kept = [k for k, t in enumerate(terms) if t.n <= order]
@@ -167,7 +169,7 @@ def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex]) -> list[int]:
         if np.all(own > 0):
             scale = 1 / np.sqrt(own)
             values = np.linalg.eigvalsh(gram[np.ix_(kept, kept)] * np.outer(scale, scale))
-            if values[0] > 0 and values[-1] / values[0] < _WORST_CONDITION:
+            if values[0] > 0 and values[-1] / values[0] < condition:
                 return kept
     raise DataError("form.no_term")
 

@@ -42,6 +42,8 @@ _NEARBY = 5.0
 _BY_CHANCE = 0.01
 # A cluster of more events than this is always form.
 _MOST_BY_CHANCE = 30
+# Standard deviations of a number that chance does not exceed.
+_CHANCE = 3.0
 # A step longer than this multiple of the usual one is a jump to another line.
 _JUMP = 10.0
 # Points narrower than this share of their length lie on a line.
@@ -104,7 +106,7 @@ class FarPoints:
                 for begin in range(0, len(form), _AT_A_TIME):
                     open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
                     form[open_] = self._like_surroundings(open_, event, rows, space)
-                form &= ~self._spikes(form, rows, space)
+                form = self._without_spikes(form, rows, space)
             else:
                 form = np.bincount(cluster)[cluster] > int(rule)
         return index[~form], form
@@ -138,14 +140,24 @@ class FarPoints:
             decided & (count >= np.maximum(_SHARE_AROUND * around, 1.0 if space.line else _FEW))
         )
 
-    def _spikes(self, form: BoolArray, rows: FloatArray, space: _Space) -> BoolArray:
-        """Return which far points (k,) of the ``form`` stand out from all around: dust on it."""
+    def _without_spikes(self, form: BoolArray, rows: FloatArray, space: _Space) -> BoolArray:
+        """Return which far points (k,) are ``form`` or lie about it, and are no dust on it.
+
+        Those that stand out from all around are dust. Where few points are around, no more of them
+        are than the dust elsewhere lets expect, the highest: others are form as narrow as tracks.
+        """
         from scipy.spatial import cKDTree
 
-        spikes = np.zeros(len(form), bool)
-        chosen, others = np.flatnonzero(form), np.concatenate([rows, *self.near], axis=1)
-        if space.line or not len(chosen):
-            return spikes
+        if space.line or not np.any(form):
+            return form
+        others = np.concatenate([rows, *self.near], axis=1)
+        away, nearest = cKDTree(rows[1:3, form].T).query(rows[1:3].T)
+        about = (away <= space.reach) & (rows[3] * rows[3, form][nearest] > 0)
+        # A Poisson number of the points about the form are dust.
+        around = float(np.sum(about) + others.shape[1] - len(form))
+        expected = float(np.sum(~about)) * around / self.points
+        most = int(expected + _CHANCE * np.sqrt(expected))
+        chosen, steep = np.flatnonzero(form), np.where(form, 0.0, np.abs(rows[3]))
         size, tree = others[3], cKDTree(others[1:3].T)
         for begin in range(0, len(chosen), _AT_A_TIME):
             part = chosen[begin : begin + _AT_A_TIME]
@@ -160,9 +172,14 @@ class FarPoints:
             full = np.isfinite(away[:, -1])
             ranked = np.sort(same, axis=1)
             level = np.where(full, ranked[:, -_AROUND // 4], _SIMILAR / _DENSE * ranked[:, -1])
-            alone = np.abs(rows[3, part]) - level > self.limit
-            spikes[part] = alone & (np.abs(rows[3, part]) > _DENSE * level)
-        return spikes
+            height = np.abs(rows[3, part])
+            alone = (height - level > self.limit) & (height > _DENSE * level)
+            steep[part] = np.where(alone, height - level, 0.0)
+            about[part[alone & full]] = False
+        steep[~about] = 0.0
+        highest = np.argsort(-steep)[:most]
+        about[highest[steep[highest] > 0]] = False
+        return np.asarray(about)
 
     def space(self) -> _Space:
         """Return how far apart neighbouring tracks are."""

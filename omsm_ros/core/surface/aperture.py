@@ -23,6 +23,8 @@ _DRAWN = 181
 _CELLS_ACROSS, _GAP_IN_TRACKS, _LEAST_CELLS = 512, 3.5, 3.0
 # Share of the points that an outline around them holds; of a rectangle, an ellipse holds 79 %.
 _HOLDS_ALL = 0.95
+# Share by which another outline than the aperture must be covered better.
+_CLEARLY = 0.02
 # Directions in which the rim of a scan may lie a track within that of the aperture.
 _AROUND = np.exp(0.25j * np.pi * np.arange(8))
 # The smallest disc about the part's origin counts if its middle is off by less than this share.
@@ -210,7 +212,8 @@ def best_covered(
     for shape in shapes:
         inside = np.all([shape.holds(u + a.real, v + a.imag) for a in around], axis=0)
         shares.append(float(np.mean(open_[inside])) if inside.any() else 1.0)
-    best = int(np.argmin(shares))
+    # Of a spiral the box is smaller by half a track, so that an ellipse seems to be covered better.
+    best = int(np.argmin(shares)) if min(shares) < shares[0] - _CLEARLY else 0
     return shares[best], shapes[best]
 
 

@@ -13,6 +13,7 @@ It depends on the path of the scan.
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.quantities import MAP_SPACING
 
 # Turns about the spindle from which a path is a spiral; a raster does not make two.
@@ -28,17 +29,20 @@ _LARGEST_ARC, _MOST_STEPS = np.pi / 6, 10.0
 _SECTORS = round(2 * np.pi / _LARGEST_ARC)
 # Most cells along the side of a grid. When their size doubles, the number of occupied cells falls
 # to a quarter if they fill the surface, and to a half along single tracks; the limit between both.
-_MOST_CELLS, _FILLED = 512, 3.5
+_MOST_CELLS, _FILLED = 768, 3.5
 # Cells along the distance of two evenly spaced points, so that points move by an eighth of it.
 _FINER = 4
 # Largest width of a single line relative to its length.
 _LINE_WIDTH = 1e-6
 
 
-def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatArray:
+def area_weights(
+    x: FloatArray, y: FloatArray, *, even: bool = False, outline: Aperture | None = None
+) -> FloatArray:
     """Return the area that each point represents (n,), with a mean of 1; points in scan order.
 
     even: the points are an evenly spaced grid, or every k-th of one, and have equal weights
+    outline: of the part; points at its rim stand for the way to it, on any path
     """
     if even:
         return np.ones(len(x))
@@ -47,14 +51,14 @@ def area_weights(x: FloatArray, y: FloatArray, *, even: bool = False) -> FloatAr
         weights = _ways(along)
         return np.asarray(weights / np.mean(weights), np.float64)
     angle = np.unwrap(np.arctan2(y, x))
-    turned = _turns(angle) if _is_path(angle) else 0.0
+    turned = _turns(angle) if outline is None and _is_path(angle) else 0.0
     share = np.ones(len(x))
     if turned >= _LEAST_TURNS:
         group, area = _rings(x, y, turned)
         share = _arcs(np.hypot(x, y), angle)
         area = area * _covered(group, angle, len(area))
     else:
-        group, area = _nearest(x, y)
+        group, area = _nearest(x, y, outline)
     whole = np.bincount(group, share, minlength=len(area))
     weights = share * (area / np.where(whole > 0, whole, 1.0))[group]
     return np.asarray(weights / np.mean(weights), np.float64)
@@ -138,11 +142,11 @@ def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
     return np.asarray(np.mean(around, axis=1), np.float64)
 
 
-def _nearest(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
+def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[IntArray, FloatArray]:
     """Return the cell of each point (n,), and the area that is nearest to each cell (k,).
 
     The areas are the Voronoi polygons of the occupied cells within the scanned area. The scanned
-    area includes gaps that are narrower than the distance of two tracks.
+    area includes gaps that are narrower than the distance of two tracks, also to the ``outline``.
     """
     # Imported here: it takes as long to load as to weigh a scan, and spirals do not need it.
     from scipy import ndimage
@@ -154,11 +158,15 @@ def _nearest(x: FloatArray, y: FloatArray) -> tuple[IntArray, FloatArray]:
     reach = side / _filled_side(x, y, even)
     # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
     margin = int(np.ceil(reach)) + 1
-    own = np.s_[margin:-margin, margin:-margin]
-    far, nearest = ndimage.distance_transform_edt(~np.pad(filled, margin), return_indices=True)
-    scanned = ndimage.distance_transform_edt(far <= reach)[own] > reach
-    row, column = (places[own] - margin for places in nearest)
-    owner = (row * shape[1] + column)[scanned | filled]
+    wide = np.pad(filled, margin)
+    far, nearest = ndimage.distance_transform_edt(~wide, return_indices=True)
+    inside = np.ones(wide.shape, bool)
+    if outline is not None:
+        inside = outline.holds(*np.meshgrid(*_middles(x, y, shape, margin), indexing="ij"))
+        far = ndimage.distance_transform_edt(inside & ~wide)
+    scanned = (ndimage.distance_transform_edt(far <= reach) > reach) & inside | wide
+    row, column = (places[scanned] - margin for places in nearest)
+    owner = row * shape[1] + column
     return cell, np.bincount(owner, minlength=filled.size).astype(np.float64)
 
 
@@ -180,6 +188,16 @@ def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int
         for values, span, count in zip((x, y), spans, counts, strict=True)
     ]
     return np.asarray(places[0] * counts[1] + places[1]), (int(counts[0]), int(counts[1]))
+
+
+def _middles(
+    x: FloatArray, y: FloatArray, shape: tuple[int, int], margin: int
+) -> tuple[FloatArray, ...]:
+    """Return the middles of the tiles along x and y [m], with ``margin`` tiles around."""
+    return tuple(
+        np.asarray(v.min() + (np.arange(-margin, n + margin) + 0.5) * (np.ptp(v) or 1.0) / n)
+        for v, n in zip((x, y), shape, strict=True)
+    )
 
 
 def _occupied(x: FloatArray, y: FloatArray, side: int) -> int:

@@ -9,7 +9,8 @@ from omsm_ros.core.form.deviation_map import (
     root_mean_square,
     weighted_quantiles,
 )
-from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
+from omsm_ros.core.form.part_extents import extents_of_part
+from omsm_ros.core.form.part_figures import rms_of_part
 from omsm_ros.core.streams.statistics import noise_of
 from omsm_ros.core.surface.aperture import Aperture
 

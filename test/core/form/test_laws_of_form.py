@@ -16,9 +16,9 @@ from omsm_ros.core.form.deviation_map import (
     root_mean_square,
     weighted_quantiles,
 )
+from omsm_ros.core.form.part_extents import extents_of_part
 from omsm_ros.core.form.part_figures import (
     asymmetric,
-    extents_of_part,
     rms_of_part,
     without_columns,
     without_form,

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_figures import extents_of_part
+from omsm_ros.core.form.part_extents import extents_of_part, extents_of_parts
+from omsm_ros.core.form.part_figures import rms_of_part
 from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.core.surface.area_weights import area_weights
 
 R, NOISE = 12.7e-3, 10e-9
 X, Y = (v.ravel() for v in np.meshgrid(*[np.linspace(-R, R, 200)] * 2))
@@ -33,3 +35,31 @@ def test_the_whole_peak_to_valley_contains_local_defects(name):
         assert whole.value + 2 * whole.uncertainty > 0.9 * np.ptp(form)
         assert whole.value > 0.8 * np.ptp(form)
     assert held >= 3
+
+
+@pytest.mark.parametrize("turns", [60, 100])
+def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
+    """A spiral reaches the rim at one place only; the rest of it is up to a turn further in.
+
+    Truth over the whole disc, in closed form: the rms of 500 nm ((r - 0.9 R) / 0.1 R)².
+    """
+
+    def rolled(r):
+        return -500e-9 * np.clip((r / R - 0.9) / 0.1, 0, None) ** 2
+
+    share = np.linspace(1, 0, 12_000)
+    x, y = (R * share * f(2 * np.pi * turns * share) for f in (np.cos, np.sin))
+    outline, spacing = Aperture(R), R / turns
+    # With s = (r/R - 0.9) / 0.1 the mean square is 2 (0.1) ∫ s⁴ (0.9 + 0.1 s) ds.
+    true = 500e-9 * np.sqrt(0.2 * (0.9 / 5 + 0.1 / 6))
+    for seed in range(2):
+        noise = np.random.default_rng(seed).normal(0, 2e-9, len(x))
+        map_ = DeviationMap(x=x, y=y, deviation=rolled(R * share) + noise, noise=2e-9,
+                            area=area_weights(x, y, outline=outline),
+                            effects=np.empty((0, len(x))))  # fmt: skip
+        [(whole, _, rim)] = extents_of_parts([map_], outline, outline, spacing)
+        rms = rms_of_part(map_, rim)
+        assert abs(whole.value - 500e-9) <= 2 * whole.uncertainty
+        assert whole.uncertainty < 30e-9
+        assert abs(rms.value - true) <= 2 * rms.uncertainty
+        assert rms.uncertainty < 0.05 * true

@@ -9,7 +9,8 @@ import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_figures import extents_of_part, rms_of_part
+from omsm_ros.core.form.part_extents import extents_of_part
+from omsm_ros.core.form.part_figures import rms_of_part
 from omsm_ros.core.registration.placement import PointBatch
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.aspheres import Biconic

@@ -100,3 +100,17 @@ def test_a_grain_on_a_defect_is_dust_and_the_defect_stays(seed):
     batch = PointBatch(x, y, height, np.empty((0, len(x))))
     found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
     assert set(found.dust.tolist()) == set(grains.tolist())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_groove_as_narrow_as_the_steps_along_a_track_stays(seed):
+    """Points at random places of its steep sides confirm no other; there is no dust elsewhere."""
+    rng = np.random.default_rng(seed)
+    share = np.linspace(1, 0, 12_000)
+    x, y = (10e-3 * share * f(120 * np.pi * share) for f in (np.cos, np.sin))
+    groove = -450e-9 * np.exp(-(((0.8 * x + 0.6 * y - 3e-3) / 0.25e-3) ** 4))
+    height = groove + rng.normal(0, 1e-9, len(x))
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert np.sum(np.abs(groove) > 50e-9) > 400
+    assert not len(found.dust)

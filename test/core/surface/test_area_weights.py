@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights, turns
 
 RADIUS = 12.7e-3
@@ -156,6 +157,21 @@ def test_lines_over_a_disc_weigh_it_as_it_is(lines: int) -> None:
     weights = area_weights(RADIUS * x, RADIUS * y)
     # At the rim a line stands for half of the way.
     assert np.average(x**2 + y**2, weights=weights) == pytest.approx(0.5, rel=1 / lines)
+
+
+@pytest.mark.parametrize("lines", [40, 90])
+def test_with_its_outline_lines_weigh_a_disc_to_its_rim(lines: int) -> None:
+    """∫ r⁴ over the unit disc is 1/3 of its area; a strip at the rim lies between the lines."""
+    line = np.linspace(-1.0, 1.0, 200)
+    x, y = (v.ravel() for v in np.meshgrid(line, np.linspace(-1.0, 1.0, lines)))
+    inside = np.hypot(x, y) <= 1
+    x, y = RADIUS * x[inside], RADIUS * y[inside]
+    fourth = (np.hypot(x, y) / RADIUS) ** 4
+    outline = Aperture(RADIUS)
+    with_rim = np.average(fourth, weights=area_weights(x, y, outline=outline))
+    without = np.average(fourth, weights=area_weights(x, y))
+    assert with_rim == pytest.approx(1 / 3, rel=0.4 / lines)
+    assert abs(with_rim - 1 / 3) < abs(without - 1 / 3) / 2
 
 
 def test_a_hole_that_nobody_scanned_has_no_area() -> None:

@@ -1,0 +1,420 @@
+"""Estimate peak to valley of a part, free of the bias by noise and systematic errors.
+
+Errors increase a peak to valley on average. Drawing errors of the same size once more shows by how
+much, because squares of such figures add where either errors or form dominate. With F of the
+deviations and F' with errors drawn anew
+
+    F² of the part = 2 F² − mean F'²
+
+(simulation and extrapolation; J. Cook, L. Stefanski, J. Am. Stat. Assoc. 89, 1314). Before, smooth
+terms, means of neighbours and a Wiener filter remove most of the noise; the rest counts as an
+error. Form taken for a move and upper bounds count as in :mod:`omsm_ros.core.form.part_figures`.
+
+A scan sees the part on its tracks only. What the form may reach between them, and from the last
+track to the rim, is extrapolated; half of it is added, and as much is the standard uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from omsm_ros.core.form.deviation_map import DeviationMap, UncertainValue
+from omsm_ros.core.form.part_figures import (
+    either,
+    length,
+    of_square,
+    real_effects,
+    root_of_products,
+    with_and_without,
+)
+from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.aperture import Aperture
+from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
+
+# 99.5 % of the area lies between these (ISO 10110-5:2015 calls for a share to be stated).
+ROBUST = (0.0025, 0.9975)
+# Orders of the smooth terms; the highest with forty points for each term is used.
+_ORDERS, _POINTS_PER_TERM = (12, 8, 4, 2), 40
+# Condition number that leaves nine digits of the sum of the terms at points that were fitted.
+_CONDITION = 1e7
+# Two hundred points for each of the 91 terms up to order 12; two thousand show the extent of a
+# smooth form.
+_MOST_FITTED, _MOST_DRAWN = 20_000, 2_000
+# 200 draws give a standard deviation to 5 %.
+_DRAWS, _SEED = 200, 7
+# Cells that show local features, in mean distances of the points, and points at either extreme.
+_CELLS, _HALF = (8.0, 4.0, 2.0, 1.0, 0.5), 500
+# Standard deviations of χ² that chance does not exceed.
+_CHANCE = 3.0
+# Least variance, so that a part without noise keeps all terms [m²].
+_TINY = 1e-40
+# Points at either extreme that show the form lost there.
+_EXTREME = 100
+# Points around a place of the rim that extrapolate the form to it; how far they may be off, in
+# distances of the tracks; and number of places.
+_AROUND, _REACH, _PLACES = 24, 1.5, 360
+# Least singular value of a plane through neighbours; those of one track determine no slope across.
+_LEAST_SPREAD = 1e-2
+# Neighbours on the next tracks, in distances of the tracks. A parabola that falls by one to them
+# from a peak may rise by a quarter between them.
+_NEXT, _QUARTER = (0.7, 1.3), 0.25
+# Distance of the middle of the neighbours beyond which a peak is at the rim; places around a peak
+# (49, 1) from which the next point may be far, half a distance of regular tracks.
+_ONE_SIDED = 0.3
+# Standard uncertainty of the rim's place, in distances of the tracks.
+_RIM_KNOWN = 1 / 12
+_HALF_WAY = np.linspace(-0.5, 0.5, 7)
+_PLACES_AROUND = np.add.outer(_HALF_WAY, 1j * _HALF_WAY).reshape(-1, 1)
+
+
+def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue, UncertainValue]:
+    """Return the peak to valley of the part at its points, and the extent of 99.5 % of its area.
+
+    disc: of the smooth terms
+    """
+    whole, robust, _ = extents_of_parts([map_], disc)[0]
+    return whole, robust
+
+
+def extents_of_parts(
+    maps: Sequence[DeviationMap],
+    disc: Aperture,
+    outline: Aperture | None = None,
+    spacing: float = 0.0,
+) -> list[tuple[UncertainValue, UncertainValue, tuple[float, float]]]:
+    """Return the extents, as :func:`extents_of_part`, of a map and of it without smooth forms.
+
+    Third is the mean square that form between the last track and the rim adds, and its standard
+    uncertainty [m²].
+
+    outline: of the part, None for a map without gaps;  spacing: distance of the tracks [m]
+    """
+    if not maps[0].noise_known:
+        ways = zip(*map(with_and_without, maps), strict=True)
+        one, other = (extents_of_parts(way, disc, outline, spacing) for way in ways)
+        return [
+            (either(a[0], b[0]), either(a[1], b[1]), b[2]) for a, b in zip(one, other, strict=True)
+        ]
+    form = _PartForm.of(maps[0], disc)
+    gaps = _Gaps.of(maps[0].every(_MOST_FITTED), outline, spacing) if outline else None
+    return [form.extents(map_, map_.deviation - maps[0].deviation, gaps) for map_ in maps]
+
+
+class _PartForm(NamedTuple):
+    """Estimated form of a part at all its points, and the noise that is left in it.
+
+    value: (n,) [m];  smooth: its smooth terms
+    cell, error: number of the cell (n,) whose mean a point has, and its noise [m]
+    local: points that differ from the smooth form (m,);  blurred: rms of the form lost [m]
+    """
+
+    value: FloatArray
+    smooth: ZernikeFit
+    cell: IntArray
+    error: FloatArray
+    local: IntArray
+    blurred: float
+
+    @classmethod
+    def of(cls, map_: DeviationMap, disc: Aperture) -> _PartForm:
+        """Return the form of a map;  disc: of the smooth terms."""
+        fit = _smooth(map_.every(_MOST_FITTED), disc)
+        smooth = fit.height(map_.x, map_.y)
+        rest = map_.deviation - smooth
+        share, blurred = _share_of_form(rest, map_.noise)
+        value, cell = smooth + share * rest, np.arange(len(map_))
+        error = np.full(len(map_), share * map_.noise)
+        local = np.empty(0, np.int64)
+        if (found := local_features(map_, smooth)) is not None:
+            local = found.points
+            value[local], error[local] = found.form, found.error
+            cell[local] = len(map_) + found.cell
+            blurred = max(blurred, found.blurred)
+        return cls(value, fit, cell, error, local, blurred)
+
+    def extents(
+        self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None
+    ) -> tuple[UncertainValue, UncertainValue, tuple[float, float]]:
+        """Return the extents of the ``map_`` whose form differs by a smooth ``shift`` (n,) [m]."""
+        form = self.value + shift
+        even = np.arange(0, len(map_), -(-len(map_) // _MOST_DRAWN))
+        order = self.local[np.argsort(form[self.local])]
+        some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
+        drawn = _drawn(map_.part(some), self, form[some], some)
+
+        def whole(deviations: FloatArray) -> FloatArray:
+            return np.asarray(np.ptp(deviations, axis=0), np.float64)
+
+        def robust(deviations: FloatArray) -> FloatArray:
+            return _quantile_ranges(deviations[: len(even)], map_.area[even])
+
+        found = []
+        few = slice(None, None, -(-len(map_) // _MOST_FITTED))
+        of_gaps = (np.zeros(2), (0.0, 0.0))
+        if gaps:
+            of_gaps = gaps.beyond(form[few], self.error[few], map_.area[few])
+        of_all = _quantile_ranges(form[few, np.newaxis], map_.area[few])
+        for extent, all_ in ((whole, float(np.ptp(form))), (robust, float(of_all[0]))):
+            of_some = float(extent(form[some, np.newaxis])[0])
+            again, more, likely, full, noise = (extent(way) ** 2 for way in drawn)
+            square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
+            of_taken = _rms(full - np.mean(likely))
+            # Where many points compete for an extreme, the mean of the draws follows the noise of
+            # the figure in part, so that it counts once to twice: the factor is √2.
+            of_errors = length(float(np.std(again)), float(np.std(noise)))
+            # An extent has two ends, each blurred independently.
+            of_blur = 2 * of_some * float(np.sqrt(2)) * self.blurred
+            figure = of_square(square, length(of_errors, _rms(more - again), of_taken, of_blur))
+            between = of_gaps[0] if extent is whole else np.zeros(2)
+            value = (figure.value or 0.0) + all_ - of_some + float(np.sum(between)) / 2
+            spread = length(figure.uncertainty or 0.0, *(between / 2))
+            found.append(UncertainValue(value, spread))
+        return found[0], found[1], of_gaps[1]
+
+
+def _quantile_ranges(values: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the extents (k,) of the ``ROBUST`` share of the weight (n,) of ``values`` (n, k)."""
+    order = np.argsort(values, axis=0)
+    ordered, weight = np.take_along_axis(values, order, 0), weights[order]
+    below = np.cumsum(weight, axis=0) - weight / 2
+    ends = np.array(ROBUST) * np.sum(weights)
+    found = [np.interp(ends, b, v) for b, v in zip(below.T, ordered.T, strict=True)]
+    return np.array([high - low for low, high in found])
+
+
+class _Gaps(NamedTuple):
+    """Places that the tracks miss.
+
+    x, y: of the points (n,) [m];  spacing: of the tracks [m]
+    near, weights: points (q, k), the nearest first, whose weighted sum extrapolates the form from
+        that to a place of the rim
+    share: of the area between each place and its nearest point (q,)
+    strip: share of the area that a shift of the rim by its uncertainty covers
+    """
+
+    x: FloatArray
+    y: FloatArray
+    spacing: float
+    near: IntArray
+    weights: FloatArray
+    share: FloatArray
+    strip: float
+
+    @classmethod
+    def of(cls, map_: DeviationMap, outline: Aperture, spacing: float) -> _Gaps | None:
+        """Return the gaps between the points and to the ``outline``; None for a profile."""
+        from scipy.spatial import cKDTree  # takes long to load
+
+        x, y = map_.x, map_.y
+        if len(x) < _AROUND or min(np.ptp(x), np.ptp(y)) < _REACH * spacing:
+            return None
+        corners = outline.rim()
+        (u, v), way = corners, np.cumsum(np.hypot(*np.diff(corners, prepend=corners[:, :1])))
+        at = np.linspace(0, way[-1], _PLACES, endpoint=False)
+        rim = np.stack([np.interp(at, way, u), np.interp(at, way, v)])
+        area = abs(float(np.sum(u[:-1] * v[1:] - u[1:] * v[:-1]))) / 2
+        away, near = cKDTree(np.column_stack([x, y])).query(rim.T, _AROUND)
+        close = away[:, 0] < _REACH * spacing
+        near, rim = near[close], rim[:, close, np.newaxis]
+        share = away[close, 0] * way[-1] / _PLACES / area
+        strip = float(way[-1]) * spacing * _RIM_KNOWN / area
+        first = near[:, :1]
+        weights = _plane(x[near] - rim[0], y[near] - rim[1])
+        weights -= _plane(x[near] - x[first], y[near] - y[first])
+        weights[:, 0] += 1.0
+        return cls(x, y, spacing, near, weights, share, strip)
+
+    def beyond(
+        self, form: FloatArray, noise: FloatArray, area: FloatArray
+    ) -> tuple[FloatArray, tuple[float, float]]:
+        """Return how far the form may reach beyond its extremes (2,) [m], and more of its square.
+
+        That is what the form between the last track and the rim adds to its mean square, and the
+        standard uncertainty of that [m²].
+
+        form, noise, area: of the points, each (n,) [m], the area of any unit
+        """
+        rim, found = np.sum(self.weights * form[self.near], axis=1), []
+        for values, at_rim in ((-form, -rim), (form, rim)):
+            at_most = float(np.max(at_rim, initial=-np.inf))
+            found.append(max(self._rise(values, noise), at_most - float(values.max()), 0.0))
+        # The points stand for the way to the rim; along it the form changes by half on average.
+        more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
+        higher = float(np.mean(rim**2) - np.average(form**2, weights=area)) if len(rim) else 0.0
+        return np.array(found), (more, length(more, self.strip * higher))
+
+    def _rise(self, values: FloatArray, noise: FloatArray) -> float:
+        """Return how far ``values`` (n,) [m] may rise between the tracks around the largest."""
+        peak = int(np.argmax(values))
+        at = ((self.x - self.x[peak]) + 1j * (self.y - self.y[peak])) / self.spacing
+        away = np.abs(at)
+        ring = (away > _NEXT[0]) & (away < _NEXT[1])
+        # At the rim there is none on the other side.
+        if not np.any(ring) or abs(np.mean(at[ring])) > _ONE_SIDED:
+            return 0.0
+        gap = np.max(np.min(np.abs(_PLACES_AROUND - at[away < 1]), axis=1))
+        fall = float(values[peak] - np.mean(values[ring]) - 2 * noise[peak])
+        return fall * _QUARTER * float(min(2 * gap, 1.0)) ** 2
+
+
+def _plane(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the weights (…, k) of values at x, y (…, k) whose sum is their plane at the origin."""
+    size = np.max(np.hypot(x, y), axis=-1, keepdims=True)
+    columns = np.stack([np.ones_like(x), x / size, y / size], axis=-1)
+    return np.asarray(np.linalg.pinv(columns, rcond=_LEAST_SPREAD)[..., 0, :])
+
+
+class LocalFeatures(NamedTuple):
+    """Points (m,) of a map whose form differs from its smooth form and its local means.
+
+    points: indices in the map;  form: estimate [m]
+    cell, error: number of the cell whose mean it is, and the noise of that [m]
+    blurred: rms of the form that the estimate does not resolve [m]
+    """
+
+    points: IntArray
+    form: FloatArray
+    cell: IntArray
+    error: FloatArray
+    blurred: float
+
+
+def local_features(map_: DeviationMap, smooth: FloatArray) -> LocalFeatures | None:
+    """Return what grooves, pips, scratches and edges add to the ``smooth`` form (n,) [m], or None.
+
+    Cells of five sizes whose mean exceeds what noise makes anywhere on the map show them, as do
+    single points (D. Donoho, I. Johnstone, Biometrika 81, 425). Each of the largest cells with one
+    has the means of the size with the least expected error (Stein); all cells have, if the means of
+    one size are closer than none all over the map, as for ripple.
+    """
+    if map_.noise == 0:
+        return None
+    rest = map_.deviation - smooth
+    spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
+    side = float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
+    levels, differs = [], np.abs(rest) > _beyond_chance(len(map_)) * map_.noise
+    ripple = False
+    for pitch in side * np.array(_CELLS):
+        column, row = (((v - v.min()) / pitch).astype(np.int64) for v in (map_.x, map_.y))
+        levels.append(column * (int(row.max()) + 1) + row)
+        mean, error = _cell_means(levels[-1], rest, map_.noise)
+        count = int(np.sum(error > 0))
+        differs |= (np.abs(mean) > _beyond_chance(count) * error)[levels[-1]]
+        # Σ (mean / error)² of noise alone is χ² with as many degrees of freedom as cells.
+        chi_square = float(np.sum((mean[error > 0] / error[error > 0]) ** 2))
+        ripple |= chi_square - 2 * count > _CHANCE * np.sqrt(2 * count)
+    chosen = (np.bincount(levels[0], differs) > 0) | ripple
+    some = np.flatnonzero(chosen[levels[0]])
+    if not len(some):
+        return None
+    cells = [np.unique(level[some], return_inverse=True)[1] for level in levels]
+    cells.append(np.arange(len(some)))
+    best = _least_risk(cells, rest[some], map_.noise)
+    firsts = np.cumsum([0, *(int(cell.max()) + 1 for cell in cells[:-1])])
+    own = np.stack(cells)[best, np.arange(len(some))] + firsts[best]
+    mean, error = _cell_means(own, rest[some], map_.noise)
+    form = smooth[some] + mean[own]
+    order = np.argsort(form)
+    ends = np.concatenate([order[:_EXTREME], order[-_EXTREME:]])
+    missed = (map_.deviation[some] - form)[ends][best[ends] < len(levels)]
+    variance = float(np.mean(missed**2)) - map_.noise**2 if len(missed) else 0.0
+    return LocalFeatures(some, form, own, error[own], float(np.sqrt(max(variance, 0.0))))
+
+
+def _least_risk(cells: Sequence[IntArray], values: FloatArray, noise: float) -> IntArray:
+    """Return the level (n,) whose cell means have the least expected error, by largest cell.
+
+    cells: number of the cell of each point at each level, each (n,), from the largest to one point
+    """
+    risks = []
+    for cell in cells:
+        mean, _ = _cell_means(cell, values, 0.0)
+        size = np.bincount(cell)[cell]
+        # Each cell follows the noise of one point.
+        risk = (values - mean[cell]) ** 2 + 2 * noise**2 / size
+        risks.append(np.bincount(cells[0], risk))
+    # A choice of its own follows the noise of a cell, so the gain must exceed that of chance.
+    usual, own = int(np.argmin(np.sum(risks, axis=1))), np.argmin(risks, axis=0)
+    gain = risks[usual] - np.min(risks, axis=0)
+    chance = _CHANCE * noise**2 * np.sqrt(2 * np.bincount(cells[0]))
+    return np.asarray(np.where(gain > chance, own, usual)[cells[0]], np.int64)
+
+
+def _cell_means(cell: IntArray, values: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of ``values`` (n,) in each cell (k,), and its standard error; zero: empty."""
+    counts = np.bincount(cell)
+    held = np.maximum(counts, 1)
+    error = np.where(counts > 0, noise / np.sqrt(held), 0.0)
+    return np.asarray(np.bincount(cell, values) / held), error
+
+
+def _beyond_chance(count: int) -> float:
+    """Return the multiple of σ that none of ``count`` normal values is likely to exceed."""
+    return float(np.sqrt(2 * np.log(max(count, 2)))) + 1.0
+
+
+def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
+    """Return smooth terms of the deviations, of as high an order as the points show."""
+    orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)] or [0]
+    for order, lower in zip(orders, [*orders[1:], -1], strict=True):
+        points = (map_.x, map_.y, map_.deviation)
+        fit = fit_zernikes(
+            *points, terms_up_to(order), disc, weights=map_.area, condition=_CONDITION
+        )
+        # Orders that only follow the noise would blur the rim, where the noise of all adds up.
+        high = np.array([term.n > lower for term in fit.terms])
+        weighted = (columns := zernike_values(*disc.scaled(map_.x, map_.y), fit.terms)) * map_.area
+        solve = np.linalg.inv(weighted @ columns.T)[high]
+        covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve.T
+        # Wald's test, because where the points leave parts of the disc out the terms are alike.
+        count, found = len(solve), fit.coefficients[high]
+        chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(count), found))
+        if chi_square > count + _CHANCE * np.sqrt(2 * count):
+            break
+    return fit
+
+
+def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
+    """Return the Wiener factor for ``values`` (n,) with ``noise``, and the form lost by it, rms."""
+    variance = float(np.mean(values**2))
+    share = max(1 - noise**2 / variance, 0.0) if variance > 0 else 0.0
+    return share, (1 - share) * float(np.sqrt(max(variance - noise**2, 0.0)))
+
+
+def _drawn(
+    map_: DeviationMap, part: _PartForm, form: FloatArray, points: IntArray
+) -> tuple[FloatArray, ...]:
+    """Return the ``form`` (m,) with five kinds of errors drawn anew, each (m, draws).
+
+    All errors that are present; these and the upper bounds; the form that the fit has probably
+    taken; the form that it may have taken at most; the remaining noise alone.
+
+    points: of the ``part`` that the map has (m,)
+    """
+    random = np.random.default_rng(_SEED)
+    terms = zernike_values(*part.smooth.disc.scaled(map_.x, map_.y), part.smooth.terms)
+    effects, still = map_.effects, form[:, np.newaxis]
+    taken = effects[: len(map_.taken)]
+
+    def anew(ways: FloatArray) -> FloatArray:
+        return np.asarray(ways.T @ random.normal(size=(len(ways), _DRAWS)), np.float64)
+
+    # Points with the mean of one cell share its noise.
+    _, cell = np.unique(part.cell[points], return_inverse=True)
+    noise = random.normal(size=(int(cell.max()) + 1, _DRAWS))[cell]
+    noisy = still + noise * part.error[points, np.newaxis]
+    errors = [effects[real_effects(map_)], root_of_products(part.smooth.covariance) @ terms]
+    drawn = noisy + anew(np.concatenate(errors))
+    bounded = drawn + anew(effects[map_.bounds]) if len(map_.bounds) else drawn
+    if not len(taken):
+        return drawn, bounded, still, still, noisy
+    likely, full = anew(root_of_products(map_.taken) @ taken), anew(taken)
+    return drawn, bounded, still + likely, still + full, noisy
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
