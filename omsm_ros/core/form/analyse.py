@@ -234,9 +234,8 @@ def analyse_form(
     held = range(len(sources), found.moved.shape[1])  # Their offsets are upper bounds, too.
     x, y = gathered.places
     uncovered, outline = best_covered(x, y, found.spacing, aperture or found.disc, aperture is None)
-    area = area_weights(x, y, even=even, outline=outline)
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
-    map_ = gathered.map(found, area, bounded)
+    map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
     zernike = _terms(map_, found)
     cells = GridCells.of(map_, even=even)
     bands = bands_of(cells, *filters)

@@ -83,6 +83,7 @@ def real_effects(map_: DeviationMap) -> BoolArray:
 
 
 def length(*shares: float) -> float:
+    """Return the root of the sum of the squares of independent ``shares``."""
     return float(np.sqrt(sum(share**2 for share in shares)))
 
 
