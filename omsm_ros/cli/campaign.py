@@ -30,7 +30,7 @@ from omsm_ros.io.files import (
     save_text,
 )
 from omsm_ros.io.folders import locked_folder
-from omsm_ros.io.json_and_yaml import ranged
+from omsm_ros.io.json_and_yaml import TEXT, group, or_none, ranged
 from omsm_ros.io.results import read_summary
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import PROCESSES, STAMP, shown
@@ -44,30 +44,15 @@ _MAX_STATE_BYTES = 50_000_000
 _ATTEMPTS = 2
 _LOCAL_HOSTS = ("127.0.0.1", "::1", "localhost")
 
-_TEXT = {"type": "string"}
-_STATE_FORM = {
-    "type": "object",
-    "properties": {
-        "schema": {"const": _SCHEMA},
-        "entries": {
-            "type": "array",
-            "maxItems": 1_000_000,
-            "items": {
-                "type": "object",
-                "properties": {
-                    "bag": _TEXT,
-                    "folder": _TEXT,
-                    "fingerprint": _TEXT,
-                    "state": {"enum": [DONE, REFUSED, CRASHED]},
-                    "said": _TEXT,
-                    "recorded_ns": {**ranged(STAMP), "type": ["integer", "null"]},
-                },
-                "required": ["bag", "folder", "fingerprint", "state", "said"],
-            },
-        },
+_ENTRY = group(
+    {
+        **dict.fromkeys(("bag", "folder", "fingerprint", "said"), TEXT),
+        "state": {"enum": [DONE, REFUSED, CRASHED]},
     },
-    "required": ["schema", "entries"],
-}
+    recorded_ns=or_none(ranged(STAMP)),
+)
+_ENTRIES = {"type": "array", "maxItems": 1_000_000, "items": _ENTRY}
+_STATE_FORM = group({"schema": {"const": _SCHEMA}, "entries": _ENTRIES})
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,6 @@ from omsm_ros.cli.command import Facts
 from omsm_ros.core.registration.isolated_points import DustRule
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.surface.aperture import Aperture
-from omsm_ros.core.surface.shape_parameters import SHAPE_PARAMETERS
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER, TOLERANCE, shown
 from omsm_ros.readable import count, measured
@@ -98,8 +97,6 @@ def registration_of(args: argparse.Namespace) -> RegistrationOptions:
 _OTHERS = ("aperture", "tolerance", "dust", "placement", "drawing")
 # Smallest standard uncertainty of a placement [m], [rad]; below an atom it is zero.
 _LEAST_PLACEMENT = 1e-12
-_UNITS = {"x": "m", "y": "m", "piston": "m", "power": "1/m"}
-_UNITS |= {n: "" if n.startswith("conic") else "m" for n in SHAPE_PARAMETERS}
 
 
 def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
@@ -128,7 +125,8 @@ def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
 
 def _pose(facts: Facts, name: str) -> str:
     from omsm_ros.report.measurement.page import settled
+    from omsm_ros.report.tables import unit_of_parameter
 
     value = {**facts["pose"], **facts["shape"]}[name]["value"]
     spread = settled(facts, name)
-    return f"{measured(value, spread, _UNITS.get(name, 'rad'))} (k = 1)"
+    return f"{measured(value, spread, unit_of_parameter(name))} (k = 1)"

@@ -85,9 +85,7 @@ def _refuse(connection: socket.socket) -> None:
     with contextlib.suppress(OSError), connection:
         connection.setblocking(False)
         with contextlib.suppress(BlockingIOError):
-            connection.recv(
-                4096
-            )  # the request: without reading it, closing would discard the answer
+            connection.recv(4096)  # the request: closing would discard the answer otherwise
         connection.send(_REFUSAL)
         connection.shutdown(socket.SHUT_WR)
 

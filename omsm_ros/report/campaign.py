@@ -170,13 +170,7 @@ def _value(measurement: CampaignEntry, series: Series) -> float:
 
 def _times(measurements: Sequence[CampaignEntry]) -> FloatArray:
     """Return the time of each recording [s], NaN if unknown."""
-    unknown = np.nan
-    return np.array(
-        [
-            unknown if m.recorded_ns is None else m.recorded_ns / NANOSECONDS_PER_S
-            for m in measurements
-        ]
-    )
+    return np.array([m.recorded_ns for m in measurements], np.float64) / NANOSECONDS_PER_S
 
 
 def _headlines(measurements: Sequence[CampaignEntry]) -> list[tuple[str, str]]:

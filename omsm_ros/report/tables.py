@@ -15,6 +15,11 @@ POSE_UNITS = {
 }  # fmt: skip
 
 
+def unit_of_parameter(name: str) -> str:
+    """Return the unit of a parameter of a pose, or of the shape of a surface."""
+    return POSE_UNITS.get(name, "" if name.startswith("conic") else "m")
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table: ``rows`` of a label and one text per column; no heading without ``columns``.

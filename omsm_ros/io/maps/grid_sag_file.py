@@ -90,15 +90,9 @@ def read_grid_sag(path: Path, units: LengthUnits | None = None) -> HeightGrid:
 
 
 def _grid(first: tuple[float, ...], table: FloatArray) -> HeightGrid:
-    columns, rows, dx, dy, unit = (
-        int(first[0]),
-        int(first[1]),
-        abs(first[2]),
-        abs(first[3]),
-        first[4],
-    )
-    decentre = first[5:] or (0.0, 0.0)
-    scale = _UNITS_M[int(unit)]
+    columns, rows, unit = int(first[0]), int(first[1]), int(first[4])
+    dx, dy, decentre = abs(first[2]), abs(first[3]), first[5:] or (0.0, 0.0)
+    scale = _UNITS_M[unit]
     height = table[:, 0] * scale
     if table.shape[1] > 4:
         height = np.where(table[:, 4] != 0, np.nan, height)

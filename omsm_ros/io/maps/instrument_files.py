@@ -78,13 +78,8 @@ def _table(content: Any, what: str) -> MeasuredPoints:
     lengths = {name: len(values) for name, values in column.items()}
     if len(set(lengths.values())) > 1:
         raise FileError(f"{what} has columns of different lengths {lengths}; write it again")
-    return measured(
-        column["x"],
-        column["y"],
-        column["height"],
-        column.get("uncertainty"),
-        sample=column.get("sample"),
-    )
+    x, y, height, spread = (column.get(n) for n in ("x", "y", "height", "uncertainty"))
+    return measured(x, y, height, spread, sample=column.get("sample"))  # type: ignore[arg-type]
 
 
 def _array(dataset: Any, what: str, axes: int) -> NDArray[Any]:

@@ -20,7 +20,7 @@ from omsm_ros.readable import (
 from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
 from omsm_ros.report.page_parts import Headline, check_places, fill, picture, title_block
-from omsm_ros.report.tables import POSE_UNITS, Table, part
+from omsm_ros.report.tables import Table, part, unit_of_parameter
 from omsm_ros.report.verdict import PageVerdict, covered, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
@@ -142,10 +142,8 @@ def removed_table(form: Mapping[str, Any]) -> Table:
         return Table(title, columns, [])
     fitted = []
     for name in part(form, "removed", "fitted") or ():
-        pose, unit = part(form, "pose", name), POSE_UNITS.get(name, "")
-        if pose is None:
-            pose = part(form, "shape", name) or {}
-            unit = "" if name.startswith("conic") else "m"
+        pose = part(form, "pose", name) or part(form, "shape", name) or {}
+        unit = unit_of_parameter(name)
         spread = settled(form, name)
         fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
@@ -178,7 +176,7 @@ def correlated_moves(form: Mapping[str, Any], name: str) -> str:
         return ""
     sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
     moves = {n: v for n, v in sizes.items() if v and n in form["pose"]}
-    stated = [f"{n} ± {quantity(v, POSE_UNITS.get(n, ''), 2)}" for n, v in moves.items()]
+    stated = [f"{n} ± {quantity(v, unit_of_parameter(n), 2)}" for n, v in moves.items()]
     if len(stated) < 2:
         return ""
     own, *others = stated
@@ -224,11 +222,8 @@ def _size_of(value: Any, unit: str) -> str:
 def _temperature(stated: Mapping[str, Any]) -> str:
     if not stated:
         return NOTHING
-    mean, change = (
-        quantity(stated.get("mean"), "°C", 4),
-        quantity(stated.get("change"), "K", 2, True),
-    )
-    return f"{mean}, {change} from start to end"
+    change = quantity(stated.get("change"), "K", 2, True)
+    return f"{quantity(stated.get('mean'), '°C', 4)}, {change} from start to end"
 
 
 def provenance_table(summary: Mapping[str, Any]) -> Table:
