@@ -5,20 +5,20 @@ A thread reads the device, and its blocks are published; no fault of the line en
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
-from omsm_msgs.msg import AccelerationBlock, AxisBlock, DistanceBlock, ProbeSettings
+from omsm_msgs import msg
 from rclpy.publisher import Publisher
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from omsm_ros.core.calibration.calibration import PROBE
+from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
 from omsm_ros.core.streams.monitoring import RecentIncrease, SampleFlow
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.factory import make_accelerometer, make_axes, make_device, make_reference
 from omsm_ros.instruments.parameters import (
     ACCELEROMETER_PARAMETERS,
@@ -55,7 +55,25 @@ _SILENCE_SAMPLES = 5
 _END_S = 5.0
 # A dark reference takes some three seconds; more if the device is slow to answer.
 _DARK_REFERENCE_S = 30.0
-_ACCELERATION = "acceleration"
+
+
+class _Output(NamedTuple):
+    """Message of a kind of blocks, and the parameter of its frame."""
+
+    message: type
+    frame: Parameter
+
+
+_OUTPUTS: Mapping[type[Block], _Output] = {
+    AxisBlock: _Output(msg.AxisBlock, Parameter("machine_frame", "machine", "frame of the axes")),
+    DistanceBlock: _Output(
+        msg.DistanceBlock, Parameter("probe_frame", "probe", "frame of the distance")
+    ),
+    AccelerationBlock: _Output(
+        msg.AccelerationBlock,
+        Parameter("accelerometer_frame", "probe", "frame of the acceleration"),
+    ),
+}
 
 
 class DriverNode(ManagedNode):
@@ -66,22 +84,16 @@ class DriverNode(ManagedNode):
         name: str,
         parameters: Sequence[Parameter],
         make: Callable[[dict[str, Any], Callable[[], int]], StreamDevice],
-        *,
-        axes: str | None = None,
-        distance: str | None = None,
+        topics: Mapping[type[Block], str],
         settings: str | None = None,
     ) -> None:
-        """axes, distance, settings: topics of blocks and of the probe's settings; None = none."""
-        frames = [Parameter("machine_frame", "machine", "frame of the axes")] if axes else []
-        if distance:
-            frames.append(Parameter("probe_frame", "probe", "frame of the distance"))
+        """topics: of each kind of blocks;  settings: topic of the probe's settings; None = none."""
+        frames = (_OUTPUTS[kind].frame for kind in topics)
         super().__init__(name, (*parameters, *frames, FRAME_PREFIX))
         self._make = make
-        self._axes_topic, self._distance_topic = axes, distance
+        self._topics = topics
         self._settings_topic = settings
         self._settings: Publisher | None = None
-        self._axes: Publisher | None = None
-        self._distance: Publisher | None = None
         self._messages = message_mapping.ros_messages()
 
     def hardware_id(self) -> str:
@@ -104,11 +116,11 @@ class DriverNode(ManagedNode):
         self._reported: dict[str, object] = {}
         if self._settings_topic:
             self._settings = publish_on(self, undo, String, self._settings_topic, LATCHED_QOS)
-            self._plotted = publish_on(self, undo, ProbeSettings, "probe", LATCHED_QOS)
-        if self._axes_topic:
-            self._axes = self.publish_on(undo, AxisBlock, self._axes_topic)
-        if self._distance_topic:
-            self._distance = self.publish_on(undo, DistanceBlock, self._distance_topic)
+            self._plotted = publish_on(self, undo, msg.ProbeSettings, "probe", LATCHED_QOS)
+        self._publisher_of = {
+            kind: self.publish_on(undo, _OUTPUTS[kind].message, topic)
+            for kind, topic in self._topics.items()
+        }
 
     def activate(self, undo: ExitStack) -> None:
         """Begin to read the device."""
@@ -118,15 +130,13 @@ class DriverNode(ManagedNode):
         undo.callback(stop.set)
         thread.start()
 
-    def _publish(self, blocks: Sequence[BlockPair]) -> None:
+    def _publish(self, blocks: Sequence[Any]) -> None:
+        """Publish blocks, or pairs of them, each on the topic of its kind."""
         self._publish_settings()
-        for axes, distance in blocks:
-            for block, publisher, frame in (
-                (axes, self._axes, "machine_frame"),
-                (distance, self._distance, "probe_frame"),
-            ):
-                if block is not None and publisher is not None:
-                    frame = self.values[frame]
+        for item in blocks:
+            for block in item if isinstance(item, tuple) else (item,):
+                if (publisher := self._publisher_of.get(type(block))) is not None:
+                    frame = self.values[_OUTPUTS[type(block)].frame.name]
                     publisher.publish(message_mapping.block_message(self._messages, block, frame))
 
     def _publish_settings(self) -> None:
@@ -148,8 +158,8 @@ class DriverNode(ManagedNode):
         values: dict[str, object] = {**self._device.identity, "state": self._reader.state.value}
         values |= counts | {"connections": self._reader.connections}
         values["rate_hz"] = round(self._flow.rate, 3)
-        for topic, publisher in self._outputs_by_topic():
-            values[f"{topic}_subscribers"] = publisher.get_subscription_count()
+        for kind, publisher in self._publisher_of.items():
+            values[f"{self._topics[kind]}_subscribers"] = publisher.get_subscription_count()
         report = StateReport(f"reading at {self._flow.rate:.6g} Hz", values)
         if self._reader.trouble:
             report.add(ERROR, self._reader.trouble)
@@ -158,10 +168,6 @@ class DriverNode(ManagedNode):
         self._add_faults(report, counts, now)
         self._add_silence(report, now)
         return report
-
-    def _outputs_by_topic(self) -> list[tuple[str, Publisher]]:
-        both = ((self._axes_topic, self._axes), (self._distance_topic, self._distance))
-        return [(topic, publisher) for topic, publisher in both if topic and publisher]
 
     def _add_faults(self, report: StateReport, counts: dict[str, float], now: float) -> None:
         faults = {name: n for name, n in counts.items() if name.startswith(_FAULTS)}
@@ -200,8 +206,7 @@ class ConfocalDriverNode(DriverNode):
             "confocal_driver",
             PARAMETERS,
             make_device,
-            axes="axes",
-            distance="confocal",
+            {AxisBlock: "axes", DistanceBlock: "confocal"},
             settings="probe_settings",
         )
 
@@ -225,36 +230,18 @@ class ConfocalDriverNode(DriverNode):
         response.success, response.message = True, f"dark reference taken{stray}; identify again"
 
 
-class AccelerometerDriverNode(DriverNode):
-    """Samples a three-axis accelerometer and publishes its blocks."""
-
-    def __init__(self) -> None:
-        frame = Parameter("accelerometer_frame", "probe", "frame of the acceleration")
-        parameters = (*ACCELEROMETER_PARAMETERS, frame)
-        super().__init__("accelerometer_driver", parameters, make_accelerometer)
-        self._acceleration: Publisher | None = None
-
-    def configure(self, undo: ExitStack) -> None:
-        """Make the device, not yet connected, and the topic."""
-        super().configure(undo)
-        self._acceleration = self.publish_on(undo, AccelerationBlock, _ACCELERATION)
-
-    def _publish(self, blocks: Sequence[Any]) -> None:
-        if self._acceleration is None:
-            return
-        frame = self.values["accelerometer_frame"]
-        for block in blocks:
-            message = message_mapping.block_message(self._messages, block, frame)
-            self._acceleration.publish(message)
-
-    def _outputs_by_topic(self) -> list[tuple[str, Publisher]]:
-        return [(_ACCELERATION, self._acceleration)] if self._acceleration is not None else []
+def _driver(*settings: Any) -> Callable[[], None]:
+    return partial(run, partial(DriverNode, *settings))
 
 
 confocal_driver = partial(run, ConfocalDriverNode)
-axis_driver = partial(
-    run, partial(DriverNode, "axis_driver", AXIS_PARAMETERS, make_axes, axes="axes")
+axis_driver = _driver("axis_driver", AXIS_PARAMETERS, make_axes, {AxisBlock: "axes"})
+reference_driver = _driver(
+    "reference_driver", REFERENCE_PARAMETERS, make_reference, {DistanceBlock: "reference"}
 )
-_reference = ("reference_driver", REFERENCE_PARAMETERS, make_reference)
-reference_driver = partial(run, partial(DriverNode, *_reference, distance="reference"))
-accelerometer_driver = partial(run, AccelerometerDriverNode)
+accelerometer_driver = _driver(
+    "accelerometer_driver",
+    ACCELEROMETER_PARAMETERS,
+    make_accelerometer,
+    {AccelerationBlock: "acceleration"},
+)

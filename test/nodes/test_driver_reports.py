@@ -34,10 +34,7 @@ class Driver(SimpleNamespace):
     """A DriverNode's own methods on what they need, without a node of ROS."""
 
     report, _publish = DriverNode.report, DriverNode._publish
-    _publish_settings, _outputs_by_topic = (
-        DriverNode._publish_settings,
-        DriverNode._outputs_by_topic,
-    )
+    _publish_settings = DriverNode._publish_settings
     _add_faults, _add_silence = DriverNode._add_faults, DriverNode._add_silence
     hardware_id = DriverNode.hardware_id
 
@@ -59,7 +56,8 @@ def driver(monkeypatch):
         _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},
         _silent_since=None, _restarts=0.0, _reset=0.0,
         _messages=message_mapping.ros_messages(),
-        _axes_topic="axes", _axes=Published(), _distance_topic="confocal", _distance=Published(),
+        _topics={AxisBlock: "axes", DistanceBlock: "confocal"},
+        _publisher_of={AxisBlock: Published(), DistanceBlock: Published()},
         _settings=Published(), _plotted=Published(), get_clock=FakeNode().get_clock,
     )  # fmt: skip
 
@@ -134,28 +132,29 @@ def pair():
 def test_blocks_go_out_with_their_frames_stamps_and_values(driver):
     axes, distance = pair()
     driver._publish([(axes, distance), (None, distance), (axes, None)])
-    assert (len(driver._axes), len(driver._distance)) == (2, 2)
-    sent = driver._axes[0]
+    sent_axes, sent_distance = driver._publisher_of.values()
+    assert (len(sent_axes), len(sent_distance)) == (2, 2)
+    sent = sent_axes[0]
     assert sent.header.frame_id == "mill"
     assert (sent.header.stamp.sec, sent.header.stamp.nanosec) == (7, 5)
     assert (sent.first_sample, sent.sample_period) == (12, 1e-3)
     for name in ("x", "y", "z", "b", "c"):
         assert list(getattr(sent, name)) == list(getattr(axes, name))
-    assert driver._distance[0].header.frame_id == "needle"
-    assert list(driver._distance[0].distance) == [0.0, 1e-6, 2e-6, 3e-6]
+    assert sent_distance[0].header.frame_id == "needle"
+    assert list(sent_distance[0].distance) == [0.0, 1e-6, 2e-6, 3e-6]
 
 
 def test_a_driver_of_axes_alone_passes_over_distances(driver):
-    driver._distance_topic = driver._distance = None
+    del driver._publisher_of[DistanceBlock]
     driver._publish([pair()])
-    assert len(driver._axes) == 1
-    assert [topic for topic, _ in driver._outputs_by_topic()] == ["axes"]
+    assert len(driver._publisher_of[AxisBlock]) == 1
+    assert "confocal_subscribers" not in driver.passes(1.0, 1000).values
 
 
 def test_settings_are_reported_once_before_the_first_block_and_again_when_they_change(driver):
     order = []
     driver._settings.publish = lambda message: order.append(json.loads(message.data))
-    driver._axes.publish = lambda message: order.append("axes")
+    driver._publisher_of[AxisBlock].publish = lambda message: order.append("axes")
     driver._publish([pair()])
     driver._publish([pair()])
     driver._device.settings = {"rate_hz": 2000.0}
