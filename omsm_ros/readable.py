@@ -15,7 +15,8 @@ from omsm_ros.units import DAY_S, NANOSECONDS_PER_S
 NOTHING = "–"
 # The smallest prefix is nano: smaller lengths are written as 0.31 nm.
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-_WITHOUT_PREFIX = {"", "%", "°", "°C", "K", "d", "ppm", "kg", "rpm"}
+# A prefix would be squared with its unit.
+_WITHOUT_PREFIX = {"", "s²", "%", "°", "°C", "K", "d", "ppm", "kg", "rpm"}
 # Limit for values that are far smaller or larger than their uncertainty.
 _MOST_DECIMALS = 9
 # Zeros after the decimal point: 0.000319 nm, but 3.19 · 10⁻⁵ nm.

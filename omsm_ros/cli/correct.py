@@ -119,7 +119,7 @@ def _check_options(args: argparse.Namespace) -> None:
             "--lateral needs the slope of the surface; give --nominal SURFACE.yaml"
         )
     if args.tolerance and not args.fit:
-        raise ConfigurationError("--tolerance needs a registered deviation; give --fit auto")
+        raise ConfigurationError("--tolerance needs the pose of the part removed; give --fit auto")
     if (args.aperture or args.placement) and not args.fit:
         raise ConfigurationError("--aperture and --placement limit the fit; give --fit auto")
     if (args.delay or args.exposure) and not args.by_stamps:

@@ -29,7 +29,11 @@ verdict.not_evaluated: not evaluated, and not shown by these scans: {names} (may
 verdict.declared_only: declared without an evaluation, and not shown by these scans: {names} (may
     change the heights by {value:m/2}); {remedy}, or evaluate it from a recording
 verdict.uncertainty: expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked
-    for
+    for{contribution}
+verdict.shrink: ; the largest contribution is {name}: its standard uncertainty of {size} would have
+    to shrink to {allowed}
+verdict.remain: ; the largest contribution is {name}, standard uncertainty {size}; without it the
+    expanded uncertainty would still be {rest:m/2}
 verdict.add_other_speed: scan the part again at twice the speed, from the centre outward
 verdict.add_other_direction: scan the part again with the spindle reversed
 verdict.add_reclocked: turn the part on the chuck by 80°, and scan it again at twice the speed

@@ -22,6 +22,7 @@ from omsm_ros.core.adjustment import (
     adjust,
 )
 from omsm_ros.core.adjustment.adjust import corrected_heights
+from omsm_ros.core.adjustment.figures import Contribution
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED, MachineSources, StatedSource
@@ -40,6 +41,7 @@ from omsm_ros.pipelines.correct import Admission, CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording, scan_data
 from omsm_ros.readable import number
+from omsm_ros.report.tables import sized
 from omsm_ros.units import RPM_RAD_S
 
 SCHEMA = "omsm-adjustment/1"
@@ -394,6 +396,17 @@ def _values(reason: Reason) -> Mapping[str, Any]:
     names, remedy = reason.names, ""
     if reason.code in _OPEN:
         names, remedy = names[:-1], sentence(f"verdict.add_{names[-1]}", {})
-    texts = [str(int(n) + 1) if scans else source_name(n) for n in names]
+    # With the name that a file of sources and --accept know.
+    texts = [str(int(n) + 1) if scans else f"{source_name(n)} ({n})" for n in names]
     joined = (", " if reason.code in _OPEN else " or ").join(texts)
-    return {"names": joined, "value": reason.value, "limit": reason.limit, "remedy": remedy}
+    return {"names": joined, "value": reason.value, "limit": reason.limit, "remedy": remedy,
+            "contribution": _contribution_text(reason.largest)}  # fmt: skip
+
+
+def _contribution_text(largest: Contribution | None) -> str:
+    if largest is None:
+        return ""
+    code = "verdict.remain" if math.isnan(largest.allowed) else "verdict.shrink"
+    size, allowed = (sized(v, largest.unit, 2) for v in (largest.size, largest.allowed))
+    name = f"{source_name(largest.name)} ({largest.name})"
+    return sentence(code, {"name": name, "size": size, "allowed": allowed, "rest": largest.rest})

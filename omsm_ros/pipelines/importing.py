@@ -246,10 +246,8 @@ class _Source:
         self.found = ImportedFile(table.label, axes=bool(axes), distance=probe)
         lacking = [a for a in AXES if mapped.has(a) and a not in streams] if axes else []
         if lacking:
-            raise FileError(
-                f"{table} has {sorted(axes)}, but not {lacking}; the axes are sampled together: "
-                "give them in one file"
-            )
+            name = mapped.columns[lacking[0]].name
+            raise FileError(f"{self.without(name, lacking[0])}; one file has all axes")
         table.used(mapped.names(self.channels))
         self._check_units()
         self._check_period()

@@ -15,9 +15,11 @@ from omsm_ros.report.verdict import PageVerdict
 _SPACE = "\N{NARROW NO-BREAK SPACE}"
 # A hyphen that is a minus sign: it does not follow a letter or a digit, as in 1e-9 or a date.
 _MINUS = re.compile(r"(?<![\w.\-])-(?=\d)")
-_UNITS = r"(?:[nµmkM]?(?:m|s|Hz|rad|g|N/m|N·s/m)(?:/s²?)?|ppm|%|°|rpm|·)"
-# Spaces that must not break, as in "12.5 nm" and "254 000".
-_JOINED = re.compile(rf"(?<=\d) (?=(?:{_UNITS}|\d{{3}})(?![\w/]))")
+_UNITS = r"(?:[nµmkM]?(?:m|s|Hz|rad|g|N/m|N·s/m)(?:/√?s²?)?|ppm|%|°|rpm|·)"
+# Spaces that must not break, as in "12.5 nm", "254 000" and "k = 2".
+_JOINED = re.compile(
+    rf"(?<=\d) (?=(?:{_UNITS}|\d{{3}})(?![\w/]))|(?<=k) (?== \d)|(?<=k =) (?=\d)|(?<=·) (?=10)"
+)
 
 
 def fill(template: str, **content: object) -> str:

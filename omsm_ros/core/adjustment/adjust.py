@@ -23,6 +23,7 @@ from omsm_ros.core.adjustment.figures import (
     FormMap,
     effects_on_form,
     form_map,
+    largest_contribution,
 )
 from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, walk_squares
 from omsm_ros.core.adjustment.part_terms import part_model
@@ -201,15 +202,19 @@ def _adjusted(
     effects = effects_on_form(solution, surface, removed)
     limit = open_limit(accuracy)
     enough = redundant(scans)
+    expanded, largest = 2 * form.pv.uncertainty, None
+    if accuracy is not None and accuracy < expanded:
+        largest = largest_contribution(solution, effects, surface, removed, doubts, accuracy)
     verdict = verdict_of(
         contradictions,
         not_evaluated(families, effects, priors, limit),
         rests_on(families, effects, form.mean_uncertainty),
         enough,
-        2 * form.pv.uncertainty,
+        expanded,
         accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed)[:2],
         calibration,
+        largest,
     )
     return Adjustment(
         form=form,

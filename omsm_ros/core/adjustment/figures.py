@@ -8,16 +8,17 @@ draws of the map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg, optimize, sparse
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
 from omsm_ros.core.adjustment.refutation import Doubt
+from omsm_ros.core.adjustment.sources import FREE, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -101,9 +102,7 @@ def form_map(
     """
     made = _Made.of(solution, nominal, removed)
     places, rows = made.places, made.rows[:, solution.active]
-    open_changes = np.stack(
-        [np.zeros(len(made.height)), *(_change(d, nominal, removed) for d in doubts)], axis=1
-    )
+    open_changes = made.open_changes(doubts, nominal, removed)
     pv, rms = made.pv_and_rms(solution, seed, open_changes)
     spread = solution.factor.forward(rows.T)
     raw = spread.T @ spread
@@ -126,12 +125,6 @@ def form_map(
         removed=tuple(removed),
         pose=made.pose,
     )
-
-
-def _change(doubt: Doubt, nominal: Surface | None, removed: Sequence[str]) -> FloatArray:
-    """Return what ``doubt`` leaves open of the map, one standard uncertainty, (n,) [m]."""
-    before, after = (_Made.of(s, nominal, removed).height for s in (doubt.before, doubt.after))
-    return np.asarray(doubt.share * (after - before))
 
 
 def pv_and_rms(
@@ -169,15 +162,77 @@ def effects_on_form(
     for family in solution.network.families:
         if family.name not in solution.sizes:
             continue
-        here = solution.network.place[family.name]
-        first = int(np.searchsorted(solution.active, here.start))
-        covariance = solution.covariance_of(here)
-        change = through[:, first : first + family.size] @ np.linalg.pinv(covariance, rcond=1e-10)
+        covariance, here = (
+            solution.covariance_of(solution.network.place[family.name]),
+            _part(solution, family),
+        )
+        change = through[:, here] @ np.linalg.pinv(covariance, rcond=1e-10)
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
         free = _rms(made.places, change @ evidence_of(solution, family).free)
         found[family.name] = Effect(left, max(left, free))
     return found
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """The source that contributes most to the uncertainty of PV.
+
+    name, unit: of the source;  size: its standard uncertainty before the scans [unit]
+    allowed: with which U is the accuracy, all else the same [unit]; NaN: U is larger without it
+    rest: expanded uncertainty (k = 2) without the source [m]
+    """
+
+    name: str
+    unit: str
+    size: float
+    allowed: float
+    rest: float
+
+
+def largest_contribution(
+    solution: Solution,
+    effects: Mapping[str, Effect],
+    nominal: Surface,
+    removed: Sequence[str],
+    doubts: Sequence[Doubt],
+    accuracy: float,
+) -> Contribution | None:
+    """Return the source with the largest effect on the form, and the size that ``accuracy`` allows.
+
+    effects: of :func:`effects_on_form`;  doubts: as for :func:`form_map`
+    accuracy: expanded uncertainty of PV asked for, less than that of the solution [m]
+    """
+    known = [f for f in solution.network.families
+             if f.named and f.name in effects and base_name(f.name) not in FREE]  # fmt: skip
+    if not known:
+        return None
+    family = max(known, key=lambda f: effects[f.name].left)
+    made, part = _Made.of(solution, nominal, removed), _part(solution, family)
+    errors, parameters = made.errors(solution, 0)
+    errors = made.with_changes(made.free(errors), made.open_changes(doubts, nominal, removed), 0)
+    covariance = solution.covariance[part, part]
+    through = made.free(made.rows[:, solution.active] @ solution.covariance[:, part])
+    own = through @ np.linalg.pinv(covariance, rcond=1e-10) @ parameters[part]
+
+    def excess(factor: float) -> float:
+        """Return U less ``accuracy`` where ``factor`` of the source is left [m]."""
+        return 2 * _figure(made.height, errors + (factor - 1) * own, _pv).uncertainty - accuracy
+
+    size = float(np.sqrt(np.mean(np.square(solution.sizes[family.name]))))
+    allowed, over = float("nan"), excess(0.0)
+    if over < 0 < excess(1.0):
+        factor = optimize.brentq(excess, 0.0, 1.0, rtol=1e-3)
+        # The scans determine the rest: 1 / left² = 1 / size² + information.
+        left = float(np.mean(np.diag(covariance))) / size**2
+        allowed = size / float(np.sqrt(1 + (factor**-2 - 1) / left))
+    return Contribution(family.name, family.unit, size, allowed, over + accuracy)
+
+
+def _part(solution: Solution, family: Family) -> slice:
+    """Return where the parameters of a family are among those that take part."""
+    first = int(np.searchsorted(solution.active, solution.network.place[family.name].start))
+    return slice(first, first + family.size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,19 +287,33 @@ class _Made:
 
         open_changes: further changes of the map (n, k), each as likely as a normal deviate [m]
         """
-        draws = self.free(self.errors(solution, seed))
+        draws = self.free(self.errors(solution, seed)[0])
         if open_changes is not None:
-            chance = np.random.default_rng([seed, 1])
-            draws += open_changes @ chance.standard_normal((open_changes.shape[1], _DRAWS))
+            draws = self.with_changes(draws, open_changes, seed)
         rms = _figure(self.height, draws, lambda h: np.sqrt(self.places.area @ h**2))
         return _figure(self.height, draws, _pv), rms
+
+    def open_changes(
+        self, doubts: Sequence[Doubt], nominal: Surface | None, removed: Sequence[str]
+    ) -> FloatArray:
+        """Return what ``doubts`` leave open, one standard uncertainty each, (n, k + 1) [m]."""
+        found = [np.zeros(len(self.height))]
+        for doubt in doubts:
+            before, after = (_Made.of(s, nominal, removed) for s in (doubt.before, doubt.after))
+            found.append(doubt.share * (after.height - before.height))
+        return np.stack(found, axis=1)
+
+    def with_changes(self, draws: FloatArray, changes: FloatArray, seed: int) -> FloatArray:
+        """Return ``draws`` (n, draws) with ``changes`` (n, k), each a normal deviate of its own."""
+        chance = np.random.default_rng([seed, 1])
+        return draws + changes @ chance.standard_normal((changes.shape[1], _DRAWS))
 
     def free(self, heights: FloatArray) -> FloatArray:
         """Return ``heights`` (n, …) without their pose."""
         return np.asarray(heights - self.columns @ (self.fit @ heights))
 
-    def errors(self, solution: Solution, seed: int) -> FloatArray:
-        """Return errors of the map as they may be, (n, draws) [m]."""
+    def errors(self, solution: Solution, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Return errors of the map as they may be, (n, draws) [m], and of the parameters."""
         random = np.random.default_rng(seed)
         factor = solution.factor
         normal = random.standard_normal((len(solution.active), _DRAWS))
@@ -253,7 +322,8 @@ class _Made:
         of_cells = np.sqrt(self.share)[:, np.newaxis] * random.standard_normal(
             (len(self.share), _DRAWS)
         )
-        return np.asarray(self.rows[:, solution.active] @ moved + self.member @ of_cells)
+        errors = self.rows[:, solution.active] @ moved + self.member @ of_cells
+        return np.asarray(errors), np.asarray(moved)
 
 
 def _pv(heights: FloatArray) -> FloatArray:

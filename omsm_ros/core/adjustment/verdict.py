@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from omsm_ros.core.adjustment.agreement import ScanAgreement
-from omsm_ros.core.adjustment.figures import NO_EFFECT, Effect
+from omsm_ros.core.adjustment.figures import NO_EFFECT, Contribution, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.sources import FREE, Family, Source, base_name
@@ -36,12 +36,14 @@ class Reason:
     """One reason against green.
 
     code: of this module;  names: families or scans it is about;  value, limit: its figures
+    largest: contribution to an uncertainty that is too large
     """
 
     code: str
     names: tuple[str, ...] = ()
     value: float = float("nan")
     limit: float = float("nan")
+    largest: Contribution | None = None
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,7 @@ def verdict_of(
     accuracy: float | None,
     addition: tuple[str, float] | None,
     calibration: Calibration | None = None,
+    largest: Contribution | None = None,
 ) -> Verdict:
     """Return the verdict.
 
@@ -180,6 +183,7 @@ def verdict_of(
     expanded: uncertainty (k = 2) of PV [m];  accuracy: asked for [m], None: none
     addition: code of the scan to add and the standard uncertainty that is reached [m]
     calibration: that corrected the heights; where it was rejected they are not valid
+    largest: contribution to ``expanded`` where it is too large
     """
     add, reached = ("", float("nan")) if addition is None else (addition[0], 2 * addition[1])
     reasons = [*contradictions, *open_sources]
@@ -191,7 +195,7 @@ def verdict_of(
     too_large = accuracy is not None and not expanded <= accuracy
     if too_large:
         limit = float("nan") if accuracy is None else accuracy
-        reasons.append(Reason(UNCERTAINTY, (), expanded, limit))
+        reasons.append(Reason(UNCERTAINTY, (), expanded, limit, largest))
     if rejected:
         code = INVALID
     elif contradictions:

@@ -255,9 +255,9 @@ def _verdict_reasons(calibration: Calibration) -> list[str]:
     delay_bound = certificate.response.inter_sample_delay_bound_s
     if delay_bound is not None:
         found.append(
-            f"motion between samples hides a lag of {quantity(delay_bound, 's', 2)} at most"
+            f"undetected lag by motion between samples: at most {quantity(delay_bound, 's', 2)}"
             if delay_bound
-            else "no motion is hidden between samples"
+            else "no undetected motion between samples"
         )
     return found
 
@@ -282,7 +282,7 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
     )
     return [
         Headline("Low-frequency delay", delay, _k1(delay, "by which the probe lags slow motion")),
-        Headline("Of it latency", latency_text(calibration), "by which X and C are delayed"),
+        Headline("Latency in it", latency_text(calibration), "by which X and C are delayed"),
         _gain_headline(calibration.static_gain, spread),
         _range_headline(calibration),
         Headline(

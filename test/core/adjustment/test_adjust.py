@@ -110,6 +110,26 @@ def test_what_a_rejected_calibration_corrected_is_not_valid(table, true_calibrat
     assert found.verdict.reasons[0].code == REJECTED
 
 
+def test_an_uncertainty_too_large_names_the_number_that_has_to_shrink(table):
+    """With the size that is named, U is the accuracy; no size reaches 1 nm."""
+    _, scans, _ = table
+    rest = [p for p in PRIORS if p.name != "straightness_x"]
+
+    def expanded(size, accuracy):
+        stated = [*rest, Source("straightness_x", size, correlation_length=0.01)]
+        found = adjust(scans[:2], stated, nominal=MIRROR, accuracy=accuracy)
+        return 2 * found.form.pv.uncertainty, found.verdict.reasons[-1].largest
+
+    before, largest = expanded(90e-9, 40e-9)
+    assert (largest.name, largest.unit, largest.size) == ("straightness_x", "m", 90e-9)
+    after, smaller = expanded(largest.allowed, 1e-9)
+    assert before > 50e-9
+    np.testing.assert_allclose(after, 40e-9, rtol=0.1)
+    # Without the source U is the same, whatever its size was.
+    np.testing.assert_allclose(largest.rest, smaller.rest, rtol=0.1)
+    assert np.isnan(smaller.allowed)
+
+
 def test_what_is_only_declared_does_not_turn_green(table):
     """The same figures, stated without a recording, for what no spiral to the centre shows."""
     _, scans, _ = table

@@ -104,7 +104,7 @@ class TestOlderCertificates:
         assert titles[:2] == ["Results", "Statements"]
         assert titles[2:] == ["Dynamics", "Static gain and background", "Records"]
         assert set(by_name(older)) == {
-            "Low-frequency delay", "Of it latency", "Static gain, probe per encoder", "Valid up to",
+            "Low-frequency delay", "Latency in it", "Static gain, probe per encoder", "Valid up to",
             "Structure",
         }  # fmt: skip
 
