@@ -196,12 +196,20 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
             "# Disturbed step tests",
             "",
             "Verdict of `omsm identify` on step tests of disturbed machines, compared with the "
-            "truth of the twin. `python -m benchmarks disturbed --full` writes this page from "
-            f"{_SEEDS} tests a case and {_PAIRS} pairs.{_fewer(by_name, pairs)} "
-            "Error and stated uncertainty are those of the linear response on the paper's scan, "
+            "truth of the twin. Error and stated uncertainty are those of the linear response on the paper's scan, "
             "in the test with the largest error. σ is the largest error of the response over its "
             "stated uncertainty, from 0.1 Hz to the end of the valid range. Named: whether the "
             "cause that is stated is the disturbance that was made.",
+            "",
+            "`python -m benchmarks disturbed --full` writes this page from "
+            f"{_SEEDS} tests a case and {_PAIRS} pairs.{_fewer(by_name, pairs)} "
+            "One machine, a servo of 40 Hz, is tried by",
+            "",
+            "```sh",
+            "printf 'servo_bandwidth_hz: 40\\n' > slow.yaml",
+            "omsm twin --out slow/ --disturbances slow.yaml",
+            "omsm identify slow/steps.mcap --out slow.json",
+            "```",
             "",
             f"Alone: {_summary(alone)} Each of {len(by_name)} cases was tested "
             f"{_times(by_name.values())}.",

@@ -110,7 +110,12 @@ def ranges() -> str:
     lines = [
         "# Quantities",
         "",
-        "Values from outside (messages, files, arguments) are checked against this table.",
+        "Values from outside (messages, files, arguments) are checked against this table. Out of range:",
+        "",
+        "```text",
+        "omsm: argument --accuracy: allowed residual is 20.0 m, expected a number from 1e-15 to "
+        "1 m; give it in metres, k = 2",
+        "```",
         "",
         "| quantity | unit | plausible range | remedy |",
         "|---|---|---|---|",

@@ -29,7 +29,7 @@ PERIOD_TOLERANCE = 100 * PPM
 RATE_TOLERANCE = 1000 * PPM
 # The same for a trigger from outside, and for a device without time stamps, by its arrivals.
 TRIGGER_TOLERANCE = ARRIVAL_TOLERANCE = 5000 * PPM
-# A period is wrong if it is so in each of these parts of a block: no pause and no spoilt time is.
+# Parts of a block: a wrong period deviates in each of them, a pause or a damaged time in one.
 _PARTS = 4
 
 
@@ -87,8 +87,8 @@ def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisSca
     return tuple(replace(axis, wrap=axis.wrap or counts) for axis in axes)
 
 
-# Encoders within this of zero may have been there before [counts], and restart within this part of
-# the counts before the restart.
+# Encoders nearer to zero than this may have been at zero all along [counts]. Those that were away
+# are back at zero if less than this part of their counts before the restart is left.
 _FROM_ZERO, _PART_OF_BEFORE = 10_000, 0.1
 
 
@@ -123,9 +123,9 @@ class BlockCutter:
         self._waiting: list[CountedRun] = []
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
         self.restarted_at_zero = self.perhaps_at_zero = self.lost_settings = False
-        # Time less that of the count, of the last samples and of spoilt ones, and arrival [ns].
+        # Of the last samples [ns]: device time less that of the count, and arrival.
         self._usual: tuple[int, int] | None = None
-        self._due = self._doubtful = 0
+        self._due = self._doubtful = 0  # time by the count; an offset to be confirmed
         self.missed = self._ahead = 0
         self.delivered = self.withheld = self.blocks = self.period_warnings = 0
         self.period_deviation = 0.0

@@ -116,7 +116,7 @@ def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, 
     return float(np.sum(along**2 / values[known])), int(np.sum(known))
 
 
-# How well do repeated step tests agree, and is that as well as each says of itself?
+# Scatter of repeated step tests, compared with the uncertainty that each states.
 
 
 @dataclass(frozen=True)

@@ -409,8 +409,7 @@ class RandomWalk:
         """Return the variance per sample of the walk's increments.
 
         residual: (n,), 0 where not compared;  rows: (c, n), fitted together with the walk
-        replaces: it is zero if ``rows`` describe the residual so much better than a walk does that
-            none is left
+        replaces: return zero if ``rows`` explain the residual so well that no walk is left
         """
         likelihood, white, explained = self._likelihood(residual, rows)
         best, price = int(np.argmax(likelihood)), float(np.log(len(self.ratios)))
@@ -428,10 +427,7 @@ class RandomWalk:
     def _likelihood(
         self, residual: FloatArray, rows: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return for each ratio the logarithm of the restricted likelihood, and more.
-
-        Further, the white variance, and χ² of what ``rows`` explain.
-        """
+        """Return, by ratio: log restricted likelihood, white variance, χ² explained by ``rows``."""
         sums = np.add.reduceat(np.vstack([rows, residual]), self.starts, axis=1)
         shares = (sums / np.sqrt(self.counts)) @ self.contrasts
         variances = 1 + np.outer(self._tried, self.ratios)

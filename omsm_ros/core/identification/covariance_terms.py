@@ -49,9 +49,9 @@ _MARGIN_SAMPLES = 20
 
 
 def inter_sample_delay_bound(motion: FloatArray, steps: Steps, sample_period: float) -> float:
-    """Return a bound on the bias of the low-frequency delay [s] by motion hidden between samples.
+    """Return a bound on the bias of the low-frequency delay [s] by motion between samples.
 
-    With U the spectrum of an edge of height A, what folds onto low frequencies is U at the
+    With U the spectrum of an edge of height A, its aliases at low frequencies are U at the
     sampling rate on both sides, so the lag shifts by up to ``2 |U(f_s)| (1 + |G|) / A``.
     U(f_s) is extrapolated from the content below f_s / 2 at the rate at which an edge with
     finite acceleration falls, 1/f³. A motion without edges is taken as one long edge.

@@ -183,7 +183,7 @@ class RunQueue:
             self.drop(len(self._runs[0]))
 
     def misplaced_runs(self, other: SampleRun) -> int:
-        """Return the number of runs before those of the time of ``other``; 0 if there are none."""
+        """Return the number of runs before the one at the time of ``other``; 0 if none is."""
         first = misses = 0
         for place in range(len(self._runs) - 1, 0, -1):
             misses = misses + 1 if _apart(self._runs[place], other) else 0

@@ -94,7 +94,7 @@ def fit_clock(blocks: Sequence[Block]) -> StampClock:
         )
     if drift <= limit:
         return clock
-    # The jitter of few blocks hides the rate: the stated period stands.
+    # Few blocks with jitter do not show the rate, so the stated period stands.
     count, since = (stamps - stamps[0]).T.astype(np.float64)
     offset = float((since - count * nominal).mean())
     return StampClock(clock.first, clock.start_ns, offset, nominal, jitter=clock.jitter)
@@ -175,7 +175,7 @@ class StampLine:
         return moved and self._current is not None and self._current[:2] == (session, count)
 
     def step_to(self, session: int, count: int, period_ns: float) -> float:
-        """Return how much later the next block is stamped than the current one shows [ns].
+        """Return the stamp of the next block less that predicted from the current one [ns].
 
         0 unless it begins at ``count``.
         """

@@ -23,7 +23,7 @@ from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 MAX_PIXELS = 400
 _POINTS_PER_PIXEL = 2
-# Quantile of the steps between filled pixels that is the distance between tracks: along straight
+# This quantile of the steps between filled pixels is the distance between tracks: along straight
 # tracks half of the steps are one pixel, the others cross to the next track.
 _CROSSING = 0.65
 
