@@ -196,9 +196,10 @@ def page(alone: Sequence[Outcome], pairs: Sequence[Outcome]) -> str:
             "# Disturbed step tests",
             "",
             "Verdict of `omsm identify` on step tests of disturbed machines, compared with the "
-            "truth of the twin. Error and stated uncertainty are those of the linear response on the paper's scan, "
-            "in the test with the largest error. σ is the largest error of the response over its "
-            "stated uncertainty, from 0.1 Hz to the end of the valid range. Named: whether the "
+            "truth of the twin. Error and stated uncertainty are those of the linear response on "
+            "the paper's scan, in the test with the largest error. σ is the largest error of the "
+            "response over its stated uncertainty, from 0.1 Hz to the end of the valid range. "
+            "Named: whether the "
             "cause that is stated is the disturbance that was made.",
             "",
             "`python -m benchmarks disturbed --full` writes this page from "

@@ -110,7 +110,8 @@ def ranges() -> str:
     lines = [
         "# Quantities",
         "",
-        "Values from outside (messages, files, arguments) are checked against this table. Out of range:",
+        "Values from outside (messages, files, arguments) are checked against this table. "
+        "A value out of its range is refused:",
         "",
         "```text",
         "omsm: argument --accuracy: allowed residual is 20.0 m, expected a number from 1e-15 to "
