@@ -21,7 +21,6 @@ CAPTIONS = {
     "uncertainty": "Standard uncertainty (k = 1) of the map, all sources together.",
     "profiles": "Sections through the map along x, y and 45°, with the band of k = 2.",
     "agreement": "E_n of each scan against the others: above 1 they disagree.",
-    "sources": "Effect on the heights (rms) of what was found; red: refuted declarations.",
 }
 
 
@@ -36,8 +35,6 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
         "uncertainty": uncertainty_map(found),
         "profiles": profiles(found),
     }
-    if (drawn := sources(facts)) is not None:
-        figures["sources"] = drawn
     if found.agreement:
         figures["agreement"] = agreement(found)
     reasons = [(reason,) for reason in verdict.reasons]
@@ -56,10 +53,7 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
                     (_truth(facts), _figures(facts)),
                 ),
                 Section(
-                    "Sources: declared and found",
-                    ("sources",),
-                    (source_table(facts),),
-                    tested_text(facts),
+                    "Sources: declared and found", (), (source_table(facts),), tested_text(facts)
                 ),
                 Section("Agreement of the scans", ("agreement",), (_scans(facts),)),
             ),
@@ -228,25 +222,4 @@ def agreement(found: Adjustment) -> Figure:
     ax.set_xticks(np.arange(len(names)) + 0.4 - width / 2, names, rotation=60)
     style.legend_above(ax)
     style.label(ax, y="E_n")
-    return made
-
-
-def sources(facts: Mapping[str, Any]) -> Figure | None:
-    """Draw the effects of the sources that were found, the largest first; None without any."""
-    rows = sorted(
-        (s for s in facts["sources"] if s["effect"] and s["identifiable"]
-         and (s["declared"] is not None or s["refuted"])),
-        key=lambda s: -s["effect"],
-    )[:12]  # fmt: skip
-    if not rows:
-        return None
-    made, axes = style.figure(9.2, 0.9 + 0.32 * len(rows))
-    ax = axes[0, 0]
-    place = ax.get_position()
-    ax.set_position((0.36, place.y0, place.x1 - 0.36, place.height))  # room for the names
-    colours = [style.BEFORE if row["refuted"] else style.AFTER for row in rows]
-    ax.barh(np.arange(len(rows)), [row["effect"] / NANOMETRE_M for row in rows], color=colours)
-    ax.set_yticks(np.arange(len(rows)), [row["text"] for row in rows])
-    ax.invert_yaxis()
-    style.label(ax, x="effect on the heights, rms [nm]")
     return made

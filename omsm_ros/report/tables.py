@@ -41,23 +41,6 @@ def part(mapping: Mapping[str, Any], *path: str) -> Any:
     return found
 
 
-def error_table(summary: Mapping[str, object]) -> Table:
-    """Return the dynamic error before and after the correction, and the uncertainty of heights.
-
-    The deviation from nominal is no row: without its pose it is a figure of the set-up.
-    """
-    rows = []
-    for key in ("peak_to_valley", "rms"):
-        both = [part(summary, f"dynamic_error_{side}", key) for side in ("before", "after")]
-        label = f"dynamic error, {key.replace('_', ' ')}"
-        rows.append((label, *(quantity(v, "m") for v in both)))
-    for key in ("median", "largest"):
-        value = part(summary, "uncertainty", key)
-        rows.append((f"standard uncertainty of a height, {key}", "", quantity(value, "m")))
-    known = [row for row in rows if set(row[1:]) - {NOTHING, ""}]
-    return Table("Errors", ("uncorrected", "corrected"), known)
-
-
 def budget_table(summary: Mapping[str, object]) -> Table:
     """Return the sources of uncertainty, the largest first, in one row those not evaluated."""
     rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()

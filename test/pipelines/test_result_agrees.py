@@ -125,10 +125,9 @@ def test_the_budget_adds_up_to_the_uncertainty_of_the_points(cloud, summary):
 
 
 def test_the_page_says_what_the_summary_says(page, summary):
-    rows = page.table("Errors")
-    median = summary["uncertainty"]["median"]
-    assert says(rows["standard uncertainty of a height, median"][1], median)
-    assert says(page.headlines["Expanded uncertainty"][0], 2 * median)
+    value, detail = page.headlines["Expanded uncertainty"]
+    assert says(value, 2 * summary["uncertainty"]["median"])
+    assert says(detail.partition("at most ")[2], 2 * summary["uncertainty"]["largest"])
     points = page.headlines["Surface points"][0]
     assert int(points.replace(" ", "")) == summary["samples"]["distance"]["corrected"]
     budget = {row["source"].replace("_", " "): row for row in summary["budget"]["sources"]}

@@ -7,7 +7,6 @@ from dataclasses import replace
 from certified import certified_by
 
 from omsm_ros.core.calibration.certificate import Certificate
-from omsm_ros.readable import NOTHING
 from omsm_ros.report import tables
 
 
@@ -16,24 +15,6 @@ def test_part_finds_what_is_there_and_nothing_else():
     assert tables.part(nested, "a", "b") == 3
     assert tables.part(nested, "a", "x") is None
     assert tables.part(nested, "c", "b") is None
-
-
-class TestErrorTable:
-    def test_names_before_and_after(self, summary):
-        rows = {row[0]: list(row[1:]) for row in tables.error_table(summary).rows}
-        assert rows["dynamic error, peak to valley"] == ["1.23 µm", "8.70 nm"]
-        assert rows["standard uncertainty of a height, largest"] == ["", "12.5 nm"]
-
-    def test_leaves_out_what_is_unknown(self, summary):
-        del summary["deviation"], summary["uncertainty"]
-        rows = tables.error_table(summary).rows
-        assert {row[0] for row in rows} == {"dynamic error, peak to valley", "dynamic error, rms"}
-        assert tables.error_table({}).rows == []
-
-    def test_an_unknown_after_is_a_dash(self, summary):
-        summary["dynamic_error_after"] = None
-        rows = {row[0]: row[2] for row in tables.error_table(summary).rows}
-        assert rows["dynamic error, rms"] == NOTHING
 
 
 class TestSampleTable:

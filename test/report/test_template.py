@@ -14,7 +14,8 @@ from omsm_ros.report.page_parts import picture, typeset
         ("-2.50 µm", "−2.50_µm"),
         ("254 000 samples", "254_000 samples"),
         ("0.12 %", "0.12_%"),
-        ("-7.9 · 10⁶", "−7.9_· 10⁶"),
+        ("-7.9 · 10⁶", "−7.9_·_10⁶"),
+        ("15 nm (k = 2)", "15_nm (k_=_2)"),
         ("drift of 3 nm/s", "drift of 3_nm/s"),
     ],
 )

@@ -77,10 +77,7 @@ def _form_figures(form: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _expanded(figure: Mapping[str, Any]) -> str:
-    """Return a figure with its expanded uncertainty, k = 2."""
-    text = expanded(figure["value"], figure["standard_uncertainty"], "m")
-    bound = text.removeprefix("at most ")
-    return text if bound == text else f"< {bound}, not resolved"
+    return expanded(figure["value"], figure["standard_uncertainty"], "m")
 
 
 def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
@@ -193,7 +190,7 @@ def _rounded(value: Any, spread: float | None, unit: str) -> str:
 def _size(value: Any, unit: str) -> str:
     if value is None:
         return NOTHING
-    return plain(value) + " 1/m" if unit == "1/m" else quantity(value, unit)
+    return f"{plain(value)} {unit}".rstrip() if unit in ("", "1/m") else quantity(value, unit)
 
 
 def limits_table(summary: Mapping[str, Any]) -> Table:
@@ -204,8 +201,8 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
     rows = [
         (
             str(limit["name"]),
-            _size_of(limit["value"], limit["unit"]),
-            _size_of(limit["allowed"], limit["unit"]),
+            _size(limit["value"], limit["unit"]),
+            _size(limit["allowed"], limit["unit"]),
             f"{plain(rounded_down(limit['speed_factor']))} ×",
         )
         for limit in limits
@@ -213,10 +210,6 @@ def limits_table(summary: Mapping[str, Any]) -> Table:
     missing = part(summary, "prediction", "not_evaluated") or ()
     rows += [(str(name), "not evaluated", NOTHING, NOTHING) for name in missing]
     return Table("Limits of the motion", ("on this scan", "allowed", "maximum speed"), rows)
-
-
-def _size_of(value: Any, unit: str) -> str:
-    return quantity(value, unit) if unit else plain(value)
 
 
 def _temperature(stated: Mapping[str, Any]) -> str:
@@ -350,7 +343,8 @@ def headlines(summary: Mapping[str, Any]) -> list[Headline]:
         found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))
     median = part(summary, "uncertainty", "median")
     if median is not None:
-        text = "of one point's height, median, k = 2"
+        most = quantity(2 * part(summary, "uncertainty", "largest"), "m")
+        text = f"of one point's height, k = 2, median; at most {most}"
         found.append(Headline("Expanded uncertainty", quantity(2 * median, "m"), text))
     stream = part(summary, "samples", "distance")
     if stream:
@@ -387,7 +381,6 @@ def _records(report: Report) -> list[tables.Table]:
     summary = report.summary
     found = [
         form_table(report.form, report.curves, part(summary, "figures")),
-        tables.error_table(summary),
         tables.budget_table(summary),
         limits_table(summary),
         tables.sample_table(summary),

@@ -31,7 +31,7 @@ def test_is_well_formed_and_has_all_parts(report):
     page = Page(render(report))
     for text in (
         "Mirror 7", "2025-01-31", "Valid", "Surface", "Profiles", "Dynamic error",
-        "Dynamics of the probe", "Errors", "Samples", "Calibration", "Settings", "Versions",
+        "Dynamics of the probe", "Samples", "Calibration", "Settings", "Versions",
         "exposure 1 ms", "0.1.0", "settling", report.calibration.id,
     ):  # fmt: skip
         assert page.says(text), text
@@ -108,7 +108,7 @@ def test_the_verdict_is_a_sign_and_a_word_before_all_else(summary, certified, co
     summary["verdict"] |= {"code": code, "text": word[2:]}
     text = Page(render(Report("a", "b", summary, certified))).text
     assert word in text
-    assert text.index(word) < text.index("Errors")
+    assert text.index(word) < text.index("Samples")
 
 
 def test_headlines_are_the_numbers_of_the_summary(summary):

@@ -105,8 +105,8 @@ def test_what_was_taken_out_has_no_more_digits_than_are_known():
 
 def test_a_figure_below_its_uncertainty_is_a_bound():
     found = summary()
-    for value, size, text in ((-1e-9, 450e-9, "< 900 nm (k = 2), not resolved"),
-                              (100e-9, 60e-9, "< 220 nm")):  # fmt: skip
+    for value, size, text in ((-1e-9, 450e-9, "at most 900 nm (k = 2)"),
+                              (100e-9, 60e-9, "at most 220 nm")):  # fmt: skip
         found["figures"]["peak_to_valley"] = {"value": value, "standard_uncertainty": size}
         assert text in verdict_on_part(found, {}).reasons[0].replace("\u202f", " ")
 
