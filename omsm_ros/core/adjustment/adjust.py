@@ -200,21 +200,17 @@ def _adjusted(
         refutations, declared, agreement, wrong, _walk(detecting, priors), accepted
     )  # fmt: skip
     effects = effects_on_form(solution, surface, removed)
-    limit = open_limit(accuracy)
     enough = redundant(scans)
-    expanded, largest = 2 * form.pv.uncertainty, None
-    if accuracy is not None and accuracy < expanded:
-        largest = largest_contribution(solution, effects, surface, removed, doubts, accuracy)
     verdict = verdict_of(
         contradictions,
-        not_evaluated(families, effects, priors, limit),
+        not_evaluated(families, effects, priors, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty),
         enough,
-        expanded,
+        2 * form.pv.uncertainty,
         accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed)[:2],
         calibration,
-        largest,
+        largest_contribution(solution, effects, surface, removed, doubts, accuracy),
     )
     return Adjustment(
         form=form,

@@ -196,16 +196,16 @@ def largest_contribution(
     nominal: Surface,
     removed: Sequence[str],
     doubts: Sequence[Doubt],
-    accuracy: float,
+    accuracy: float | None,
 ) -> Contribution | None:
     """Return the source with the largest effect on the form, and the size that ``accuracy`` allows.
 
     effects: of :func:`effects_on_form`;  doubts: as for :func:`form_map`
-    accuracy: expanded uncertainty of PV asked for, less than that of the solution [m]
+    accuracy: expanded uncertainty of PV asked for [m]; None, or more than there is: None
     """
     known = [f for f in solution.network.families
              if f.named and f.name in effects and base_name(f.name) not in FREE]  # fmt: skip
-    if not known:
+    if accuracy is None or not known:
         return None
     family = max(known, key=lambda f: effects[f.name].left)
     made, part = _Made.of(solution, nominal, removed), _part(solution, family)
@@ -221,7 +221,9 @@ def largest_contribution(
 
     size = float(np.sqrt(np.mean(np.square(solution.sizes[family.name]))))
     allowed, over = float("nan"), excess(0.0)
-    if over < 0 < excess(1.0):
+    if excess(1.0) <= 0:
+        return None
+    if over < 0:
         factor = optimize.brentq(excess, 0.0, 1.0, rtol=1e-3)
         # The scans determine the rest: 1 / left² = 1 / size² + information.
         left = float(np.mean(np.diag(covariance))) / size**2

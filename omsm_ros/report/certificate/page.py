@@ -255,9 +255,9 @@ def _verdict_reasons(calibration: Calibration) -> list[str]:
     delay_bound = certificate.response.inter_sample_delay_bound_s
     if delay_bound is not None:
         found.append(
-            f"undetected lag by motion between samples: at most {quantity(delay_bound, 's', 2)}"
+            f"bias of the lag by motion between samples: at most {quantity(delay_bound, 's', 2)}"
             if delay_bound
-            else "no undetected motion between samples"
+            else "no bias of the lag by motion between samples"
         )
     return found
 
