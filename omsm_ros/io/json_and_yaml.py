@@ -306,8 +306,9 @@ def _said_of_schemas(found: jsonschema.ValidationError) -> str:
             known = sorted(found.schema["properties"])  # type: ignore[index]
             unknown = next(name for name in found.instance if name not in known)  # type: ignore[union-attr]
             # "{reason: still, one minute}" is YAML for a reason and a name without a value.
-            comma = found.instance[unknown] is None and "; quote a text that contains a comma"
-            return f"{shown(unknown)} is unknown, expected one of {known}{comma or ''}"
+            none = found.instance[unknown] is None  # type: ignore[index]
+            hint = "; quote a text that contains a comma" if none else ""
+            return f"{shown(unknown)} is unknown, expected one of {known}{hint}"
         case "required":
             missing = [name for name in wanted if name not in found.instance]  # type: ignore[operator, union-attr]
             return f"{missing[0]} is required and missing; write it there"
