@@ -224,7 +224,9 @@ def test_a_remounted_part_is_placed_by_the_adjustment():
     assert not found.refutations
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, 3))]
+)
 def test_a_turned_part_with_rings_keeps_its_form(seed):
     """Z follows the nominal surface, so that the distance is the form.
 

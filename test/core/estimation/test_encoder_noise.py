@@ -154,8 +154,15 @@ def test_it_is_taken_out_once():
     assert correct_errors_in_variables(quiet, again) is None
 
 
-@pytest.mark.parametrize("rest", [500, 2000])
-@pytest.mark.parametrize("noise", [1e-9, 4e-9])
+@pytest.mark.parametrize(
+    ("rest", "noise"),
+    [
+        (500, 1e-9),
+        (2000, 4e-9),
+        pytest.param(500, 4e-9, marks=pytest.mark.soak),
+        pytest.param(2000, 1e-9, marks=pytest.mark.soak),
+    ],
+)
 def test_a_lightly_damped_mode_is_known_in_addition(rest, noise):
     """No backlash, further mode or scale error is reported, although each could fit the noise."""
     found = identify(record_of(staircase(rest), noise)).calibration
