@@ -292,6 +292,7 @@ def coarser(problem: Problem, every: int) -> Problem:
         plateau=None,
         input_rounding=problem.input_rounding / every,
         errors_in_variables=None,
+        recorded=None,
     )
 
 

@@ -207,70 +207,79 @@ _BANDS_AN_OCTAVE, _NARROWEST = 3, 64
 def correct_errors_in_variables(
     problem: Problem, fitted: Fit, edges: Sequence[Edge] = ()
 ) -> Problem | None:
-    """Return the problem without the noise of the input that the probe did not follow.
+    """Return the problem without the noise of the input; the background has what the probe follows.
 
     edges: of the input, if it has any
-    fitted: to ``problem``; its residual shows the share of the noise that the probe did not follow.
-        The expected motion of the rest stays in the input (Carroll et al. 2006, ch. 4).
+    fitted: to ``problem``; its gain and response tell how far the probe follows the noise: jitter
+        of the axis through G, what moves axis and probe alike without G, noise of the reading not
+        at all (Carroll et al. 2006, ch. 4).
 
-    Return None where the probe followed all of it, or where it was taken out before.
+    Return None where the probe followed all of it through G, or where it was taken out before.
     """
     if problem.noise <= 0 or problem.errors_in_variables is not None:
         return None
     # Readings that change by one step agree with a constant.
     reach = max(problem.noise, 0.5 * float(np.sqrt(12 * problem.input_rounding)))
     smooth, left = smoothed(problem.input, reach, edges)
-    left *= problem.noise / reach
     noise = problem.input - smooth
-    quiet = replace(problem, input=smooth, noise=left)
-    made = np.where(problem.used, problem.modelled(fitted) - quiet.modelled(fitted), 0.0)
-    if not np.any(made):
+    # Unfiltered: the readings have noise at all frequencies.
+    quiet = replace(problem, input=smooth, noise=0.0)
+    modelled = quiet.modelled(fitted)
+    made = replace(problem, noise=0.0).modelled(fitted) - modelled
+    if not np.any(made[problem.used]):
         return None
-    share, band = _errors_in_variables_share(problem.on_grid(fitted.residual, 0.0), made)
-    if share is None:
+    spectra = [
+        fft.rfft(np.where(problem.used, values, 0.0))
+        for values in (problem.output - modelled, made, fitted.gain * noise)
+    ]
+    share, direct = _followed(*spectra)
+    if np.all(share == 1) and direct == 0:
         return None
-    errors_in_variables = fft.irfft(share[band] * fft.rfft(noise), len(noise))
+    parts = [fft.irfft(share * fft.rfft(v), len(v)) + direct * w for v, w in ((made, fitted.gain * noise), (noise, noise))]
     return replace(
-        problem,
-        input=problem.input - errors_in_variables,
-        noise=left,
-        errors_in_variables=errors_in_variables,
+        quiet,
+        noise=left * problem.noise / reach,
+        background=np.column_stack([problem.background, *parts[: int(np.any(parts[0]))]]),
+        errors_in_variables=noise - parts[1],
+        recorded=problem.input,
     )
 
 
-def _errors_in_variables_share(
-    residual: FloatArray, made: FloatArray
-) -> tuple[FloatArray | None, IntArray]:
-    """Return the share of ``made`` (n,) that ``residual`` (n,) lacks in each band, and the bands.
+def _followed(
+    seen: ComplexArray, made: ComplexArray, direct: ComplexArray
+) -> tuple[FloatArray, float]:
+    """Return how much of ``made`` (k,) is in ``seen`` (k,), (k,), and how much of ``direct`` (k,).
 
-    Bands that do not differ have one share. Others have their own: vibration of the servo is
-    followed by the probe, while noise in other bands is not. The share is None where it is 0
-    everywhere.
+    Bands that do not differ have one share of ``made``. Others have their own: vibration of the
+    servo is followed by the probe, while noise in other bands is not. A share that may be 1 is
+    taken as 1, one that may be 0 as 0.
     """
-    expected, seen = fft.rfft(made), fft.rfft(residual)
-    line = np.arange(len(expected))
+    line = np.arange(len(seen))
     band = np.floor(np.log2(1 + line / _NARROWEST) * _BANDS_AN_OCTAVE).astype(np.int64)
-    found, known_to = _shares(expected, seen, band)
+    # What differs from a part of ``made`` in each band tells the share of ``direct``.
+    odd, left = (each - _shares(made, each, band)[0][band] * made for each in (direct, seen))
+    whole = np.zeros_like(band)
+    (alike,), (chance,) = _shares(odd, left, whole)
+    alike = float(alike) if alike > _CLEARLY * chance else 0.0
+    found, known_to = _shares(made, seen - alike * direct, band)
     own = np.abs(found - _weighted_median(found, 1 / known_to)) > _CLEARLY * known_to
     weight = np.where(own, 0.0, known_to**-2.0)
     share = np.where(own, found, np.sum(weight * found) / np.sum(weight))
-    known_to = np.where(own, known_to, np.sum(weight) ** -0.5)
-    # A share that may be 0 is taken as 0, one that may be 1 as 1.
-    lacking = share > _CLEARLY * known_to
-    share = np.where(lacking, np.where(share > 1 - _CLEARLY * known_to, 1.0, share), 0.0)
-    return (share if np.any(lacking) else None), band
+    known_to = _CLEARLY * np.where(own, known_to, np.sum(weight) ** -0.5)
+    share = np.where(share > 1 - known_to, 1.0, np.where(share < known_to, 0.0, share))
+    return np.asarray(share[band], np.float64), alike
 
 
 def _shares(
     expected: ComplexArray, seen: ComplexArray, band: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the share of ``expected`` (k,) that ``seen`` (k,) lacks in each band (b,).
+    """Return the share of ``expected`` (k,) that is in ``seen`` (k,) in each band (b,).
 
     The second is the standard deviation of each, from the rest of the spectrum.
     """
     power = np.maximum(np.bincount(band, np.abs(expected) ** 2), _TINY)
-    share = np.bincount(band, -(seen * expected.conj()).real) / power
-    rest = seen + share[band] * expected
+    share = np.bincount(band, (seen * expected.conj()).real) / power
+    rest = seen - share[band] * expected
     spread = np.sqrt(np.bincount(band, 0.5 * np.abs(rest * expected) ** 2)) / power
     return np.asarray(share, np.float64), np.asarray(np.maximum(spread, _TINY), np.float64)
 
@@ -301,6 +310,9 @@ def smoothed(
     count = earlier + later[::-1] - 1
     mean = (earlier * before + later[::-1] * after[::-1] - rest) / count
     alike, left = _alike(rest - mean, noise, edges)
+    for edge in edges:
+        # What agrees there by chance is no constant.
+        count[edge.start : edge.stop] = 1.0
     return np.asarray(mean + alike + middle), noise * float(np.sqrt(np.mean(1 / count + left)))
 
 

@@ -96,7 +96,9 @@ class Problem:
     plateau: number of the plateau of a sample, (n,), -1 elsewhere; or None
     shared: variance of the rounding error that the readings of a plateau share [m²]
     input_rounding: variance of the rounding error of the input while it moves [m²]
-    errors_in_variables: noise that was taken out of the input, (n,) [m]; or None
+    errors_in_variables: noise that was taken out of the input and that the probe does not follow,
+        (n,) [m]; or None
+    recorded: the input as it was, (n,) [m], where noise was taken out of it
     """
 
     input: FloatArray
@@ -113,6 +115,7 @@ class Problem:
     shared: float = 0.0
     input_rounding: float = 0.0
     errors_in_variables: FloatArray | None = None
+    recorded: FloatArray | None = None
 
     @property
     def recordings(self) -> list[slice]:
@@ -139,6 +142,11 @@ class Problem:
         # The initial-condition response, or a further axis, may be faster than the motion.
         whole = self.fits_initial_condition or len(self.further) > 0
         return np.pad(moved, (0, self.closed_length // 2 + 1 - len(moved))) if whole else moved
+
+    @cached_property
+    def motion(self) -> FloatArray:
+        """The input (n,) as far as it is above its noise, which is what a model is driven by."""
+        return np.asarray(fft.irfft(self._spectrum, self.closed_length)[: len(self.input)])
 
     @cached_property
     def s(self) -> ComplexArray:

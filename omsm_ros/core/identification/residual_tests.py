@@ -92,11 +92,7 @@ def _axis_timing(
     """
     rate = rate_of(problem)
     # Noise removed only where the axis is stationary would look like scatter in motion.
-    recorded = (
-        problem.input
-        if problem.errors_in_variables is None
-        else problem.input + problem.errors_in_variables
-    )
+    recorded = problem.input if problem.recorded is None else problem.recorded
     scatter = motion_scatter(recorded, rate)
     lines = np.linspace(0.0, 0.5 / problem.period, _LINES)
     passed = float(np.mean(np.abs(fitted.gain * fitted.dynamics.response(lines)) ** 2))

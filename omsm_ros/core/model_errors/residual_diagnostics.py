@@ -364,7 +364,7 @@ class ResidualDiagnostics:
     @cached_property
     def independence(self) -> float:
         """Return the p-value of the correlation of the residual with the rate of the motion."""
-        rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.input)])
+        rate = np.concatenate([np.zeros(_LAGS - 1), np.gradient(self.problem.motion)])
         # The last values of the rate, the newest last, 0 before the record.
         past = np.lib.stride_tricks.sliding_window_view(rate, _LAGS)
         gram = np.zeros((_LAGS, _LAGS))
