@@ -290,7 +290,7 @@ def coarser(problem: Problem, every: int) -> Problem:
         background=np.column_stack([thinned(column) for column in problem.background.T]),
         noise=problem.noise / np.sqrt(every),
         plateau=None,
-        input_rounding=problem.input_rounding / every,
+        input_error=problem.input_error / every,
         errors_in_variables=None,
         recorded=None,
     )

@@ -62,15 +62,20 @@ def uneven_rows(problem: Problem, columns: FloatArray, scatter: float) -> FloatA
         np.add.at(sums, plateau + 1, columns)
         moving = np.pi / np.sqrt(6) * columns[plateau < 0]
         rows.append(np.sqrt(problem.shared) * np.concatenate([sums[1:], moving]))
-    if problem.input_rounding > 0:
-        # One for each reading of the encoder while it moves; where it is stationary, its errors
-        # are a constant or were taken out.
-        taken = problem.errors_in_variables
-        variance = problem.input_rounding + (0.0 if taken is None else float(np.mean(taken**2)))
-        rows.append(np.sqrt(variance) * columns[rate**2 > _STILL * np.max(rate**2)])
+    wrong = motion_error_variance(problem)[used]
+    rows.append(np.sqrt(wrong[wrong > 0])[:, np.newaxis] * columns[wrong > 0])
     if scatter > 0:
         rows.append(np.sqrt(scatter) * rate[:, np.newaxis] * columns)
     return np.concatenate(rows)
+
+
+def motion_error_variance(problem: Problem) -> FloatArray:
+    """Return the variance [m²] of each reading of the input that the probe does not follow, (n,).
+
+    Where the axis is stationary, its errors are a constant or were taken out.
+    """
+    square = rate_of(problem) ** 2
+    return np.where(square > _STILL * np.max(square), problem.input_error, 0.0)
 
 
 def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
@@ -81,7 +86,8 @@ def scatter_in_time(problem: Problem, residual: FloatArray) -> float:
     """
     if problem.shared > 0:
         return 0.0
-    return timing_variance(problem.on_grid(residual, np.nan), rate_of(problem))
+    noisy = problem.errors_in_variables is not None
+    return timing_variance(problem.on_grid(residual, np.nan), rate_of(problem), noisy=noisy)
 
 
 def rate_of(problem: Problem) -> FloatArray:
@@ -89,10 +95,11 @@ def rate_of(problem: Problem) -> FloatArray:
     return np.asarray(np.gradient(problem.input, problem.period))
 
 
-def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
+def timing_variance(on_grid: FloatArray, rate: FloatArray, *, noisy: bool = False) -> float:
     """Return the variance [s²] of the time of a reading, 0 where it is not significant.
 
     on_grid: residual (n,) [m], NaN where nothing is compared;  rate: of the motion (n,) [m/s]
+    noisy: whether all readings in motion have further noise, of the encoder
     """
     square = rate**2
     second = np.diff(on_grid, 2)
@@ -103,6 +110,9 @@ def timing_variance(on_grid: FloatArray, rate: FloatArray) -> float:
     if np.sum(still) < _LEAST_STILL or _persists(on_grid, rate):
         return 0.0
     at_rest = float(np.mean(second[still] ** 2))
+    if noisy:
+        at_rest = float(np.mean(second[~still] ** 2))
+        weight = np.where(still, 0.0, weight - np.mean(weight[~still]))
     total = float(np.sum(weight**2))
     found = float(np.sum(weight * (second**2 - at_rest))) / total
     # Relative variance of the excess, and of the stationary noise that is subtracted.
@@ -196,8 +206,6 @@ def plateau_variance(readings: FloatArray, plateau: IntArray, step: float) -> fl
 # Half width of the intervals that must intersect, in standard deviations. On quintic steps with
 # noise of 1 and 3 nm, 2 leaves the least noise (0.15 of it) and nothing of the edges.
 _INTERVAL = 2.0
-# Standard deviations beyond which a mean over all edges is significant, a hundred samples each.
-_SEEN = 3.0
 # Protects divisions of signals without power.
 _TINY = float(np.finfo(np.float64).tiny)
 # Bands of the spectrum: dozens of them, the lowest with enough lines to estimate its noise.
@@ -219,7 +227,7 @@ def correct_errors_in_variables(
     if problem.noise <= 0 or problem.errors_in_variables is not None:
         return None
     # Readings that change by one step agree with a constant.
-    reach = max(problem.noise, 0.5 * float(np.sqrt(12 * problem.input_rounding)))
+    reach = max(problem.noise, 0.5 * float(np.sqrt(12 * problem.input_error)))
     smooth, left = smoothed(problem.input, reach, edges)
     noise = problem.input - smooth
     # Unfiltered: the readings have noise at all frequencies.
@@ -235,12 +243,16 @@ def correct_errors_in_variables(
     share, direct = _followed(*spectra)
     if np.all(share == 1) and direct == 0:
         return None
-    parts = [fft.irfft(share * fft.rfft(v), len(v)) + direct * w for v, w in ((made, fitted.gain * noise), (noise, noise))]
+    followed, column = (
+        fft.irfft(share * fft.rfft(values), len(noise)) + direct * alike
+        for values, alike in ((noise, noise), (made, fitted.gain * noise))
+    )
     return replace(
         quiet,
         noise=left * problem.noise / reach,
-        background=np.column_stack([problem.background, *parts[: int(np.any(parts[0]))]]),
-        errors_in_variables=noise - parts[1],
+        background=np.column_stack([problem.background, *([column] if np.any(column) else [])]),
+        input_error=max(problem.input_error, float(np.mean((made - column) ** 2)) / fitted.gain**2),
+        errors_in_variables=noise - followed,
         recorded=problem.input,
     )
 
@@ -300,7 +312,7 @@ def smoothed(
     Each sample becomes the mean of as many neighbours on each side as agree with a constant: the
     intervals of their means intersect (Goldenshluger and Nemirovski 1997). Edges and any motion
     above the noise keep their shape. The settling of the axis would be averaged too; the part of it
-    that is common to all edges and significant in their mean is added back.
+    that is common to all edges is added back.
     """
     middle = float(np.mean(positions))
     rest = positions - middle
@@ -319,8 +331,8 @@ def smoothed(
 def _alike(taken: FloatArray, noise: float, edges: Sequence[Edge]) -> tuple[FloatArray, FloatArray]:
     """Return the part of ``taken`` (n,) common to all ``edges``, per height, (n,).
 
-    The second is the share of the variance of ``noise`` in it, (n,). Only what is significant is
-    returned, because noise common to all edges would show in no residual.
+    The second is the share of the variance of ``noise`` in it, (n,). The mean over all edges is
+    averaged as positions are, because noise common to all edges would show in no residual.
     """
     alike, left = np.zeros((2, len(taken)))
     if not edges:
@@ -333,13 +345,14 @@ def _alike(taken: FloatArray, noise: float, edges: Sequence[Edge]) -> tuple[Floa
     for edge, part in zip(edges, parts, strict=True):
         moved[: part.stop - part.start] += edge.height * taken[part]
         power[: part.stop - part.start] += edge.height**2
-    seen = np.abs(moved) > _SEEN * noise * np.sqrt(power)
+    # Edges that return to their start have neither a common part nor power.
+    if np.max(power) == 0:
+        return alike, left
+    spread = noise / float(np.sqrt(np.max(power)))
+    shape, known_to = smoothed(moved / np.maximum(power, _TINY), spread)
     for edge, part in zip(edges, parts, strict=True):
-        within = slice(part.stop - part.start)
-        # Edges that return to their start have neither a common part nor power.
-        scale = np.where(seen[within], edge.height / np.maximum(power[within], _TINY), 0.0)
-        alike[part] = scale * moved[within]
-        left[part] = scale * edge.height
+        alike[part] = edge.height * shape[: part.stop - part.start]
+        left[part] = (edge.height * known_to / noise) ** 2
     return alike, left
 
 

@@ -95,7 +95,7 @@ class Problem:
     starts: first sample of each recording
     plateau: number of the plateau of a sample, (n,), -1 elsewhere; or None
     shared: variance of the rounding error that the readings of a plateau share [m²]
-    input_rounding: variance of the rounding error of the input while it moves [m²]
+    input_error: variance of the error of the input while it moves [m²]: rounding, and noise
     errors_in_variables: noise that was taken out of the input and that the probe does not follow,
         (n,) [m]; or None
     recorded: the input as it was, (n,) [m], where noise was taken out of it
@@ -113,7 +113,7 @@ class Problem:
     starts: tuple[int, ...] = (0,)
     plateau: IntArray | None = None
     shared: float = 0.0
-    input_rounding: float = 0.0
+    input_error: float = 0.0
     errors_in_variables: FloatArray | None = None
     recorded: FloatArray | None = None
 

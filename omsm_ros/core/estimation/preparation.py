@@ -92,7 +92,7 @@ def _with_reading_steps(problem: Problem, steps: Steps) -> Problem:
     plateau, output = plateaus(steps, problem.used), problem.output[problem.used]
     shared = plateau_variance(output, plateau[problem.used], reading_step(output))
     step = reading_step(problem.input)
-    return replace(problem, plateau=plateau, shared=shared, input_rounding=step**2 / 12)
+    return replace(problem, plateau=plateau, shared=shared, input_error=step**2 / 12)
 
 
 def _motion(record: MotionRecord, source: str) -> FloatArray:

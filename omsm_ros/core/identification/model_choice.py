@@ -151,7 +151,8 @@ def rechosen(problem: Problem, before: ChosenModel, budget: EvaluationBudget) ->
         if known.bic < best + _MAY_BE_CHOSEN_BIC:
             changes.append(change)
         candidates.append(Candidate(now, known.bic + change))
-    if max(changes) - min(changes) > _ALIKE_BIC:
+    overtaken = min(c.bic for c in candidates) < best + min(changes)
+    if overtaken or max(changes) - min(changes) > _ALIKE_BIC:
         return None
     fitted, nonlinear = before.chosen.fit, before.chosen.fit.nonlinear
     again = fit(problem, fitted.structure, [nonlinear], budget=budget)

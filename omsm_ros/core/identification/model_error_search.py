@@ -210,15 +210,22 @@ def _with_errors_in_variables(
 
     The problem without it is searched anew, with a budget of its own.
     """
-    problem = correct_errors_in_variables(prepared.problem, model.chosen.fit, prepared.steps.edges)
-    if problem is None:
-        return prepared, model, budget
-    quieter, own = replace(prepared, problem=problem), budget.renewed()
-    found = rechosen(problem, model, own)
-    if found is None:
-        quieter, found = choose(quieter, own)
-    better = information(found.chosen.fit) < information(model.chosen.fit)
-    return (quieter, found, own) if better else (prepared, model, budget)
+    best = prepared, model, budget
+    # Twice, because noise in the input may have led to a wild response.
+    for _ in range(2):
+        before = best[1].chosen.fit
+        known = evaluated(prepared.problem, before.structure, before.nonlinear)
+        problem = correct_errors_in_variables(prepared.problem, known, prepared.steps.edges)
+        if problem is None:
+            break
+        quieter, own = replace(prepared, problem=problem), budget.renewed()
+        found = rechosen(problem, best[1], own)
+        if found is None:
+            quieter, found = choose(quieter, own)
+        if information(found.chosen.fit) >= information(before):
+            break
+        best = quieter, found, own
+    return best
 
 
 def _drift(prepared: Prepared, budget: EvaluationBudget) -> list[ScoreTest]:

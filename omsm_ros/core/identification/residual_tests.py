@@ -11,7 +11,13 @@ import numpy as np
 from scipy import fft, stats
 
 from omsm_ros.core.estimation.covariance import autoregression
-from omsm_ros.core.estimation.noise import motion_scatter, rate_of, reading_step, scatter_in_time
+from omsm_ros.core.estimation.noise import (
+    motion_error_variance,
+    motion_scatter,
+    rate_of,
+    reading_step,
+    scatter_in_time,
+)
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.estimation.steps import Steps, extended
 from omsm_ros.core.lti.frequency_response import FrequencyResponse, frequency_response
@@ -73,6 +79,8 @@ def residual_tests(problem: Problem, fitted: Fit, steps: Steps) -> ResidualTests
     timing = scatter_in_time(problem, fitted.residual)
     moves = active if np.any(active) else problem.used
     expected = noise**2 + timing * float(np.mean(rate_of(problem)[moves] ** 2))
+    if problem.errors_in_variables is not None:
+        expected += float(np.mean(motion_error_variance(problem)[moves]))
     chi_square = float(np.sum(seen_moving**2)) / max(len(seen_moving) - lost, 1) / expected
     return ResidualTests(
         chi_square,

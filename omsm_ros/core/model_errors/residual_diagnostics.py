@@ -188,7 +188,7 @@ class ResidualSpace:
                 rate = 2 * np.sin(np.pi * np.arange(1, len(noise)) / length)
                 noise[1:] = np.maximum(noise[1:], walk / rate**2)
             even += weighted_gram(rows[:, part], length, noise)
-        if self._scatter == 0 and self.problem.shared == self.problem.input_rounding == 0:
+        if self._scatter == 0 and self.problem.shared == self.problem.input_error == 0:
             return even
         uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
         return np.asarray(even + uneven.T @ uneven)
