@@ -3,11 +3,11 @@
 import numpy as np
 from scipy import fft
 
-from omsm_ros.core.estimation.noise import scatter_in_time, uneven_rows
+from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
 from omsm_ros.core.estimation.output_error import Fit, Problem
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.linear_algebra import BLOCK_VALUES
+from omsm_ros.linear_algebra import BLOCK_VALUES, orthonormal
 
 # Two orders for each of six lines of hum.
 _MAX_NOISE_ORDER = 12
@@ -87,7 +87,8 @@ def parameter_covariance(
 ) -> FloatArray:
     """Return the covariance (q, q) of the parameters of ``columns`` (k, q) in coloured noise.
 
-    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
+    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual, and of a random
+    walk where it shows one.
 
     passed: response through which noise of the encoder reaches the residual; None to add none.
         A sharp resonance amplifies that noise in a line too narrow for the spectrum of the residual
@@ -99,12 +100,15 @@ def parameter_covariance(
     on_grid[:, problem.used] = columns.T
     uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
     score_covariance = uneven.T @ uneven
+    walk = RandomWalk.of(problem, orthonormal(columns, _RANK_TOLERANCE)).variance_if_shown(
+        problem.on_grid(residual, 0.0)
+    )
     missed = problem.on_grid(residual, np.nan)
     for part in problem.recordings:
         # Each recording has noise of its own.
         own = missed[part][problem.used[part]]
         length = fft.next_fast_len(part.stop - part.start + _MAX_NOISE_ORDER, real=True)
-        noise = noise_spectrum(own, length)
+        noise = with_walk(noise_spectrum(own, length), walk, length)
         if passed is not None:
             came = _motion_noise_spectrum(problem, passed, length)
             noise = np.maximum(noise, np.mean(own**2) - np.mean(came) + came)

@@ -430,6 +430,11 @@ class RandomWalk:
         likelihood, *_ = self._likelihood(residual, np.empty((0, len(residual))))
         return bool(2 * np.max(likelihood - likelihood[0]) > np.log(len(self.ratios)))
 
+    def variance_if_shown(self, residual: FloatArray) -> float:
+        """Return the variance per sample of the walk's increments, 0 where none shows."""
+        none = np.empty((0, len(residual)))
+        return self.variance(residual, none, replaces=False) if self.shows(residual) else 0.0
+
     def variance(self, residual: FloatArray, rows: FloatArray, *, replaces: bool) -> float:
         """Return the variance per sample of the walk's increments.
 
@@ -466,3 +471,12 @@ class RandomWalk:
         spread = 0.5 * np.sum(np.log(variances), axis=1) + np.sum(diagonal[:, :-1], axis=1)
         white = np.exp(2 * diagonal[:, -1]) / degrees
         return -degrees * diagonal[:, -1] - spread, white, scale[:, -1] ** 2 / white - degrees
+
+
+def with_walk(noise: FloatArray, walk: float, length: int) -> FloatArray:
+    """Return the larger of ``noise`` (``length`` // 2 + 1,) and the spectrum of a random walk.
+
+    walk: variance per sample of its increments
+    """
+    rate = 2 * np.sin(np.pi * np.arange(1, len(noise)) / length)
+    return np.append(noise[0], np.maximum(noise[1:], walk / rate**2))

@@ -387,6 +387,8 @@ def _plausible(fitted: TwoMassFit) -> bool:
 
 # Rest after an edge that is not averaged, for the response to settle.
 _SETTLE_S = 0.1
+# Variance of a random walk over the record that is tried, over that of a plateau's mean.
+_WALK_SHARES = (0.0, *np.geomspace(1e-2, 1e4, 25))
 # GainEstimate, drift and offset are three unknowns.
 _LEAST_PLATEAUS = 4
 
@@ -394,9 +396,11 @@ _LEAST_PLATEAUS = 4
 def static_gains(record: MotionRecord) -> StaticGain:
     """Return the travel of one per travel of the other, magnitudes.
 
-    From the means of the plateaus, with offset and linear drift fitted. The uncertainty is that of
-    the regression over plateaus, so it contains whatever makes them scatter: noise, backlash,
-    slip. Raises StepTestError with fewer than four plateaus.
+    From the means of the plateaus, with offset and linear drift fitted, in white noise and a random
+    walk of the most likely size. The uncertainty is that of the regression over plateaus, so it
+    contains whatever makes them scatter: noise, drift, backlash, slip.
+
+    Raises StepTestError with fewer than four plateaus.
     """
     steps = find_steps(record.z, record.sample_period)
     rests = [
@@ -451,9 +455,25 @@ def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray, part: IntArr
     each = [column for one in own for column in (one, one * t / t[-1])]
     columns = np.column_stack([x - x.mean(), *each]).astype(np.float64)
     unit, scale = unit_columns(columns)
-    inverse = np.linalg.pinv(unit)
-    solved = inverse @ y
-    residual = y - unit @ solved
-    variance = float(residual @ residual) / max(len(y) - columns.shape[1], 1)
-    uncertainty = np.sqrt(variance * (inverse[0] @ inverse[0])) / scale[0]
-    return GainEstimate(float(abs(solved[0]) / scale[0]), float(uncertainty))
+    walk = sum(np.minimum.outer(t, t) / t[-1] * np.outer(one, one) for one in own)
+    tried = [_weighted(unit, y, np.eye(len(y)) + share * walk) for share in _WALK_SHARES]
+    _, solved, uncertainty = max(tried)
+    return GainEstimate(abs(solved) / float(scale[0]), uncertainty / float(scale[0]))
+
+
+def _weighted(
+    columns: FloatArray, values: FloatArray, covariance: FloatArray
+) -> tuple[float, float, float]:
+    """Return the restricted log likelihood, the first coefficient and its standard uncertainty."""
+    factor = np.linalg.cholesky(covariance)
+    both = np.linalg.solve(factor, np.column_stack([columns, values]))
+    q, r = np.linalg.qr(both[:, :-1])
+    residual = both[:, -1] - q @ (q.T @ both[:, -1])
+    inverse, degrees = np.linalg.pinv(r), max(len(values) - columns.shape[1], 1)
+    variance = max(float(residual @ residual) / degrees, float(np.finfo(np.float64).tiny))
+    spread = float(np.sum(np.log(np.diag(factor)))) + float(np.linalg.slogdet(r)[1])
+    return (
+        -0.5 * degrees * float(np.log(variance)) - spread,
+        float(inverse[0] @ (q.T @ both[:, -1])),
+        float(np.sqrt(variance * (inverse[0] @ inverse[0]))),
+    )

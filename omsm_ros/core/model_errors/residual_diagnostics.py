@@ -19,7 +19,7 @@ from scipy import fft, stats
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
 from omsm_ros.core.estimation.model_order import ABOVE_CONTENT, ENOUGH_SAMPLES, coarser
-from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows
+from omsm_ros.core.estimation.noise import RandomWalk, scatter_in_time, uneven_rows, with_walk
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated
 from omsm_ros.core.estimation.steps import Edge, Steps, segments
 from omsm_ros.core.model_errors.families import (
@@ -184,10 +184,7 @@ class ResidualSpace:
             length = fft.next_fast_len(samples, real=True)
             noise = smoothed_noise_spectrum(missed[part][places], places, samples, length)
             noise *= self.fitted.samples / max(self.fitted.samples - self.fitted.size, 1)
-            if walk > 0:
-                rate = 2 * np.sin(np.pi * np.arange(1, len(noise)) / length)
-                noise[1:] = np.maximum(noise[1:], walk / rate**2)
-            even += weighted_gram(rows[:, part], length, noise)
+            even += weighted_gram(rows[:, part], length, with_walk(noise, walk, length))
         if self._scatter == 0 and self.problem.shared == self.problem.input_error == 0:
             return even
         uneven = uneven_rows(self.problem, rows[:, used].T, self._scatter)
