@@ -135,6 +135,25 @@ def test_half_followed_is_half_taken_out():
     assert shown @ taken / (shown @ shown) == pytest.approx(0.5, abs=0.12)
 
 
+def test_what_moves_probe_and_axis_alike_passes_without_the_response():
+    """Shaken together, axis and probe show the jitter at once, and G is that of the steps."""
+    z, shaken = staircase(500), jitter(11_000, 5e-9)[: len(staircase(500))]
+    record = record_of(z, 0.0)
+    alike = record_from_arrays(PERIOD, record.z + shaken, record.distance - shaken)
+    problem, quiet = cleaned(alike)
+    assert quiet is not None
+    rests = problem.used & (np.abs(np.gradient(z)) == 0)
+    column = quiet.background[:, -1]
+    assert column[rests] @ shaken[rests] / (column[rests] @ column[rests]) == pytest.approx(
+        -1.0, abs=0.1
+    )
+    two = Structure(2, 0, True)
+    start = StartingPoints(quiet, fit(quiet, Structure(0, 0, True), [np.array([0.1])]))
+    found = fit(quiet, two, start.of(two, [start.pure_delay]))
+    assert found.rms < 1.1 * READING
+    assert np.min(np.abs(found.dynamics.poles())) == pytest.approx(OMEGA, rel=2e-3)
+
+
 def test_real_hum_is_kept_while_encoder_noise_is_removed():
     z = staircase(500)
     time = np.arange(len(z)) * PERIOD

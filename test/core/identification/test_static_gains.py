@@ -9,12 +9,13 @@ from omsm_ros.core.kinematics.trajectories import Chirp, StepTest
 from omsm_ros.errors import StepTestError
 
 
-def stepped(probe_gain, reference_gain=None, drift=0.0, noise=1e-8, seed=1, count=10):
+def stepped(probe_gain, reference_gain=None, drift=0.0, noise=1e-8, seed=1, count=10, walk=0.0):
     rng = np.random.default_rng(seed)
     motion = StepTest(count=count)
     time = np.arange(round(motion.duration / 1e-3)) * 1e-3
     z = motion.positions(time).z
     distance = 1e-5 - probe_gain * z + drift * time + rng.normal(0, noise, len(z))
+    distance += walk * np.cumsum(rng.normal(0, np.sqrt(1e-3), len(z)))
     reference = (
         None if reference_gain is None else reference_gain * z + rng.normal(0, noise, len(z))
     )
@@ -31,6 +32,16 @@ def test_uncertainty_is_the_scatter_of_repeated_tests():
     gains = [static_gains(stepped(1.0, seed=s)).probe_per_encoder for s in range(40)]
     scatter = np.std([g.value for g in gains])
     assert np.mean([g.uncertainty for g in gains]) == pytest.approx(scatter, rel=0.4)
+
+
+def test_uncertainty_is_the_scatter_where_the_machine_drifts_by_chance():
+    """A random walk of 1.2 nm/√s, of which the means of plateaus have more than of noise."""
+    gains = [
+        static_gains(stepped(1.0, seed=s, walk=1.2e-9)).probe_per_encoder for s in range(60)
+    ]
+    scatter = np.std([g.value for g in gains])
+    stated = np.sqrt(np.mean([g.uncertainty**2 for g in gains]))
+    assert stated == pytest.approx(scatter, rel=0.25)
 
 
 def test_a_reference_tells_probe_from_encoder():
