@@ -84,15 +84,18 @@ def parameter_covariance(
     columns: FloatArray,
     residual: FloatArray,
     passed: TransferFunction | None = None,
+    *,
+    walks: bool = False,
 ) -> FloatArray:
     """Return the covariance (q, q) of the parameters of ``columns`` (k, q) in coloured noise.
 
-    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual, and of a random
-    walk where it shows one.
+    The sandwich (JᵀJ)⁻¹ Jᵀ R J (JᵀJ)⁻¹, with R the autocovariance of the residual.
 
     passed: response through which noise of the encoder reaches the residual; None to add none.
         A sharp resonance amplifies that noise in a line too narrow for the spectrum of the residual
         to resolve.
+    walks: the noise has a random walk besides, where the residual shows one. Columns of a drift
+        describe a part of it, and their size is known better than what it would be by chance.
     """
     samples, size = columns.shape
     residual = residual * np.sqrt(samples / max(samples - size, 1))
@@ -100,9 +103,10 @@ def parameter_covariance(
     on_grid[:, problem.used] = columns.T
     uneven = uneven_rows(problem, columns, scatter_in_time(problem, residual))
     score_covariance = uneven.T @ uneven
-    walk = RandomWalk.of(problem, orthonormal(columns, _RANK_TOLERANCE)).variance_if_shown(
-        problem.on_grid(residual, 0.0)
-    )
+    walk = 0.0
+    if walks:
+        likelihood = RandomWalk.of(problem, orthonormal(columns, _RANK_TOLERANCE))
+        walk = likelihood.variance_if_shown(problem.on_grid(residual, 0.0))
     missed = problem.on_grid(residual, np.nan)
     for part in problem.recordings:
         # Each recording has noise of its own.

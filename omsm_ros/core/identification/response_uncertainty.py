@@ -63,7 +63,9 @@ def response_uncertainty(
     problem, best = prepared.problem, model.chosen.fit
     size, dynamics = best.structure.size, best.dynamics
     passed = replace(dynamics, numerator=best.gain * dynamics.numerator)
-    every = parameter_covariance(problem, problem.sensitivity(best), best.residual, passed)
+    every = parameter_covariance(
+        problem, problem.sensitivity(best), best.residual, passed, walks=True
+    )
     transform = best.scaled.coefficient_jacobian(best.nonlinear)
     from_noise = _symmetric(transform @ every[:size, :size] @ transform.T)
     terms = [*(term(prepared, best) for term in COVARIANCE_TERMS), *further]

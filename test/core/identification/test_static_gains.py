@@ -36,9 +36,7 @@ def test_uncertainty_is_the_scatter_of_repeated_tests():
 
 def test_uncertainty_is_the_scatter_where_the_machine_drifts_by_chance():
     """A random walk of 1.2 nm/√s, of which the means of plateaus have more than of noise."""
-    gains = [
-        static_gains(stepped(1.0, seed=s, walk=1.2e-9)).probe_per_encoder for s in range(60)
-    ]
+    gains = [static_gains(stepped(1.0, seed=s, walk=1.2e-9)).probe_per_encoder for s in range(60)]
     scatter = np.std([g.value for g in gains])
     stated = np.sqrt(np.mean([g.uncertainty**2 for g in gains]))
     assert stated == pytest.approx(scatter, rel=0.25)
