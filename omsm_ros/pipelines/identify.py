@@ -117,24 +117,15 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
     source: name of the recording, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.page import (
-        CertificatePage,
-        certificate_figures_of,
-        render,
-        render_dcc,
-    )
+    from omsm_ros.report.certificate.page import certificate_figures_of, render, render_dcc
+    from omsm_ros.report.page_parts import Issue
 
     calibration = identified.calibration
-    certificate = CertificatePage(
-        calibration=calibration,
-        date=_today(),
-        source=source,
-        version=__version__,
-        figures=certificate_figures_of(calibration, fitted_record(identified)),
-    )
+    figures = certificate_figures_of(calibration, fitted_record(identified))
+    issue = Issue(date=_today(), source=source, version=__version__, figures=figures)
     with result_folder(out, (PAGE, DCC)) as folder:
         save_bytes(folder / DCC, render_dcc(calibration, __version__).encode("utf-8", "replace"))
-        save_bytes(folder / PAGE, render(certificate).encode("utf-8", "replace"))
+        save_bytes(folder / PAGE, render(calibration, issue).encode("utf-8", "replace"))
     return out / PAGE
 
 
@@ -146,18 +137,13 @@ def write_model_page(
     source: name of the record, as the page states it
     """
     # Imported on demand, because loading the figures takes a second.
-    from omsm_ros.report.certificate.model_page import ModelPage, model_figures_of, render_model
+    from omsm_ros.report.certificate.model_page import model_figures_of, render_model
+    from omsm_ros.report.page_parts import Issue
 
-    page = ModelPage(
-        model=model,
-        run=run,
-        date=_today(),
-        source=source,
-        version=__version__,
-        figures=model_figures_of(model, record.inputs, record.output, run),
-    )
+    figures = model_figures_of(model, record.inputs, record.output, run)
+    issue = Issue(date=_today(), source=source, version=__version__, figures=figures)
     with result_folder(out, (MODEL_PAGE,)) as folder:
-        save_bytes(folder / MODEL_PAGE, render_model(page).encode("utf-8", "replace"))
+        save_bytes(folder / MODEL_PAGE, render_model(model, run, issue).encode("utf-8", "replace"))
     return out / MODEL_PAGE
 
 

@@ -4,7 +4,6 @@ import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import jinja2
 
@@ -104,25 +103,19 @@ def present(sections: Sequence[Section], figures: Mapping[str, bytes]) -> list[S
 
 
 @dataclass(frozen=True, kw_only=True)
-class IssuedPage:
-    """Common parts of certificates and model pages.
+class Issue:
+    """Issue of a certificate or of the page of a model.
 
-    date: of issue, as printed;  source: name of the recording
-    version: of the software;  figures: PNG files by the names in ``captions``
-
-    Raises ConfigurationError for a figure of another name.
+    date: as printed;  source: name of the recording;  version: of the software
+    figures: PNG files by name
     """
 
-    captions: ClassVar[Mapping[str, str]]
     date: str
     source: str = ""
     version: str = ""
     figures: Mapping[str, bytes] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        check_places(self.figures, self.captions)
-
-    def issued(self, identity: str = "") -> str:
+    def line(self, identity: str = "") -> str:
         """Return recording, date and identity on one line."""
         return " · ".join(p for p in (self.source, f"issued {self.date}", identity) if p)
 

@@ -20,14 +20,13 @@ from omsm_ros.core.ripple.source_hypotheses import KINDS
 from omsm_ros.live_page.server import render as render_live
 from omsm_ros.report.campaign import CampaignEntry
 from omsm_ros.report.campaign import render as render_campaign
-from omsm_ros.report.certificate.model_page import ModelPage, render_model
-from omsm_ros.report.certificate.page import CertificatePage
+from omsm_ros.report.certificate.model_page import render_model
 from omsm_ros.report.certificate.page import render as render_certificate
 from omsm_ros.report.experiments import Compared, done
 from omsm_ros.report.measurement.page import CAPTIONS, Report
 from omsm_ros.report.measurement.page import render as render_report
 from omsm_ros.report.measurement.surface_map import Layer, embedded
-from omsm_ros.report.page_parts import Section, StudyPage, fill_study
+from omsm_ros.report.page_parts import Issue, Section, StudyPage, fill_study
 from omsm_ros.report.spectrum import render as render_spectrum
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
@@ -131,9 +130,7 @@ def certificate(text, calibration):
         "consistency": [{"parts": text}],
     }  # fmt: skip
     hostile = replace(calibration, settings={text: text}, certificate=certified_by(entries))
-    return render_certificate(
-        CertificatePage(calibration=hostile, date=text, source=text, version=text)
-    )
+    return render_certificate(hostile, Issue(date=text, source=text, version=text))
 
 
 def model(text, _):
@@ -141,7 +138,7 @@ def model(text, _):
     entries = {"verdict": text, "warnings": [text], "limits": {text: 1.0}, "order": text}
     hostile = replace(MODEL, certificate=entries)
     run = free_run(hostile, rng.normal(size=60), rng.normal(size=60))
-    return render_model(ModelPage(model=hostile, run=run, date=text, source=text, version=text))
+    return render_model(hostile, run, Issue(date=text, source=text, version=text))
 
 
 def live(text, _):

@@ -1,7 +1,6 @@
 """The page of a model between any two sampled quantities, with a record that it is run over."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.calibration.certificate import REJECTED
@@ -11,7 +10,15 @@ from omsm_ros.readable import NOTHING, count, percent, plain, probability, quant
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as drawn
 from omsm_ros.report.certificate.tables import known_rows, texts
-from omsm_ros.report.page_parts import Headline, IssuedPage, Section, fill, picture, present
+from omsm_ros.report.page_parts import (
+    Headline,
+    Issue,
+    Section,
+    check_places,
+    fill,
+    picture,
+    present,
+)
 from omsm_ros.report.tables import Table, mapping_table, part
 from omsm_ros.report.verdict import PageVerdict
 
@@ -30,15 +37,6 @@ _NOTE = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ModelPage(IssuedPage):
-    """The model, a free run over a record, and what a reader should know of both."""
-
-    captions = CAPTIONS
-    model: SampledModel
-    run: FreeRun
-
-
 def model_figures_of(
     model: SampledModel, inputs: FloatArray, output: FloatArray, run: FreeRun
 ) -> dict[str, bytes]:
@@ -51,19 +49,23 @@ def model_figures_of(
     return {name: style.png(figure) for name, figure in made.items()}
 
 
-def render_model(page: ModelPage) -> str:
-    """Return the page as HTML; all text from outside is escaped."""
+def render_model(model: SampledModel, run: FreeRun, issue: Issue) -> str:
+    """Return the page of a model and its ``run`` as HTML; all text from outside is escaped.
+
+    Raises ConfigurationError for a figure that is not in :data:`CAPTIONS`.
+    """
+    check_places(issue.figures, CAPTIONS)
     return fill(
         "certificate.html",
         heading="Model",
-        issued=page.issued(),
+        issued=issue.line(),
         closing=_NOTE,
-        figures=page.figures,
-        verdict=verdict_on_model(page.model),
-        headlines=_headlines(page),
-        sections=_sections(page),
+        figures=issue.figures,
+        verdict=verdict_on_model(model),
+        headlines=_headlines(model, run),
+        sections=_sections(model, issue),
         band=BAND,
-        picture=lambda name: picture(page.figures[name]),
+        picture=lambda name: picture(issue.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
 
@@ -81,11 +83,11 @@ def verdict_on_model(model: SampledModel) -> PageVerdict:
     )
 
 
-def _headlines(page: ModelPage) -> list[Headline]:
-    model, certificate = page.model, page.model.certificate
+def _headlines(model: SampledModel, run: FreeRun) -> list[Headline]:
+    certificate = model.certificate
     return [
-        Headline("Free run accounts for", percent(page.run.explained, 4), "of this record"),
-        Headline("Residual, rms", plain(page.run.rms, 4), "in the units of the output"),
+        Headline("Free run accounts for", percent(run.explained, 4), "of this record"),
+        Headline("Residual, rms", plain(run.rms, 4), "in the units of the output"),
         Headline(
             "Hidden parts accounted for",
             percent(certificate.get("predicted"), 4),
@@ -100,8 +102,8 @@ def _headlines(page: ModelPage) -> list[Headline]:
     ]
 
 
-def _sections(page: ModelPage) -> list[Section]:
-    certificate = page.model.certificate
+def _sections(model: SampledModel, issue: Issue) -> list[Section]:
+    certificate = model.certificate
     tests = [
         ("whiteness, p", probability(certificate.get("whiteness_p"))),
         ("independence of the input, p", probability(certificate.get("independence_p"))),
@@ -113,9 +115,9 @@ def _sections(page: ModelPage) -> list[Section]:
     every = [
         Section("Record", (RECORD, CORRELATION), (Table("", (), known_rows(tests, 1)),)),
         Section("Poles", (), (_poles(certificate),)),
-        Section("Records", (), (_identity(page), _limits(certificate))),
+        Section("Records", (), (_identity(model, issue), _limits(certificate))),
     ]
-    return present(every, page.figures)
+    return present(every, issue.figures)
 
 
 def _poles(certificate: Mapping[str, Any]) -> Table:
@@ -130,15 +132,14 @@ def _poles(certificate: Mapping[str, Any]) -> Table:
     return Table("", ("damping ratio",), rows)
 
 
-def _identity(page: ModelPage) -> Table:
-    model = page.model
+def _identity(model: SampledModel, issue: Issue) -> Table:
     rows = [
         ("schema", SCHEMA),
-        ("record", page.source or NOTHING),
+        ("record", issue.source or NOTHING),
         ("sample period", quantity(model.sections.period, "s", 4)),
         ("working point, inputs", ", ".join(plain(x, 6) for x in model.working_point[:-1])),
         ("working point, output", plain(model.working_point[-1], 6)),
-        ("omsm_ros", page.version or NOTHING),
+        ("omsm_ros", issue.version or NOTHING),
     ]
     return Table("Identity", (), known_rows(rows, 1))
 

@@ -1,6 +1,5 @@
 """The certificate of a calibration as a page to file: HTML in one piece."""
 
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from typing import NamedTuple
 
@@ -25,8 +24,9 @@ from omsm_ros.report.certificate import tables
 from omsm_ros.report.certificate.tables import known_rows
 from omsm_ros.report.page_parts import (
     Headline,
-    IssuedPage,
+    Issue,
     Section,
+    check_places,
     fill,
     picture,
     present,
@@ -178,19 +178,6 @@ _CLOSING = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CertificatePage(IssuedPage):
-    """Everything on the page; what is absent is left out."""
-
-    captions = CAPTIONS
-    calibration: Calibration
-
-    @property
-    def issue(self) -> str:
-        """Recording, date and identity on one line."""
-        return self.issued(self.calibration.id[:16])
-
-
 def certificate_figures_of(calibration: Calibration, fitted: FittedRecord) -> dict[str, bytes]:
     """Return PNG files for the page."""
     certificate = calibration.certificate
@@ -209,21 +196,26 @@ def _bridged(fitted: FittedRecord) -> FloatArray:
     return np.asarray(np.where(np.isfinite(fitted.output), fitted.output, fitted.modelled))
 
 
-def render(certificate: CertificatePage) -> str:
-    """Return the page as HTML; all text from outside is escaped."""
+def render(calibration: Calibration, issue: Issue) -> str:
+    """Return the page as HTML; all text from outside is escaped.
+
+    Raises ConfigurationError for a figure that is not in :data:`CAPTIONS`.
+    """
+    check_places(issue.figures, CAPTIONS)
+    origin = calibration.certificate.origin
     return fill(
         "certificate.html",
         heading="Calibration certificate",
-        issued=certificate.issue,
-        closing=f"{_CLOSING} Calibration {certificate.calibration.id}.",
-        figures=certificate.figures,
-        verdict=verdict_on_calibration(certificate.calibration),
-        headlines=headlines(certificate.calibration),
-        sections=sections(certificate),
-        block=title_block(to_json(certificate.calibration.certificate.origin)),
-        signer=certificate.calibration.certificate.origin.operator or "",
+        issued=issue.line(calibration.id[:16]),
+        closing=f"{_CLOSING} Calibration {calibration.id}.",
+        figures=issue.figures,
+        verdict=verdict_on_calibration(calibration),
+        headlines=headlines(calibration),
+        sections=sections(calibration, issue),
+        block=title_block(to_json(origin)),
+        signer=origin.operator or "",
         band=BAND,
-        picture=lambda name: picture(certificate.figures[name]),
+        picture=lambda name: picture(issue.figures[name]),
         caption=CAPTIONS.__getitem__,
     )
 
@@ -348,11 +340,11 @@ def _order(certificate: Certificate) -> Section:
     )
 
 
-def sections(page: CertificatePage) -> list[Section]:
+def sections(calibration: Calibration, issue: Issue) -> list[Section]:
     """Return all parts below the first screen that have anything to show."""
-    calibration, certificate = page.calibration, page.calibration.certificate
+    certificate = calibration.certificate
     warnings = [(str(warning),) for warning in certificate.warnings]
-    identity = tables.identity_table(calibration, page.source, page.version)
+    identity = tables.identity_table(calibration, issue.source, issue.version)
     every = [
         Section("Warnings", (), (Table("", (), warnings),)),
         *_laboratory(calibration),
@@ -391,7 +383,7 @@ def sections(page: CertificatePage) -> list[Section]:
             ),
         ),
     ]
-    return present(every, page.figures)
+    return present(every, issue.figures)
 
 
 def _laboratory(calibration: Calibration) -> list[Section]:

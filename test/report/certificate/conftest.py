@@ -8,7 +8,8 @@ from parsed_page import Page
 from omsm_ros.core.identification.fitted_record import fitted_record
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import assemble
-from omsm_ros.report.certificate.page import CertificatePage, certificate_figures_of, render
+from omsm_ros.report.certificate.page import certificate_figures_of, render
+from omsm_ros.report.page_parts import Issue
 
 
 @pytest.fixture(scope="module")
@@ -38,15 +39,11 @@ def figures(calibration, fitted):
 
 @pytest.fixture(scope="module")
 def certificate(calibration, figures):
-    return CertificatePage(
-        calibration=calibration,
-        date="2025-01-31 12:00 UTC",
-        source="steps.mcap",
-        version="0.1.0",
-        figures=figures,
+    return calibration, Issue(
+        date="2025-01-31 12:00 UTC", source="steps.mcap", version="0.1.0", figures=figures
     )
 
 
 @pytest.fixture(scope="module")
 def page(certificate):
-    return Page(render(certificate))
+    return Page(render(*certificate))

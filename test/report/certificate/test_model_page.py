@@ -8,12 +8,8 @@ from sections_of_polynomials import from_polynomials
 
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
 from omsm_ros.report.certificate.figures import response
-from omsm_ros.report.certificate.model_page import (
-    ModelPage,
-    model_figures_of,
-    render_model,
-    verdict_on_model,
-)
+from omsm_ros.report.certificate.model_page import model_figures_of, render_model, verdict_on_model
+from omsm_ros.report.page_parts import Issue
 
 HELD = SampledModel(
     sections=replace(
@@ -43,14 +39,13 @@ def record():
 
 def page_of(model, record, **parts):
     run = free_run(model, *record)
-    return ModelPage(
-        model=model, run=run, date="today", figures=model_figures_of(model, *record, run), **parts
-    )
+    figures = model_figures_of(model, *record, run)
+    return model, run, Issue(date="today", figures=figures, **parts)
 
 
 @pytest.mark.parametrize("model", [HELD, SMOOTH])
 def test_all_parts_are_there(model, record):
-    page = render_model(page_of(model, record, source="<b>.csv", version="1.2"))
+    page = render_model(*page_of(model, record, source="<b>.csv", version="1.2"))
     for text in ("Accepted from", "91.00", "Poles", "Working point".lower(), "&lt;b&gt;.csv"):
         assert text in page, text
     assert "<b>.csv" not in page
@@ -61,7 +56,7 @@ def test_all_parts_are_there(model, record):
 def test_a_pole_that_the_data_do_not_resolve_has_a_bound(record):
     poles = [{"frequency_hz": 2.5, "damping": 0.07}, {"faster_than_hz": 4.0}]
     made = replace(HELD, certificate=HELD.certificate | {"poles": poles})
-    page = render_model(page_of(made, record))
+    page = render_model(*page_of(made, record))
     row = page[page.index(">2.50") :]
     assert row.index("0.0700") < row.index("not resolved (faster")
 

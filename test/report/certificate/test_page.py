@@ -16,13 +16,8 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError, ConfigurationError
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
-from omsm_ros.report.certificate.page import (
-    CAPTIONS,
-    CertificatePage,
-    render,
-    sections,
-    verdict_on_calibration,
-)
+from omsm_ros.report.certificate.page import CAPTIONS, render, sections, verdict_on_calibration
+from omsm_ros.report.page_parts import Issue
 from omsm_ros.report.verdict import verdict_text
 
 from .certificates import ATTACK, bare, by_name, certified, range_detail
@@ -48,22 +43,22 @@ class TestPage:
         assert page.text.index(word) < page.text.index("Low-frequency delay")
 
     def test_carries_every_picture_whole(self, certificate):
-        html = render(certificate)
+        html = render(*certificate)
         found = [b64decode(data) for data in re.findall(r"data:image/png;base64,([^\"]+)", html)]
-        assert set(certificate.figures) == set(CAPTIONS)
-        assert sorted(found) == sorted(certificate.figures.values())
+        assert set(certificate[1].figures) == set(CAPTIONS)
+        assert sorted(found) == sorted(certificate[1].figures.values())
 
     def test_fetches_nothing(self, certificate, page):
         assert not {"script", "link", "iframe", "object"} & set(page.tags)
         addresses = [v for k, v in page.attributes if k in ("src", "href", "srcset", "action")]
         assert all(a.startswith("data:image/png;base64,") for a in addresses)
-        assert not re.search(r"https?://|url\(|@import", render(certificate))
+        assert not re.search(r"https?://|url\(|@import", render(*certificate))
         policy = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
         assert ("content", policy) in page.attributes
 
     def test_every_entry_without_a_place_is_shown_all_the_same(self, calibration):
         more = certified_by({"humidity": 0.41}, calibration.certificate)
-        text = Page(render(bare(replace(calibration, certificate=more)))).text
+        text = Page(render(*bare(replace(calibration, certificate=more)))).text
         assert "Further entries" in text
         assert "humidity 0.41" in text
 
@@ -79,16 +74,14 @@ class TestPage:
                 "samples": {ATTACK: 3}, "self_calibration": {ATTACK: ATTACK}, "input": ATTACK,
             }),
         )  # fmt: skip
-        page = Page(
-            render(CertificatePage(calibration=hostile, date=ATTACK, source=ATTACK, version=ATTACK))
-        )
+        page = Page(render(hostile, Issue(date=ATTACK, source=ATTACK, version=ATTACK)))
         assert not {"script", "img"} & set(page.tags)
         assert not any(key.startswith("on") for key, _ in page.attributes)
         assert "<script>alert('x')</script>" in page.text
 
     def test_a_figure_without_a_place_is_refused(self, calibration):
         with pytest.raises(ConfigurationError, match="'selfie'"):
-            CertificatePage(calibration=calibration, date="today", figures={"selfie": b""})
+            render(calibration, Issue(date="today", figures={"selfie": b""}))
 
 
 class TestOlderCertificates:
@@ -97,10 +90,10 @@ class TestOlderCertificates:
         return certified(calibration, **request.param)
 
     def test_what_is_absent_leaves_no_hole(self, older):
-        page = Page(render(bare(older)))
+        page = Page(render(*bare(older)))
         assert "–" not in page.text
         assert "None" not in page.text
-        titles = [section.title for section in sections(bare(older))]
+        titles = [section.title for section in sections(*bare(older))]
         assert titles[:2] == ["Results", "Statements"]
         assert titles[2:] == ["Dynamics", "Static gain and background", "Records"]
         assert set(by_name(older)) == {
@@ -114,7 +107,7 @@ class TestOlderCertificates:
         for name in content:
             rest = Certificate.from_content({k: v for k, v in content.items() if k != name})
             altered = bare(replace(calibration, certificate=rest))
-            assert Page(render(altered)).text
+            assert Page(render(*altered)).text
 
     def test_an_entry_of_another_kind_is_refused(self, calibration):
         content = calibration.certificate.content()
@@ -133,8 +126,10 @@ class TestOlderCertificates:
             covariance=np.zeros((2, 2)),
         )
         figures = {"band": style.png(certificate_figures.response_with_band(still))}
-        certificate = CertificatePage(calibration=still, date="today", figures=figures)
-        assert "0 poles, 0 zeros, delay" in Page(render(certificate)).text
+        assert (
+            "0 poles, 0 zeros, delay"
+            in Page(render(still, Issue(date="today", figures=figures))).text
+        )
 
 
 class TestVerdict:
@@ -157,7 +152,7 @@ class TestVerdict:
         bad = certified(calibration, verdict="rejected", reasons=["too sharp"])
         assert verdict_on_calibration(bad).reasons == ("too sharp",)
         assert "Valid up to" not in by_name(bad)
-        text = Page(render(bare(bad))).text
+        text = Page(render(*bare(bad))).text
         assert "✕ Rejected too sharp" in text
         assert "rejected: not to be used" in text
 
