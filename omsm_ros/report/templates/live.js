@@ -211,7 +211,7 @@ function robust(values, positive) {
 
 function chart(canvas, x, lines, unit, label, logarithmic) {
   const dense = window.devicePixelRatio || 1, box = canvas.getBoundingClientRect();
-  if (!box.width || !x.length) return;
+  if (!box.width || x.length < 2) return;
   canvas.width = Math.round(box.width * dense);
   canvas.height = Math.round(box.height * dense);
   const pen = canvas.getContext("2d");
