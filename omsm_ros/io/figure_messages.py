@@ -137,6 +137,7 @@ def vibration_message(
         "VibrationLevels",
         header=head,
         height_total=_known(levels.total_effect),
+        height_noise=_known(levels.noise_effect),
         line_axis=levels.line[0],
         line_frequency=levels.line[1],
         line_amplitude=levels.line[2],

@@ -53,7 +53,11 @@ def test_vibration_has_a_level_for_each_band_and_nan_without_a_calibration():
     message = figures.vibration_message(MESSAGES, levels, False, 20e-9, header(MESSAGES, 0, "p"))
     assert (list(message.low), list(message.high)) == ([5.0, 50.0], [50.0, 500.0])
     assert list(message.rms_z) == [1e-3, 2e-3]
-    assert all(map(math.isnan, [*message.height, message.height_total]))
+    unknown = [*message.height, message.height_total, message.height_noise]
+    assert all(map(math.isnan, unknown))
+    known = replace(levels, effect=(1e-9, 2e-9), total_effect=3e-9, noise_effect=4e-9)
+    message = figures.vibration_message(MESSAGES, known, False, 20e-9, message.header)
+    assert (message.height_total, message.height_noise) == (3e-9, 4e-9)
     assert message.header.frame_id == "p"
 
 
