@@ -99,7 +99,7 @@ class FarPoints:
             space = self.space()
             event = np.arange(len(index))
             if not space.line:
-                event = _events(index, x, y, residual, space.reach)
+                event = _events(index, rows[1:], space.reach)
             cluster, space.similar = _clusters(event, x, y, residual, space.reach)
             if rule == ISOLATED:
                 form = _confirmed(event, cluster, rows, space, self.points)
@@ -217,11 +217,14 @@ class _Space:
         return factor if self.line else factor**2
 
 
-def _events(
-    index: IntArray, x: FloatArray, y: FloatArray, residual: FloatArray, reach: float
-) -> IntArray:
-    """Return the event (k,) of each far point: successive similar ones belong together."""
-    apart = np.hypot(np.diff(x), np.diff(y)) > reach
+def _events(index: IntArray, rows: FloatArray, reach: float) -> IntArray:
+    """Return the event (k,) of each far point: successive similar ones belong together.
+
+    rows: x, y, residual and step of the far points (4, k)
+    """
+    residual = rows[2]
+    # Steps along a track may be longer than the distance of the tracks.
+    apart = np.hypot(*np.diff(rows[:2])) > np.maximum(reach, _REACH * rows[3, :-1])
     ratio = residual[1:] / residual[:-1]
     new = (np.diff(index) > _GAP) | apart | (ratio < 1 / _SIMILAR) | (ratio > _SIMILAR)
     return np.concatenate([[0], np.cumsum(new)])
@@ -283,5 +286,5 @@ def _confirmed(
     form = ((expected < _BY_CHANCE) & (sizes > 1)) | (sizes > _MOST_BY_CHANCE)
     steps = np.where(np.diff(event) == 0, np.hypot(*np.diff(rows[1:3])), 0.0)
     lengths = np.add.reduceat(np.concatenate([steps, [0.0]]), begins)
-    form[of_event[lengths > _LONG * space.reach]] = True
+    form[of_event[lengths > _LONG * np.maximum(space.reach, rows[4, begins])]] = True
     return np.asarray(form[cluster])

@@ -114,3 +114,15 @@ def test_a_groove_as_narrow_as_the_steps_along_a_track_stays(seed):
     found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
     assert np.sum(np.abs(groove) > 50e-9) > 400
     assert not len(found.dust)
+
+
+def test_a_rolled_edge_stays_where_steps_are_longer_than_the_tracks_are_apart():
+    """Only the outer two turns are far from the form; points of one turn follow each other."""
+    share = np.linspace(1, 0, 12_000)
+    x, y = (10e-3 * share * f(140 * np.pi * share) for f in (np.cos, np.sin))
+    rolled = -500e-9 * np.clip((share - 0.96) / 0.04, 0, None) ** 2
+    height = rolled + np.random.default_rng(1).normal(0, 10e-9, len(x))
+    batch = PointBatch(x, y, height, np.empty((0, len(x))))
+    found = register(Flat(), lambda: [batch], ("piston", "tip", "tilt"))
+    assert np.sum(rolled < -100e-9) > 200
+    assert len(found.dust) < 5
