@@ -70,19 +70,14 @@ class Source:
 
 
 def _harmonic(kind: Callable, per_turn: float) -> Build:
-    """Draw phase and size of a harmonic whose rms is the declared value."""
-
-    def build(m: Machine, value: float, site: Site) -> Machine:
-        amplitude = abs(value) * site.rng.chisquare(2) ** 0.5
-        return m.plus("loop", kind(per_turn, amplitude, site.phase()))
-
-    return build
+    """Draw the phase of a harmonic."""
+    return lambda m, value, site: m.plus("loop", kind(per_turn, value, site.phase()))
 
 
 def _radial(m: Machine, value: float, site: Site) -> Machine:
     """Move the spindle laterally twice a turn."""
     phase = site.phase()
-    wave = effects.offset_beam_by(lambda now: np.cos(2 * now.c + phase), abs(value) * 2**0.5)
+    wave = effects.offset_beam_by(lambda now: np.cos(2 * now.c + phase), value)
     return m.plus("place", wave)
 
 
@@ -219,7 +214,9 @@ def drawn(seed: int, radius: float, share: float = 1.0) -> Shop:
     site = Site(np.random.default_rng([seed, 311]), radius)
     machine, values, since_test = quiet(), {}, None
     for source in SOURCES:
-        value = share * source.value * float(site.rng.normal())
+        # Cosine and sine of a harmonic have the declared size each.
+        chance = site.rng.chisquare(2) ** 0.5 if "per_turn" in source.more else site.rng.normal()
+        value = share * source.value * float(chance)
         values[source.name] = value
         machine = source.build(machine, value, site)
         if source.name == "lag_change":
