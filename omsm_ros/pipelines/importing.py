@@ -247,7 +247,7 @@ class _Source:
         lacking = [a for a in AXES if mapped.has(a) and a not in streams] if axes else []
         if lacking:
             name = mapped.columns[lacking[0]].name
-            raise FileError(f"{self.without(name, lacking[0])}; one file has all axes")
+            raise FileError(f"{self.without(name, lacking[0])}; give all axes in one file")
         table.used(mapped.names(self.channels))
         self._check_units()
         self._check_period()
