@@ -28,6 +28,8 @@ verdict.not_evaluated: not evaluated, and not shown by these scans: {names} (may
     by {value:m/2}); {remedy}, or declare it with its evaluation
 verdict.declared_only: declared without an evaluation, and not shown by these scans: {names} (may
     change the heights by {value:m/2}); {remedy}, or evaluate it from a recording
+verdict.looks_like: the form ({value:m/2} rms of it) looks like {names}, which these scans cannot
+    tell from the part; {remedy}, or accept it as the form of the part with omsm adjust --accept
 verdict.uncertainty: expanded uncertainty {value:m/2}, larger than the accuracy of {limit:m/2} asked
     for{contribution}
 verdict.shrink: ; the largest contribution is {name}: its standard uncertainty of {size} would have
@@ -87,7 +89,7 @@ SOURCE_NAMES = {
     "encoder_scale": "scale of the Z encoder",
     "straightness_x": "straightness of X",
     "straightness_z": "straightness of Z",
-    "pitch": "pitch of Z",
+    "pitch": "pitch or bending by the height of Z",
     "static_gain": "scale of the probe",
     "probe_square": "quadratic linearity error of the probe",
     "probe_linearity": "cubic linearity error of the probe",

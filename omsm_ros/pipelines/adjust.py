@@ -388,7 +388,7 @@ def _grouped(reasons: Sequence[Reason]) -> list[Reason]:
 
 
 # Reasons whose last name is the scan that would show the sources named before it.
-_OPEN = ("not_evaluated", "declared_only")
+_OPEN = ("not_evaluated", "declared_only", "looks_like")
 
 
 def _values(reason: Reason) -> Mapping[str, Any]:

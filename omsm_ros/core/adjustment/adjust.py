@@ -40,6 +40,7 @@ from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, fitted_surfac
 from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes, with_dynamics
 from omsm_ros.core.adjustment.verdict import (
     Verdict,
+    looks_like,
     not_evaluated,
     open_limit,
     reasons_of,
@@ -192,18 +193,21 @@ def _adjusted(
     evidences = _evidences(detecting, refutations)
     solution = completed(detecting, refutations)
     families = solution.network.families
-    form = form_map(solution, surface, removed, doubts)
+    effects = effects_on_form(solution, surface, removed)
+    form = form_map(solution, surface, removed, doubts, effects)
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
     declared = {p.name for p in priors}
     contradictions = reasons_of(
         refutations, declared, agreement, wrong, _walk(detecting, priors), accepted
     )  # fmt: skip
-    effects = effects_on_form(solution, surface, removed)
     enough = redundant(scans)
     verdict = verdict_of(
         contradictions,
-        not_evaluated(families, effects, priors, open_limit(accuracy)),
+        (
+            *not_evaluated(families, effects, priors, open_limit(accuracy)),
+            *looks_like(form.resembled, families, accepted),
+        ),
         rests_on(families, effects, form.mean_uncertainty),
         enough,
         2 * form.pv.uncertainty,

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from omsm_ros.core.adjustment.scan_data import ScanView
 from omsm_ros.core.adjustment.sources import VIBRATION, Columns, Family, Source, base_name
@@ -249,8 +250,11 @@ def _curve(
     def over(position: FloatArray) -> FloatArray:
         return np.stack([np.interp(position, nodes, part) for part in parts])
 
+    place = np.linspace(-1.0, 1.0, len(nodes))
+    bends = legendre.legvander(place, 3)[:, 2:]
+    bent = np.kron(np.linalg.lstsq(parts.T, bends, rcond=1e-6)[0], np.eye(ways))
     return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by,
-                  default)  # fmt: skip
+                  default, smooth=bent)  # fmt: skip
 
 
 def _of_the_probe(r: Ranges) -> list[Family]:

@@ -17,7 +17,8 @@ from scipy import linalg, optimize, sparse
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
-from omsm_ros.core.adjustment.refutation import Doubt
+from omsm_ros.core.adjustment.refutation import ODDS_ABSENT, SURE, Doubt
+from omsm_ros.core.adjustment.resemblance import FormTerms
 from omsm_ros.core.adjustment.sources import FREE, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -32,6 +33,8 @@ _RIM = 96
 _DRAWS = 300
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
+# Of the probability of the likeliest family: one that is named beside it.
+_AS_LIKELY = 0.3
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,8 @@ class FormMap:
     pv, rms: figures;  terms: of degree 2 to 4 on ``disc``, coefficients one at its rim [m], and
         their covariance [m²]
     removed: names of the pose, with their values ``pose`` [m], [1], [rad]
+    resembled: families that the form looks like, the likeliest first, with the rms of their share
+        of it [m]
     """
 
     x: FloatArray
@@ -66,6 +71,7 @@ class FormMap:
     term_covariance: FloatArray
     removed: tuple[str, ...]
     pose: FloatArray
+    resembled: tuple[tuple[str, float], ...] = ()
 
     @property
     def uncertainty(self) -> FloatArray:
@@ -93,23 +99,31 @@ def form_map(
     nominal: Surface | None,
     removed: Sequence[str] = POSE,
     doubts: Sequence[Doubt] = (),
+    effects: Mapping[str, Effect] | None = None,
     seed: int = 0,
 ) -> FormMap:
     """Return the form error that ``solution`` found.
 
     nominal: for the slopes of ``x``, ``y`` and ``clocking``;  removed: names of the pose
-    doubts: what they change is uncertain;  seed: of the draws
+    doubts: what they change is uncertain;  effects: of families, which the form may look like
+    seed: of the draws
     """
     made = _Made.of(solution, nominal, removed)
     places, rows = made.places, made.rows[:, solution.active]
     open_changes = made.open_changes(doubts, nominal, removed)
-    pv, rms = made.pv_and_rms(solution, seed, open_changes)
     spread = solution.factor.forward(rows.T)
     raw = spread.T @ spread
     of_cells = made.member @ sparse.diags_array(made.share) @ made.member.T
     raw += of_cells.toarray()
     covariance = made.free(made.free(raw).T) + open_changes @ open_changes.T
-    terms, by_heights = _term_fit(solution, places)
+    every, by_height = _term_fit(solution, places)
+    alike = _resembled(made, covariance, every, by_height, effects or {}, solution.network.families)
+    more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)
+    covariance += more @ more.T
+    together = sum(share for _, share, _ in alike)
+    pv, rms = made.pv_and_rms(solution, seed, np.concatenate([open_changes, more], axis=1))
+    kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
+    by_heights = by_height[kept]
     return FormMap(
         x=places.x,
         y=places.y,
@@ -119,11 +133,16 @@ def form_map(
         pv=pv,
         rms=rms,
         disc=solution.network.part.disc,
-        terms=terms,
+        terms=tuple(every[k] for k in kept),
         coefficients=by_heights @ made.height,
         term_covariance=by_heights @ covariance @ by_heights.T,
         removed=tuple(removed),
         pose=made.pose,
+        resembled=tuple(
+            (name, _rms(places, change[:, np.newaxis]))
+            for name, share, change in alike
+            if together > 0.5 and share > _AS_LIKELY * alike[0][1]
+        ),
     )
 
 
@@ -142,13 +161,15 @@ class Effect(NamedTuple):
 
     left: by what scans and prior leave open;  free: by what the scans alone leave open if the prior
         is worth nothing, and the family may have its size ``wide``
+    shape: change of the map by each of its parameters (n, size) [m]
     """
 
     left: float
     free: float
+    shape: FloatArray
 
 
-NO_EFFECT = Effect(0.0, 0.0)
+NO_EFFECT = Effect(0.0, 0.0, np.zeros((0, 0)))
 
 
 def effects_on_form(
@@ -170,7 +191,7 @@ def effects_on_form(
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
         free = _rms(made.places, change @ evidence_of(solution, family).free)
-        found[family.name] = Effect(left, max(left, free))
+        found[family.name] = Effect(left, max(left, free), change)
     return found
 
 
@@ -389,11 +410,40 @@ def _figure(
 
 
 def _term_fit(solution: Solution, places: _Places) -> tuple[tuple[ZernikeIndex, ...], FloatArray]:
-    """Return the terms of degree 2 to 4, and the matrix from heights to their coefficients."""
+    """Return the fitted terms, and the matrix from heights to their coefficients."""
     every = terms_up_to(_FITTED_DEGREE)
     u, v = solution.network.part.disc.scaled(places.x, places.y)
     values = zernike_values(u, v, every).T
     root = np.sqrt(places.area)[:, np.newaxis]
-    fit = np.linalg.pinv(values * root, rcond=1e-6) * root.T
-    kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
-    return tuple(every[k] for k in kept), fit[kept]
+    return every, np.asarray(np.linalg.pinv(values * root, rcond=1e-6) * root.T)
+
+
+def _resembled(
+    made: _Made, covariance: FloatArray, terms: Sequence[ZernikeIndex], by_height: FloatArray,
+    effects: Mapping[str, Effect], families: Sequence[Family],
+) -> list[tuple[str, float, FloatArray]]:  # fmt: skip
+    """Return families that the scans leave open, likeliest first.
+
+    Of each its name, the probability that the form is partly its, and what it then does to the map,
+    one standard uncertainty (n,) [m]. One machine in ten has one of them.
+    """
+    if not np.any(made.height):
+        return []
+    used = [k for k, t in enumerate(terms) if t.n >= 2]
+    fit, degrees = by_height[used], np.array([terms[k].n for k in used])
+    symmetric = np.array([terms[k].m == 0 for k in used])
+    form = FormTerms(fit @ made.height, fit @ covariance @ fit.T, degrees, symmetric)
+    least = float(np.sqrt(made.places.area @ np.diag(covariance)))
+    found = []
+    for family in families:
+        effect = effects.get(family.name, NO_EFFECT)
+        if effect.free < least or not family.named or base_name(family.name) in FREE:
+            continue
+        shape = effect.shape if family.smooth is None else effect.shape @ family.smooth
+        gain, values = form.looks_like(fit @ shape, family.wide)
+        found.append((family.name, float(np.exp(min(gain, SURE) / 2)), shape @ values))
+    total = ODDS_ABSENT * len(found) + sum(odds for _, odds, _ in found)
+    # Less than this ratio is not worth more than a bare mention (Kass and Raftery 1995).
+    shares = [(name, odds / total, change) for name, odds, change in found if odds > np.e]
+    shares.sort(key=lambda one: -one[1])
+    return [(name, share, np.sqrt(share) * change) for name, share, change in shares]

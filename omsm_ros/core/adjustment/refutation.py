@@ -35,7 +35,7 @@ _UNCHANGED = 0.3
 _OFFSET = "lag_change"
 _MOST_RELEASED = 8
 # Before the scans: of ten errors that nobody declared, a machine has one.
-_ODDS_ABSENT, _SURE = 9.0, 50.0
+ODDS_ABSENT, SURE = 9.0, 50.0
 # Starting values; each step moves a variance by 30 at most, and four are enough for 2 %.
 _WALK_START, _BAND_START_M, _CELLS_START_M = 1e-18, 3e-9, 3e-9
 _FIRST_STEPS, _FURTHER_STEPS = 5, 3
@@ -139,7 +139,7 @@ def fit_and_refute(
         still = {e.family.name for e in refuted_by(solution, [r.name for r in found])}
         alike = [e for e in beyond if e is not best and e.family.named and _as_good(e, best)
                  and e.family.name not in still]  # fmt: skip
-        minor = best.effect < 2 * solution.scales.texture and best.gain < _SURE
+        minor = best.effect < 2 * solution.scales.texture and best.gain < SURE
         rivals = [e for e in evidences if e is not best and e.deviate > _RARE and not minor
                   and explained(e, best) > _RIVAL_SHARE]  # fmt: skip
         found.append(Refutation(best, tuple(alike), tuple(rivals), minor))
@@ -242,7 +242,7 @@ def completed(solution: Solution, refutations: Sequence[Refutation] = ()) -> Sol
     for family in solution.network.families:
         if family.named and family.name not in sizes:
             one = evidence_of(solution, family)
-            there = 1 / (1 + _ODDS_ABSENT * np.exp(-min(one.gain, _SURE) / 2))
+            there = 1 / (1 + ODDS_ABSENT * np.exp(-min(one.gain, SURE) / 2))
             size = np.sqrt(there) * np.hypot(one.values, one.uncertainty)
             sizes[family.name] = np.minimum(size, family.wide)
     for refutation in refutations:

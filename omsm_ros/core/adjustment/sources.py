@@ -57,6 +57,7 @@ class Family:
         in the uncertainty with the probability that it is there
     shown_by: code of the scan that shows it best
     named: False for columns that detect, but have no cause of their own
+    smooth: of a curve, what makes parabola and cubic of its columns (size, k)
     """
 
     name: str
@@ -67,6 +68,7 @@ class Family:
     shown_by: str
     default: float | None = None
     named: bool = True
+    smooth: FloatArray | None = None
 
 
 def base_name(family: str) -> str:

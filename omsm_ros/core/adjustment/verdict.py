@@ -23,7 +23,7 @@ CONTRADICTED, TOO_UNCERTAIN, INVALID = "contradicted", "too_uncertain", "invalid
 REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
 UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redundant", "uncertainty"
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
-UNIDENTIFIED = "unidentified"
+UNIDENTIFIED, LOOKS_LIKE = "unidentified", "looks_like"
 
 # Standard deviations; drift beyond them is not the declared drift (probability 1e-4, one-sided).
 _RARE_WALK = 3.7
@@ -148,6 +148,21 @@ def not_evaluated(
             code = NOT_EVALUATED if prior is None else DECLARED_ONLY
             found.append(Reason(code, (family.name, family.shown_by), free, limit))
     return tuple(found)
+
+
+def looks_like(
+    resembled: Sequence[tuple[str, float]], families: Sequence[Family], accepted: Collection[str]
+) -> tuple[Reason, ...]:
+    """Return the families that the form looks like, which these scans cannot tell from the part.
+
+    resembled: their names, with the rms of their share of the form [m];  accepted: as the part's
+    """
+    by = {f.name: f.shown_by for f in families}
+    return tuple(
+        Reason(LOOKS_LIKE, (name, by[name]), size)
+        for name, size in resembled
+        if name not in accepted
+    )
 
 
 def rests_on(

@@ -1,0 +1,42 @@
+"""Forms that follow one column of the machine, against forms that nothing orders."""
+
+import numpy as np
+
+from omsm_ros.core.adjustment.resemblance import FormTerms
+
+DEGREES = np.repeat(np.arange(2, 9), np.arange(3, 10))
+SYMMETRIC = np.zeros(len(DEGREES), np.bool_)
+
+
+def drawn(seed, added=0.0):
+    """Terms that fall with the degree, of 30 nm in all, and ``added`` of a known column."""
+    rng = np.random.default_rng(seed)
+    values = rng.normal(size=len(DEGREES)) / DEGREES**1.5
+    values *= 30e-9 / np.linalg.norm(values)
+    column = np.zeros((len(DEGREES), 1))
+    column[[0, 1, 7, 9], 0] = 0.8, 0.4, 0.4, 0.2
+    known = np.eye(len(DEGREES)) * (0.5e-9) ** 2
+    return FormTerms(values + added * column[:, 0], known, DEGREES, SYMMETRIC), column
+
+
+def test_a_form_of_chance_looks_like_no_column():
+    gains = [form.looks_like(column, 1e-7)[0] for form, column in map(drawn, range(12))]
+    assert np.median(gains) < 0
+    assert max(gains) < 10
+
+
+def test_a_form_that_follows_a_column_is_found_with_its_size():
+    for seed in range(4):
+        form, column = drawn(seed, 600e-9)
+        gain, (value,) = form.looks_like(column, 1e-7)
+        assert gain > 10
+        # The part itself has some 15 nm of the column.
+        assert abs(value - 600e-9) < 60e-9
+
+
+def test_what_the_adjustment_leaves_open_is_no_evidence():
+    """The same terms with an uncertainty of their size along the column."""
+    form, column = drawn(0, 600e-9)
+    unsure = form.covariance + (1e-6) ** 2 * column @ column.T
+    known = FormTerms(form.values, unsure, DEGREES, SYMMETRIC)
+    assert known.looks_like(column, 1e-7)[0] < 1
