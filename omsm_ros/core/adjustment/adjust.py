@@ -197,17 +197,12 @@ def _adjusted(
     form = form_map(solution, surface, removed, doubts, effects)
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
-    declared = {p.name for p in priors}
-    contradictions = reasons_of(
-        refutations, declared, agreement, wrong, _walk(detecting, priors), accepted
-    )  # fmt: skip
+    walk = _walk(detecting, priors)
     enough = redundant(scans)
     verdict = verdict_of(
-        contradictions,
-        (
-            *not_evaluated(families, effects, priors, open_limit(accuracy)),
-            *looks_like(form.resembled, families, accepted),
-        ),
+        reasons_of(refutations, {p.name for p in priors}, agreement, wrong, walk, accepted),
+        not_evaluated(families, effects, priors, open_limit(accuracy))
+        + looks_like(form.resembled, families, accepted),
         rests_on(families, effects, form.mean_uncertainty),
         enough,
         2 * form.pv.uncertainty,

@@ -252,9 +252,9 @@ def _curve(
 
     place = np.linspace(-1.0, 1.0, len(nodes))
     bends = legendre.legvander(place, 3)[:, 2:]
-    bent = np.kron(np.linalg.lstsq(parts.T, bends, rcond=1e-6)[0], np.eye(ways))
+    shapes = np.kron(np.linalg.lstsq(parts.T, bends, rcond=1e-6)[0], np.eye(ways))
     return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by,
-                  default, smooth=bent)  # fmt: skip
+                  default, smooth=shapes)  # fmt: skip
 
 
 def _of_the_probe(r: Ranges) -> list[Family]:

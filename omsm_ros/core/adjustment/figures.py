@@ -17,8 +17,8 @@ from scipy import linalg, optimize, sparse
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
+from omsm_ros.core.adjustment.part_terms import FormTerms
 from omsm_ros.core.adjustment.refutation import ODDS_ABSENT, SURE, Doubt
-from omsm_ros.core.adjustment.resemblance import FormTerms
 from omsm_ros.core.adjustment.sources import FREE, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -33,7 +33,7 @@ _RIM = 96
 _DRAWS = 300
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
-# Of the probability of the likeliest family: one that is named beside it.
+# Of the probability of the likeliest family: from which on one is named too.
 _AS_LIKELY = 0.3
 
 

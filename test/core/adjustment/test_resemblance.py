@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from omsm_ros.core.adjustment.resemblance import FormTerms
+from omsm_ros.core.adjustment.part_terms import FormTerms
 
 DEGREES = np.repeat(np.arange(2, 9), np.arange(3, 10))
 SYMMETRIC = np.zeros(len(DEGREES), np.bool_)
