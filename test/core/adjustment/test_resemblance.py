@@ -40,3 +40,13 @@ def test_what_the_adjustment_leaves_open_is_no_evidence():
     unsure = form.covariance + (1e-6) ** 2 * column @ column.T
     known = FormTerms(form.values, unsure, DEGREES, SYMMETRIC)
     assert known.looks_like(column, 1e-7)[0] < 1
+
+
+def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
+    """Three directions of 42 are known, the rest by rounding; nothing looks like the machine."""
+    rng = np.random.default_rng(3)
+    known = rng.normal(size=(len(DEGREES), 3)) * 1e-7
+    terms = FormTerms(known @ [0.3, -0.2, 0.1], known @ known.T, DEGREES, SYMMETRIC)
+    gain, values = terms.looks_like(rng.normal(size=(len(DEGREES), 1)), 1e-7)
+    assert gain < 2
+    assert np.all(np.isfinite(values))
