@@ -108,6 +108,7 @@ def become(command, environment, folder, log):
     sys.argv = sys.orig_argv = command
     sys.modules["__main__"] = start  # which a process of its own imports anew
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup before the tests would ignore
 
 
 def main():
