@@ -76,12 +76,11 @@ def test_identify_states_its_progress_and_ends_when_cancelled(cell, bag):
     cell.processes.start("calibrator", output=str(output))
     node = cell.processes.pid("calibrator")
     first = Client(cell, Identify, "calibrator/identify", bag=str(bag))
-    cell.wait("an order", lambda: any(f.order for f in first.feedback))
-    busy = workers_of(node)
-    assert busy
     waiting = Client(cell, Identify, "calibrator/identify", bag=str(bag))
     waiting.cancel()
     assert waiting.result().status == GoalStatus.STATUS_CANCELED
+    cell.wait("an order", lambda: any(f.order for f in first.feedback))
+    assert workers_of(node)
     began = time.monotonic()
     first.cancel()
     answer = first.result()
