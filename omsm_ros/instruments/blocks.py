@@ -123,7 +123,7 @@ class BlockCutter:
         self._waiting: list[CountedRun] = []
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
         self.restarted_at_zero = self.perhaps_at_zero = self.lost_settings = False
-        # Of the last samples [ns]: device time less that of the count, and arrival.
+        # Device time less that of the count, and arrival, of the last samples [ns].
         self._usual: tuple[int, int] | None = None
         self._due = self._doubtful = 0  # time by the count; an offset to be confirmed
         self.missed = self._ahead = 0

@@ -33,7 +33,7 @@ _RIM = 96
 _DRAWS = 300
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
-# Of the probability of the likeliest family: from which on one is named too.
+# A family at least this share as probable as the likeliest one is named with it.
 _AS_LIKELY = 0.3
 
 
@@ -424,8 +424,8 @@ def _resembled(
 ) -> list[tuple[str, float, FloatArray]]:  # fmt: skip
     """Return families that the scans leave open, likeliest first.
 
-    Of each its name, the probability that the form is partly its, and what it then does to the map,
-    one standard uncertainty (n,) [m]. One machine in ten has one of them.
+    Each has its name, the probability that it made a part of the form, and its change of the map as
+    one standard uncertainty (n,) [m]. One machine in ten is taken to have one.
     """
     if not np.any(made.height):
         return []

@@ -128,11 +128,11 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
 
 # Amplitudes of turned and of polished parts fall with about the 1.5th power of the degree.
 _START_POWER = 3.0
-# Over the plausible size; each is as probable.
+# Sizes that are compared, over the plausible one; each is as probable.
 _SIZES = 10.0 ** np.arange(-1.5, 1.1, 0.5)
-# What the data determine of a logarithm of A, and of p, is 0.3; of a likelihood, 0.5 matters.
+# The data determine ln A and p to about 0.3; a log likelihood matters from 0.5 on.
 _TOLERANCE = {"xatol": 0.1, "fatol": 0.05}
-# Of the largest variance, twenty times what a factorisation of fifty rows loses.
+# Share of the largest variance: twenty times what a factorisation of fifty rows loses.
 _ROUNDING = 1e-13
 
 

@@ -90,7 +90,7 @@ def fast_mode(record: MotionRecord) -> FastMode:
 
 def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
     place, encoder, probe, half, noise = [], [], [], [], []
-    # Rounding is an error of the encoder also where its readings at rest are all equal.
+    # The rounding of an encoder counts even where all its readings on a plateau are equal.
     rounding = reading_step(record.z) / np.sqrt(12)
     for edge in edges:
         level = slice(edge.start + _LEVEL.start, edge.start + _LEVEL.stop)

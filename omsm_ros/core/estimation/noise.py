@@ -268,7 +268,7 @@ def _followed(
     """
     line = np.arange(len(seen))
     band = np.floor(np.log2(1 + line / _NARROWEST) * _BANDS_AN_OCTAVE).astype(np.int64)
-    # What differs from a part of ``made`` in each band tells the share of ``direct``.
+    # The share of ``direct`` follows from its difference to a part of ``made`` in each band.
     odd, left = (each - _shares(made, each, band)[0][band] * made for each in (direct, seen))
     whole = np.zeros_like(band)
     (alike,), (chance,) = _shares(odd, left, whole)
@@ -323,7 +323,7 @@ def smoothed(
     mean = (earlier * before + later[::-1] * after[::-1] - rest) / count
     alike, left = _alike(rest - mean, noise, edges)
     for edge in edges:
-        # What agrees there by chance is no constant.
+        # Samples that agree there by chance are no constant.
         count[edge.start : edge.stop] = 1.0
     return np.asarray(mean + alike + middle), noise * float(np.sqrt(np.mean(1 / count + left)))
 

@@ -212,7 +212,7 @@ def best_covered(
     for shape in shapes:
         inside = np.all([shape.holds(u + a.real, v + a.imag) for a in around], axis=0)
         shares.append(float(np.mean(open_[inside])) if inside.any() else 1.0)
-    # Of a spiral the box is smaller by half a track, so that an ellipse seems to be covered better.
+    # The box of a spiral is smaller by half a track, so that an ellipse seems to be covered better.
     best = int(np.argmin(shares)) if min(shares) < shares[0] - _CLEARLY else 0
     return shares[best], shapes[best]
 
