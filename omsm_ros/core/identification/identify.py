@@ -16,7 +16,7 @@ The static gains are regressions on the plateaus. With a reference sensor on the
 are three, and two of them show whether the scale of the probe or that of the encoder is wrong.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial, wraps
 from itertools import pairwise
@@ -396,9 +396,9 @@ _LEAST_PLATEAUS = 4
 def static_gains(record: MotionRecord) -> StaticGain:
     """Return the travel of one per travel of the other, magnitudes.
 
-    From the means of the plateaus, with offset and linear drift fitted, in white noise and a random
-    walk of the most likely size. The uncertainty is that of the regression over plateaus, so it
-    contains whatever makes them scatter: noise, drift, backlash, slip.
+    From the means of the plateaus, with offset, linear drift and the further axes fitted, in white
+    noise and a random walk of the most likely size. The uncertainty is that of the regression over
+    plateaus, so it contains whatever makes them scatter: noise, drift, backlash, slip.
 
     Raises StepTestError with fewer than four plateaus.
     """
@@ -414,13 +414,15 @@ def static_gains(record: MotionRecord) -> StaticGain:
     time = _means(np.arange(len(record), dtype=np.float64), rests)
     part = np.searchsorted(record.starts, [start for start, _ in rests], side="right")
     encoder, probe = _means(record.z, rests), _means(np.asarray(readings), rests)
+    further = [_means(motion, rests) for motion in record.further.values()]
+    ratio = partial(_ratio, further=further, time=time, part=part)
     if record.reference is None:
-        return StaticGain(probe_per_encoder=_ratio(encoder, probe, time, part))
+        return StaticGain(probe_per_encoder=ratio(encoder, probe))
     reference = _means(record.reference, rests)
     return StaticGain(
-        probe_per_encoder=_ratio(encoder, probe, time, part),
-        probe_per_reference=_ratio(reference, probe, time, part),
-        reference_per_encoder=_ratio(encoder, reference, time, part),
+        probe_per_encoder=ratio(encoder, probe),
+        probe_per_reference=ratio(reference, probe),
+        reference_per_encoder=ratio(encoder, reference),
     )
 
 
@@ -443,17 +445,27 @@ def _means(values: FloatArray, rests: list[tuple[int, int]]) -> FloatArray:
     return np.asarray(means)
 
 
-def _ratio(travel: FloatArray, other: FloatArray, time: FloatArray, part: IntArray) -> GainEstimate:
-    """Return the ratio; part: number of the recording of each plateau, with its own offset."""
+def _ratio(
+    travel: FloatArray,
+    other: FloatArray,
+    further: Sequence[FloatArray],
+    time: FloatArray,
+    part: IntArray,
+) -> GainEstimate:
+    """Return ``other`` per ``travel``, means of the plateaus (k,), with ``further`` axes fitted.
+
+    part: number of the recording of each plateau, with its own offset and drift
+    """
     known = np.isfinite(travel) & np.isfinite(other)
     if np.sum(known) < _LEAST_PLATEAUS:
         raise StepTestError(
             "identification.few_plateaus", found=int(np.sum(known)), least=_LEAST_PLATEAUS
         )
-    x, t, y = travel[known], time[known], other[known]
+    t, y = time[known], other[known]
     own = [part[known] == number for number in np.unique(part[known])]
     each = [column for one in own for column in (one, one * t / t[-1])]
-    columns = np.column_stack([x - x.mean(), *each]).astype(np.float64)
+    moved = [motion[known] - motion[known].mean() for motion in (travel, *further)]
+    columns = np.column_stack([*moved, *each]).astype(np.float64)
     unit, scale = unit_columns(columns)
     walk = sum(np.minimum.outer(t, t) / t[-1] * np.outer(one, one) for one in own)
     tried = [_weighted(unit, y, np.eye(len(y)) + share * walk) for share in _WALK_SHARES]

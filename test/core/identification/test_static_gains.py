@@ -1,5 +1,7 @@
 """Static gains from plateaus show whether the probe or the encoder is wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -40,6 +42,21 @@ def test_uncertainty_is_the_scatter_where_the_machine_drifts_by_chance():
     scatter = np.std([g.value for g in gains])
     stated = np.sqrt(np.mean([g.uncertainty**2 for g in gains]))
     assert stated == pytest.approx(scatter, rel=0.25)
+
+
+def test_uncertainty_is_the_scatter_where_another_axis_moves_too():
+    """Its motion reaches the probe: in other steps, at other times."""
+    own = StepTest(count=4, dwell=0.9)
+    found = []
+    for seed in range(40):
+        record = stepped(1.0, seed=seed)
+        x = np.resize(own.positions(np.arange(round(own.duration / 1e-3)) * 1e-3).z, len(record))
+        moved = replace(record, distance=record.distance + 0.01 * x, further={"x": x})
+        found.append(static_gains(moved).probe_per_encoder)
+    off = np.array([gain.value - 1 for gain in found])
+    stated = np.sqrt(np.mean([gain.uncertainty**2 for gain in found]))
+    assert np.sqrt(np.mean(off**2)) == pytest.approx(stated, rel=0.3)
+    assert stated < 1e-4
 
 
 def test_a_reference_tells_probe_from_encoder():
