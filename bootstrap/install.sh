@@ -34,5 +34,8 @@ else
     .venv/bin/python -c "import colcon, colcon_cmake, colcon_ros" 2>/dev/null ||
         packages="$packages -r bootstrap/colcon.in"
 fi
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --use-pep517 $packages
+install=".venv/bin/python -m pip install --quiet --disable-pip-version-check"
+$install --upgrade pip
+# Bytecode is written by what is used: that of all takes as long as the rest.
+$install --use-pep517 --no-compile $packages
 [ -n "$distribution" ] || .venv/bin/python bootstrap/repair_wheels.py
