@@ -7,7 +7,7 @@ has to type is given in the unit of its field instead.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 
 from omsm_ros.units import DAY_S, NANOSECONDS_PER_S
@@ -17,10 +17,14 @@ NOTHING = "–"
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 # A prefix would be squared with its unit.
 _WITHOUT_PREFIX = {"", "s²", "%", "°", "°C", "K", "d", "ppm", "kg", "rpm"}
+# Small numbers of these units have a power of ten.
+_WITH_POWER = {"", "s²"}
 # Limit for values that are far smaller or larger than their uncertainty.
 _MOST_DECIMALS = 9
-# Zeros after the decimal point: 0.000319 nm, but 3.19 · 10⁻⁵ nm.
+# Zeros after the decimal point: 0.000319 nm, but < 0.0001 nm.
 _MOST_ZEROS = 4
+# Without a prefix, smaller numbers are written as 3.19 · 10⁻⁵.
+_LEAST_PLAIN = 1e-3
 _FIGURES = {
     "robust_peak_to_valley": "PV of 99.5 %",
     "peak_to_valley": "PV",
@@ -56,7 +60,7 @@ def number(value: object) -> float | None:
 
 
 def quantity(value: object, unit: str, digits: int = 3, signed: bool = False) -> str:
-    """Return a number with an SI prefix, rounded to ``digits``: ``83.1 nm``.
+    """Return a number with an SI prefix, rounded to ``digits``: ``83.1 nm``, ``< 0.0001 nm``.
 
     value: in ``unit``, which has no prefix;  signed: write a plus before positive values
     """
@@ -67,8 +71,38 @@ def quantity(value: object, unit: str, digits: int = 3, signed: bool = False) ->
     rounded = _rounded(known, digits)
     exponent = _exponent(rounded, unit)
     tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
+    if rounded and abs(rounded) < 10.0 ** (exponent - _MOST_ZEROS):
+        if unit in _WITH_POWER:
+            return f"{plain(rounded, digits)}{tail}"
+        least = f"{10.0**-_MOST_ZEROS:.{_MOST_ZEROS}f}{tail}"
+        return f"< {least}" if rounded > 0 else f"> -{least}"
     sign = "+" if signed and rounded > 0 else ""
     return f"{sign}{_fixed(rounded, digits, exponent)}{tail}"
+
+
+def column(values: Sequence[object], unit: str, digits: int = 3) -> list[str]:
+    """Return the numbers of one column with equal prefix and decimals: ``11.5 nm``, ``< 0.1 nm``.
+
+    The largest has ``digits``. A number that is zero is written as ``none``.
+    """
+    known = [number(value) for value in values]
+    largest = max((_rounded(abs(value), digits) for value in known if value), default=0.0)
+    if not largest:
+        return [NOTHING if value is None else "none" for value in known]
+    exponent = _exponent(largest, unit)
+    decimals = max(digits - 1 - math.floor(math.log10(largest)) + exponent, 0)
+    tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
+    least = 10.0**-decimals
+
+    def cell(value: float | None) -> str:
+        if not value:
+            return NOTHING if value is None else "none"
+        shown = value / 10.0**exponent
+        if abs(shown) < least / 2:
+            return f"< {least:.{decimals}f}{tail}"
+        return f"{shown:.{decimals}f}{tail}"
+
+    return [cell(value) for value in known]
 
 
 def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4) -> str:
@@ -84,9 +118,14 @@ def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4
         return quantity(known, unit, digits) if unit else plain(known, digits)
     # Rounded first, so that 0.996 becomes 1.0.
     spread = _rounded(spread, 2)
-    exponent = _exponent(max(abs(known), spread), unit)
+    largest = max(abs(known), spread)
+    exponent = _exponent(largest, unit)
+    power = ""
+    if unit in _WITH_POWER and largest < _LEAST_PLAIN:
+        exponent = math.floor(math.log10(_rounded(largest, 2)))
+        power = f" · 10{superscript(exponent)}"
     decimals = min(max(1 - math.floor(math.log10(spread)) + exponent, 0), _MOST_DECIMALS)
-    tail = f" {_PREFIXES[exponent]}{unit}" if unit else ""
+    tail = power + (f" {'' if power else _PREFIXES[exponent]}{unit}" if unit else "")
     # Adding 0 removes the sign of -0.
     shown = (round(part / 10.0**exponent, decimals) + 0.0 for part in (known, spread))
     return " ± ".join(f"{part:.{decimals}f}{tail}" for part in shown)
@@ -104,7 +143,8 @@ def expanded(value: object, uncertainty: object, unit: str = "", signed: bool = 
     if signed or abs(known) >= 2 * spread:
         return f"{measured(value, 2 * spread, unit)} (k = 2)"
     most = max(known, 0.0) + 2 * spread
-    return f"at most {quantity(most, unit) if unit else plain(most)} (k = 2)"
+    bound = quantity(most, unit) if unit else plain(most)
+    return f"{bound} (k = 2)" if bound.startswith("<") else f"at most {bound} (k = 2)"
 
 
 def figure(name: str) -> str:
@@ -127,7 +167,7 @@ def plain(value: object, digits: int = 3) -> str:
         return NOTHING
     if known == 0:
         return "0"
-    if 1e-3 <= abs(known) < 10**digits:
+    if _LEAST_PLAIN <= abs(known) < 10**digits:
         return f"{known:#.{digits}g}".rstrip(".")
     mantissa, _, power = f"{known:.{digits - 1}e}".partition("e")
     return f"{mantissa} · 10{superscript(int(power))}"
@@ -207,10 +247,7 @@ def _exponent(value: float, unit: str) -> int:
 def _fixed(rounded: float, digits: int, exponent: int) -> str:
     if not rounded:
         return "0"
-    magnitude = math.floor(math.log10(abs(rounded)))
-    if magnitude < exponent - _MOST_ZEROS:
-        return plain(rounded / 10.0**exponent, digits)
-    decimals = max(digits - 1 - (magnitude - exponent), 0)
+    decimals = max(digits - 1 - math.floor(math.log10(abs(rounded))) + exponent, 0)
     return f"{rounded / 10.0**exponent:.{decimals}f}"
 
 

@@ -69,8 +69,8 @@ class PageTables(HTMLParser):
 
 def value_of(text):
     """The number that a cell says, in SI; None for a dash."""
-    if text == "–":
-        return None
+    if text in ("–", "none"):
+        return None if text == "–" else 0.0
     found = _NUMBER.fullmatch(text.replace("−", "-"))
     assert found, text
     number, power, unit = found.groups()
@@ -83,10 +83,14 @@ def value_of(text):
     return value * _PREFIXES[unit[0]]
 
 
-def says(text, value, digits=3):
-    """Return whether a cell contains ``value``, rounded to ``digits``."""
+def says(text, value, digits=3, largest=0.0):
+    """Return whether a cell contains ``value``, with the ``digits`` of itself or of ``largest``."""
+    if text.startswith("< "):
+        return 0 < value < value_of(text[2:])
     reported = value_of(text)
     if reported is None or value is None:
         return reported is value
     # Allow half a unit in the last place, and rounding of binary fractions.
-    return abs(reported - value) <= 0.5001 * 10.0 ** (1 - digits) * abs(value) + 1e-300
+    return (
+        abs(reported - value) <= 0.5001 * 10.0 ** (1 - digits) * max(abs(value), largest) + 1e-300
+    )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from omsm_ros.readable import (
     NOTHING,
+    column,
     count,
     date_text,
     expanded,
@@ -216,13 +217,25 @@ def test_the_largest_of_all_numbers_is_shown_and_not_rounded_up_to_infinity():
     ("value", "unit", "expected"),
     [
         (3.19e-13, "m", "0.000319 nm"),
-        (-2.49e-14, "m", "-2.49 · 10⁻⁵ nm"),
-        (5.5e-14, "%", "5.50 · 10⁻¹⁴ %"),
-        (3.1e-20, "rad", "3.10 · 10⁻¹¹ nrad"),
+        (-2.49e-14, "m", "> -0.0001 nm"),
+        (5.5e-14, "%", "< 0.0001 %"),
+        (3.1e-20, "rad", "< 0.0001 nrad"),
     ],
 )
 def test_no_row_of_zeros_has_to_be_counted(value, unit, expected):
     assert quantity(value, unit) == expected
+
+
+def test_a_column_has_one_unit_and_the_decimals_of_its_largest():
+    rows = column([11.54e-9, 2.72e-9, 1.95e-11, 0.0, None], "m")
+    assert rows == ["11.5 nm", "2.7 nm", "< 0.1 nm", "none", "–"]
+    assert column([1.2e-6, 3e-9], "m") == ["1.20 µm", "< 0.01 µm"]
+    assert column([0.0, None], "m") == ["none", "–"]
+
+
+def test_a_small_number_without_prefix_has_the_power_of_its_uncertainty():
+    assert measured(6.43e-6, 7.7e-6) == "6.4 · 10⁻⁶ ± 7.7 · 10⁻⁶"
+    assert measured(1.49e-8, 1.1e-9, "s²") == "1.49 · 10⁻⁸ s² ± 0.11 · 10⁻⁸ s²"
 
 
 @pytest.mark.parametrize(

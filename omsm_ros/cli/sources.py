@@ -24,7 +24,7 @@ from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.adjust import read_scan
 from omsm_ros.pipelines.study_scans import alignment_of
 from omsm_ros.quantities import RADIUS
-from omsm_ros.readable import date_text, date_text_of_stamp, plain, quantity
+from omsm_ros.readable import date_text, date_text_of_stamp, measured
 
 _SPHERE = "sphere"
 _HOW = """\
@@ -102,11 +102,8 @@ def _show(facts: Facts) -> None:
     rows = []
     for entry in facts["sources"]:
         order = f"/{entry['per_turn']:g}" if "per_turn" in entry else ""
-        plainly = entry["unit"] == "1"
-        text = " ± ".join(
-            plain(entry[name]) if plainly else quantity(entry[name], entry["unit"])
-            for name in ("found", "uncertainty")
-        )
+        unit = "" if entry["unit"] == "1" else entry["unit"]
+        text = measured(entry["found"], entry["uncertainty"], unit)
         rows.append((source_name(entry["source"] + order), f"{text} (k = 1)"))
     rows += [(source_name(name), "not shown by this recording") for name in facts["not_shown"]]
     table([*rows, written([facts["file"]])])

@@ -41,6 +41,7 @@ from omsm_ros.report.measurement.figures import (
     levelled,
     registered_map,
     surface_figures,
+    unit_for,
 )
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.measurement.surface_map import CloudView, EmbeddedMap, Layer, embedded
@@ -65,7 +66,10 @@ def view_of(cloud: NDArray[np.void], sample_period: float) -> CloudView | None:
 
 
 def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> EmbeddedMap | None:
-    """Return the zoomable map, with the registered deviation if ``out`` has one."""
+    """Return the zoomable map, the deviation without the pose of the part first.
+
+    This is the registered deviation if ``out`` has one, else that without piston and tilt.
+    """
     if view is None:
         return None
     layers = []
@@ -76,10 +80,15 @@ def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> Embedd
         height = view.height - view.height.min()
         layers.append(Layer("height", view.x, view.y, height, "µm", symmetric=False))
     else:
-        heights = {"corrected": (view.height, "nm"), "uncorrected": (view.raw_height, "µm")}
-        for name, (height, unit) in heights.items():
-            level = levelled(view, height, nominal)
-            layers.append(Layer(f"{name}, piston removed", view.x, view.y, level, unit))
+        seated, _ = levelled(view, nominal, tilt=False)
+        corrected, raw = levelled(view, nominal)
+        for name, away in (
+            ("corrected, tilt removed", corrected),
+            ("uncorrected, same tilt removed", raw),
+            ("corrected, as it sits", seated),
+        ):
+            unit = unit_for(float(np.max(np.abs(away))))
+            layers.append(Layer(name, view.x, view.y, away, unit))
     spread = Layer("uncertainty, k = 1", view.x, view.y, view.uncertainty, "nm", symmetric=False)
     return embedded([*layers, spread])
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.messages import sentence
-from omsm_ros.readable import NOTHING, count, expanded, plain, quantity
+from omsm_ros.readable import column, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study, title_block
 from omsm_ros.report.tables import Table, sized
@@ -99,19 +99,13 @@ def _figures(facts: Mapping[str, Any]) -> Table:
 
 def source_table(facts: Mapping[str, Any]) -> Table:
     """Return each source that was declared or is significant: declared against found."""
-    rows = []
-    for source in sorted(facts["sources"], key=lambda s: -(s["effect"] or 0.0)):
-        if source["declared"] is None and not source["refuted"]:
-            continue
-        rows.append(
-            (
-                source["text"],
-                declared_text(source),
-                found_text(source),
-                quantity(source["effect"], "m", 2) if source["identifiable"] else NOTHING,
-                _status(source),
-            )
-        )
+    shown = [s for s in facts["sources"] if s["declared"] is not None or s["refuted"]]
+    shown.sort(key=lambda s: -(s["effect"] or 0.0))
+    effects = column([s["effect"] if s["identifiable"] else None for s in shown], "m")
+    rows = [
+        (source["text"], declared_text(source), found_text(source), effect, _status(source))
+        for source, effect in zip(shown, effects, strict=True)
+    ]
     heads = ("declared (k = 1)", "found (k = 1)", "effect, rms", "")
     return Table("", heads, rows)
 
@@ -127,7 +121,7 @@ def declared_text(source: Mapping[str, Any]) -> str:
     declared = source["declared"]
     if declared is None:
         return "not declared"
-    return sized(declared, source["unit"]) if declared else "no effect"
+    return sized(declared, source["unit"], 2) if declared else "no effect"
 
 
 def _status(source: Mapping[str, Any]) -> str:
@@ -143,7 +137,7 @@ def found_text(source: Mapping[str, Any]) -> str:
         return f"not identifiable; to find it, {wanted}"
     size = float(np.linalg.norm(source["found"]))
     spread = float(np.sqrt(np.mean(np.square(source["uncertainty"]))))
-    return f"{sized(size, source['unit'])} ± {sized(spread, source['unit'], 2)}"
+    return measured(size, spread, "" if source["unit"] == "1" else source["unit"])
 
 
 def _scans(facts: Mapping[str, Any]) -> Table:
@@ -161,13 +155,13 @@ def form_map(found: Adjustment) -> Figure:
     """Draw the form deviation, colours symmetric about zero."""
     values = found.form.height / NANOMETRE_M
     largest = float(np.max(np.abs(values)))
-    return _map(found, values, "RdBu_r", (-largest, largest), "form deviation [nm]")
+    return _map(found, values, style.MAP_COLOURS, (-largest, largest), "form deviation [nm]")
 
 
 def uncertainty_map(found: Adjustment) -> Figure:
     """Draw the standard uncertainty of the form deviation."""
     values = found.form.uncertainty / NANOMETRE_M
-    return _map(found, values, "viridis", (0.0, float(np.max(values))), "u (k = 1) [nm]")
+    return _map(found, values, "viridis", (0.0, float(np.max(values))), "standard uncertainty [nm]")
 
 
 def _map(
@@ -180,7 +174,9 @@ def _map(
         cmap=colours, vmin=limits[0], vmax=limits[1], shading="gouraud",
     )  # fmt: skip
     ax.set_aspect("equal")
-    made.colorbar(drawn, ax=ax, label=name)
+    bar = made.colorbar(drawn, ax=ax)
+    style.quiet(bar.ax)
+    style.label(bar.ax, y=name)
     style.label(ax, x="x [mm]", y="y [mm]", title=name.split(" [")[0])
     return made
 

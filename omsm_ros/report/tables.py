@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.readable import NOTHING, count, measured, plain, quantity
+from omsm_ros.core.correction.machine_sources import OF_CALIBRATION
+from omsm_ros.readable import NOTHING, column, count, measured, number, plain, quantity
 
 _OPEN = "not evaluated"
 POSE_UNITS = {
@@ -45,7 +46,9 @@ def budget_table(summary: Mapping[str, object]) -> Table:
     """Return the sources of uncertainty, the largest first, in one row those not evaluated."""
     rows: Sequence[Mapping[str, Any]] = part(summary, "budget", "sources") or ()
     known = [row for row in rows if row["status"] != _OPEN]
-    ordered = [_budget_row(row) for row in sorted(known, key=lambda r: -(r["height"] or 0.0))]
+    known.sort(key=lambda row: -(row["height"] or 0.0))
+    heights = column([row["height"] for row in known], "m")
+    ordered = [_budget_row(row, height) for row, height in zip(known, heights, strict=True)]
     if missing := [row["says"] or row["source"] for row in rows if row["status"] == _OPEN]:
         ordered.append((_OPEN, NOTHING, NOTHING, NOTHING, "; ".join(missing)))
     return Table(
@@ -56,22 +59,24 @@ def budget_table(summary: Mapping[str, object]) -> Table:
     )
 
 
-def _budget_row(row: Mapping[str, Any]) -> tuple[str, ...]:
-    size, unit = row["standard_uncertainty"], row["unit"]
+def _budget_row(row: Mapping[str, Any], height: str) -> tuple[str, ...]:
+    size = row["standard_uncertainty"]
     known = f"{row['status']}: {row['reason']}" if row["reason"] else row["status"]
     return (
         f"{row['source'].replace('_', ' ')} ({row['says']})",
-        sized(size, unit),
-        quantity(row["height"], "m"),
+        NOTHING if row["source"] in OF_CALIBRATION else sized(size, row["unit"], 2),
+        height,
         "none" if row["kind"] == "random" else "all points",
         known,
     )
 
 
 def sized(size: object, unit: str, digits: int = 3) -> str:
-    """Return a size in its unit; a size without a unit has no SI prefix."""
+    """Return a size in its unit; without a unit it has no SI prefix, and zero is ``none``."""
+    if number(size) == 0:
+        return "none"
     if unit == "1":
-        return plain(size, digits) if size is not None else NOTHING
+        return plain(size, digits)
     return quantity(size, unit, digits)
 
 

@@ -82,6 +82,6 @@ class TestBudgetAndMotion:
         names = [row[0].split(" (")[0] for row in rows]
         assert names == ["probe noise", "encoder noise", "not evaluated"]
         assert rows[0][2] == "10.0 nm"
-        assert rows[1][1] == "2.00 nm"
+        assert rows[1][1] == "2.0 nm"
         assert rows[2][1:4] == ("–", "–", "–")
         assert tables.budget_table({}).rows == []

@@ -38,7 +38,7 @@ DISTRIBUTIONS = {"normal": 1.0, "uniform": 1 / math.sqrt(3.0), "arcsine": 1 / ma
 POINT_SOURCES = tuple(field.name for field in fields(ErrorSources))
 # Sources of single readings that are also common to all points.
 _ALSO_SYSTEMATIC = ("static_gain", "probe_latency", "motion_error", "pitch")
-_OF_CALIBRATION = ("dynamics", "undetected_model_error")
+OF_CALIBRATION = ("dynamics", "undetected_model_error")
 # Sources of single readings that can be stated, and all that are independent between points.
 _STATED_RANDOM = tuple(name for name in POINT_SOURCES if name not in _ALSO_SYSTEMATIC)
 RANDOM = (*_STATED_RANDOM, SCAN_SCATTER)
@@ -65,7 +65,7 @@ class StatedSource:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        allowed = [name for name in NAMES if name not in _OF_CALIBRATION]
+        allowed = [name for name in NAMES if name not in OF_CALIBRATION]
         if self.source not in allowed:
             raise ConfigurationError(
                 "correction.source", source=shown(self.source), known=sorted(allowed)
@@ -172,7 +172,7 @@ def whole_scan_sources(
     found = []
     reason: str | Notice
     members = calibration.members if isinstance(calibration, CalibrationSet) else (calibration,)
-    for name, part in zip(_OF_CALIBRATION, (0, 1), strict=True):
+    for name, part in zip(OF_CALIBRATION, (0, 1), strict=True):
         if any(covariance_parts(member)[part].covariance.any() for member in members):
             reason = Notice("correction.from_covariance")
             found.append(source_of(name, 1.0, EVALUATED, reason, {}))
@@ -206,6 +206,8 @@ def origin_of(
         return said[0].how, said[0].reason
     if name == "probe_latency":
         latency = calibration.latency
+        if not latency.resolved:
+            return EVALUATED, Notice("correction.latency_in_lag")
         return EVALUATED if latency.source != "declared" else DECLARED, latency.reason
     return EVALUATED, Notice("correction.from_certificate")
 

@@ -25,6 +25,12 @@ from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 UNITS_M = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "mm": MILLIMETRE_M}
 
+
+def unit_for(largest: float) -> str:
+    """Return the unit in which a deviation of ``largest`` [m] has few zeros."""
+    return "nm" if largest < MICROMETRE_M else "µm"
+
+
 Limits = tuple[float, float]
 
 # Share of the pixels within the colour range, so that outliers do not set it.
@@ -143,17 +149,18 @@ def _colour_bar(image: AxesImage, place: Axes, extend: str, text: str) -> None:
 
 
 def profile(raw: Profile, corrected: Profile, *, title: str, position: str) -> Figure:
-    """Draw one profile before and after the correction in µm, and below it that after in nm.
+    """Draw one profile before and after the correction, and below it that after in nm.
 
     position: name of the horizontal axis, drawn in mm
     """
     made, axes = style.figure(6.1, 3.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
-    _draw_profile(upper, raw, MICROMETRE_M, color=style.BEFORE, label="uncorrected")
-    _draw_profile(upper, corrected, MICROMETRE_M, color=style.AFTER, label="corrected")
+    unit = unit_for(float(np.max(np.abs(raw.value))))
+    _draw_profile(upper, raw, UNITS_M[unit], color=style.BEFORE, label="uncorrected")
+    _draw_profile(upper, corrected, UNITS_M[unit], color=style.AFTER, label="corrected")
     _draw_profile(lower, corrected, NANOMETRE_M, color=style.AFTER, label="corrected")
     style.legend_above(upper)
-    style.label(upper, y="deviation [µm]", title=title)
+    style.label(upper, y=f"deviation [{unit}]", title=title)
     style.label(lower, x=f"{position} [mm]", y="deviation [nm]")
     return made
 
@@ -169,15 +176,16 @@ def _draw_profile(axes: Axes, drawn: Profile, scale: float, **look: Any) -> None
 def dynamic_error(
     time: FloatArray, before: FloatArray, *, uncertainty: FloatArray | None = None
 ) -> Figure:
-    """Draw the dynamic error over the scan in µm, and the uncertainty of a height below it in nm.
+    """Draw the dynamic error over the scan, and the uncertainty of a height below it in nm.
 
     time: [s];  before: [m];  uncertainty: standard, drawn as ±2u [m]; each (n,)
     """
     shown = uncertainty is not None
     made, axes = style.figure(6.1, 3.7 if shown else 2.2, rows=1 + shown, sharex=True)
     upper, lower = axes[0, 0], axes[-1, 0]
-    _draw_envelope(upper, time, before, MICROMETRE_M, style.BEFORE)
-    style.label(upper, y="before [µm]", title="Dynamic error over the scan")
+    unit = unit_for(float(np.max(np.abs(before))))
+    _draw_envelope(upper, time, before, UNITS_M[unit], style.BEFORE)
+    style.label(upper, y=f"before [{unit}]", title="Dynamic error over the scan")
     if uncertainty is not None:
         at, _, largest = style.envelope(time, uncertainty)
         bound = 2 * largest / NANOMETRE_M
@@ -216,15 +224,24 @@ def surface_figures(cloud: CloudView, nominal: Surface | None) -> dict[str, byte
     made = {"dynamic_error": style.png(trace)}
     if nominal is None:
         return {**made, **_height_maps(cloud)}
-    heights = {"raw": cloud.raw_height, "corrected": cloud.height}
-    deviations = {name: levelled(cloud, h, nominal) for name, h in heights.items()}
+    corrected, raw = levelled(cloud, nominal)
+    deviations = {"raw": raw, "corrected": corrected}
     return {**made, **_maps(cloud, deviations), **_profiles(cloud, deviations)}
 
 
-def levelled(cloud: CloudView, height: FloatArray, nominal: Surface) -> FloatArray:
-    """Return ``height`` (n,) [m] minus the nominal surface, with zero mean over the area."""
-    away = form.deviation(cloud.x, cloud.y, height, nominal)
-    return form.level(cloud.x, cloud.y, away, weights=cloud.area)
+def levelled(
+    cloud: CloudView, nominal: Surface, *, tilt: bool = True
+) -> tuple[FloatArray, FloatArray]:
+    """Return corrected and uncorrected height minus the nominal surface, each (n,) [m].
+
+    The mean over the area of each is zero. With ``tilt`` the tilt of the corrected points, the seat
+    of the part on the machine, is removed from both, so that they differ by the dynamic error.
+    """
+    x, y = cloud.x, cloud.y
+    away = form.deviation(x, y, cloud.height, nominal)
+    corrected = form.level(x, y, away, tilt=tilt, weights=cloud.area)
+    raw = form.level(x, y, corrected + cloud.dynamic_error, weights=cloud.area)
+    return corrected, raw
 
 
 def _height_maps(cloud: CloudView) -> dict[str, bytes]:
@@ -244,9 +261,10 @@ def _height_maps(cloud: CloudView) -> dict[str, bytes]:
 def _maps(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, bytes]:
     raw, corrected = deviations["raw"], deviations["corrected"]
     limits = symmetric_limits(cloud.x, cloud.y, raw)
+    unit = unit_for(limits[1])
     shown = {
-        "raw_map": (raw, "µm", "Uncorrected [µm]", limits),
-        "corrected_map_same_scale": (corrected, "µm", "Corrected, same scale [µm]", limits),
+        "raw_map": (raw, unit, f"Uncorrected [{unit}]", limits),
+        "corrected_map_same_scale": (corrected, unit, f"Corrected, same scale [{unit}]", limits),
         "corrected_map": (corrected, "nm", "Corrected, enlarged [nm]", None),
     }
     return {

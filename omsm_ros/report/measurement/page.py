@@ -172,8 +172,10 @@ def correlated_moves(form: Mapping[str, Any], name: str) -> str:
     if not shares:
         return ""
     sizes = {name: part(form, "pose", name, "uncertainty"), **shares}
-    moves = {n: v for n, v in sizes.items() if v and n in form["pose"]}
-    stated = [f"{n} ± {quantity(v, unit_of_parameter(n), 2)}" for n, v in moves.items()]
+    moves = {n: v for n, v in sizes.items() if n in form["pose"]}
+    spans = {n: quantity(v, unit_of_parameter(n), 2) for n, v in moves.items()}
+    # A move without effect is zero, or rounding only.
+    stated = [f"{n} ± {span}" for n, span in spans.items() if moves[n] and span[0] != "<"]
     if len(stated) < 2:
         return ""
     own, *others = stated
@@ -244,9 +246,9 @@ class Caption:
 
 
 MAPS = {
-    "raw_map": Caption("Before the correction: encoder plus probe, in micrometres.", False),
+    "raw_map": Caption("Before the correction: encoder plus probe.", False),
     "corrected_map_same_scale": Caption("After it, on the scale of the map before.", False),
-    "corrected_map": Caption("After it, enlarged, in nanometres.", False),
+    "corrected_map": Caption("After it, enlarged.", False),
     "height_map": Caption("Corrected height; no nominal surface was given.", False),
     "error_map": Caption("Dynamic error that was removed.", False),
 }
@@ -256,7 +258,7 @@ PROFILES = {
     "profile_diagonal": Caption("A lag's error is largest here if the part is tilted along x."),
     "profile_radius": Caption("Mean of each ring: rotationally symmetric error."),
 }
-ERRORS = {"dynamic_error": Caption("Before in µm, after in nm: different scales.")}
+ERRORS = {"dynamic_error": Caption("Before and after: mind the different scales.")}
 DYNAMICS = {
     "bode": Caption("Grey: above the frequency up to which the calibration is valid."),
     "step_response": Caption("One edge of the step test, and the residual of the model."),

@@ -134,7 +134,7 @@ class TestDynamicError:
     def test_alone_it_is_one_panel(self, cloud):
         figure = figures.dynamic_error(cloud.time, cloud.dynamic_error)
         assert len(figure.get_axes()) == 1
-        assert {"before [µm]", "time [s]"} <= texts(figure)
+        assert {"before [nm]", "time [s]"} <= texts(figure)
 
 
 def test_a_registered_map_shows_points_left_out_and_what_no_point_covers():

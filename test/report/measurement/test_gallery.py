@@ -9,7 +9,7 @@ import pytest
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import DataError
-from omsm_ros.report.measurement.figures import surface_figures
+from omsm_ros.report.measurement.figures import levelled, surface_figures
 from omsm_ros.report.measurement.page import CAPTIONS, MAPS, PROFILES
 from omsm_ros.report.measurement.surface_map import CloudView
 
@@ -26,6 +26,17 @@ def test_with_a_nominal_surface_it_is_all_there(cloud):
         {"raw_map", "corrected_map_same_scale", "corrected_map"} | set(PROFILES) | {"dynamic_error"}
     )
     assert all(picture.startswith(PNG) for picture in made.values())
+
+
+def test_the_seat_of_the_part_is_removed_and_the_dynamic_error_is_not(cloud):
+    tilted = replace(cloud, height=cloud.height + 5e-6 + 1e-4 * cloud.x - 2e-4 * cloud.y)
+    corrected, raw = levelled(tilted, PAPER_MIRROR)
+    flat, _ = levelled(cloud, PAPER_MIRROR)
+    np.testing.assert_allclose(corrected, flat, atol=1e-14)
+    difference = raw - corrected - cloud.dynamic_error
+    assert np.ptp(difference) < 1e-15  # a constant: only a piston was removed
+    seated, _ = levelled(tilted, PAPER_MIRROR, tilt=False)
+    assert np.ptp(seated) > 20 * np.ptp(corrected)
 
 
 def test_without_a_nominal_surface_it_shows_height_and_error(cloud):
