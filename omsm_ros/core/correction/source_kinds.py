@@ -67,68 +67,21 @@ def components(kernel: Kernel, where: FloatArray) -> FloatArray:
     )
 
 
-def tilt(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return tilts about y and about x; the lateral shift of the points is negligible."""
-    return np.stack([-p.x, p.y])
+def _across(p: ScanPoints, x: FloatArray | float, y: FloatArray | float) -> FloatArray:
+    """Return the field of a shift by x, y [m] in the machine's frame."""
+    one = np.ones(len(p))
+    return p.height_change_of_shift(*workpiece_xy(x * one, y * one, p.c))
 
 
-def decentre(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the shift of the part along x and along y."""
+def _along_both(p: ScanPoints) -> FloatArray:
+    """Return the fields (2, n) of a shift of the part along x and along y."""
     one, zero = np.ones(len(p)), np.zeros(len(p))
     return np.stack([p.height_change_of_shift(one, zero), p.height_change_of_shift(zero, one)])
 
 
-def clocking(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the turn of the part about the spindle."""
-    return p.height_change_of_shift(-p.y, p.x)
-
-
-def expansion(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the growth of the part in all directions."""
-    return p.height + p.height_change_of_shift(p.x, p.y)
-
-
-def _across(p: ScanPoints, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the field of a shift by x, y [m] in the machine's frame."""
-    return p.height_change_of_shift(*workpiece_xy(x, y, p.c))
-
-
-def centre_x(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the shift of the zero of X."""
-    return _across(p, np.ones(len(p)), np.zeros(len(p)))
-
-
-def centre_y(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the shift of the zero of Y."""
-    return _across(p, np.zeros(len(p)), np.ones(len(p)))
-
-
-def beam(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the tilt of the beam along X and along Y, a shift proportional to the distance."""
-    zero = np.zeros(len(p))
-    return np.stack([_across(p, p.distance, zero), _across(p, zero, p.distance)])
-
-
-def squareness(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the angle of X to the plane of the spindle, which makes a cone."""
-    return p.slide_x
-
-
-def parallelism(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the angle of Z to the spindle in X and in Y, a shift proportional to Z."""
-    zero = np.zeros(len(p))
-    return np.stack([_across(p, p.z, zero), _across(p, zero, p.z)])
-
-
-def straightness_x(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return an unknown curve over X, towards the probe."""
-    return _curve_components(p.slide_x, parameters)
-
-
-def straightness_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return an unknown curve over Z, along X."""
-    zero = np.zeros(len(p))
-    return np.stack([_across(p, bow, zero) for bow in _curve_components(p.z, parameters)])
+def _across_both(p: ScanPoints, size: FloatArray | float) -> FloatArray:
+    """Return the fields (2, n) of a shift by ``size`` [m] along X and along Y of the machine."""
+    return np.stack([_across(p, size, 0.0), _across(p, 0.0, size)])
 
 
 def _curve_components(position: FloatArray, parameters: Parameters) -> FloatArray:
@@ -137,137 +90,34 @@ def _curve_components(position: FloatArray, parameters: Parameters) -> FloatArra
     return components(smooth(length), position)
 
 
-def _turning(p: ScanPoints, parameters: Parameters) -> tuple[FloatArray, FloatArray]:
-    angle = parameters["per_turn"] * p.c
+def _across_z(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    """Return the fields of an unknown curve over Z, along X."""
+    return np.stack([_across(p, bow, 0.0) for bow in _curve_components(p.z, parameters)])
+
+
+def _phases(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return both phases of a wave of unknown phase."""
     return np.cos(angle), np.sin(angle)
 
 
-def spindle_axial(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of an axial motion that is periodic in the turn."""
-    return np.stack(_turning(p, parameters))
-
-
-def spindle_radial(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a rotating shift."""
-    along, across = _turning(p, parameters)
+def _rotating_shift(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    along, across = _phases(parameters["per_turn"] * p.c)
     return np.stack([_across(p, along, across), _across(p, -across, along)])
 
 
-def spindle_tilt(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a rotating tilt."""
-    along, across = _turning(p, parameters)
+def _rotating_tilt(p: ScanPoints, parameters: Parameters) -> FloatArray:
+    along, across = _phases(parameters["per_turn"] * p.c)
     return np.stack(
         [p.slide_x * along + p.slide_y * across, p.slide_y * along - p.slide_x * across]
     )
 
 
-def encoder_scale(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the scale of Z."""
-    return p.z
-
-
-def encoder_interpolation(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a wave over Z."""
-    return _periodic(p.z, parameters["period"])
-
-
-def pitch(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return an unknown angle over Z times the Abbe arm."""
-    return parameters["arm"] * _curve_components(p.z, parameters)
-
-
-def backlash(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the direction in which Z moves."""
-    return np.sign(p.z_rate)
-
-
-def static_gain(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return the scale of the distance."""
-    return -p.distance / parameters["gain"]
-
-
-def probe_latency(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the rate of Z: delayed points lie further along the path."""
-    return p.z_rate
-
-
-def dynamics(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the directions of the covariance from noise."""
-    return _rows_or_empty(p.dynamics[~p.undetected], p)
-
-
-def undetected_error(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the directions of the covariance from undetected model error."""
-    return _rows_or_empty(p.dynamics[p.undetected], p)
+def _periodic(position: FloatArray, parameters: Parameters) -> FloatArray:
+    return np.stack(_phases(2 * np.pi / parameters["period"] * position))
 
 
 def _rows_or_empty(rows: FloatArray, p: ScanPoints) -> FloatArray:
     return rows if len(rows) else np.zeros((1, len(p)))
-
-
-def linearity(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return the cube of the distance, one at the end of the range."""
-    return np.asarray((p.distance / parameters["half_range"]) ** 3, np.float64)
-
-
-def linearity_periodic(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return both phases of a wave over the distance."""
-    return _periodic(p.distance, parameters["period"])
-
-
-def _periodic(position: FloatArray, period: float) -> FloatArray:
-    angle = 2 * np.pi / period * position
-    return np.stack([np.cos(angle), np.sin(angle)])
-
-
-def slope(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the slope in both directions, because the direction of the error is unknown."""
-    one, zero = np.ones(len(p)), np.zeros(len(p))
-    return np.stack([_across(p, one, zero), _across(p, zero, one)])
-
-
-def slope_square(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the square of the slope."""
-    one, zero = np.ones(len(p)), np.zeros(len(p))
-    return np.asarray(
-        p.height_change_of_shift(one, zero) ** 2 + p.height_change_of_shift(zero, one) ** 2,
-        np.float64,
-    )
-
-
-def drift_rate(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the time."""
-    return p.time
-
-
-def drift_walk(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return an unknown walk over time."""
-    return components(random_walk, p.time)
-
-
-def drift(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return an unknown, exponentially correlated curve over time."""
-    return components(fading(parameters["correlation_time"]), p.time)
-
-
-def random_walk_variance(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the sum of squares of a random walk."""
-    return p.time
-
-
-def curve_variance(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the sum of squares of an unknown curve."""
-    return np.ones(len(p))
-
-
-def lateral_curve_variance(p: ScanPoints, _: Parameters) -> FloatArray:
-    """Return the sum of squares of an unknown curve along X."""
-    return np.asarray(_across(p, np.ones(len(p)), np.zeros(len(p))) ** 2, np.float64)
-
-
-def pitch_variance(p: ScanPoints, parameters: Parameters) -> FloatArray:
-    """Return the sum of squares of an unknown pitch."""
-    return np.full(len(p), parameters["arm"] ** 2)
 
 
 @dataclass(frozen=True)
@@ -333,52 +183,97 @@ _LENGTH_OPTIONAL = ("correlation_length",)
 FORMER_NAMES = {"lateral_lag": "probe_latency", "could_hide": "undetected_model_error"}
 
 KINDS: dict[str, SourceKind] = {
-    "dynamics": SourceKind(_SHARE, dynamics),
-    "undetected_model_error": SourceKind(_SHARE, undetected_error),
-    "static_gain": SourceKind(_SHARE, static_gain, {"gain": quantities.GAIN}),
-    "probe_latency": SourceKind(_SECONDS, probe_latency),
-    "lag_change": SourceKind(_SECONDS, probe_latency),
-    "motion_error": SourceKind(_METRES, backlash),
-    "tilt": SourceKind(_RADIANS, tilt),
-    "decentre": SourceKind(_METRES, decentre, needs_slope=True),
-    "clocking": SourceKind(_RADIANS, clocking, needs_slope=True),
-    "expansion": SourceKind(_SHARE, expansion, needs_slope=True),
-    "centre_x": SourceKind(_METRES, centre_x, needs_slope=True),
-    "centre_y": SourceKind(_METRES, centre_y, needs_slope=True),
-    "beam": SourceKind(_SHARE, beam, needs_slope=True),
-    "squareness": SourceKind(_RADIANS, squareness),
-    "parallelism": SourceKind(_RADIANS, parallelism, needs_slope=True),
+    # Directions of the calibration's covariance.
+    "dynamics": SourceKind(_SHARE, lambda p, _: _rows_or_empty(p.dynamics[~p.undetected], p)),
+    "undetected_model_error": SourceKind(
+        _SHARE, lambda p, _: _rows_or_empty(p.dynamics[p.undetected], p)
+    ),
+    # The scale of the distance.
+    "static_gain": SourceKind(
+        _SHARE, lambda p, own: -p.distance / own["gain"], {"gain": quantities.GAIN}
+    ),
+    # Delayed points lie further along the path.
+    "probe_latency": SourceKind(_SECONDS, lambda p, _: p.z_rate),
+    "lag_change": SourceKind(_SECONDS, lambda p, _: p.z_rate),
+    # The direction in which Z moves.
+    "motion_error": SourceKind(_METRES, lambda p, _: np.sign(p.z_rate)),
+    # Tilts of the part about y and about x; the lateral shift of the points is negligible.
+    "tilt": SourceKind(_RADIANS, lambda p, _: np.stack([-p.x, p.y])),
+    "decentre": SourceKind(_METRES, lambda p, _: _along_both(p), needs_slope=True),
+    # The turn of the part about the spindle.
+    "clocking": SourceKind(
+        _RADIANS, lambda p, _: p.height_change_of_shift(-p.y, p.x), needs_slope=True
+    ),
+    # The growth of the part in all directions.
+    "expansion": SourceKind(
+        _SHARE, lambda p, _: p.height + p.height_change_of_shift(p.x, p.y), needs_slope=True
+    ),
+    # Shifts of the zeros of X and Y.
+    "centre_x": SourceKind(_METRES, lambda p, _: _across(p, 1.0, 0.0), needs_slope=True),
+    "centre_y": SourceKind(_METRES, lambda p, _: _across(p, 0.0, 1.0), needs_slope=True),
+    # The tilt of the beam along X and along Y, a shift proportional to the distance.
+    "beam": SourceKind(_SHARE, lambda p, _: _across_both(p, p.distance), needs_slope=True),
+    # The angle of X to the plane of the spindle, which makes a cone.
+    "squareness": SourceKind(_RADIANS, lambda p, _: p.slide_x),
+    # The angle of Z to the spindle in X and in Y, a shift proportional to Z.
+    "parallelism": SourceKind(_RADIANS, lambda p, _: _across_both(p, p.z), needs_slope=True),
+    # Unknown curves: over X towards the probe, over Z along X, over Z as an angle.
     "straightness_x": SourceKind(
-        _METRES, straightness_x, _CORRELATED, _LENGTH_OPTIONAL, squares=curve_variance
+        _METRES,
+        lambda p, own: _curve_components(p.slide_x, own),
+        _CORRELATED,
+        _LENGTH_OPTIONAL,
+        squares=lambda p, _: np.ones(len(p)),
     ),
     "straightness_z": SourceKind(
         _METRES,
-        straightness_z,
+        _across_z,
         _CORRELATED,
         _LENGTH_OPTIONAL,
         needs_slope=True,
-        squares=lateral_curve_variance,
+        squares=lambda p, _: _across(p, 1.0, 0.0) ** 2,
     ),
     "pitch": SourceKind(
         _RADIANS,
-        pitch,
+        lambda p, own: own["arm"] * _curve_components(p.z, own),
         {"arm": quantities.LENGTH, **_CORRELATED},
         _LENGTH_OPTIONAL,
-        squares=pitch_variance,
+        squares=lambda p, own: np.full(len(p), own["arm"] ** 2),
     ),
-    "spindle_axial": SourceKind(_METRES, spindle_axial, _PER_TURN),
-    "spindle_radial": SourceKind(_METRES, spindle_radial, _PER_TURN, needs_slope=True),
-    "spindle_tilt": SourceKind(_RADIANS, spindle_tilt, _PER_TURN),
-    "encoder_scale": SourceKind(_SHARE, encoder_scale),
-    "encoder_interpolation": SourceKind(_METRES, encoder_interpolation, _PERIOD),
-    "probe_linearity": SourceKind(_METRES, linearity, {"half_range": quantities.PERIOD}),
-    "probe_periodic": SourceKind(_METRES, linearity_periodic, _PERIOD),
-    "probe_slope": SourceKind(quantities.SLOPE_ERROR, slope, needs_slope=True),
-    "probe_slope_square": SourceKind(quantities.SLOPE_ERROR, slope_square, needs_slope=True),
-    "drift_rate": SourceKind(quantities.RATE_UNCERTAINTY, drift_rate),
-    "drift_walk": SourceKind(quantities.WALK_UNCERTAINTY, drift_walk, squares=random_walk_variance),
+    # Both phases of motions that are periodic in the turn.
+    "spindle_axial": SourceKind(
+        _METRES, lambda p, own: np.stack(_phases(own["per_turn"] * p.c)), _PER_TURN
+    ),
+    "spindle_radial": SourceKind(_METRES, _rotating_shift, _PER_TURN, needs_slope=True),
+    "spindle_tilt": SourceKind(_RADIANS, _rotating_tilt, _PER_TURN),
+    "encoder_scale": SourceKind(_SHARE, lambda p, _: p.z),
+    "encoder_interpolation": SourceKind(_METRES, lambda p, own: _periodic(p.z, own), _PERIOD),
+    # The cube of the distance, one at the end of the range.
+    "probe_linearity": SourceKind(
+        _METRES,
+        lambda p, own: (p.distance / own["half_range"]) ** 3,
+        {"half_range": quantities.PERIOD},
+    ),
+    "probe_periodic": SourceKind(_METRES, lambda p, own: _periodic(p.distance, own), _PERIOD),
+    # The slope in both directions, because the direction of the error is unknown.
+    "probe_slope": SourceKind(
+        quantities.SLOPE_ERROR, lambda p, _: _across_both(p, 1.0), needs_slope=True
+    ),
+    "probe_slope_square": SourceKind(
+        quantities.SLOPE_ERROR, lambda p, _: np.sum(_along_both(p) ** 2, axis=0), needs_slope=True
+    ),
+    # Errors that grow with the time, walk, or are exponentially correlated.
+    "drift_rate": SourceKind(quantities.RATE_UNCERTAINTY, lambda p, _: p.time),
+    "drift_walk": SourceKind(
+        quantities.WALK_UNCERTAINTY,
+        lambda p, _: components(random_walk, p.time),
+        squares=lambda p, _: p.time,
+    ),
     "drift": SourceKind(
-        _METRES, drift, {"correlation_time": quantities.CORRELATION_TIME}, squares=curve_variance
+        _METRES,
+        lambda p, own: components(fading(own["correlation_time"]), p.time),
+        {"correlation_time": quantities.CORRELATION_TIME},
+        squares=lambda p, _: np.ones(len(p)),
     ),
 }
 """Kinds of systematic error by their names."""
