@@ -29,8 +29,6 @@ registration.few_points: {count} points lie on the nominal surface, expected {le
     its parameters, the aperture and the units of the cloud
 registration.small_extent: the points lie within {extent:m} of each other; measure across the part,
     or check the units of the cloud
-registration.foreign_sample: sample {sample} is in none of the axis blocks; give the blocks of the
-    scan that was corrected
 registration.sphere_outside_machine: the scan does not fit a sphere of radius {radius:m}: its centre
     lies outside the machine; check the radius and its sign, and that the scan covers the sphere
 registration.no_sphere: the scan does not fit a sphere of radius {radius:m}: the residual is
@@ -39,6 +37,6 @@ registration.other_radius: the scan is of a sphere of radius {fitted:m/9} with a
     uncertainty of {uncertainty:m/2}, not {radius:m/6}; check the radius, or the scale of Z
 registration.centre_not_determined: the scan does not determine the spindle centre: the probe hardly
     moved over the sphere; scan across it while the spindle turns
-registration.short_sphere_scan: scan of {finite} finite points of {samples}, expected {least} or
-    more; record a longer one
+registration.short_sphere_scan: scan of {points} points, expected {least} or more; record a longer
+    one
 """)

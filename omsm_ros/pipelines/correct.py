@@ -15,6 +15,7 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import (
+    MOST_TRACED,
     ScanFields,
     ScanTrace,
     resolves_per_turn_waves,
@@ -82,6 +83,7 @@ class CorrectedScan:
     temperatures: as recorded (n,) [°C], in their order; NaN: implausible
     by_stamps: join the streams by their stamps, for which all samples are held in memory;
         None: by the trigger counter they share, in bounded memory
+    most_traced: largest number of points in ``trace``
 
     Raises BagError for a bag without samples, CalibrationError for a calibration that does not
     match the scan, unless overridden.
@@ -95,6 +97,7 @@ class CorrectedScan:
         *,
         admission: Admission = Admission(),
         by_stamps: StampJoining | None = None,
+        most_traced: int = MOST_TRACED,
     ) -> None:
         self.path, self.options = recording.path, options
         blocks = _blocks(recording, by_stamps)
@@ -118,7 +121,7 @@ class CorrectedScan:
             polarity=options.polarity,
         )
         self.admitted = admit(calibration, self.reasons, admission.override)
-        self._corrector = Corrector(calibration, options, MAX_PENDING_SAMPLES)
+        self._corrector = Corrector(calibration, options, MAX_PENDING_SAMPLES, most_traced)
 
     def steps(self) -> Iterator[tuple[AxisBlock | DistanceBlock | None, SurfacePoints | None]]:
         """Yield each block with the points that it completed; at the end None with the rest.

@@ -18,7 +18,12 @@ from omsm_ros.core.adjustment.self_calibration import SelfCalibration, self_cali
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.kinematics.kinematics import Geometry
-from omsm_ros.core.registration.probe_alignment import Alignment, SphereScanReader, align_on_sphere
+from omsm_ros.core.registration.probe_alignment import (
+    MOST_POINTS,
+    Alignment,
+    SphereScan,
+    align_on_sphere,
+)
 from omsm_ros.core.streams.blocks import Account, AxisBlock
 from omsm_ros.errors import BagError
 from omsm_ros.io.topics import AnyBag
@@ -85,19 +90,15 @@ def _read_scans(
     for recording in recordings:
         scan = CorrectedScan(recording, calibration, options)
         reader = ScanReader(scan.sample_period)
-        _read(scan, reader)
+        for block, points in scan.steps():
+            if isinstance(block, AxisBlock):
+                reader.add_axes(block)
+            if points is not None:
+                reader.add(points)
+        _check_points(scan)
         scans.append(reader.columns())
         accounts.append(scan.account)
     return scans, accounts
-
-
-def _read(scan: CorrectedScan, reader: ScanReader | SphereScanReader) -> None:
-    for block, points in scan.steps():
-        if isinstance(block, AxisBlock):
-            reader.add_axes(block)
-        if points is not None:
-            reader.add(points)
-    _check_points(scan)
 
 
 def alignment_of(
@@ -111,11 +112,12 @@ def alignment_of(
 
     Also return the account of the samples of the scan.
     """
-    reader = SphereScanReader()
     with Recording(path, progress) as recording:
-        scan = CorrectedScan(recording, calibration, _UNCORRECTED_LAG)
-        _read(scan, reader)
-        return align_on_sphere(reader.scan(), radius, geometry), scan.account
+        scan = CorrectedScan(recording, calibration, _UNCORRECTED_LAG, most_traced=MOST_POINTS)
+        for _ in scan.steps():
+            pass
+        _check_points(scan)
+        return align_on_sphere(SphereScan.of(scan.trace.points()), radius, geometry), scan.account
 
 
 def _check_points(scan: CorrectedScan) -> None:

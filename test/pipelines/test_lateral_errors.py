@@ -68,7 +68,7 @@ def test_points_too_far_apart_for_the_turns_say_so(tmp_path, small_scan, true_ca
         0,
         points.sample * 1e-3,
         points,
-        small_scan.axes.c[points.sample],
+        (small_scan.axes.b[points.sample], small_scan.axes.c[points.sample]),
         np.zeros((2, len(points))),
         np.zeros(len(points)),
     )

@@ -23,7 +23,7 @@ from omsm_ros.core.correction.motion_filter import (
     undetected_rows,
 )
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
-from omsm_ros.core.correction.systematic import ScanPoints, ScanTrace, SystematicSource
+from omsm_ros.core.correction.systematic import MOST_TRACED, ScanPoints, ScanTrace, SystematicSource
 from omsm_ros.core.correction.uncertainty import (
     SCAN_SCATTER,
     ErrorSources,
@@ -99,6 +99,7 @@ class Corrector:
     ``max_pending`` for their partner are dropped, so that memory is bounded.
 
     most_waiting: number of samples that may wait, for files; None takes ``max_pending``
+    most_traced: largest number of points in ``trace``
     trace: evenly spaced points for the systematic errors of the whole scan
     """
 
@@ -107,6 +108,7 @@ class Corrector:
         calibration: Calibration,
         options: CorrectionOptions = CorrectionOptions(),
         most_waiting: int | None = None,
+        most_traced: int = MOST_TRACED,
     ) -> None:
         self._calibration = calibration
         self._options = options
@@ -125,7 +127,7 @@ class Corrector:
             for source in options.systematic
             if options.surface is not None or not source.needs_slope
         ]
-        self.trace = ScanTrace()
+        self.trace = ScanTrace(most_traced)
 
     def push_axes(self, *blocks: AxisBlock) -> None:
         """Filter the encoder samples of one block or of several consecutive ones.
@@ -263,7 +265,7 @@ class Corrector:
         away = reading * (self._options.polarity / self._static_gain)
         where = workpiece_points(self._options.geometry, (x, y, moved), b, c, away)
         time = np.asarray(sample * (axes.period_ns / NANOSECONDS_PER_S), np.float64)
-        points = self.trace.add(axes.session, time, where, c, axis_values[MOVED:], away)
+        points = self.trace.add(axes.session, time, where, (b, c), axis_values[MOVED:], away)
         return SurfacePoints(
             sample=sample,
             x=where.x,

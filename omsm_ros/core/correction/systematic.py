@@ -41,7 +41,7 @@ class ScanPoints:
     """Points of a scan in the order of time, each array (n,): arguments of sensitivity fields.
 
     time: since the start [s];  x, y, height: in the workpiece frame [m]
-    z: of the probe, H(z) [m];  z_rate: its rate [m/s];  c: angle of the spindle [rad]
+    z: of the probe, H(z) [m];  z_rate: its rate [m/s];  b, c: angles of table and spindle [rad]
     distance: that the probe measured, growing with height [m]
     slope_x, slope_y: of the surface along the workpiece's x and y [1]; None if not known
     dynamics: change of the heights per standard uncertainty along each independent direction of
@@ -55,6 +55,7 @@ class ScanPoints:
     height: FloatArray
     z: FloatArray
     z_rate: FloatArray
+    b: FloatArray
     c: FloatArray
     distance: FloatArray
     slope_x: FloatArray | None = None
@@ -266,7 +267,7 @@ def _count(rows: FloatArray, left_out: float) -> BoolArray:
 # have sixteen points each, enough for errors with eight waves a turn.
 MOST_TRACED = 8192
 
-_COLUMNS = ("time", "x", "y", "height", "z", "z_rate", "c", "distance")
+_COLUMNS = ("time", "x", "y", "height", "z", "z_rate", "b", "c", "distance")
 
 
 class ScanTrace:
@@ -288,7 +289,7 @@ class ScanTrace:
         session: int,
         time: FloatArray,
         where: WorkpiecePoints,
-        c: FloatArray,
+        turned: tuple[FloatArray, FloatArray],
         motion: FloatArray,
         distance: FloatArray,
     ) -> ScanPoints:
@@ -296,6 +297,7 @@ class ScanTrace:
 
         session, time: of the trigger counter [s]; after a restart of the counter the time
             continues without a gap
+        turned: b and c [rad]
         motion: H(z), its rate, and its change by each direction of the covariance, (2 + r, n)
         """
         if len(time):
@@ -311,7 +313,8 @@ class ScanTrace:
             height=where.height,
             z=motion[0] - self._first_z,
             z_rate=motion[1],
-            c=c,
+            b=turned[0],
+            c=turned[1],
             distance=distance,
             dynamics=motion[2:],
             undetected=self.undetected,

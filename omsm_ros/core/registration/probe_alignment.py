@@ -5,26 +5,28 @@ offset across the feed as a flat centre. A beam inclined by β measures d β to 
 distance d. Offset and inclination are fitted so that the corrected points lie on the sphere.
 """
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import optimize
 
-from omsm_ros.core.correction.surface_points import SurfacePoints
+from omsm_ros.core.correction.systematic import ScanPoints
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
-from omsm_ros.core.streams.blocks import AxisBlock, FloatArray
-from omsm_ros.core.streams.statistics import EvenSelection, noise_of
+from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.streams.statistics import noise_of
 from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.linear_algebra import least_squares, unit_columns
 from omsm_ros.units import MICROMETRE_M
 
+MOST_POINTS = 60_000
+"""Points of a scan that are fitted, which bounds time and memory."""
+
 _OfUnknown = Callable[[FloatArray], FloatArray]
-_COLUMNS = ("x", "y", "z", "b", "c", "distance")
 # Ten groups of consecutive points, from which a standard deviation is known to 25 %.
 _MIN_POINTS = 1000
-# More points are thinned evenly, to bound time and memory of the fit.
-_MAX_POINTS = 60_000
 # Consecutive points within which residuals may be correlated: 0.1 s at 1 kHz.
 _GROUP_POINTS = 100
 # Unit of slopes in the fit, a milliradian; lengths are in micrometres.
@@ -53,6 +55,19 @@ class SphereScan:
     c: FloatArray
     distance: FloatArray
 
+    @classmethod
+    def of(cls, points: ScanPoints) -> SphereScan:
+        """Return the samples behind points that were corrected without geometry and latency."""
+        along, away = points.distance * np.cos(points.b), points.distance * np.sin(points.b)
+        return cls(
+            x=points.slide_x - away,
+            y=points.slide_y,
+            z=points.height - along,
+            b=points.b,
+            c=points.c,
+            distance=points.distance,
+        )
+
 
 @dataclass(frozen=True)
 class Alignment:
@@ -73,56 +88,6 @@ class Alignment:
     used: int
 
 
-class SphereScanReader:
-    """Collects the scan behind corrected points that come in portions, in bounded memory.
-
-    points: number received, of which an even selection is kept
-    """
-
-    def __init__(self) -> None:
-        self.points = 0
-        self._axes: list[AxisBlock] = []
-        self._kept = EvenSelection(_MAX_POINTS)
-
-    def add_axes(self, block: AxisBlock) -> None:
-        """Add an axis block, before the points that are computed from it."""
-        self._axes.append(block)
-
-    def add(self, points: SurfacePoints) -> None:
-        """Add points that were corrected without geometry and without latency."""
-        if not len(points):
-            return
-        scan = sphere_scan_of(points, self._axes)
-        self._kept.add(np.stack([getattr(scan, name) for name in _COLUMNS], axis=1))
-        self.points += len(points)
-        last = points.sample[-1]
-        self._axes = [b for b in self._axes if b.end > last]
-
-    def scan(self) -> SphereScan:
-        """Return the kept points."""
-        rows = self._kept.rows().reshape(-1, len(_COLUMNS))
-        return SphereScan(**dict(zip(_COLUMNS, rows.T, strict=True)))
-
-
-def sphere_scan_of(points: SurfacePoints, axes: Sequence[AxisBlock]) -> SphereScan:
-    """Return the scan behind points that were corrected without geometry and without latency.
-
-    axes: the blocks of that scan. Raises DataError for a point that is in none of them.
-    """
-    counts = np.concatenate([b.first_sample + np.arange(len(b)) for b in axes])
-    order = np.argsort(counts, kind="stable")
-    index = np.minimum(np.searchsorted(counts, points.sample, sorter=order), len(counts) - 1)
-    place = order[index]
-    strange = np.flatnonzero(counts[place] != points.sample)
-    if len(strange):
-        raise DataError("registration.foreign_sample", sample=int(points.sample[strange[0]]))
-    x, y, z, b, c = (
-        np.concatenate([getattr(block, name) for block in axes])[place] for name in "xyzbc"
-    )
-    moved = z - points.dynamic_error
-    return SphereScan(x=x, y=y, z=moved, b=b, c=c, distance=(points.height - moved) / np.cos(b))
-
-
 def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None = None) -> Alignment:
     """Fit the spindle centre and the inclination of the beam to a scan of a sphere.
 
@@ -131,7 +96,8 @@ def align_on_sphere(scan: SphereScan, radius: float, geometry: Geometry | None =
 
     Raises DataError for a scan that is too short, or does not fit a sphere of this radius.
     """
-    scan = _thinned(scan)
+    if len(scan.z) < _MIN_POINTS:
+        raise DataError("registration.short_sphere_scan", points=len(scan.z), least=_MIN_POINTS)
     start = geometry or Geometry()
     beam = bool(np.ptp(scan.distance) > _USEFUL_DISTANCE_M)
     first = _first_guess(scan, radius, start, beam)
@@ -278,17 +244,3 @@ def _standard_uncertainties(jacobian: FloatArray, residual: FloatArray) -> Float
     covariance = inverse @ (correction * scores.T @ scores) @ inverse
     with np.errstate(invalid="ignore"):  # an undetermined variance may round below zero
         return np.asarray(np.sqrt(np.diag(covariance)), np.float64)
-
-
-def _thinned(scan: SphereScan) -> SphereScan:
-    samples = len(scan.z)
-    good = np.all([np.isfinite(getattr(scan, name)) for name in _COLUMNS], axis=0)
-    if np.count_nonzero(good) < _MIN_POINTS:
-        raise DataError(
-            "registration.short_sphere_scan",
-            finite=int(np.count_nonzero(good)),
-            samples=samples,
-            least=_MIN_POINTS,
-        )
-    used = np.flatnonzero(good)[:: -(-samples // _MAX_POINTS)]
-    return SphereScan(**{name: getattr(scan, name)[used] for name in _COLUMNS})

@@ -21,6 +21,7 @@ def spiral_points(n: int = 3000) -> ScanPoints:
     distance = 20e-6 * np.sin(0.7 * time)
     z = height - distance
     points = ScanPoints(
-        time=time, x=x, y=y, height=height, z=z, z_rate=np.gradient(z, time), c=c, distance=distance
-    )
+        time=time, x=x, y=y, height=height, z=z, z_rate=np.gradient(z, time),
+        b=np.zeros(n), c=c, distance=distance,
+    )  # fmt: skip
     return points.with_slopes(PAPER_MIRROR)

@@ -215,7 +215,7 @@ def test_a_restarted_counter_goes_on_in_time() -> None:
     place = WorkpiecePoints(*(np.ones(3) for _ in range(3)))
     for session, first in ((0, 100.0), (1, 0.0)):
         time = first + np.arange(3.0)
-        trace.add(session, time, place, np.zeros(3), np.ones((2, 3)), np.zeros(3))
+        trace.add(session, time, place, np.zeros((2, 3)), np.ones((2, 3)), np.zeros(3))
     assert np.array_equal(trace.points().time, [0, 1, 2, 2, 3, 4])
     assert len(ScanTrace().points()) == 0
 

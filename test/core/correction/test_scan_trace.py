@@ -15,7 +15,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 
 COUNT, PERIOD = 500, 1e-3
 TIME = 40.0 + PERIOD * np.arange(COUNT)
-NAMES = ("x", "y", "height", "z_rate", "c", "distance")
+NAMES = ("x", "y", "height", "z_rate", "b", "c", "distance")
 COLUMNS = {name: np.random.default_rng(k).normal(size=COUNT) for k, name in enumerate(NAMES)}
 # H(z), its rate, and its change by two directions of the covariance.
 MOTION = np.random.default_rng(9).normal(size=(4, COUNT))
@@ -28,8 +28,8 @@ def where(part: slice) -> WorkpiecePoints:
 
 def added(trace: ScanTrace, part: slice, session: int = 1, late: float = 0.0) -> ScanPoints:
     return trace.add(
-        session, TIME[part] + late, where(part), COLUMNS["c"][part], MOTION[:, part],
-        COLUMNS["distance"][part],
+        session, TIME[part] + late, where(part), (COLUMNS["b"][part], COLUMNS["c"][part]),
+        MOTION[:, part], COLUMNS["distance"][part],
     )  # fmt: skip
 
 

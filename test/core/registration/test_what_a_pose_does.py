@@ -1,4 +1,4 @@
-"""Effects of a registration: rigid motions of scipy, portions, and the reader of a sphere."""
+"""Effects of a registration: rigid motions of scipy, portions, and scans that are no sphere."""
 
 from __future__ import annotations
 
@@ -8,16 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.registration.placement import Placement, PointBatch, dof_columns, placed
-from omsm_ros.core.registration.probe_alignment import (
-    SphereScan,
-    SphereScanReader,
-    align_on_sphere,
-    sphere_scan_of,
-)
+from omsm_ros.core.registration.probe_alignment import SphereScan, align_on_sphere
 from omsm_ros.core.registration.register import register
-from omsm_ros.core.streams.blocks import AxisBlock
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.core.surface.posed import Pose, PosedSurface
@@ -119,56 +112,6 @@ def test_a_smaller_aperture_knows_the_tilts_less_well(found):
 # The scan of a sphere.
 
 
-def axes(first, count, seed=1):
-    rng = np.random.default_rng(seed)
-    channels = dict(zip("xyzbc", rng.normal(size=(5, count)) * 1e-3, strict=True))
-    return AxisBlock(stamp_ns=0, first_sample=first, sample_period=1e-3, **channels)
-
-
-def corrected(block, pick=slice(None)):
-    """Return the points of a block corrected without geometry: height = z − error + d cos b."""
-    rng = np.random.default_rng(block.first_sample + 5)
-    error, distance = rng.normal(0, 1e-7, (2, len(block)))
-    empty = join_points([])
-    sample = np.arange(block.first_sample, block.end)
-    height = block.z - error + distance * np.cos(block.b)
-    points = replace(
-        empty, sample=sample, x=block.x, y=block.y, height=height, dynamic_error=error,
-        uncertainty=0 * height, intensity=np.zeros(len(block), np.float32),
-    )  # fmt: skip
-    return points.part(pick), distance[pick], (block.z - error)[pick]
-
-
-def test_the_scan_behind_corrected_points_is_read_back_whatever_was_left_out():
-    block = axes(1000, 300)
-    points, distance, moved = corrected(block, slice(10, None, 3))
-    scan = sphere_scan_of(points, [axes(0, 1000), block])
-    np.testing.assert_array_equal(scan.x, block.x[10::3])
-    np.testing.assert_array_equal(scan.c, block.c[10::3])
-    np.testing.assert_array_equal(scan.z, moved)
-    np.testing.assert_allclose(scan.distance, distance, atol=1e-18)
-
-
-def test_a_reader_keeps_the_points_whatever_the_blocks_they_come_in():
-    blocks = [axes(first, 100, seed=first) for first in range(0, 500, 100)]
-    one, other = SphereScanReader(), SphereScanReader()
-    for block in blocks:
-        one.add_axes(block)
-        one.add(corrected(block)[0])
-        other.add_axes(block)
-    other.add(join_points([]))
-    other.add(join_points([corrected(block)[0] for block in blocks]))
-    assert one.points == other.points == 500
-    for name in ("x", "y", "z", "b", "c", "distance"):
-        np.testing.assert_array_equal(getattr(one.scan(), name), getattr(other.scan(), name))
-
-
-def test_a_reader_of_nothing_has_a_scan_of_no_points():
-    reader = SphereScanReader()
-    assert reader.points == 0
-    assert len(reader.scan().z) == 0
-
-
 def still(count=2000):
     zero = np.zeros(count)
     return SphereScan(x=zero, y=zero, z=zero, b=zero, c=zero, distance=zero)
@@ -177,13 +120,6 @@ def still(count=2000):
 def test_a_probe_that_rests_shows_no_centre():
     with pytest.raises(DataError, match="scan across it while the spindle turns"):
         align_on_sphere(still(), 0.02)
-
-
-def test_points_that_are_not_finite_are_counted_with_those_there_are():
-    scan = still()
-    lost = replace(scan, distance=np.where(np.arange(2000) < 900, 0.0, np.nan))
-    with pytest.raises(DataError, match="900 finite points of 2000, expected 1000 or more"):
-        align_on_sphere(lost, 0.02)
 
 
 def test_a_scan_of_a_flat_is_no_sphere():
