@@ -35,6 +35,7 @@ from omsm_ros.core.form.texture import (
     PowerDensity,
     UncertainCurve,
     bands_of,
+    edge_roll_off,
     power_density,
     profiles,
     slopes,
@@ -244,6 +245,7 @@ def analyse_form(
         aperture=outline,
         map=map_,
         deviation=_figures(map_, gathered, found, None if even else outline)
+        | {"edge_roll_off": edge_roll_off(map_, outline)}
         | optical_terms(map_, zernike)
         | _textures(map_, cells, bands, found, even),
         zernike=zernike,

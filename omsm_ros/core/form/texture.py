@@ -45,6 +45,8 @@ _PARTS = 3
 _HALF_WIDTH, _SPACING = 1 / 100, 1 / 100
 # The angular profile averages the outer third of the radius over two degrees.
 _OUTER, _DEGREES = 2 / 3, 2.0
+# Shares of the way to the rim between which the form continues to the edge.
+_FLAT = (0.6, 0.9)
 # The profile at the edge: share of the radius where it begins; factor by which rings are narrower.
 _EDGE, _FINER_AT_EDGE = 0.9, 4
 # Widths of rings over the radius; the narrowest that the turns of the scan fill to 80 % is used.
@@ -419,6 +421,33 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
         made["edge"] = lambda d: radial_profile(x[rim], y[rim], d[rim], spacing=narrow)
     found = {name: _curve(map_, average) for name, average in made.items()}
     return {name: curve for name, curve in found.items() if len(curve.position)}
+
+
+def edge_roll_off(map_: DeviationMap, outline: Aperture) -> UncertainValue:
+    """Return how far the rim of the ``outline`` lies above the form within it [m].
+
+    That is the outermost complete ring, less the parabola over the distance from the middle through
+    the rings from 0.6 to 0.9 of it: below zero for a rolled edge. Rings have the outline's shape.
+    """
+    size = outline.share_of_rim(map_.x, map_.y)
+    angle = np.arctan2(map_.y - outline.y, map_.x - outline.x)
+    x, y = size * np.cos(angle), size * np.sin(angle)
+    width = _ring(x, y, 1.0 / _FINER_AT_EDGE, 1.0)
+    rings = radial_profile(x, y, map_.deviation, spacing=width)
+    inner = (rings.position > _FLAT[0]) & (rings.position < _FLAT[1])
+    if np.sum(inner) < 4 or rings.position[-1] < _EDGE:
+        return UncertainValue(None, None)
+    columns = np.vander(rings.position, 3)
+    weights = -columns[-1] @ np.linalg.pinv(columns[inner])
+    weights = np.append(weights, 1.0)
+    chosen = np.append(np.flatnonzero(inner), len(inner) - 1)
+
+    def fall(profile: Profile) -> float:
+        return float(weights @ profile.value[chosen])
+
+    found = [fall(radial_profile(x, y, effect, spacing=width)) for effect in map_.effects]
+    noise = map_.noise * np.linalg.norm(weights / np.sqrt(rings.points[chosen]))
+    return UncertainValue(fall(rings), float(np.linalg.norm([noise, *found])))
 
 
 def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:

@@ -1,14 +1,15 @@
 """Tell dust from form: points far from the smooth form that no neighbouring track confirms.
 
 Successive far points of one track are one event. Events of neighbouring tracks, or of repeated
-scans, with the same sign and a similar size confirm each other. Dust lies at random, so clusters of
-it occur by chance; a cluster is form if one of its size is improbable at the density of single
-events, or if it is long along its track, like a scratch.
+scans, with the same sign and a similar size confirm each other, as do events farther apart, along a
+scratch oblique to the tracks, whose size is nearly the same. Dust lies at random, so clusters of it
+occur by chance; a cluster is form if one of its size is improbable at the density of single events,
+or if an event is longer along its track than a round grain that the neighbouring tracks miss.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -23,10 +24,12 @@ NO_DUST: DustRule = "none"
 _REACH = 1.5
 # Far points of a track with one point between them belong to one event.
 _GAP = 2
-# An event that is longer along its track, in reaches, is no grain of dust.
-_LONG = 4.0
-# Events of one defect differ in size by less than this factor.
+# Points of an event that is longer along its track than the reach, and no grain of dust.
+_LONG = 3
+# Events of one defect differ in size by less than this factor; and reaches between them, with the
+# factor for events that are farther apart.
 _SIMILAR = 2.0
+_SCALES = ((1.0, _SIMILAR), (3.0, 1.2))
 # A point of a defect is dust beyond this multiple of the usual size of this number of neighbours.
 _DENSE, _AROUND = 1.5, 16
 # A point little beyond the limit is form if this share of the points around is half as far; noise
@@ -40,12 +43,12 @@ _FEW = 2.0
 _NEARBY = 5.0
 # Expected number of clusters by chance that are mistaken for form, in a whole measurement.
 _BY_CHANCE = 0.01
-# A cluster of more events than this is always form.
-_MOST_BY_CHANCE = 30
 # Standard deviations of a number that chance does not exceed.
 _CHANCE = 3.0
 # A step longer than this multiple of the usual one is a jump to another line.
 _JUMP = 10.0
+# Mean step of a path in spacings; points in random order have larger ones.
+_MOST_ALONG = 4.0
 # Points narrower than this share of their length lie on a line.
 _LINE = 1e-3
 
@@ -98,16 +101,16 @@ class FarPoints:
         if rule != NO_DUST and len(index):
             space = self.space()
             event = np.arange(len(index))
-            if not space.line:
+            if self.path < _MOST_ALONG * space.spacing * self.points and not space.line:
                 event = _events(index, rows[1:], space.reach)
-            cluster, space.similar = _clusters(event, x, y, residual, space.reach)
             if rule == ISOLATED:
-                form = _confirmed(event, cluster, rows, space, self.points)
+                form = _confirmed(event, rows, space, self.points)
                 for begin in range(0, len(form), _AT_A_TIME):
                     open_ = begin + np.flatnonzero(~form[begin : begin + _AT_A_TIME])
                     form[open_] = self._like_surroundings(open_, event, rows, space)
                 form = self._without_spikes(form, rows, space)
             else:
+                cluster, _ = _clusters(event, x, y, residual, space.reach, _SIMILAR)
                 form = np.bincount(cluster)[cluster] > int(rule)
         return index[~form], form
 
@@ -198,14 +201,12 @@ class _Space:
     """Distance of neighbours [m], its share of the whole, and whether the points are on a line.
 
     spacing: of the tracks, or of the points on a line [m]
-    similar: share of pairs of events that are similar by chance
     """
 
     reach: float
     share: float
     line: bool
     spacing: float
-    similar: float = 1.0
 
     def around(self, step: FloatArray) -> FloatArray:
         """Return the number of points within the reach where the track has steps (k,) [m]."""
@@ -231,9 +232,17 @@ def _events(index: IntArray, rows: FloatArray, reach: float) -> IntArray:
 
 
 def _clusters(
-    event: IntArray, x: FloatArray, y: FloatArray, residual: FloatArray, reach: float
+    event: IntArray,
+    x: FloatArray,
+    y: FloatArray,
+    residual: FloatArray,
+    reach: float,
+    similar: float,
 ) -> tuple[IntArray, float]:
-    """Return the cluster (k,) of each far point, and the share of pairs that are similar."""
+    """Return the cluster (k,) of each far point, and the share of pairs that are similar.
+
+    similar: factor by which the sizes of neighbours differ at most
+    """
     # Imported here, because clean measurements do not need them.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -250,41 +259,57 @@ def _clusters(
     pairs = cKDTree(np.column_stack([x, y])[some]).query_pairs(reach, output_type="ndarray")
     one, other = some[pairs[:, 0]], some[pairs[:, 1]]
     ratio = residual[one] / residual[other]
-    linked = (ratio > 1 / _SIMILAR) & (ratio < _SIMILAR)
+    linked = (ratio > 1 / similar) & (ratio < similar)
     links = np.ones(int(linked.sum())), (event[one[linked]], event[other[linked]])
     count = int(event[-1]) + 1
     group = connected_components(coo_array(links, (count, count)), directed=False)[1]
     sizes = np.log(np.abs(residual[some[: 2 * (len(some) // 2)]])).reshape(2, -1)
-    near = np.abs(sizes[0] - sizes[1]) < np.log(_SIMILAR)
+    near = np.abs(sizes[0] - sizes[1]) < np.log(similar)
     return group[event], float(np.mean(near)) if near.size else 1.0
 
 
-def _confirmed(
-    event: IntArray, cluster: IntArray, rows: FloatArray, space: _Space, points: int
-) -> BoolArray:
-    """Return which far points (k,) are form.
-
-    The expected number of similar events around one follows from the single events, in all and
-    nearby, because a spiral has more points, and so more dust, about its centre.
-    """
-    from scipy.spatial import cKDTree
-
+def _confirmed(event: IntArray, rows: FloatArray, space: _Space, points: int) -> BoolArray:
+    """Return which far points (k,) are form: those of long events, and of large clusters."""
     begins = np.concatenate([[0], np.flatnonzero(np.diff(event)) + 1])
-    of_event, places = cluster[begins], rows[1:3, begins].T
-    sizes = np.bincount(of_event)
-    single = sizes[of_event] == 1
-    trees = cKDTree(places), cKDTree(places[single])
-    some = np.asarray(trees[1].query_ball_point(places, _NEARBY * space.reach, return_length=True))
-    nearby = np.zeros(len(sizes))
-    np.maximum.at(nearby, of_event, np.maximum(some - single, 0) + 1.0)
-    total = float(np.sum(single))
-    dense = np.zeros(len(sizes))
-    np.maximum.at(dense, of_event, space.around(rows[4, begins]) / points)
-    chance = np.maximum(nearby / space.larger(_NEARBY), total * np.maximum(dense, space.share))
-    chance *= space.similar
-    expected = total * np.minimum(chance, 0.99) ** (np.minimum(sizes, _MOST_BY_CHANCE) - 1)
-    form = ((expected < _BY_CHANCE) & (sizes > 1)) | (sizes > _MOST_BY_CHANCE)
     steps = np.where(np.diff(event) == 0, np.hypot(*np.diff(rows[1:3])), 0.0)
     lengths = np.add.reduceat(np.concatenate([steps, [0.0]]), begins)
-    form[of_event[lengths > _LONG * np.maximum(space.reach, rows[4, begins])]] = True
-    return np.asarray(form[cluster])
+    many = np.bincount(event) >= _LONG
+    form = (many & (lengths > np.maximum(space.reach, rows[4, begins])))[event]
+    for factor, similar in _SCALES:
+        wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
+        cluster, alike = _clusters(event, *rows[1:4], wide.reach, similar)
+        form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
+    return np.asarray(form)
+
+
+def _no_chance(
+    cluster: IntArray, rows: FloatArray, space: _Space, points: int, similar: float
+) -> BoolArray:
+    """Return which clusters (c,) dust does not make by chance.
+
+    Where each event has μ neighbours on average, clusters of k have Borel's distribution at most,
+    e^(−μk) (μk)^(k−1) / k!, because links that meet again add none (M. Penrose, Random Geometric
+    Graphs, 2003).
+    The expected number of similar events around one follows from the single events, in all and
+    nearby, because a spiral has more points, and so more dust, about its centre.
+
+    cluster: of each event (m,);  rows: of its first point (5, m)
+    similar: share of pairs of events that are similar by chance
+    """
+    from scipy.spatial import cKDTree
+    from scipy.special import gammaln
+
+    sizes, places = np.bincount(cluster), rows[1:3].T
+    single = sizes[cluster] == 1
+    trees = cKDTree(places), cKDTree(places[single])
+    some = np.asarray(trees[1].query_ball_point(places, _NEARBY * space.reach, return_length=True))
+    nearby = (np.maximum(some - single, 0) + 1.0) / space.larger(_NEARBY)
+    total = float(np.sum(single))
+    dense = total * np.maximum(space.around(rows[4]) / points, space.share)
+    chance = np.bincount(cluster, np.maximum(nearby, dense)) / sizes
+    # An event of dust is single with the probability e^(−μ).
+    chance = chance * similar * np.exp(np.minimum(chance * similar, 1.0))
+    chance = np.clip(chance, np.finfo(np.float64).tiny, 1.0)
+    among = chance * sizes
+    expected = total * np.exp(chance + (sizes - 1) * np.log(among) - among - gammaln(sizes + 1.0))
+    return np.asarray((expected < _BY_CHANCE) & (sizes > 1))

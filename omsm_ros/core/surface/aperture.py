@@ -21,8 +21,9 @@ _RIM = 1 + 1e-6
 _DRAWN = 181
 # Cells that show gaps; the widest gap that is covered, in tracks, and at least in cells.
 _CELLS_ACROSS, _GAP_IN_TRACKS, _LEAST_CELLS = 512, 3.5, 3.0
-# Share of the points that an outline around them holds; of a rectangle, an ellipse holds 79 %.
-_HOLDS_ALL = 0.95
+# Share of the points that an outline holds within a track of its rim. An ellipse holds 79 % of a
+# rectangle, and 97 % of a disc without a sector.
+_HOLDS_ALL = 0.998
 # Share by which another outline than the aperture must be covered better.
 _CLEARLY = 0.02
 # Directions in which the rim of a scan may lie a track within that of the aperture.
@@ -92,15 +93,25 @@ class Aperture:
         u, v = np.asarray(x) - self.x, np.asarray(y) - self.y
         if self.outline == "polygon":
             return _within(u, v, _RIM * (self._corners() - [[self.x], [self.y]]))
-        if self.outline in ("ellipse", "rectangle"):
-            a, b = np.abs(u) / self.sizes[0], np.abs(v) / self.sizes[1]
-            size = np.maximum(a, b) if self.outline == "rectangle" else np.hypot(a, b)
-            return np.asarray(size <= _RIM)
-        square = u**2 + v**2
-        inside = square <= (self.radius * _RIM) ** 2
+        share = self.share_of_rim(x, y)
+        inside = share <= _RIM
         if self.outline == "annulus":
-            inside &= square >= (self.sizes[0] / _RIM) ** 2
+            inside &= share >= self.sizes[0] / self.radius / _RIM
         return np.asarray(inside)
+
+    def share_of_rim(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the size of the outline of this shape through each point: 1 at the outer rim.
+
+        For a polygon it is one less the distance from its nearest side over the largest of them.
+        """
+        u, v = np.asarray(x) - self.x, np.asarray(y) - self.y
+        if self.outline == "polygon":
+            away = _to_sides(u, v, self._corners() - [[self.x], [self.y]])
+            return 1 - away / np.max(away, initial=np.finfo(np.float64).tiny)
+        if self.outline not in ("ellipse", "rectangle"):
+            return np.asarray(np.hypot(u, v) / self.radius)
+        a, b = np.abs(u) / self.sizes[0], np.abs(v) / self.sizes[1]
+        return np.asarray(np.maximum(a, b) if self.outline == "rectangle" else np.hypot(a, b))
 
     def scaled(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return x and y on the unit disc."""
@@ -131,6 +142,16 @@ def _within(x: FloatArray, y: FloatArray, corners: FloatArray) -> BoolArray:
         crossed = (ay > y) != (by > y)
         inside ^= crossed & (x < ax + (bx - ax) * (y - ay) / ((by - ay) or 1.0))
     return inside
+
+
+def _to_sides(x: FloatArray, y: FloatArray, corners: FloatArray) -> FloatArray:
+    """Return the distance of points from the nearest side of the polygon of ``corners`` (2, k)."""
+    place, found = x + 1j * y, np.full(np.shape(x), np.inf)
+    begins = corners[0] + 1j * corners[1]
+    for begin, side in zip(begins, np.roll(begins, -1) - begins, strict=True):
+        along = np.clip(np.real((place - begin) / (side or 1.0)), 0.0, 1.0)
+        found = np.minimum(found, np.abs(place - begin - along * side))
+    return found
 
 
 def smallest_disc(x: FloatArray, y: FloatArray) -> tuple[tuple[float, float], float]:
@@ -206,7 +227,8 @@ def best_covered(
     shapes = [aperture]
     if free:
         around_points = [Aperture.of(outline, *sizes) for outline in ("rectangle", "ellipse")]
-        shapes += [s for s in around_points if np.mean(s.holds(x, y)) > _HOLDS_ALL]
+        most = 1 + track / min(sizes[:2])
+        shapes += [s for s in around_points if np.mean(s.share_of_rim(x, y) < most) > _HOLDS_ALL]
     u, v = np.meshgrid(*[(e[1:] + e[:-1]) / 2 for e in ends], indexing="ij")
     around, shares = (track + pitch) * _AROUND, []
     for shape in shapes:

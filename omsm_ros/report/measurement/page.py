@@ -26,7 +26,7 @@ from omsm_ros.units import MILLIMETRE_M
 
 _SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
 _OTHER_UNITS = {"Ssk": "", "Sku": ""} | dict.fromkeys(_SLOPES, "rad")
-_SIGNED = ("Ssk",)
+_SIGNED = ("Ssk", "edge_roll_off")
 _CONFORMITY = {
     "holds": ("good", "The part meets its tolerance"),
     "fails": ("bad", "The part exceeds its tolerance"),

@@ -25,7 +25,7 @@ from omsm_ros.core.form.part_figures import (
     without_power,
     without_tilt,
 )
-from omsm_ros.core.form.texture import UncertainCurve, profiles
+from omsm_ros.core.form.texture import UncertainCurve, edge_roll_off, profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
@@ -286,3 +286,25 @@ def test_the_profile_at_the_edge_shows_its_roll_off():
     assert edge.position[0] > 0.89 * RADIUS
     np.testing.assert_allclose(edge.value, -80e-9 * share**2, atol=2e-9)
     assert edge.value[-1] < -60e-9
+
+
+@pytest.mark.parametrize(
+    "text", ["10e-3", "annulus:10e-3,3e-3", "ellipse:10e-3,7e-3", "rectangle:10e-3,6e-3,1e-3,0",
+             "polygon:0,0,8e-3,0,8e-3,8e-3,0,8e-3"],
+)  # fmt: skip
+def test_the_roll_off_of_the_edge_is_what_the_rim_lacks_of_the_form_within(text):
+    """80 nm over the outer 4 % with power and astigmatism, and an error of tilt and one of gain."""
+    outline = Aperture.parse(text)
+    x, y = (RNG.uniform(v.min(), v.max(), 80_000) for v in outline.rim())
+    inside = outline.holds(x, y)
+    x, y = x[inside], y[inside]
+    size = outline.share_of_rim(x, y)
+    fall = -80e-9 * (np.maximum(size - 0.96, 0.0) / 0.04) ** 2
+    angle = np.arctan2(y - outline.y, x - outline.x)
+    form = 60e-9 * size**2 + 30e-9 * size * np.cos(2 * angle)
+    map_ = map_of(form + fall, x=x, y=y, area=np.ones(len(x)),
+                  effects=np.stack([1e-9 * size * np.cos(angle), 0.1 * fall]))  # fmt: skip
+    found = edge_roll_off(map_, outline)
+    assert found.value == pytest.approx(-70e-9, abs=6e-9)
+    assert found.uncertainty == pytest.approx(np.hypot(0.1 * found.value, map_.noise / 20), rel=0.2)
+    assert edge_roll_off(map_.part(size < 0.8), outline).value is None
