@@ -203,6 +203,9 @@ def _at(form: str, head: bytes, place: int) -> Any:
 
 
 MAX_FOREIGN_BYTES = 1_000_000_000
+# Readers of SurfaceTopography whose first row has the least y: of standards that say so, and of
+# places. All others begin with the upper row of the image, as Gwyddion does.
+_UPWARDS = ("SDFReader", "XYZReader", "NCReader")
 
 
 def read_foreign(
@@ -249,8 +252,9 @@ def read_foreign(
     if found.physical_sizes is None:
         raise FileError(f"{what} is no map with its size; convert it to xyz")
     dx, dy = (size / count for size, count in zip(found.physical_sizes, height.shape, strict=True))
+    rows = height.T if type(reader).__name__ in _UPWARDS else np.flipud(height.T)
     return HeightGrid(
-        height=height.T * scale.height, x0=0.0, y0=0.0, dx=dx * scale.lateral, dy=dy * scale.lateral
+        height=rows * scale.height, x0=0.0, y0=0.0, dx=dx * scale.lateral, dy=dy * scale.lateral
     ).points(notes)
 
 

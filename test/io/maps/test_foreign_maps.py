@@ -19,7 +19,9 @@ SLOPES, SIZES, PLACES = (3e-3, -1e-3), (40.0, 15.0), (20, 5)
 def map_of(tmp_path, monkeypatch):
     """A file that the library takes for a map, whose heights begin with the direction x."""
 
-    def made(unit="µm", sizes=SIZES, heights=None, names=(("Height", "HEIGHT"),)):
+    def made(
+        unit="µm", sizes=SIZES, heights=None, names=(("Height", "HEIGHT"),), reader="SDFReader"
+    ):
         x, y = (size / n * np.arange(n) for size, n in zip(SIZES, PLACES, strict=True))
         plane = SLOPES[0] * x[:, np.newaxis] + SLOPES[1] * y if heights is None else heights
         along = 2.0 * np.arange(len(plane))
@@ -31,8 +33,9 @@ def map_of(tmp_path, monkeypatch):
             )  # fmt: skip
 
         channels = [SimpleNamespace(name=n, data_kind=SimpleNamespace(name=k)) for n, k in names]
-        reader = SimpleNamespace(topography=topography, channels=channels)
-        library = SimpleNamespace(open_topography=lambda path: nullcontext(reader))
+        opened = type(reader, (), {})()
+        opened.topography, opened.channels = topography, channels
+        library = SimpleNamespace(open_topography=lambda path: nullcontext(opened))
         monkeypatch.setitem(sys.modules, "SurfaceTopography", library)
         path = tmp_path / "map.other"
         path.write_bytes(b"\0" * 100)
@@ -41,11 +44,13 @@ def map_of(tmp_path, monkeypatch):
     return made
 
 
-def test_a_plane_keeps_its_slopes_and_its_size(map_of):
-    points = read_points(map_of())
+@pytest.mark.parametrize(("reader", "upwards"), [("SDFReader", 1), ("OPDReader", -1)])
+def test_a_plane_keeps_its_slopes_and_its_size(map_of, reader, upwards):
+    """Heights of an instrument begin with the upper row of the image, those of SDF with least y."""
+    points = read_points(map_of(reader=reader))
     design = np.stack([points.x, points.y, np.ones(len(points.x))], axis=1)
     found = np.linalg.lstsq(design, points.height, rcond=None)[0]
-    np.testing.assert_allclose(found[:2], SLOPES, rtol=1e-9)
+    np.testing.assert_allclose(found[:2], [SLOPES[0], upwards * SLOPES[1]], rtol=1e-9)
     # From the first place to the last: one less than the map has.
     assert np.ptp(points.x) == pytest.approx(38e-6)
     assert np.ptp(points.y) == pytest.approx(12e-6)
