@@ -244,8 +244,7 @@ def analyse_form(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=_figures(map_, gathered, found, None if even else outline)
-        | {"edge_roll_off": edge_roll_off(map_, outline)}
+        deviation=_figures(map_, gathered, found, outline, even)
         | optical_terms(map_, zernike)
         | _textures(map_, cells, bands, found, even),
         zernike=zernike,
@@ -259,11 +258,11 @@ def analyse_form(
 
 
 def _figures(
-    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture | None
+    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture, even: bool
 ) -> dict[str, UncertainValue]:
     fitted, rest = best_fit(map_), without_second_order(map_)
     maps = [map_, fitted, rest, without_power(map_, found.disc)]
-    extents = extents_of_parts(maps, found.disc, outline, found.spacing)
+    extents = extents_of_parts(maps, found.disc, None if even else outline, found.spacing)
     whole, robust, _ = extents[0]
     return {
         # Irregularity: the peak to valley without piston, tilts and power.
@@ -275,6 +274,7 @@ def _figures(
         "rms_best_fit": rms_of_part(fitted, extents[1][2]),
         "peak_to_valley_without_second_order": extents[2][0],
         "rms_without_second_order": rms_of_part(rest, extents[2][2]),
+        "edge_roll_off": edge_roll_off(map_, outline),
         # These are as measured, with noise and systematic errors.
         "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
