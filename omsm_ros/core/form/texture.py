@@ -447,7 +447,7 @@ def edge_roll_off(map_: DeviationMap, outline: Aperture) -> UncertainValue:
 
     found = [fall(radial_profile(x, y, effect, spacing=width)) for effect in map_.effects]
     noise = map_.noise * np.linalg.norm(weights / np.sqrt(rings.points[chosen]))
-    return UncertainValue(fall(rings), float(np.linalg.norm([noise, *found])))
+    return UncertainValue(fall(rings), float(np.hypot(noise, np.linalg.norm(found))))
 
 
 def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:

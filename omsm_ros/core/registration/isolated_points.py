@@ -96,7 +96,7 @@ class FarPoints:
         rule: "none", "isolated", or the most points that a cluster of dust has
         """
         rows = np.concatenate(self.rows, axis=1)
-        index, (x, y, residual) = rows[0].astype(np.int64), rows[1:4]
+        index = rows[0].astype(np.int64)
         form = np.ones(len(index), bool)
         if rule != NO_DUST and len(index):
             space = self.space()
@@ -110,7 +110,7 @@ class FarPoints:
                     form[open_] = self._like_surroundings(open_, event, rows, space)
                 form = self._without_spikes(form, rows, space)
             else:
-                cluster, _ = _clusters(event, x, y, residual, space.reach, _SIMILAR)
+                cluster, _ = _clusters(event, rows, space.reach, _SIMILAR)
                 form = np.bincount(cluster)[cluster] > int(rule)
         return index[~form], form
 
@@ -232,12 +232,7 @@ def _events(index: IntArray, rows: FloatArray, reach: float) -> IntArray:
 
 
 def _clusters(
-    event: IntArray,
-    x: FloatArray,
-    y: FloatArray,
-    residual: FloatArray,
-    reach: float,
-    similar: float,
+    event: IntArray, rows: FloatArray, reach: float, similar: float
 ) -> tuple[IntArray, float]:
     """Return the cluster (k,) of each far point, and the share of pairs that are similar.
 
@@ -248,6 +243,7 @@ def _clusters(
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
+    x, y, residual = rows[1:4]
     # One point for each half reach along an event, the farthest from the form, is enough.
     way = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     first = np.concatenate([[0], np.flatnonzero(np.diff(event)) + 1])
@@ -277,7 +273,7 @@ def _confirmed(event: IntArray, rows: FloatArray, space: _Space, points: int) ->
     form = (many & (lengths > np.maximum(space.reach, rows[4, begins])))[event]
     for factor, similar in _SCALES:
         wide = replace(space, reach=factor * space.reach, share=space.larger(factor) * space.share)
-        cluster, alike = _clusters(event, *rows[1:4], wide.reach, similar)
+        cluster, alike = _clusters(event, rows, wide.reach, similar)
         form |= _no_chance(cluster[begins], rows[:, begins], wide, points, alike)[cluster]
     return np.asarray(form)
 
