@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import omsm_ros as omsm
-from omsm_ros.errors import ConfigurationError, DataError, FileError
+from omsm_ros.errors import BagError, ConfigurationError, DataError, FileError
 from omsm_ros.pipelines.record_twin import write_recording
 from omsm_ros.twin.plant import PAPER_DYNAMICS
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
@@ -122,6 +122,18 @@ def results(identified, points):
         omsm.plan(mirror, radius=1e-3),
         omsm.predict(omsm.plan(mirror, radius=1e-3), identified),
     )
+
+
+def test_the_same_scan_twice_does_not_verify_itself(results):
+    identified, scan, *_ = results
+    with pytest.raises(BagError, match="the same scan"):
+        omsm.adjust([scan, scan], identified)
+
+
+def test_points_of_another_surface_are_reported_before_any_other_remedy(results):
+    identified, scan, *_ = results
+    found = omsm.adjust([scan], identified, nominal=omsm.surface("sphere", radius=-0.02))
+    assert str(found).index("another surface") < str(found).index("next: scan")
 
 
 def test_results_print_in_a_few_lines_and_draw(results):

@@ -38,8 +38,8 @@ estimation.no_reference: input 'reference', but the recording has no reading of 
 estimation.few_compared: {compared} of {samples} samples can be compared: the others are lost, or
     recorded while a transient settles or the motion starts or ends; record at least {least} more
 estimation.implausible_gain: the probe moves by {gain:plain} per travel of the axis, expected about
-    1: check that it looks at a fixed target within its range, that both are in metres, and that Z
-    moves in both directions; a steady motion in one direction is taken for drift
+    1: check that it looks at a fixed target within its range, the units of both, and that Z moves
+    in both directions; a steady motion in one direction is taken for drift
 estimation.constant_distance: the distance does not change while the axis moves; check that the
     probe is connected, detects its target and is not held at the end of its range
 estimation.clipped: the probe gives its {end} distance {times} times while the axis moves by

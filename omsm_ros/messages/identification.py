@@ -129,7 +129,8 @@ identification.disagreement: the response estimated without a model differs from
     {difference:plain/2} times its variance, at most {agreement_greatest:g} are due to chance: the
     model misses a part of the machine; make more steps of two heights, and look for a loose part
 # The range.
-identification.unknown_response: the response is known within limits at no frequency
+identification.unknown_response: the response is known within limits at no frequency: let machine
+    and probe settle, make longer dwells, and check the unit of time
 identification.narrow_band: the response is known within limits only up to {up_to_hz:Hz/2}, the
     intended scans need {valid_up_to_least_hz:Hz/2}; make more or larger steps
 identification.accuracy: on the intended scan the response alone makes an uncertainty of

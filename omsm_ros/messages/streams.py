@@ -3,8 +3,8 @@
 from omsm_ros.messages import catalogue
 
 _RISING = (
-    "import the parts before and after it separately, or, if time is rounded too coarsely, leave "
-    "it out and state sample_period"
+    "sort the rows by time; or, if the clock began anew, import the parts before and after it "
+    "separately; or, if time is rounded too coarsely, leave it out and state sample_period"
 )
 _SLIP = (
     "the trigger counter slipped by {samples} samples against that of the axes: at equal counts "

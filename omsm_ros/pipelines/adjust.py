@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from omsm_ros.core.correction.systematic import EVALUATED
 from omsm_ros.core.form.deviation_map import Doubt, UncertainValue, conformity
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import Account
+from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io.files import REPORT, save_json, save_text
 from omsm_ros.io.results import PlyWriter
@@ -56,7 +58,8 @@ class AdjustedScan:
 
     bag: where it is from;  data: for the adjustment;  points: as corrected
     account: of every sample;  began_ns: ROS time of its first sample, None if it is not known
-    doubts: mismatches with the calibration, which was used all the same
+    doubts: mismatches with the calibration, which was used all the same, and with the nominal
+        surface
     """
 
     bag: str
@@ -179,7 +182,7 @@ def adjust_bags(
     clockings: of the part on the chuck in each scan [rad];  clampings: their numbers
     accuracy: asked for, k = 2 [m]
 
-    Raises ConfigurationError where ``clockings`` or ``clampings`` are not one for each scan.
+    Raises ConfigurationError unless clockings and clampings fit the bags, BagError for equal scans.
     """
     for name, given in (("clocking", clockings), ("clamping", clampings)):
         if given and len(given) != len(bags):
@@ -199,7 +202,7 @@ def adjust_bags(
         )
         for k, bag in enumerate(bags)
     ]
-    scans = on_one_clock(scans)
+    scans = on_one_clock(_checked(scans, nominal))
     return adjust(
         [scan.data for scan in scans],
         priors_of(stated, options.geometry.abbe_arm),
@@ -208,6 +211,23 @@ def adjust_bags(
         accuracy=accuracy,
         accepted=accepted,
     ), scans  # fmt: skip
+
+
+def _checked(scans: Sequence[AdjustedScan], nominal: Surface | None) -> list[AdjustedScan]:
+    """Return the scans, with a doubt where one is not of ``nominal``; BagError for equal scans."""
+    for one, other in combinations(scans, 2):
+        if np.array_equal(one.points.height, other.points.height):
+            raise BagError(
+                f"{one.bag!r} and {other.bag!r} hold the same scan, which does not verify itself; "
+                "give two scans of the part"
+            )
+    if nominal is None:
+        return [*scans]
+    unlike = (mismatch(s.points.x, s.points.y, s.points.height, nominal) for s in scans)
+    return [
+        replace(scan, doubts=(*map(str, doubt), *scan.doubts))
+        for scan, doubt in zip(scans, unlike, strict=True)
+    ]
 
 
 def write_adjustment(
@@ -328,7 +348,7 @@ def _source_entry(source: SourceFinding) -> dict[str, Any]:
 def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) -> dict[str, Any]:
     """Return a verdict as JSON values: code, text, reasons, and the scan to add that helps most.
 
-    doubts: sentences about the recordings, with which nothing is verified
+    doubts: sentences about the recordings, with which nothing is verified: the first reasons
     """
     code = verdict.code
     against = [{"code": "recording", "text": text} for text in doubts]
@@ -338,6 +358,7 @@ def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) 
         "code": code,
         "text": sentence(f"verdict.{code}", {"scans": scans}),
         "reasons": [
+            *against,
             *(
                 {
                     "code": reason.code,
@@ -348,7 +369,6 @@ def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) 
                 }
                 for reason in _grouped(verdict.reasons)
             ),
-            *against,
         ],
     }
     if verdict.rests_on:

@@ -139,7 +139,8 @@ def add_verdict(
         _, area = within_aperture(judgement.options.surface, register.aperture)
     if scan is not None and area is not None:
         scan = _within(scan, area)
-    doubts = [*done.faults, *map(str, _losses(done))]
+    doubts = [*_mismatch_text(done, judgement.options.surface), *done.faults]
+    doubts += map(str, _losses(done))
     if scan is None or scan.turns < _LEAST_TURNS:
         systematic = summary["budget"]["systematic"]
         verdict = untested_verdict(2 * systematic, judgement.accuracy, calibration)
@@ -367,7 +368,6 @@ def summarise(
         return summary
     judged = _motion_judged(done, calibration)
     summary["warnings"] += judged.pop("warnings")
-    summary["warnings"] += _mismatch_text(done, judgement.options.surface)
     if (
         late := excess_latency_text(calibration, judgement.options.probe_latency or 0.0)
     ) is not None:

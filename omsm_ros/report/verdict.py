@@ -47,13 +47,15 @@ def page_verdict(verdict: Mapping[str, Any], more: Iterable[str] = ()) -> PageVe
 def next_steps(verdict: Mapping[str, Any]) -> list[str]:
     """Return what to do next, first of all, and the reasons against green.
 
-    This is the scan that helps most, but for heights that are contradicted what contradicts them.
+    This is a doubt about the recordings, else the scan that helps most, but for heights that are
+    contradicted what contradicts them.
     """
     steps = [reason["text"] for reason in verdict["reasons"]]
+    doubts = sum(reason["code"] == "recording" for reason in verdict["reasons"])
     if (add := verdict.get("add")) is not None and verdict["code"] != "contradicted":
         reached = add["reached"]
         then = "" if reached is None else f": then U = {quantity(reached, 'm', 2)} (rms, k = 2)"
-        steps.insert(0, f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
+        steps.insert(doubts, f"next: {add['text']}, and run 'omsm adjust' with both scans{then}")
     if verdict["code"] == "verified":
         steps.append("the scans agree, and no declared source is refuted")
         if (resting := verdict.get("rests_on")) is not None:
