@@ -159,13 +159,14 @@ def test_align_warns_programs_too_of_a_form_that_is_no_noise(capsys, tmp_path, c
 
 def test_a_pitch_that_was_measured_elsewhere_is_reported(capsys, tmp_path, scan_bag, calibration):
     (tmp_path / "g.yaml").write_text("abbe_arm: 0.05\n")
-    words = ["correct", scan_bag, "--calibration", calibration, "--geometry", tmp_path / "g.yaml"]
+    words = ["correct", str(scan_bag), "--calibration", str(calibration), "--no-report", "--json",
+             "--geometry", f"{tmp_path}/g.yaml"]  # fmt: skip
     reported = {}
     for name, low, high in (("here", -0.1, 0.1), ("elsewhere", 5.0, 6.0)):
         table = tmp_path / f"{name}.csv"
         table.write_text(f"z_m,pitch_rad\n{low},1e-6\n{high},2e-6\n")
-        out = ["--out", tmp_path / name, "--no-report", "--pitch", table]
-        reasons = facts(capsys, *words, *out)["verdict"]["reasons"]
+        assert cli.main([*words, "--out", f"{tmp_path}/{name}", "--pitch", str(table)]) == 0
+        reasons = json.loads(capsys.readouterr().out)["verdict"]["reasons"]
         reported[name] = [r["text"] for r in reasons if "pitch was measured" in r["text"]]
     assert reported["here"] == []
     assert "from 5.00 m to 6.00 m" in reported["elsewhere"][0]

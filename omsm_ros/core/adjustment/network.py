@@ -8,6 +8,7 @@ The normal equations without y are the geometry alone: planning uses them too.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -122,10 +123,11 @@ class Network:
         blocks, families = self.blocks.with_columns(columns), (*self.families, *extra)
         return Network(blocks, families, self.part, _values=self._values)
 
-    def _own(self, scan: int) -> IntArray:
-        """Return the parameters that blocks of ``scan`` depend on: all but others' knots."""
-        knots = self.knots[scan]
-        return np.append(np.arange(self.terms.stop), np.arange(knots.start, knots.stop))
+    def _own(self, scan: int) -> list[tuple[slice, slice]]:
+        """Return the parameters that blocks of ``scan`` depend on, which are all but others' knots,
+        and their places among these: the common ones and the knots."""
+        knots, split = self.knots[scan], self.terms.stop
+        return [(slice(split), slice(split)), (knots, slice(split, None))]
 
     def _by_scan(self) -> list[tuple[FloatArray, FloatArray]]:
         """Return XᵀWX and Σ w x over each cell of each scan by white noise alone.
@@ -157,7 +159,8 @@ class Network:
         """Return Σ w x over each cell, (cells, size)."""
         made = np.zeros((self.part.cells, self.size))
         for k, (_, sums) in enumerate(self._by_scan()):
-            made[:, self._own(k)] += sums / scales.noise[k]
+            for here, place in self._own(k):
+                made[:, here] += sums[:, place] / scales.noise[k]
         return made
 
     def normal_matrix(self, scales: Scales) -> FloatArray:
@@ -167,8 +170,8 @@ class Network:
         sums *= np.sqrt(share)[:, np.newaxis]
         made = -(sums.T @ sums)
         for k, (matrix, _) in enumerate(self._by_scan()):
-            own = self._own(k)
-            made[np.ix_(own, own)] += matrix / scales.noise[k]
+            for (row, above), (column, beside) in itertools.product(self._own(k), repeat=2):
+                made[row, column] += matrix[above, beside] / scales.noise[k]
         return made
 
     def right_side(self, scales: Scales, y: FloatArray) -> FloatArray:

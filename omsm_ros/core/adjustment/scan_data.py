@@ -7,10 +7,11 @@ the part has one x and y in all scans. Rates are local polynomials over the samp
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
@@ -225,24 +226,20 @@ def _slope(time: FloatArray, values: FloatArray) -> float:
     return float((values[-1] - values[0]) / (time[-1] - time[0])) if len(time) > 1 else 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class FittedSurface:
     """A polynomial in x and y through the points, where no nominal surface is given.
 
-    powers: of x and y of each term (k, 2);  coefficients: (k,) [m];  scale: of x and y [m]
+    coefficients: of u^i v^j (i, j) [m];  scale: of x and y, u = x / scale [m]
     """
 
-    powers: tuple[tuple[int, int], ...]
-    coefficients: tuple[float, ...]
-    scale: float = field(default=1.0)
+    coefficients: FloatArray
+    scale: float
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""
-        u, v = np.asarray(x) / self.scale, np.asarray(y) / self.scale
-        made = np.zeros(np.broadcast(u, v).shape)
-        for (i, j), value in zip(self.powers, self.coefficients, strict=True):
-            made += value * u**i * v**j
-        return made
+        u, v = np.broadcast_arrays(np.asarray(x) / self.scale, np.asarray(y) / self.scale)
+        return np.asarray(polynomial.polyval2d(u, v, self.coefficients))
 
 
 # Degree of the slopes' polynomial: on the paper's mirror the eighth is 4 pm.
@@ -255,7 +252,9 @@ def fitted_surface(scan: ScanData) -> FittedSurface:
     x, y = workpiece_xy(scan.x[::every], scan.y[::every], np.full(len(scan.x[::every]),
                                                                    scan.clocking))  # fmt: skip
     scale = float(np.max(np.hypot(x, y)))
-    powers = tuple((i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i))
-    columns = np.stack([(x / scale) ** i * (y / scale) ** j for i, j in powers], axis=1)
-    found = np.linalg.lstsq(columns, scan.height[::every], rcond=1e-10)[0]
-    return FittedSurface(powers, tuple(found.tolist()), scale)
+    size = _DEGREE + 1
+    low = np.add.outer(np.arange(size), np.arange(size)) <= _DEGREE
+    columns = polynomial.polyvander2d(x / scale, y / scale, [_DEGREE, _DEGREE])[:, low.ravel()]
+    coefficients = np.zeros((size, size))
+    coefficients[low] = np.linalg.lstsq(columns, scan.height[::every], rcond=1e-10)[0]
+    return FittedSurface(coefficients, scale)

@@ -353,8 +353,8 @@ def _first_rows(
     """
     uu, uv, vv = moments
     basis = np.stack([np.ones_like(u), u, v, u * u + uu, u * v + uv, v * v + vv], axis=2)
-    weighted = basis * weight[:, :, None]
-    normal = np.einsum("mki,mkj->mij", weighted, basis)
+    weighted = (basis * weight[:, :, None]).transpose(0, 2, 1)
+    normal = weighted @ basis
     scale = np.sqrt(np.einsum("mii->mi", normal))
     normal /= scale[:, :, None] * scale[:, None, :]
     lowest = np.linalg.eigvalsh(normal)[:, 0] if len(normal) else np.empty(0)
@@ -363,7 +363,7 @@ def _first_rows(
     normal += np.where(lowest < _WORST_CONDITION, 1e-4, 0.0)[:, None, None] * np.eye(6)
     first = np.eye(6)[:, :3] / scale[:, :, None]
     solved = np.linalg.solve(normal, first) / scale[:, :, None]
-    return np.asarray(np.einsum("mki,mij->mjk", weighted, solved), np.float64)
+    return np.asarray(solved.transpose(0, 2, 1) @ weighted, np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

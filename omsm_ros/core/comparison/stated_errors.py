@@ -14,6 +14,7 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.spatial.distance import cdist
 from scipy.special import erf
 
 from omsm_ros.core.comparison.agreement import (
@@ -74,8 +75,7 @@ def _nodes(x: FloatArray, y: FloatArray) -> tuple[IntArray, float]:
 
 
 def _kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
-    square = np.sum((one[:, np.newaxis] - other[np.newaxis]) ** 2, axis=2)
-    return np.asarray(np.exp(-square / (2 * length**2)), np.float64)
+    return np.asarray(np.exp(-cdist(one, other, "sqeuclidean") / (2 * length**2)), np.float64)
 
 
 def drift(order: FloatArray, size: float) -> FloatArray:

@@ -16,8 +16,8 @@ ONE_SCAN = [
     ("centre_x", "centre_x", [-3e-6]),
     ("asymmetry", "lag_asymmetry", [20e-6]),
     ("backlash", "motion_error", [30e-9]),
-    ("spindle_3", "spindle_axial/3", None),
-    ("spindle_6", "spindle_axial/6", [20e-9, 0.0]),
+    pytest.param("spindle_3", "spindle_axial/3", None, marks=pytest.mark.soak),
+    pytest.param("spindle_6", "spindle_axial/6", [20e-9, 0.0], marks=pytest.mark.soak),
     ("spindle_2.5", "spindle_axial/2.5", [20e-9, 0.0]),
     ("height_step", "height_step@0", [90e-9]),
     ("c_lost", "c_lost@0", [5e-4]),
@@ -27,14 +27,20 @@ ALWAYS = ("backlash", "height_step")
 TWO_SCANS = [
     *(
         pytest.param(*kind, marks=() if kind[0] in ALWAYS else pytest.mark.soak)
-        for kind in ONE_SCAN
+        for kind in (getattr(k, "values", k) for k in ONE_SCAN)
     ),
     ("latency", "lag_change", None),
     ("lag_by_z", "lag_motion", None),
-    ("lag_by_x", "lag_x", None),
+    pytest.param("lag_by_x", "lag_x", None, marks=pytest.mark.soak),
     ("creep", "creep", [3e-4]),
     ("warming", "drift_rate", None),
 ]
+# Uncertainty that is left where an error in part looks like form: a lag that depends on the place
+# like the coma, a slow drift like a creep, which changes the scale of Z.
+IN_PART_FORM_M = {
+    "lag_by_z": 12e-9, "lag_by_x": 12e-9, "creep": 15e-9, "c_lost": 19e-9, "warming": 24e-9
+}  # fmt: skip
+MORE_LINES = [("floor", 1), ("hum", 2)]
 
 
 @functools.cache
@@ -68,10 +74,10 @@ def test_two_scans_refute_and_correct(kind, family, true):
     check(found, family, true)
     *_, error = normalised(machine, found)
     assert error < 1.5 * 2 * found.form.mean_uncertainty
-    # A centre off is as well a tilt of the spindle twice a turn, another form for the part; a slow
-    # drift is in part a creep, which changes the scale of Z.
+    # A centre off is as well a tilt of the spindle twice a turn, another form for the part.
     alike = {n for r in found.refutations for n in r.alike}
-    assert found.form.mean_uncertainty < (150e-9 if "spindle_tilt/2" in alike else 25e-9)
+    most = 150e-9 if "spindle_tilt/2" in alike else IN_PART_FORM_M.get(kind, 6e-9)
+    assert found.form.mean_uncertainty < most
 
 
 def test_what_two_causes_explain_is_in_the_uncertainty():
@@ -89,8 +95,10 @@ def test_candidates_that_look_alike_are_all_named():
     assert "spindle_tilt/2" in found.refutations[0].alike
 
 
-@pytest.mark.parametrize("kind", ["hum", "floor"])
-@pytest.mark.parametrize("scans", [1, 2])
+@pytest.mark.parametrize(
+    ("kind", "scans"),
+    [("hum", 1), ("floor", 2), *(pytest.param(*k, marks=pytest.mark.soak) for k in MORE_LINES)],
+)
 def test_lines_in_time_are_named_by_their_frequency(kind, scans):
     machine, found = disturbed(kind, scans)
     names = {r.name.split("@")[0] for r in found.refutations}
@@ -104,7 +112,7 @@ def test_lines_in_time_are_named_by_their_frequency(kind, scans):
     assert error < 2 * found.form.mean_uncertainty
 
 
-@pytest.mark.parametrize("scans", [1, 2])
+@pytest.mark.parametrize("scans", [pytest.param(1, marks=pytest.mark.soak), 2])
 def test_a_correction_of_the_wrong_sign_is_seen(scans):
     _, found = disturbed("wrong_sign", scans)
     assert [k for k, _ in found.wrong_sign] == list(range(scans))

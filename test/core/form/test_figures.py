@@ -72,7 +72,7 @@ def test_noise_is_not_taken_for_form(noise):
         for name, figure in figures(map_).items():
             # Rings that are finer than the smooth terms drown in noise.
             assert abs(figure.value - TRUE[name]) < 2.5 * figure.uncertainty + 3e-9, name
-            assert figure.uncertainty < 1.2e-9 + 0.5 * noise
+            assert figure.uncertainty < 1.05e-9 + 0.5 * noise
 
 
 def test_noise_that_is_left_does_not_make_a_part_with_rings_larger():
