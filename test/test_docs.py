@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-import pytest
 
 import omsm_ros
 
@@ -25,9 +24,12 @@ def named(page):
             )
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_a_page_points_at_exists(page):
-    missing = [str(path) for path in named(page) if not path.exists()]
+def test_what_a_page_points_at_exists():
+    pointed = {page.name: list(named(page)) for page in PAGES}
+    assert sum(map(bool, pointed.values())) > len(PAGES) / 2
+    missing = [
+        (page, str(path)) for page, to in pointed.items() for path in to if not path.exists()
+    ]
     assert not missing
 
 
