@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-
 import omsm_ros
 
 ROOT = Path(omsm_ros.__file__).resolve().parent.parent

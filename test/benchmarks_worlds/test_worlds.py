@@ -1,6 +1,7 @@
 """Worlds repeat by seed, hold what they declare, and every kind of the catalogue does something."""
 
 import csv
+import functools
 import json
 
 import numpy as np
@@ -47,16 +48,18 @@ def test_catalogue_is_large_and_consistent():
     assert {kind.scope for kind in KINDS.values()} <= set(SCOPES)
 
 
+@functools.cache
+def recordings(world):
+    path = steps((10e-6,), count=2, dwell=0.2)
+    return {"scan": world.scan(feed=COARSE), "test": world.step_test(path)}
+
+
 @pytest.mark.parametrize("name", sorted(set(KINDS) - {"none"}))
 def test_each_kind_changes_its_recordings_alone(name):
     """The error acts where its scope says, beside the same chances as without it."""
     world = World(name, 2, seed=5)
-    path = steps((10e-6,), count=2, dwell=0.2)
-    pairs = {
-        "scan": (world.scan(feed=COARSE), world.clean.scan(feed=COARSE)),
-        "test": (world.step_test(path), world.clean.step_test(path)),
-    }
-    for where, (bad, good) in pairs.items():
+    for where, bad in recordings.__wrapped__(world).items():
+        good = recordings(world.clean)[where]
         acts = KINDS[name].scope in (where, "both")
         same = all(
             np.array_equal(getattr(bad, k), getattr(good, k), equal_nan=True) for k in CHANNELS
