@@ -170,8 +170,8 @@ class Network:
         sums *= np.sqrt(share)[:, np.newaxis]
         made = -(sums.T @ sums)
         for k, (matrix, _) in enumerate(self._by_scan()):
-            for (row, above), (column, beside) in itertools.product(self._own(k), repeat=2):
-                made[row, column] += matrix[above, beside] / scales.noise[k]
+            for (row, top), (column, left) in itertools.product(self._own(k), repeat=2):
+                made[row, column] += matrix[top, left] / scales.noise[k]
         return made
 
     def right_side(self, scales: Scales, y: FloatArray) -> FloatArray:
