@@ -138,6 +138,21 @@ def node_server(ros):
 
 
 @pytest.fixture
+def refused(node_server, tmp_path):
+    """A function that starts a node with what cannot be meant, and returns its last line."""
+
+    def line(node, *arguments):
+        log = tmp_path / f"{node}.log"
+        ended = node_server.start([node, "--ros-args", *arguments], log).wait(60)
+        said = log.read_text()
+        assert ended == 2, said
+        assert "Traceback" not in said
+        return said.strip().splitlines()[-1]
+
+    return line
+
+
+@pytest.fixture
 def cell(tmp_path, monkeypatch, request):
     """All that is started ends with the test; it is started in the test's folder.
 
