@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -37,29 +38,36 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
     return folder
 
 
+@pytest.fixture(scope="module")
+def finished(shop, tmp_path_factory):
+    """A campaign over the shop, and its entries."""
+    folder = tmp_path_factory.mktemp("finished")
+    return folder, run_campaign(shop / "bags", shop / "cal.json", folder, OPTIONS, jobs=2)
+
+
 def states(entries):
     return {entry.bag: entry.state for entry in entries}
 
 
-def test_every_bag_becomes_a_result_or_a_reason(shop, tmp_path):
-    entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=2)
+def test_every_bag_becomes_a_result_or_a_reason(shop, finished, tmp_path):
+    folder, entries = finished
     assert states(entries) == {
         "a.mcap": DONE, "b.mcap": DONE, "monday/c.mcap": DONE, "torn.mcap": REFUSED,
     }  # fmt: skip
     assert "torn.mcap" in entries[-1].said
-    assert load_campaign(tmp_path) == entries
+    assert load_campaign(folder) == entries
     alone = tmp_path / "alone"
     cli.main(
         ["correct", str(shop / "bags/a.mcap"), "--calibration", str(shop / "cal.json"),
          "--out", str(alone), *OPTIONS]
     )  # fmt: skip
     for name in ("a", "monday/c"):
-        cloud = (tmp_path / name / "cloud.ply").read_bytes()
+        cloud = (folder / name / "cloud.ply").read_bytes()
         assert cloud == (alone / "cloud.ply").read_bytes()
 
 
-def test_what_is_done_is_not_done_again(shop, tmp_path, monkeypatch):
-    run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
+def test_what_is_done_is_not_done_again(shop, finished, tmp_path, monkeypatch):
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
     started = []
 
     def note(task):

@@ -35,7 +35,7 @@ def link(
     return device, host, np.maximum.accumulate(host + late.astype(np.int64))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("drift_ppm", [-50.0, 0.0, 50.0])
 def test_within_a_tenth_of_a_millisecond_after_ten_seconds(drift_ppm: float, seed: int) -> None:
     device, host, arrival = link(8000, drift=drift_ppm * 1e-6, seed=seed)

@@ -98,7 +98,7 @@ def test_masses_and_springs_lie_within_what_is_stated_of_them(collocated):
     random = np.random.default_rng(5)
     exact = np.log([soft.m2, soft.k1, soft.k2, soft.c1, soft.c2])
     errors, misfits = [], []
-    for _ in range(30):
+    for _ in range(16):
         drawn = np.concatenate([numerator, truth.denominator[1:]])
         drawn[1:] += root @ random.normal(size=len(free)) / size
         fitted = fit_two_mass(
@@ -113,7 +113,7 @@ def test_masses_and_springs_lie_within_what_is_stated_of_them(collocated):
         misfits.append(fitted.misfit)
     assert max(misfits) < 3
     ratio = np.sqrt(np.mean(np.square(errors), axis=0))
-    # An rms of 30 draws scatters by 13 %.
+    # An rms of 16 draws scatters by 18 %.
     assert np.all((ratio > 0.6) & (ratio < 1.4)), ratio
 
 
