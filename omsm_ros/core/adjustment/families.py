@@ -325,7 +325,7 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         ("spindle_axial", "m", 2, (*SPINDLE_HARMONICS, *SUB_HARMONICS), _axial, 1e-7),
         ("spindle_tilt", "rad", 2, _TILT_HARMONICS, _tilting, 1e-5),
         ("spindle_radial", "m", 4, _RADIAL_HARMONICS, _radial, 1e-6),
-        ("c_error", "rad", 2, _C_HARMONICS, _angular, 2e-5),
+        ("c_error", "rad", 2, _C_HARMONICS, _angular, 1e-4),
     )
     return [
         # Once a turn, a radial motion looks like a decentred part: only its size tells. Every scale

@@ -33,8 +33,9 @@ _RIM = 96
 _DRAWS = 300
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
-# A family at least this share as probable as the likeliest one is named with it.
-_AS_LIKELY = 0.3
+# Twice the logarithm of odds that is worth more than a bare mention, and that is strong evidence
+# (Kass and Raftery 1995).
+_POSITIVE, _STRONG = 2.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def form_map(
     alike = _resembled(made, covariance, every, by_height, effects or {}, solution.network.families)
     more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)
     covariance += more @ more.T
-    together = sum(share for _, share, _ in alike)
+    strongest = max((gain for _, gain, _ in alike), default=0.0)
     pv, rms = made.pv_and_rms(solution, seed, np.concatenate([open_changes, more], axis=1))
     kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
     by_heights = by_height[kept]
@@ -140,8 +141,8 @@ def form_map(
         pose=made.pose,
         resembled=tuple(
             (name, _rms(places, change[:, np.newaxis]))
-            for name, share, change in alike
-            if together > 0.5 and share > _AS_LIKELY * alike[0][1]
+            for name, gain, change in alike
+            if strongest > _STRONG and gain > strongest - _POSITIVE
         ),
     )
 
@@ -422,10 +423,10 @@ def _resembled(
     made: _Made, covariance: FloatArray, terms: Sequence[ZernikeIndex], by_height: FloatArray,
     effects: Mapping[str, Effect], families: Sequence[Family],
 ) -> list[tuple[str, float, FloatArray]]:  # fmt: skip
-    """Return families that the scans leave open, likeliest first.
+    """Return families that the scans leave open and that the form speaks for, likeliest first.
 
-    Each has its name, the probability that it made a part of the form, and its change of the map as
-    one standard uncertainty (n,) [m]. One machine in ten is taken to have one.
+    Each has its name, twice the logarithm of its odds, and its change of the map as one standard
+    uncertainty (n,) [m]. Of ten declarations that no scan shows, one is taken to be wrong.
     """
     if not np.any(made.height):
         return []
@@ -441,9 +442,7 @@ def _resembled(
             continue
         shape = effect.shape if family.smooth is None else effect.shape @ family.smooth
         gain, values = form.looks_like(fit @ shape, family.wide)
-        found.append((family.name, float(np.exp(min(gain, SURE) / 2)), shape @ values))
-    total = ODDS_ABSENT * len(found) + sum(odds for _, odds, _ in found)
-    # Less than this ratio is not worth more than a bare mention (Kass and Raftery 1995).
-    shares = [(name, odds / total, change) for name, odds, change in found if odds > np.e]
-    shares.sort(key=lambda one: -one[1])
-    return [(name, share, np.sqrt(share) * change) for name, share, change in shares]
+        if gain > _POSITIVE:
+            share = 1 / (1 + ODDS_ABSENT * np.exp(-min(gain, SURE) / 2))
+            found.append((family.name, gain, np.sqrt(share) * (shape @ values)))
+    return sorted(found, key=lambda one: -one[1])

@@ -91,15 +91,15 @@ def reasons_of(
     accepted: names of families whose found value somebody has accepted
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
-    for refutation in refutations:
-        names = (refutation.name, *refutation.alike)
-        if refutation.minor or refutation.name in accepted:
-            continue
-        known = base_name(refutation.name) in declared
-        code = REFUTED if known else UNDECLARED_EFFECT
-        if not refutation.explains:
-            code, names = UNIDENTIFIED, ()
-        found.append(Reason(code, names, refutation.evidence.deviate, 3.0))
+    causes = [r for r in refutations if not r.minor and r.name not in accepted]
+    if all(r.explains for r in causes):
+        for cause in causes:
+            code = REFUTED if base_name(cause.name) in declared else UNDECLARED_EFFECT
+            found.append(Reason(code, (cause.name, *cause.alike), cause.evidence.deviate, 3.0))
+    else:
+        # What is found with a cause that no family explains may be a part of it.
+        largest = max(r.evidence.deviate for r in causes)
+        found.append(Reason(UNIDENTIFIED, (), largest, 3.0))
     for one in agreement:
         if one.largest >= one.limit:
             found.append(Reason(DISAGREE, (str(one.scan),), one.largest, one.limit))

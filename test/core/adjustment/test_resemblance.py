@@ -1,8 +1,14 @@
-"""Forms that follow one column of the machine, against forms that nothing orders."""
+"""Forms that follow one column of the machine, and what is named; no scan is needed."""
+
+from dataclasses import replace
 
 import numpy as np
 
+from omsm_ros.core.adjustment.evidence import Evidence
 from omsm_ros.core.adjustment.part_terms import FormTerms
+from omsm_ros.core.adjustment.refutation import Refutation
+from omsm_ros.core.adjustment.sources import Family
+from omsm_ros.core.adjustment.verdict import reasons_of
 
 DEGREES = np.repeat(np.arange(2, 9), np.arange(3, 10))
 SYMMETRIC = np.zeros(len(DEGREES), np.bool_)
@@ -50,3 +56,24 @@ def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
     gain, values = terms.looks_like(rng.normal(size=(len(DEGREES), 1)), 1e-7)
     assert gain < 2
     assert np.all(np.isfinite(values))
+
+
+def cause(name, deviate, explains=True):
+    """A family that the scans show beyond its declaration."""
+    family = Family(name, "m", 1, lambda view: view.x[np.newaxis], 1e-6, "reclocked")
+    found = Evidence(family, np.ones(1), np.ones(1), deviate**2, 1, 1e-8, deviate**2,
+                     np.eye(1), declared=True)  # fmt: skip
+    return Refutation(found, (), explains=explains)
+
+
+def test_nothing_is_named_beside_a_cause_that_no_family_explains():
+    causes = [cause("centre_x", 20.0), cause("spindle_axial/6", 9.0)]
+    named = reasons_of(causes, {"centre_x"}, (), (), (0.0, 0.1, None), ())
+    assert [(r.code, r.names) for r in named] == [
+        ("refuted", ("centre_x",)),
+        ("undeclared_effect", ("spindle_axial/6",)),
+    ]
+    causes[0] = replace(causes[0], explains=False)
+    (one,) = reasons_of(causes, {"centre_x"}, (), (), (0.0, 0.1, None), ())
+    assert (one.code, one.names) == ("unidentified", ())
+    assert one.value == max(c.evidence.deviate for c in causes)
