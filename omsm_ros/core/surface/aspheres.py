@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import Gradient
@@ -71,9 +72,9 @@ class Asphere:
         s, c = np.square(x) + np.square(y), curvature_of(self.radius)
         height = c * s / (1 + real_root(1 - (1 + self.conic_constant) * c**2 * s))
         if self.even_terms:
-            height = height + s * _polynomial(self.even_terms, s)
+            height = height + s * polyval(s, self.even_terms)
         if self.odd_terms:
-            height = height + np.sqrt(s) * _polynomial(self.odd_terms, s)
+            height = height + np.sqrt(s) * polyval(s, self.odd_terms)
         return np.asarray(height, np.float64)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
@@ -83,12 +84,12 @@ class Asphere:
         each = c / real_root(1 - (1 + self.conic_constant) * c**2 * s)
         if self.even_terms:
             powers = [2 * (i + 1) * a for i, a in enumerate(self.even_terms)]
-            each = each + _polynomial(powers, s)
+            each = each + polyval(s, powers)
         if self.odd_terms:
             powers = [(2 * i + 1) * a for i, a in enumerate(self.odd_terms)]
             r = np.sqrt(s)
             with np.errstate(divide="ignore", invalid="ignore"):
-                each = each + np.where(r > 0, _polynomial(powers, s) / r, 0.0)
+                each = each + np.where(r > 0, polyval(s, powers) / r, 0.0)
         return np.asarray(each * x), np.asarray(each * y)
 
 
@@ -177,60 +178,16 @@ class Biconic:
         return np.asarray(cx * np.square(x) + cy * np.square(y)), root, p, q
 
 
-def _polynomial(coefficients: tuple[float, ...] | list[float], s: FloatArray) -> FloatArray:
-    """Return Σ c_i s^i by Horner's rule."""
-    value = np.zeros_like(s, np.float64)
-    for coefficient in reversed(coefficients):
-        value = value * s + coefficient
-    return value
-
-
 Series = tuple[FloatArray, FloatArray]
 
 
 def bfs_series(coefficients: Sequence[float], x: FloatArray) -> Series:
     """Return Σ a_m Q_m^bfs(x) of mild aspheres, and its derivative.
 
-    ``P_(m+1) = (2 − 4x) P_m − P_(m−1)`` and ``f_m Q_m = P_m − g_(m−1) Q_(m−1) − h_(m−2) Q_(m−2)``
-    (2010, eq. 2.9 and appendix): orthonormal in the slope of the deviation along the normal.
+    The functions ``u²(1 − u²) Q_m(u²)`` are orthonormal in the slope, averaged over u with the
+    weight 1/√(1 − u²) (2007).
     """
-    zero = np.zeros_like(x)
-    plain = [(2 + zero, zero), (6 - 8 * x, zero - 8)]
-    q: list[Series] = []
-    total, slope = zero, zero
-    for m, (f, g, h) in enumerate(_recurrence(len(coefficients))):
-        if m >= 2:
-            plain.append(
-                (
-                    (2 - 4 * x) * plain[-1][0] - plain[-2][0],
-                    (2 - 4 * x) * plain[-1][1] - 4 * plain[-1][0] - plain[-2][1],
-                )
-            )
-        value, rate = plain[m]
-        if m >= 1:
-            value, rate = value - g * q[-1][0], rate - g * q[-1][1]
-        if m >= 2:
-            value, rate = value - h * q[-2][0], rate - h * q[-2][1]
-        q.append((value / f, rate / f))
-        total = total + coefficients[m] * q[-1][0]
-        slope = slope + coefficients[m] * q[-1][1]
-    return total, slope
-
-
-def _recurrence(count: int) -> list[tuple[float, float, float]]:
-    """Return f_m, g_(m−1), h_(m−2) for m = 0 to ``count − 1``, with zeros for negative indices."""
-    found: list[tuple[float, float, float]] = []
-    f: list[float] = []
-    g: list[float] = []
-    for m in range(count):
-        if m == 0:
-            f, found = [2.0], [(2.0, 0.0, 0.0)]
-            continue
-        h = -m * (m - 1) / (2 * f[m - 2]) if m >= 2 else 0.0
-        g.append(-0.5 if m == 1 else -(1 + g[m - 2] * h) / f[m - 1])
-        f.append(float(np.sqrt(m * (m + 1) + 3 - g[m - 1] ** 2 - h**2)))
-        found.append((f[m], g[m - 1], h))
-    return found
+    return _orthonormal_series(coefficients, 0, (0.5, 1.5), x)
 
 
 def con_series(coefficients: Sequence[float], x: FloatArray) -> Series:
@@ -248,8 +205,13 @@ def freeform_series(coefficients: Sequence[float], m: int, x: FloatArray) -> Ser
     ``u^m cos mθ Q_n^m(u²)`` are orthonormal in the gradient, averaged over θ and, with the weight
     1/√(1 − u²), over u.
     """
-    # Jacobi polynomials of this weight are well conditioned up to high degrees.
-    orders = -0.5, m - 1.5
+    return _orthonormal_series(coefficients, m, (-0.5, m - 1.5), x)
+
+
+def _orthonormal_series(
+    coefficients: Sequence[float], m: int, orders: tuple[float, float], x: FloatArray
+) -> Series:
+    """Return the series by Jacobi polynomials of ``orders``, which condition it well."""
     changed = _orthonormal(len(coefficients), m, orders) @ np.asarray(coefficients, np.float64)
     return _jacobi_series([float(a) for a in changed], *orders, x)
 
@@ -259,13 +221,18 @@ def _orthonormal(count: int, m: int, orders: tuple[float, float]) -> FloatArray:
     """Return the upper triangle (count, count) whose columns are Q_n^m in Jacobi polynomials.
 
     The mean of ``|∇(u^m Q cos mθ)|²`` over θ is ``(A² + m² B²)/2``, with A = ∂/∂u (u^m Q) and
-    B = u^(m−1) Q. The mean over u = sin φ is a sum over even steps of φ, exact for polynomials.
+    B = u^(m−1) Q; that of the form of revolution is ``A²``, A = ∂/∂u (u²(1 − u²) Q). The mean over
+    u = sin φ is a sum over even steps of φ, exact for polynomials.
     """
-    steps = m + 2 * count + 2
+    steps = m + 2 * count + 4
     u = np.sin((np.arange(steps) + 0.5) * np.pi / (2 * steps))
     columns = []
     for unit in np.eye(count):
         value, rate = _jacobi_series([float(a) for a in unit], *orders, u**2)
+        if m == 0:
+            along = 2 * u * ((1 - 2 * u**2) * value + u**2 * (1 - u**2) * rate)
+            columns.append(np.sqrt(2.0) * along)
+            continue
         along = u ** (m - 1) * (m * value + 2 * u**2 * rate)
         columns.append(np.concatenate([along, m * u ** (m - 1) * value]))
     root = np.linalg.qr(np.array(columns).T / np.sqrt(2 * steps), mode="r")

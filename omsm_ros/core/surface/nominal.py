@@ -4,6 +4,8 @@ A surface is described in the workpiece frame of the scan: x, y in the plane of 
 along the spindle axis, all in metres.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -181,23 +183,15 @@ class QBfs:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
-        height, _ = self._by_square(np.square(x) + np.square(y))
-        return height
+        return self._freeform().height(x, y)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
-        _, rate = self._by_square(np.square(x) + np.square(y))
-        return np.asarray(2 * rate * x), np.asarray(2 * rate * y)
+        return self._freeform().gradient(x, y)
 
-    def _by_square(self, s: FloatArray) -> Series:
-        """Return the height over s = r², and its derivative by s."""
-        c, area = curvature_of(self.radius), self.aperture_radius**2
-        u = s / area
-        root = real_root(1 - c**2 * s)
-        q, slope = bfs_series(self.coefficients, u)
-        bump, bump_slope = u * (1 - u) * q, (1 - 2 * u) * q + u * (1 - u) * slope
-        rate = c / (2 * root) + bump_slope / (area * root) + bump * c**2 / (2 * root**3)
-        return np.asarray(c * s / (1 + root) + bump / root), np.asarray(rate)
+    def _freeform(self) -> QFreeform:
+        terms = tuple(QTerm(n, 0, value) for n, value in enumerate(self.coefficients))
+        return QFreeform(self.aperture_radius, terms, self.radius)
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,11 +367,8 @@ class Sphere:
         RADIUS.checked(self.radius, SurfaceError)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the height [m]; NaN outside the sphere's equator."""
-        square = np.asarray(x) ** 2 + np.asarray(y) ** 2
-        root = np.sqrt(np.maximum(self.radius**2 - square, 0.0))
-        sag = np.sign(self.radius) * square / (abs(self.radius) + root)
-        return np.where(square <= self.radius**2, sag, np.nan)
+        """Return the height [m] at x, y [m]; NaN from the equator on."""
+        return Asphere(self.radius).height(x, y)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]; NaN from the equator on."""
