@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import polynomial
 
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.surface.nominal import PolynomialSurface
 from omsm_ros.errors import DataError
 
 # A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.
@@ -226,35 +226,13 @@ def _slope(time: FloatArray, values: FloatArray) -> float:
     return float((values[-1] - values[0]) / (time[-1] - time[0])) if len(time) > 1 else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class FittedSurface:
-    """A polynomial in x and y through the points, where no nominal surface is given.
-
-    coefficients: of u^i v^j (i, j) [m];  scale: of x and y, u = x / scale [m]
-    """
-
-    coefficients: FloatArray
-    scale: float
-
-    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the height [m] at x, y [m]."""
-        u, v = np.broadcast_arrays(np.asarray(x) / self.scale, np.asarray(y) / self.scale)
-        return np.asarray(polynomial.polyval2d(u, v, self.coefficients))
-
-
 # Degree of the slopes' polynomial: on the paper's mirror the eighth is 4 pm.
 _DEGREE, _POINTS = 8, 20_000
 
 
-def fitted_surface(scan: ScanData) -> FittedSurface:
+def fitted_surface(scan: ScanData) -> PolynomialSurface:
     """Return a polynomial of degree 8 through ``scan``, in the part frame."""
     every = max(len(scan) // _POINTS, 1)
     x, y = workpiece_xy(scan.x[::every], scan.y[::every], np.full(len(scan.x[::every]),
                                                                    scan.clocking))  # fmt: skip
-    scale = float(np.max(np.hypot(x, y)))
-    size = _DEGREE + 1
-    low = np.add.outer(np.arange(size), np.arange(size)) <= _DEGREE
-    columns = polynomial.polyvander2d(x / scale, y / scale, [_DEGREE, _DEGREE])[:, low.ravel()]
-    coefficients = np.zeros((size, size))
-    coefficients[low] = np.linalg.lstsq(columns, scan.height[::every], rcond=1e-10)[0]
-    return FittedSurface(coefficients, scale)
+    return PolynomialSurface.through(x, y, scan.height[::every], _DEGREE)

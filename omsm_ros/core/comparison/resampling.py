@@ -16,13 +16,14 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.statistics import spread
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
+from omsm_ros.core.surface.nominal import PolynomialSurface
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import MAP_SPACING
 
 # The highest order that is compared; without it the surface would curve within a cell.
 TREND_DEGREE = 6
-# Seven hundred points for each of its 28 terms.
-_TREND_POINTS = 20_000
+# Seven hundred points for each of its 28 terms, and ten at least.
+_TREND_POINTS, _ENOUGH_FOR_A_TREND = 20_000, 280
 # Ratio of occupied cells at half the side from which the points fill the surface; at most 4.
 _FILLED = 3.5
 # A wave of the sixth order has nearly three cells.
@@ -64,44 +65,12 @@ class AveragedCells:
     points: FloatArray
 
 
-class SurfaceTrend:
-    """Least-squares polynomial of the whole surface."""
-
-    def __init__(self, points: MeasuredPoints) -> None:
-        some = slice(None, None, max(len(points) // _TREND_POINTS, 1))
-        x, y = points.x[some], points.y[some]
-        self._middle = (float(np.mean(x)), float(np.mean(y)))
-        self._scale = float(max(np.ptp(points.x), np.ptp(points.y))) / 2 or 1.0
-        degree = TREND_DEGREE if len(x) > 10 * len(_powers(TREND_DEGREE)) else 1
-        self._powers = _powers(degree)
-        self._coefficients = np.linalg.lstsq(self._columns(x, y), points.height[some], rcond=1e-10)[
-            0
-        ]
-
-    def at(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the height [m], (n,)."""
-        parts = [self._columns(x[p], y[p]) @ self._coefficients for p in portions(len(x))]
-        return np.concatenate([np.empty(0), *parts])
-
-    def slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the slopes [1], each (n,)."""
-        step = 1e-5 * self._scale
-        return (
-            (self.at(x + step, y) - self.at(x - step, y)) / (2 * step),
-            (self.at(x, y + step) - self.at(x, y - step)) / (2 * step),
-        )
-
-    def _columns(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        u, v = (x - self._middle[0]) / self._scale, (y - self._middle[1]) / self._scale
-        powers_u, powers_v = ([np.ones_like(x)], [np.ones_like(x)])
-        for _ in range(max(i + j for i, j in self._powers)):
-            powers_u.append(powers_u[-1] * u)
-            powers_v.append(powers_v[-1] * v)
-        return np.stack([powers_u[i] * powers_v[j] for i, j in self._powers], axis=1)
-
-
-def _powers(degree: int) -> list[tuple[int, int]]:
-    return [(n - j, j) for n in range(degree + 1) for j in range(n + 1)]
+def surface_trend(points: MeasuredPoints) -> PolynomialSurface:
+    """Return the polynomial of the whole surface; a plane for few points."""
+    some = slice(None, None, max(len(points) // _TREND_POINTS, 1))
+    x, y, height = points.x[some], points.y[some], points.height[some]
+    degree = TREND_DEGREE if len(x) > _ENOUGH_FOR_A_TREND else 1
+    return PolynomialSurface.through(x, y, height, degree)
 
 
 def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
@@ -203,9 +172,9 @@ class LocalQuadratic:
 
     def __init__(self, points: MeasuredPoints, cell: float) -> None:
         self.cell = cell
-        self._trend = SurfaceTrend(points)
+        self._trend = surface_trend(points)
         self._cells, self._cell = averaged(
-            points, points.height - self._trend.at(points.x, points.y), cell
+            points, points.height - self._trend.height(points.x, points.y), cell
         )
         if len(self._cells.x) < _LEAST_NEIGHBOURS:
             raise DataError(
@@ -220,9 +189,9 @@ class LocalQuadratic:
     def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
         """Return the heights, slopes and their uncertainties at x, y [m], each (m,)."""
         found = self._fitted(x, y, RADIUS_CELLS * self.cell)
-        tx, ty = self._trend.slopes(x, y)
+        tx, ty = self._trend.gradient(x, y)
         return LocalHeights(
-            value=found[0] + self._trend.at(x, y),
+            value=found[0] + self._trend.height(x, y),
             slope_x=found[1] + tx,
             slope_y=found[2] + ty,
             density=found[3],

@@ -26,8 +26,8 @@ from omsm_ros.core.kinematics.kinematics import (
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection
+from omsm_ros.core.surface.nominal import PolynomialSurface
 from omsm_ros.errors import ConfigurationError, DataError, Notice
-from omsm_ros.quantities import MAP_SPACING
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
 ASSUMED = "assumed"
@@ -87,7 +87,8 @@ class ScanPoints:
         If it is None, the slopes are those of a polynomial of degree 6 through the points.
         """
         if surface is None:
-            slope_x, slope_y = _polynomial_slopes(self.x, self.y, self.height)
+            through = PolynomialSurface.through(self.x, self.y, self.height, _POLYNOMIAL_DEGREE)
+            slope_x, slope_y = through.gradient(self.x, self.y)
         else:
             slope_x, slope_y = slopes_by_differences(surface, self.x, self.y)
         return replace(self, slope_x=slope_x, slope_y=slope_y)
@@ -157,24 +158,6 @@ def standard_fields(
     for source in sources:
         found.setdefault(source.name, []).append(source.standard_fields(points))
     return {name: np.concatenate(parts) for name, parts in found.items()}
-
-
-def _polynomial_slopes(
-    x: FloatArray, y: FloatArray, height: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    scale = float(max(np.max(abs(x), initial=0.0), np.max(abs(y), initial=0.0)))
-    scale = scale if scale > MAP_SPACING.low else 1.0  # all points at one place, up to rounding
-    powers = [(i, j) for i in range(_POLYNOMIAL_DEGREE + 1) for j in range(i + 1)]
-    u, v = (np.vander(a / scale, _POLYNOMIAL_DEGREE + 1, increasing=True) for a in (x, y))
-    design = np.stack([u[:, i - j] * v[:, j] for i, j in powers], axis=1)
-    coefficient = np.linalg.lstsq(design, height, rcond=None)[0] / scale
-    slope_x, slope_y = np.zeros(len(x)), np.zeros(len(x))
-    for value, (i, j) in zip(coefficient, powers, strict=True):
-        if i > j:
-            slope_x += value * (i - j) * u[:, i - j - 1] * v[:, j]
-        if j:
-            slope_y += value * j * u[:, i - j] * v[:, j - 1]
-    return slope_x, slope_y
 
 
 # Share of the variance that may be left out: of one source (0.5 % of its standard uncertainty), and

@@ -46,6 +46,7 @@ from omsm_ros.quantities import (
     DISC_RADIUS,
     FOCAL_LENGTH,
     LENGTH,
+    MAP_SPACING,
     RADIUS,
     TERM_ORDER,
     TERM_SIZE,
@@ -81,26 +82,59 @@ class XYPolynomial:
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""
-        return self._at(x, y, self._coefficients())
+        return self._polynomial().height(x, y)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        return self._polynomial().gradient(x, y)
+
+    def _polynomial(self) -> PolynomialSurface:
+        table = np.zeros([max((getattr(t, n) for t in self.terms), default=0) + 1 for n in "xy"])
+        for term in self.terms:
+            table[term.x, term.y] += term.value
+        return PolynomialSurface(table, self.radius)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolynomialSurface:
+    """``z = Σ table[i, j] ((x − middle_x)/scale)^i ((y − middle_y)/scale)^j``, all lengths [m]."""
+
+    table: FloatArray
+    scale: float
+    middle: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def through(
+        cls, x: FloatArray, y: FloatArray, height: FloatArray, degree: int
+    ) -> PolynomialSurface:
+        """Return the least-squares polynomial of total ``degree`` of points x, y, height (n,)."""
+        middle = float(np.mean(x)), float(np.mean(y))
+        scale = float(max(np.max(np.abs(x - middle[0])), np.max(np.abs(y - middle[1]))))
+        scale = scale if scale > MAP_SPACING.low else 1.0  # all points at one place, up to rounding
+        i, j = np.array([(i, n - i) for n in range(degree + 1) for i in range(n + 1)]).T
+        u, v = (np.vander((a - m) / scale, degree + 1, increasing=True)
+                for a, m in zip((x, y), middle, strict=True))  # fmt: skip
+        table = np.zeros((degree + 1, degree + 1))
+        table[i, j] = np.linalg.lstsq(u[:, i] * v[:, j], height, rcond=1e-10)[0]
+        return cls(table, scale, middle)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]."""
+        return self._at(x, y, self.table)
 
     def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
         """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
         along_x, along_y = (
-            np.asarray(polyder(self._coefficients(), axis=k) / self.radius, np.float64)
-            for k in range(2)
+            np.asarray(polyder(self.table / self.scale, axis=k), np.float64) for k in range(2)
         )
         return self._at(x, y, along_x), self._at(x, y, along_y)
 
-    def _coefficients(self) -> FloatArray:
-        """Return the value [m] of each pair of powers (i, j), the sum of its terms."""
-        table = np.zeros([max((getattr(t, n) for t in self.terms), default=0) + 1 for n in "xy"])
-        for term in self.terms:
-            table[term.x, term.y] += term.value
-        return table
-
-    def _at(self, x: FloatArray, y: FloatArray, coefficients: FloatArray) -> FloatArray:
-        u, v = np.broadcast_arrays(np.asarray(x) / self.radius, np.asarray(y) / self.radius)
-        return np.asarray(polyval2d(u, v, coefficients), np.float64)
+    def _at(self, x: FloatArray, y: FloatArray, table: FloatArray) -> FloatArray:
+        u, v = np.broadcast_arrays(
+            (np.asarray(x) - self.middle[0]) / self.scale,
+            (np.asarray(y) - self.middle[1]) / self.scale,
+        )
+        return np.asarray(polyval2d(u, v, table), np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, match
 from omsm_ros.core.comparison.resampling import (
     TREND_DEGREE,
     LocalQuadratic,
-    SurfaceTrend,
     averaged,
     cell_side,
     on_grid,
     portions,
+    surface_trend,
 )
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
@@ -51,10 +51,10 @@ def wavy(x, y):
 
 
 def test_a_trend_is_the_polynomial_and_its_slopes_are_its_derivatives():
-    trend = SurfaceTrend(points(polynomial(X, Y)))
-    np.testing.assert_allclose(trend.at(AT_X, AT_Y), polynomial(AT_X, AT_Y), atol=1e-15)
+    trend = surface_trend(points(polynomial(X, Y)))
+    np.testing.assert_allclose(trend.height(AT_X, AT_Y), polynomial(AT_X, AT_Y), atol=1e-15)
     step = 1e-6
-    along_x, along_y = trend.slopes(AT_X, AT_Y)
+    along_x, along_y = trend.gradient(AT_X, AT_Y)
     by_x = (polynomial(AT_X + step, AT_Y) - polynomial(AT_X - step, AT_Y)) / (2 * step)
     by_y = (polynomial(AT_X, AT_Y + step) - polynomial(AT_X, AT_Y - step)) / (2 * step)
     np.testing.assert_allclose(along_x, by_x, atol=1e-9)
@@ -63,10 +63,10 @@ def test_a_trend_is_the_polynomial_and_its_slopes_are_its_derivatives():
 
 def test_of_few_points_the_trend_is_their_plane():
     few = points(3e-6 + 2e-3 * X[:200] - 1e-3 * Y[:200], X[:200], Y[:200])
-    trend = SurfaceTrend(few)
-    np.testing.assert_allclose(trend.at(AT_X, AT_Y), 3e-6 + 2e-3 * AT_X - 1e-3 * AT_Y, atol=1e-15)
-    bowl = SurfaceTrend(points(X[:200] ** 2, X[:200], Y[:200]))
-    assert np.ptp(bowl.slopes(AT_X, AT_Y)[0]) < 1e-9
+    plane = 3e-6 + 2e-3 * AT_X - 1e-3 * AT_Y
+    np.testing.assert_allclose(surface_trend(few).height(AT_X, AT_Y), plane, atol=1e-15)
+    bowl = surface_trend(points(X[:200] ** 2, X[:200], Y[:200]))
+    assert np.ptp(bowl.gradient(AT_X, AT_Y)[0]) < 1e-9
 
 
 def test_portions_cover_all_and_none_twice():
