@@ -33,7 +33,6 @@ from omsm_ros.core.lti.discretisation import (
     DigitalFilter,
     checked_motion,
     discretise,
-    fast_length,
     velocity_spectrum,
 )
 from omsm_ros.core.lti.recursion import START_SAMPLES, Recursion, through
@@ -115,13 +114,15 @@ class Residual:
 
 def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
     """Return the mean square of (1 - G) z above ``up_to`` [Hz], running over the record, (n,)."""
+    from scipy import signal  # takes half a second to load
+
     kernel = _band_kernel(up_to, digital.sample_period, len(z))
     half = len(kernel) // 2
     if not half:
         return np.zeros(len(z))
     centred = z - z[0]
     # Cut by the length of the kernel, where the ends of the record would count as motion.
-    fast = (centred - _convolved(centred, kernel))[half:-half]
+    fast = centred[half:-half] - signal.oaconvolve(centred, kernel, "valid")
     missed = running_mean(
         (fast - through(digital, fast)) ** 2, round(_RUNNING_S / digital.sample_period)
     )
@@ -136,30 +137,13 @@ def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray
     """
     if up_to >= 0.5 / sample_period:
         return np.ones(1)
-    transition = (1 - _PASSED_SHARE) * up_to * sample_period
-    # Kaiser (1974): taps and shape for an attenuation over a transition.
-    half = int(np.ceil((_ATTENUATION_DB - 8) / (2.285 * 2 * np.pi * transition) / 2))
-    half = min(half, samples // 4)
-    index = np.arange(-half, half + 1)
-    cutoff = (1 + _PASSED_SHARE) / 2 * up_to * sample_period
-    kernel = 2 * cutoff * np.sinc(2 * cutoff * index)
-    kernel = kernel * np.kaiser(len(index), 0.1102 * (_ATTENUATION_DB - 8.7))
-    return np.asarray(kernel / kernel.sum())
+    from scipy import signal  # takes half a second to load
 
-
-def _convolved(values: FloatArray, kernel: FloatArray) -> FloatArray:
-    """Return the convolution (n,) by FFT, valid where the kernel lies inside the record."""
-    # Overlap-save in stretches of eight kernels.
-    reach = len(kernel) - 1
-    length = min(fast_length(8 * len(kernel)), fast_length(len(values) + reach))
-    step = length - reach
-    stretches = -(-(len(values) + reach) // step)
-    padded = np.zeros(stretches * step + reach)
-    padded[reach : reach + len(values)] = values
-    rows = np.lib.stride_tricks.sliding_window_view(padded, length)[::step]
-    spectra = np.fft.rfft(rows) * np.fft.rfft(kernel, length)
-    whole = np.fft.irfft(spectra, length)[:, reach:].ravel()
-    return np.asarray(whole[reach // 2 : reach // 2 + len(values)])
+    taps, beta = signal.kaiserord(_ATTENUATION_DB, 2 * (1 - _PASSED_SHARE) * up_to * sample_period)
+    half = min(taps // 2, samples // 4)
+    cutoff = (1 + _PASSED_SHARE) / 2 * up_to
+    kernel = signal.firwin(2 * half + 1, cutoff, window=("kaiser", beta), fs=1 / sample_period)
+    return np.asarray(kernel, np.float64)
 
 
 def running_mean(values: FloatArray, width: int) -> FloatArray:
