@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from math import comb
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.polynomial import legendre
 
 from omsm_ros.core.ripple.scan_signal import ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.zernike_terms import ZernikeIndex, zernike_values
 
 Waves: TypeAlias = "Callable[[np.ndarray], FloatArray]"
 """Columns (m, q) to fit together with the form, at the samples (m,) asked for."""
@@ -138,10 +139,11 @@ class FormFit:
         residual = self._height
         for _ in range(2):  # the second pass removes rounding errors of millimetres
             solution += inverse @ moment
-            residual = self._height - _evaluated(basis, signal, solution[:own])
-            bare = (
-                residual if waves is None else residual - _waves_of(waves, signal, solution[own:])
-            )
+            form = partial(basis.columns, signal)
+            residual = self._height - _evaluated(form, len(signal), solution[:own])
+            bare = residual
+            if waves is not None:
+                bare = residual - _evaluated(waves, len(signal), solution[own:])
             _, moment = _normal_equations(basis, signal, bare, chosen, waves)
         variance = float(np.mean(bare[chosen] ** 2))
         spread = np.sqrt(np.maximum(np.diag(inverse)[:own], 0.0) * variance)
@@ -220,26 +222,17 @@ class _Basis:
         """Return the values of all columns at the samples ``chosen`` (m,): (m, p)."""
         time = 2 * signal.sample[chosen] / max(int(signal.sample[-1]), 1) - 1
         rho, angle = signal.radius[chosen] / self.largest, 2 * np.pi * signal.turn[chosen]
-        highest = max((abs(m) for _, _, m in self.names), default=0)
-        turns = {k: np.exp(1j * k * angle) for k in range(highest + 1)}
+        turns = {k: np.exp(1j * k * angle) for k in range(HIGHEST_ORDER + 1)}
         found = np.empty((len(chosen), len(self.names)))
         for place, (kind, n, m) in enumerate(self.names):
-            wave = turns[abs(m)].real if m >= 0 else turns[-m].imag
             if kind == "drift":
                 found[:, place] = legendre.legval(time, [0.0] * n + [1.0])
             elif kind == "order":
-                found[:, place] = wave
-            else:
-                found[:, place] = _radial(n, abs(m), rho) * wave
+                found[:, place] = turns[m].real if m >= 0 else turns[-m].imag
+        form = [place for place, name in enumerate(self.names) if name[0] == "form"]
+        terms = [ZernikeIndex(*self.names[place][1:]) for place in form]
+        found[:, form] = zernike_values(rho * turns[1].real, rho * turns[1].imag, terms).T
         return found
-
-
-def _radial(degree: int, harmonic: int, rho: FloatArray) -> FloatArray:
-    half = (degree - harmonic) // 2
-    terms = [
-        (-1) ** s * comb(degree - s, s) * comb(degree - 2 * s, half - s) for s in range(half + 1)
-    ]
-    return np.asarray(np.polyval(terms, rho**2) * rho**harmonic)
 
 
 def _normal_equations(
@@ -260,14 +253,6 @@ def _normal_equations(
         gram += columns.T @ columns
         moment += columns.T @ values[part]
     return gram, moment
-
-
-def _waves_of(waves: Waves, signal: ScanSignal, solution: FloatArray) -> FloatArray:
-    parts = [
-        waves(np.arange(first, min(first + _CHUNK, len(signal)))) @ solution
-        for first in range(0, len(signal), _CHUNK)
-    ]
-    return np.concatenate(parts)
 
 
 def _sufficient_degree(
@@ -315,10 +300,11 @@ def _inverse(gram: FloatArray) -> FloatArray:
     return np.asarray(half @ half.T)
 
 
-def _evaluated(basis: _Basis, signal: ScanSignal, solution: FloatArray) -> FloatArray:
+def _evaluated(columns: Waves, count: int, solution: FloatArray) -> FloatArray:
+    """Return the sum (count,) [m] of ``columns`` with the coefficients ``solution`` (p,)."""
     parts = [
-        basis.columns(signal, np.arange(first, min(first + _CHUNK, len(signal)))) @ solution
-        for first in range(0, len(signal), _CHUNK)
+        columns(np.arange(first, min(first + _CHUNK, count))) @ solution
+        for first in range(0, count, _CHUNK)
     ]
     return np.concatenate(parts)
 
