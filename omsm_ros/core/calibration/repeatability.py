@@ -106,12 +106,17 @@ def response_covariance(calibration: Calibration, lines: FloatArray) -> FloatArr
     return np.asarray(jacobian @ calibration.noise_covariance @ jacobian.T)
 
 
-def mahalanobis(difference: FloatArray, covariance: FloatArray) -> tuple[float, int]:
-    """Return χ² of ``difference`` in the directions that ``covariance`` spans, and their number."""
+def mahalanobis(
+    difference: FloatArray, covariance: FloatArray, tolerance: float = _RANK_TOLERANCE
+) -> tuple[float, int]:
+    """Return χ² of ``difference`` in the directions that ``covariance`` spans, and their number.
+
+    tolerance: directions of the correlation with less than this part of the largest are left out
+    """
     scale = np.sqrt(np.diag(covariance))
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    known = values > _RANK_TOLERANCE * values[-1]
+    known = values > tolerance * values[-1]
     along = vectors[:, known].T @ (difference / scale)
     return float(np.sum(along**2 / values[known])), int(np.sum(known))
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.special import chdtrc, ndtri
 
+from omsm_ros.core.calibration.repeatability import mahalanobis
 from omsm_ros.core.comparison.matching import Matched
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
@@ -247,24 +248,13 @@ def _terms(
     shapes = fitted @ rows.T
     covariance = shapes.T @ shapes + (rows * averaged**2) @ rows.T
     spread = np.sqrt(np.diag(covariance))
-    chi_square, degrees = _chi_square(value / spread, covariance / np.outer(spread, spread))
+    chi_square, degrees = mahalanobis(value, covariance, _ROUNDING)
     factor = _coverage_factor(len(names))
     terms = tuple(
         ComparedTerm(term.n, term.m, float(d), float(s), factor * float(s), float(d / (factor * s)))
         for term, d, s in zip(names, value, spread, strict=True)
     )
     return terms, float(chdtrc(degrees, chi_square)), (radius, x0, y0)
-
-
-def _chi_square(value: FloatArray, correlation: FloatArray) -> tuple[float, int]:
-    """Return χ² of ``value`` (t,) with its ``correlation`` (t, t), and its rank.
-
-    Directions with a variance of rounding only are left out.
-    """
-    powers, directions = np.linalg.eigh(correlation)
-    known = powers > _ROUNDING * powers[-1]
-    along = directions[:, known].T @ value
-    return float(np.sum(along**2 / powers[known])), int(np.sum(known))
 
 
 def _rows(matched: Matched, values: FloatArray) -> tuple[list[ZernikeIndex], FloatArray]:

@@ -189,16 +189,8 @@ class LocalQuadratic:
     def at(self, x: FloatArray, y: FloatArray) -> LocalHeights:
         """Return the heights, slopes and their uncertainties at x, y [m], each (m,)."""
         found = self._fitted(x, y, RADIUS_CELLS * self.cell)
-        tx, ty = self._trend.gradient(x, y)
-        return LocalHeights(
-            value=found[0] + self._trend.height(x, y),
-            slope_x=found[1] + tx,
-            slope_y=found[2] + ty,
-            density=found[3],
-            gain=found[4],
-            stated=found[5],
-            order=found[6],
-        )
+        found[:3] += [self._trend.height(x, y), *self._trend.gradient(x, y)]
+        return LocalHeights(*found)
 
     @property
     def surrounds_a_place(self) -> bool:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage, signal, special
 
-from omsm_ros.core.lti.discretisation import BLACKMAN_HARRIS
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, DataError
 
@@ -34,7 +33,7 @@ class Density:
     """One-sided density, each array (m,).
 
     frequency: [Hz] over time, [1/m] along a path
-    density: [m²/Hz] or [m³]; its sum times ``step`` is the mean square under ``window``
+    density: [m²/Hz] or [m³]; its sum times ``step`` is the mean square under the window
     """
 
     frequency: FloatArray
@@ -47,30 +46,18 @@ class Density:
         return float(np.sum(self.density[inside]) * self.step)
 
 
-def window(count: int) -> FloatArray:
-    """Return a Blackman-Harris window (n,), scaled to a mean square of one.
-
-    Its side lobes below 1e-9 of the power separate nanometres from millimetres of travel.
-    """
-    phase = 2 * np.pi * np.arange(count) / count
-    shape = sum(a * np.cos(k * phase) for k, a in enumerate(BLACKMAN_HARRIS))
-    return np.asarray(shape / np.sqrt(np.mean(shape**2)))
-
-
 def density(values: FloatArray, step: float) -> Density:
     """Return the density of ``values`` (n,) every ``step`` [s] or [m], with their mean.
 
-    ``Σ S(f) Δf = Σ (w x)² / n`` exactly, with the window w. A line of amplitude a has the power
-    a²/2, spread over the main lobe of ±4 bins. Raises DataError for fewer than 16 values.
+    ``Σ S(f) Δf = Σ (w x)² / Σ w²`` exactly, with a Blackman-Harris window w, whose side lobes below
+    1e-9 of the power separate nanometres from millimetres of travel. A line of amplitude a has the
+    power a²/2, spread over the main lobe of ±4 bins. Raises DataError for fewer than 16 values.
     """
     count = len(values)
     if count < 16:
         raise DataError("ripple.short_spectrum", count=count, least=16)
-    power = abs(np.fft.rfft(values * window(count))) ** 2 * step / count
-    # One-sided: all frequencies except zero and Nyquist count twice.
-    power[1 : (count + 1) // 2] *= 2
-    spacing = 1.0 / (count * step)
-    return Density(np.asarray(np.arange(len(power)) * spacing), np.asarray(power), spacing)
+    frequency, power = signal.periodogram(values, 1 / step, "blackmanharris", detrend=False)
+    return Density(frequency, power, 1 / (count * step))
 
 
 def evenly(place: FloatArray, values: FloatArray, step: float) -> FloatArray:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from omsm_ros.core.ripple.coordinates import (
     LEAST_WAVES,
@@ -152,11 +153,17 @@ def _strongest(
         for frequency, bins in (*lines, *taken.get(coordinate.name, ())):
             place, half = frequency / spacing, bins * OVERSAMPLING
             ratio[max(int(np.ceil(place - half)), 0) : max(int(place + half) + 1, 0)] = 0.0
-        peaks = _peaks(ratio, ratio_at(LEAST_SIGMA, tried))
+        # The last frequency may be a peak, too.
+        peaks, found = find_peaks(
+            np.append(ratio, 0.0),
+            height=ratio_at(LEAST_SIGMA, tried),
+            distance=_APART_BINS * OVERSAMPLING,
+        )
+        peaks = peaks[np.argsort(-found["peak_heights"], kind="stable")]
         if len(peaks) and power[peaks[0]] > best[0]:
             strong = peaks[power[peaks] > _TAKEN_TOGETHER * power[peaks[0]]]
-            places = _spaced(strong, MOST_TOGETHER - len(known))
-            new = [start(coordinate, k * spacing, residual) for k in places]
+            places = strong[: MOST_TOGETHER - len(known)]
+            new = [start(coordinate, float(k * spacing), residual) for k in places]
             best = float(power[peaks[0]]), new
     return best[1]
 
@@ -216,25 +223,6 @@ def _outside_reserved(
             for frequency, bins in reserved.get(line.coordinate, ())
         )
     ]
-
-
-def _peaks(ratio: FloatArray, least: float) -> np.ndarray:
-    inner = ratio[1:-1]
-    top = (inner >= ratio[:-2]) & (inner > ratio[2:]) & (inner > least)
-    places = np.flatnonzero(top) + 1
-    if ratio[-1] > max(least, ratio[-2]):
-        places = np.r_[places, len(ratio) - 1]
-    return places[np.argsort(-ratio[places], kind="stable")]
-
-
-def _spaced(places: np.ndarray, most: int) -> list[int]:
-    kept: list[int] = []
-    for place in places:
-        if len(kept) >= most:
-            break
-        if all(abs(int(place) - k) >= _APART_BINS * OVERSAMPLING for k in kept):
-            kept.append(int(place))
-    return kept
 
 
 def _judged(

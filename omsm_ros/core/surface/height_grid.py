@@ -6,7 +6,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import MAP_SPACING, POSITION
@@ -18,6 +18,8 @@ _LARGEST_DEVIATION = 0.02
 _LEVEL = 1e-7
 # Least share of measured places of a map; fewer points are a list.
 _LEAST_FILLED = 0.2
+# Rounding of a place on the edge of a map, in spacings.
+_SLACK = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -100,14 +102,19 @@ class GridSurface:
     """
 
     def __init__(self, grid: HeightGrid) -> None:
-        from scipy.interpolate import RectBivariateSpline  # takes 0.3 s to load
+        # Imported here: it takes 0.3 s to load.
+        from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
 
         if min(grid.height.shape) < 4:
             raise DataError("surface.small_map", shape=grid.height.shape)
-        self._grid, self._known = grid, np.isfinite(grid.height)
+        self._grid = grid
         # Missing places are filled, so that the spline in the complete cells is smooth.
-        filled = np.where(self._known, grid.height, _filled(grid.height))
+        filled = np.where(np.isfinite(grid.height), grid.height, _filled(grid.height))
         self._spline = RectBivariateSpline(grid.y, grid.x, filled)
+        # NaN where one of the four places around is missing; the edges belong to the map.
+        y, x = (np.r_[v[0] - s, v[1:-1], v[-1] + s] for v, s in
+                ((grid.y, _SLACK * grid.dy), (grid.x, _SLACK * grid.dx)))  # fmt: skip
+        self._linear = RegularGridInterpolator((y, x), grid.height, bounds_error=False)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the map has none."""
@@ -119,26 +126,10 @@ class GridSurface:
 
     def _at(self, x: FloatArray, y: FloatArray, dx: int, dy: int) -> FloatArray:
         across, along = (np.asarray(v, np.float64) for v in np.broadcast_arrays(x, y))
-        known = self._measured(across, along)
+        known = np.isfinite(self._linear((along, across)))
         places = (np.where(known, v, start) for v, start in
                   ((along, self._grid.y0), (across, self._grid.x0)))  # fmt: skip
         return np.where(known, self._spline.ev(*places, dx=dy, dy=dx), np.nan)
-
-    def _measured(self, x: FloatArray, y: FloatArray) -> BoolArray:
-        """Return True where the four places around are all known."""
-        grid, slack = self._grid, 1e-9
-        column, row = (x - grid.x0) / grid.dx, (y - grid.y0) / grid.dy
-        rows, columns = grid.height.shape
-        inside = np.isfinite(column) & np.isfinite(row)
-        for place, count in ((column, columns), (row, rows)):
-            inside = inside & (place >= -slack) & (place <= count - 1 + slack)
-        left, low = (
-            np.clip(np.where(inside, place, 0).astype(np.int64), 0, count - 2)
-            for place, count in ((column, columns), (row, rows))
-        )
-        whole = self._known[:-1] & self._known[1:]
-        whole = whole[:, :-1] & whole[:, 1:]
-        return np.asarray(inside & whole[low, left])
 
 
 def _filled(height: FloatArray) -> FloatArray:

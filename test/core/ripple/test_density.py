@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.signal.windows import blackmanharris
 
 from omsm_ros.core.ripple.coordinates import fourier_sum
-from omsm_ros.core.ripple.density import density, evenly, smoothed, window
+from omsm_ros.core.ripple.density import density, evenly, smoothed
 from omsm_ros.errors import DataError
 
 
@@ -12,9 +13,9 @@ from omsm_ros.errors import DataError
 def test_parseval_holds(count):
     values = np.random.default_rng(1).normal(0, 3.0, count)
     spectrum = density(values, 1e-3)
-    weighted = np.mean((window(count) * values) ** 2)
+    window = blackmanharris(count, sym=False)
+    weighted = np.sum((window * values) ** 2) / np.sum(window**2)
     assert np.sum(spectrum.density) * spectrum.step == pytest.approx(weighted, rel=1e-12)
-    assert np.mean(window(count) ** 2) == pytest.approx(1.0)
 
 
 def test_a_line_has_half_its_amplitude_squared():
