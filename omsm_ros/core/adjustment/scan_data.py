@@ -12,9 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
+from omsm_ros.core.kinematics.kinematics import (
+    PolynomialSurface,
+    Surface,
+    slopes_by_differences,
+    workpiece_xy,
+)
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.core.surface.nominal import PolynomialSurface
 from omsm_ros.errors import DataError
 
 # A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from omsm_ros.core.kinematics.kinematics import PolynomialSurface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.streams.statistics import spread
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints
-from omsm_ros.core.surface.nominal import PolynomialSurface
 from omsm_ros.errors import DataError
 from omsm_ros.quantities import MAP_SPACING
 

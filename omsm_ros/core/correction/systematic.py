@@ -19,6 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import (
+    PolynomialSurface,
     Surface,
     WorkpiecePoints,
     slopes_by_differences,
@@ -26,7 +27,6 @@ from omsm_ros.core.kinematics.kinematics import (
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection
-from omsm_ros.core.surface.nominal import PolynomialSurface
 from omsm_ros.errors import ConfigurationError, DataError, Notice
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"

@@ -4,14 +4,17 @@ Chain: workpiece → C → Y → X → base → Z → B → probe. The workpiece
 the spindle, which is parallel to Z; x and y are slide positions relative to the spindle axis.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval2d
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import LENGTH, SLOPE
+from omsm_ros.quantities import LENGTH, MAP_SPACING, SLOPE
 from omsm_ros.units import MICROMETRE_M
 
 
@@ -147,3 +150,45 @@ def slopes_by_differences(
     along_x = (surface.height(x + step, y) - surface.height(x - step, y)) / (2 * step)
     along_y = (surface.height(x, y + step) - surface.height(x, y - step)) / (2 * step)
     return np.asarray(along_x, np.float64), np.asarray(along_y, np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PolynomialSurface:
+    """``z = Σ table[i, j] ((x − middle_x)/scale)^i ((y − middle_y)/scale)^j``, all lengths [m]."""
+
+    table: FloatArray
+    scale: float
+    middle: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def through(
+        cls, x: FloatArray, y: FloatArray, height: FloatArray, degree: int
+    ) -> PolynomialSurface:
+        """Return the least-squares polynomial of total ``degree`` of points x, y, height (n,)."""
+        middle = float(np.mean(x)), float(np.mean(y))
+        scale = float(max(np.max(np.abs(x - middle[0])), np.max(np.abs(y - middle[1]))))
+        scale = scale if scale > MAP_SPACING.low else 1.0  # all points at one place, up to rounding
+        i, j = np.array([(i, n - i) for n in range(degree + 1) for i in range(n + 1)]).T
+        u, v = (np.vander((a - m) / scale, degree + 1, increasing=True)
+                for a, m in zip((x, y), middle, strict=True))  # fmt: skip
+        table = np.zeros((degree + 1, degree + 1))
+        table[i, j] = np.linalg.lstsq(u[:, i] * v[:, j], height, rcond=1e-10)[0]
+        return cls(table, scale, middle)
+
+    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the height [m] at x, y [m]."""
+        return self._at(x, y, self.table)
+
+    def gradient(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
+        along_x, along_y = (
+            np.asarray(polyder(self.table / self.scale, axis=k), np.float64) for k in range(2)
+        )
+        return self._at(x, y, along_x), self._at(x, y, along_y)
+
+    def _at(self, x: FloatArray, y: FloatArray, table: FloatArray) -> FloatArray:
+        u, v = np.broadcast_arrays(
+            (np.asarray(x) - self.middle[0]) / self.scale,
+            (np.asarray(y) - self.middle[1]) / self.scale,
+        )
+        return np.asarray(polyval2d(u, v, table), np.float64)

@@ -10,9 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial.polynomial import polyder, polyval2d
 
-from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.kinematics.kinematics import PolynomialSurface, Surface
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aspheres import (
@@ -46,7 +45,6 @@ from omsm_ros.quantities import (
     DISC_RADIUS,
     FOCAL_LENGTH,
     LENGTH,
-    MAP_SPACING,
     RADIUS,
     TERM_ORDER,
     TERM_SIZE,
@@ -93,48 +91,6 @@ class XYPolynomial:
         for term in self.terms:
             table[term.x, term.y] += term.value
         return PolynomialSurface(table, self.radius)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PolynomialSurface:
-    """``z = Σ table[i, j] ((x − middle_x)/scale)^i ((y − middle_y)/scale)^j``, all lengths [m]."""
-
-    table: FloatArray
-    scale: float
-    middle: tuple[float, float] = (0.0, 0.0)
-
-    @classmethod
-    def through(
-        cls, x: FloatArray, y: FloatArray, height: FloatArray, degree: int
-    ) -> PolynomialSurface:
-        """Return the least-squares polynomial of total ``degree`` of points x, y, height (n,)."""
-        middle = float(np.mean(x)), float(np.mean(y))
-        scale = float(max(np.max(np.abs(x - middle[0])), np.max(np.abs(y - middle[1]))))
-        scale = scale if scale > MAP_SPACING.low else 1.0  # all points at one place, up to rounding
-        i, j = np.array([(i, n - i) for n in range(degree + 1) for i in range(n + 1)]).T
-        u, v = (np.vander((a - m) / scale, degree + 1, increasing=True)
-                for a, m in zip((x, y), middle, strict=True))  # fmt: skip
-        table = np.zeros((degree + 1, degree + 1))
-        table[i, j] = np.linalg.lstsq(u[:, i] * v[:, j], height, rcond=1e-10)[0]
-        return cls(table, scale, middle)
-
-    def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the height [m] at x, y [m]."""
-        return self._at(x, y, self.table)
-
-    def gradient(self, x: FloatArray, y: FloatArray) -> Gradient:
-        """Return the slopes ∂z/∂x, ∂z/∂y [1]."""
-        along_x, along_y = (
-            np.asarray(polyder(self.table / self.scale, axis=k), np.float64) for k in range(2)
-        )
-        return self._at(x, y, along_x), self._at(x, y, along_y)
-
-    def _at(self, x: FloatArray, y: FloatArray, table: FloatArray) -> FloatArray:
-        u, v = np.broadcast_arrays(
-            (np.asarray(x) - self.middle[0]) / self.scale,
-            (np.asarray(y) - self.middle[1]) / self.scale,
-        )
-        return np.asarray(polyval2d(u, v, table), np.float64)
 
 
 @dataclass(frozen=True, slots=True)
