@@ -134,7 +134,7 @@ def _tidy(place: Path, usual: set[str]) -> None:
 
 @pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__name__)
 def test_a_sample_of_hostile_inputs(door, place, small_scan_blocks):
-    _all_refused_or_right(door, place, small_scan_blocks[:BLOCKS], 5 * DOORS[door], True)
+    _all_refused_or_right(door, place, small_scan_blocks[:BLOCKS], 3 * DOORS[door], True)
 
 
 @pytest.mark.soak

@@ -57,11 +57,12 @@ def test_noise_of_the_encoder_that_rings_at_the_mode_counts():
     assert 0.5 < np.sqrt(np.mean(np.square(over))) < 1.3
 
 
-@pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("truth", [MACHINE.non_collocated(), MACHINE.collocated()])
-def test_either_mode_of_two_masses(truth, index):
-    over = [off(identified(truth, seed), truth, index) for seed in (1, 2)]
-    assert np.all(np.abs(over) < 4)
+def test_either_mode_of_two_masses(truth):
+    for seed in (1, 2):
+        found = identified(truth, seed)
+        over = [off(found, truth, index) for index in (0, 1)]
+        assert np.all(np.abs(over) < 4)
 
 
 def test_a_pure_delay():
