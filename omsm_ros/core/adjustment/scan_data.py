@@ -184,7 +184,7 @@ def view_of(scan: ScanData, index: int, begin: float, nominal: Surface) -> ScanV
         slope_y=slope_y,
         motion=scan.motion,
         motion_rate=_rate(scan.time, scan.motion),
-        motion_acceleration=_rate(scan.time, scan.motion, 2),
+        motion_acceleration=_of_neighbours(scan, _rate(scan.time, scan.motion, 2)),
         motion_fading=_fading(scan.time, scan.motion),
         # The measured distance holds the form itself, as a regressor it would take it away.
         distance=scan.distance - deviation,
@@ -211,6 +211,23 @@ def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
         else:
             made[run] = 0.0 if order == 2 else _slope(time[run], values[run])
     return made
+
+
+def _of_neighbours(scan: ScanData, values: FloatArray) -> FloatArray:
+    """Return ``values`` (n,) as the turns before and after have them at the same angle.
+
+    The noise of the encoder stands in the corrected height too, as G passes it on: a second
+    derivative of the same turn would find it there. Without a neighbour the value stays.
+    """
+    c = np.maximum.accumulate(scan.c * np.sign(scan.c[-1] - scan.c[0]))
+    known = values.copy()
+    # Nothing is interpolated over a gap.
+    known[np.append(np.diff(scan.time) > 1.5 * np.median(np.diff(scan.time)), False)] = np.nan
+    sides = np.stack([np.interp(c + turn, c, known, np.nan, np.nan)
+                      for turn in (-2 * np.pi, 2 * np.pi)])  # fmt: skip
+    found = np.isfinite(sides)
+    total = np.sum(np.where(found, sides, 0.0), axis=0)
+    return np.where(found.any(axis=0), total / np.maximum(found.sum(axis=0), 1), values)
 
 
 # Creep of guides and mounts that a step test with plateaus of half a second does not show.
