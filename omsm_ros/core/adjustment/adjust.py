@@ -36,7 +36,14 @@ from omsm_ros.core.adjustment.refutation import (
     settled,
     start_scales,
 )
-from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, fitted_surface, view_of
+from omsm_ros.core.adjustment.scan_data import (
+    ScanData,
+    ScanView,
+    Zero,
+    fitted_surface,
+    view_of,
+    zero_of,
+)
 from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes, with_dynamics
 from omsm_ros.core.adjustment.verdict import (
     Verdict,
@@ -97,7 +104,7 @@ class Adjustment:
     verdict: may the heights be relied on
     scales: noise, drift and form below the terms, estimated;  noise: of a reading, each scan [m]
     solution: parameters, covariance, residuals
-    begin: time of the first point of all [s]
+    zero: from where times, heights and distances count
     """
 
     form: FormMap
@@ -110,7 +117,7 @@ class Adjustment:
     noise: FloatArray
     solution: Solution
     nominal: Surface
-    begin: float
+    zero: Zero
 
     def source(self, name: str) -> SourceFinding:
         """Return the finding of family ``name``.
@@ -186,8 +193,8 @@ def _adjusted(
     accepted: Collection[str],
 ) -> Adjustment:
     """Return the adjustment of ``scans`` to the nominal ``surface``."""
-    begin = float(min(s.time[0] for s in scans))
-    views = [view_of(s, k, begin, surface) for k, s in enumerate(scans)]
+    zero = zero_of(scans, surface)
+    views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, priors)
     detecting, refutations, doubts = _fitted(network, views, sizes, priors)
     evidences = _evidences(detecting, refutations)
@@ -222,7 +229,7 @@ def _adjusted(
         noise=network.blocks.noise,
         solution=solution,
         nominal=surface,
-        begin=begin,
+        zero=zero,
     )
 
 
@@ -322,7 +329,7 @@ def corrected_heights(adjustment: Adjustment, scan: ScanData, index: int) -> Flo
     """
     solution = adjustment.solution
     net = solution.network
-    view = view_of(scan, index, adjustment.begin, adjustment.nominal)
+    view = view_of(scan, index, adjustment.zero, adjustment.nominal)
     taking = [f for f in net.families if f.name in solution.sizes]
     knots = solution.values[net.knots[index]]
     drift = np.interp(view.since, np.arange(len(knots)) * net.steps[index], knots)

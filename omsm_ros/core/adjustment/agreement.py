@@ -13,10 +13,10 @@ import numpy as np
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import DIFFERS
-from omsm_ros.core.adjustment.figures import Figure, pv_and_rms
+from omsm_ros.core.adjustment.figures import Figure, Places, places_of, pv_and_rms
 from omsm_ros.core.adjustment.network import Solution, solve
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 
 # Share of adjustments with agreeing scans in which any E_n exceeds its limit.
 _BY_CHANCE = 0.005
@@ -58,19 +58,21 @@ def agreement_of(
     common = np.all(seen, axis=0)
     if not common.any():
         common = np.any(seen, axis=0)
-    alone = [_alone(solution, y, k, nominal, removed, common) for k in range(blocks.scans)]
+    # A form has another PV where it is read elsewhere: all scans at the same places.
+    places = places_of(solution, common)
+    alone = [_alone(solution, y, k, nominal, removed, places) for k in range(blocks.scans)]
     return tuple(_compared(solution, k, alone) for k in range(blocks.scans))
 
 
 def _alone(
     solution: Solution, y: FloatArray, scan: int, nominal: Surface | None, removed: Sequence[str],
-    common: BoolArray,
+    places: Places,
 ) -> tuple[Figure, Figure]:  # fmt: skip
-    """Return PV and rms of the form by ``scan`` alone, over the cells that all scans saw."""
+    """Return PV and rms of the form by ``scan`` alone, at ``places`` that all scans saw."""
     net = solution.network.alone(scan)
     scales = replace(solution.scales, noise=solution.scales.noise[[scan]])
     mine = solution.network.blocks.scan == scan
-    return pv_and_rms(solve(net, y[mine], scales, {}), nominal, removed, common)
+    return pv_and_rms(solve(net, y[mine], scales, {}), nominal, removed, places)
 
 
 def _compared(

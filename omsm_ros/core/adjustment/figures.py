@@ -86,7 +86,7 @@ class FormMap:
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
+class Places:
     """Where the map is made: x, y, span-free terms, cell of each place, and areas."""
 
     x: FloatArray
@@ -151,10 +151,10 @@ def pv_and_rms(
     solution: Solution,
     nominal: Surface | None,
     removed: Sequence[str] = POSE,
-    within: BoolArray | None = None,
+    places: Places | None = None,
 ) -> tuple[Figure, Figure]:
-    """Return PV and rms of the form that ``solution`` found, as :func:`form_map` does."""
-    return _Made.of(solution, nominal, removed, within).pv_and_rms(solution, 0)
+    """Return PV and rms of the form that ``solution`` found at ``places``; None: as `form_map`."""
+    return _Made.of(solution, nominal, removed, places).pv_and_rms(solution, 0)
 
 
 class Effect(NamedTuple):
@@ -267,7 +267,7 @@ class _Made:
     member: cell of each place (n, cells);  columns, fit: of the pose (n, k), (k, n)
     """
 
-    places: _Places
+    places: Places
     height: FloatArray
     pose: FloatArray
     rows: FloatArray
@@ -282,11 +282,11 @@ class _Made:
         solution: Solution,
         nominal: Surface | None,
         removed: Sequence[str],
-        within: BoolArray | None = None,
+        places: Places | None = None,
     ) -> _Made:
-        """Return the map of ``solution``; of the cells ``within`` alone, if given."""
+        """Return the map of ``solution`` at ``places``; None: at all that were scanned."""
         net, scales = solution.network, solution.scales
-        places = _places(solution, within)
+        places = places or places_of(solution)
         share = net.cell_share(net.weights(scales), scales)
         found = net.cells_of(scales, solution.residual())
         values = net.part.values(places.x, places.y)
@@ -354,13 +354,16 @@ def _pv(heights: FloatArray) -> FloatArray:
     return np.asarray(np.ptp(heights, axis=0))
 
 
-def _rms(places: _Places, shapes: FloatArray) -> float:
+def _rms(places: Places, shapes: FloatArray) -> float:
     """Return the rms over the part of the sum of independent ``shapes`` (n, k)."""
     return float(np.sqrt(np.sum(places.area @ shapes**2)))
 
 
-def _places(solution: Solution, within: BoolArray | None = None) -> _Places:
-    """Return the centre of the blocks of every cell that was scanned, and points of the rim."""
+def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
+    """Return the centre of the blocks of every cell that was scanned, and points of the rim.
+
+    within: cells to which they are confined
+    """
     net = solution.network
     blocks, part = net.blocks, net.part
     number = np.bincount(part.cell, minlength=part.cells)
@@ -375,17 +378,20 @@ def _places(solution: Solution, within: BoolArray | None = None) -> _Places:
     rim_y = part.disc.y + part.disc.radius * np.sin(angle) * (1 - 1e-3)
     cell = part.cell_of(rim_x, rim_y)
     kept = number[cell] > 0
-    area = np.append(np.ones(len(seen)), np.zeros(np.count_nonzero(kept)))
-    return _Places(
+    # Towards the rim cells are narrower than blocks: one without a block between two that have
+    # some is scanned too, and they stand for half of it each.
+    between = np.roll(number > 0, 1) & (number == 0) & np.roll(number > 0, -1)
+    weights = (1 + np.roll(between, 1) / 2 + np.roll(between, -1) / 2)[seen]
+    return Places(
         np.append(x, rim_x[kept]),
         np.append(y, rim_y[kept]),
         np.append(seen, cell[kept]),
-        area / len(seen),
+        np.append(weights / np.sum(weights), np.zeros(np.count_nonzero(kept))),
     )
 
 
 def _pose(
-    places: _Places, nominal: Surface | None, removed: Sequence[str]
+    places: Places, nominal: Surface | None, removed: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
     """Return columns of the pose (n, k), and what fits them by least squares (k, n)."""
     x, y = places.x, places.y
@@ -410,7 +416,7 @@ def _figure(
     return Figure(value, float(np.hypot(np.std(many), bias)))
 
 
-def _term_fit(solution: Solution, places: _Places) -> tuple[tuple[ZernikeIndex, ...], FloatArray]:
+def _term_fit(solution: Solution, places: Places) -> tuple[tuple[ZernikeIndex, ...], FloatArray]:
     """Return the fitted terms, and the matrix from heights to their coefficients."""
     every = terms_up_to(_FITTED_DEGREE)
     u, v = solution.network.part.disc.scaled(places.x, places.y)

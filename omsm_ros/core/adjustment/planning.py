@@ -23,7 +23,7 @@ from omsm_ros.core.adjustment.figures import POSE, form_map
 from omsm_ros.core.adjustment.network import Network, Scales, solve
 from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, RINGS, SYMMETRIC, part_model
 from omsm_ros.core.adjustment.refutation import completed
-from omsm_ros.core.adjustment.scan_data import ScanData, view_of
+from omsm_ros.core.adjustment.scan_data import ScanData, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Source, prior_sizes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
@@ -111,7 +111,8 @@ def posterior_uncertainty(
     for design in designs:
         scans.append(design_scan(design, nominal, begin / shorter, design.turns / shorter))
         begin += design.duration + _PAUSE_S
-    views = [view_of(s, k, 0.0, nominal) for k, s in enumerate(scans)]
+    zero = zero_of(scans, nominal)
+    views = [view_of(s, k, zero, nominal) for k, s in enumerate(scans)]
     ranges = ranges_of(views, priors, [s.clamping for s in scans])
     families = families_of(ranges, priors)
     sizes = prior_sizes(families, priors)

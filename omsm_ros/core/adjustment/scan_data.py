@@ -7,8 +7,9 @@ the part has one x and y in all scans. Rates are local polynomials over the samp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -159,18 +160,36 @@ class ScanView:
         return self.lateral_error(*workpiece_xy(x * one, y * one, self.turned))
 
 
-def view_of(scan: ScanData, index: int, begin: float, nominal: Surface) -> ScanView:
-    """Return ``scan`` with rates, slopes and deviation from ``nominal``.
+class Zero(NamedTuple):
+    """From where all scans count time [s], height, distance and motion [m]: where the first is.
 
-    index: of the scan;  begin: time at which the first scan began [s]
+    Zeros of machine and probe lie anywhere: a scale times their distance would pass for the level
+    of the part, which no scan knows.
     """
+
+    time: float
+    height: float
+    distance: float
+    motion: float
+
+
+def zero_of(scans: Sequence[ScanData], nominal: Surface) -> Zero:
+    """Return from where ``scans`` count."""
+    first = scans[0]
+    x, y = workpiece_xy(first.x, first.y, np.full(len(first), first.clocking))
+    means = (first.height - nominal.height(x, y), first.distance, first.motion)
+    return Zero(float(min(s.time[0] for s in scans)), *(float(np.mean(v)) for v in means))
+
+
+def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanView:
+    """Return ``scan``, number ``index``, with rates, slopes and deviation from ``nominal``."""
     x, y = workpiece_xy(scan.x, scan.y, np.full(len(scan), scan.clocking))
     slide_x, slide_y = workpiece_xy(scan.x, scan.y, -scan.c)
     x_rate, y_rate = (_rate(scan.time, v) for v in (x, y))
     slope_x, slope_y = slopes_by_differences(nominal, x, y)
-    deviation = scan.height - nominal.height(x, y)
+    deviation = scan.height - zero.height - nominal.height(x, y)
     return ScanView(
-        time=scan.time - begin,
+        time=scan.time - zero.time,
         since=scan.time - scan.time[0],
         x=x,
         y=y,
@@ -182,12 +201,12 @@ def view_of(scan: ScanData, index: int, begin: float, nominal: Surface) -> ScanV
         y_rate=y_rate,
         slope_x=slope_x,
         slope_y=slope_y,
-        motion=scan.motion,
+        motion=scan.motion - zero.motion,
         motion_rate=_rate(scan.time, scan.motion),
         motion_acceleration=_of_neighbours(scan, _rate(scan.time, scan.motion, 2)),
         motion_fading=_fading(scan.time, scan.motion),
         # The measured distance holds the form itself, as a regressor it would take it away.
-        distance=scan.distance - deviation,
+        distance=scan.distance - zero.distance - deviation,
         removed=scan.removed,
         deviation=deviation,
         speed=scan.speed,

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg, optimize
 
 from omsm_ros.core.adjustment.families import families_of, ranges_of
-from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, view_of
+from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, view_of, zero_of
 from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.kinematics.kinematics import Geometry, Surface
 from omsm_ros.core.registration.probe_alignment import Alignment
@@ -81,7 +81,7 @@ def evaluate_sources(
     """
     if kind not in KINDS:
         raise DataError("adjustment.recording_kind", kind=kind, known=KINDS)
-    view = view_of(scan, 0, float(scan.time[0]), nominal)
+    view = view_of(scan, 0, zero_of([scan], nominal), nominal)
     ranges = ranges_of([view], (), [0])
     families = [f for f in families_of(ranges, ()) if f.name in _SOURCES[kind]]
     size = max(

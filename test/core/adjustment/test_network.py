@@ -10,7 +10,7 @@ from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Factor, solve
 from omsm_ros.core.adjustment.refutation import start_scales
-from omsm_ros.core.adjustment.scan_data import view_of
+from omsm_ros.core.adjustment.scan_data import view_of, zero_of
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,8 @@ def small():
     """Two short scans, their views and network."""
     machine = Machine(1, lag=20e-6, pitch=1.6e-3)
     scans = [machine.scan(60), machine.scan(-90, outward=True)]
-    views = [view_of(s, k, 0.0, MIRROR) for k, s in enumerate(scans)]
+    zero = zero_of(scans, MIRROR)
+    views = [view_of(s, k, zero, MIRROR) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, PRIORS)
     return views, network, sizes
 
