@@ -1,7 +1,7 @@
 """Adjust scans of one part together: form, errors of the machine, and what is contradicted."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -202,6 +202,8 @@ def _adjusted(
     families = solution.network.families
     effects = effects_on_form(solution, surface, removed)
     form = form_map(solution, surface, removed, doubts, effects)
+    # As high as the heights that came in.
+    form = replace(form, pose=form.pose + zero.height * (np.array(removed) == "piston"))
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
     walk = _walk(detecting, priors)
