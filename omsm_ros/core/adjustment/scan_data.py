@@ -242,11 +242,13 @@ def _of_neighbours(scan: ScanData, values: FloatArray) -> FloatArray:
     known = values.copy()
     # Nothing is interpolated over a gap.
     known[np.append(np.diff(scan.time) > 1.5 * np.median(np.diff(scan.time)), False)] = np.nan
-    sides = np.stack([np.interp(c + turn, c, known, np.nan, np.nan)
-                      for turn in (-2 * np.pi, 2 * np.pi)])  # fmt: skip
-    found = np.isfinite(sides)
-    total = np.sum(np.where(found, sides, 0.0), axis=0)
-    return np.where(found.any(axis=0), total / np.maximum(found.sum(axis=0), 1), values)
+    before, last, following, after = (
+        np.interp(c + 2 * np.pi * turn, c, known, np.nan, np.nan) for turn in (-2, -1, 1, 2)
+    )
+    # At both ends, and beside a gap, the two turns on one side continue.
+    for found in (2 * last - before, 2 * following - after, (last + following) / 2):
+        values = np.where(np.isfinite(found), found, values)
+    return values
 
 
 # Creep of guides and mounts that a step test with plateaus of half a second does not show.
