@@ -245,7 +245,7 @@ def _of_neighbours(scan: ScanData, values: FloatArray) -> FloatArray:
     before, last, following, after = (
         np.interp(c + 2 * np.pi * turn, c, known, np.nan, np.nan) for turn in (-2, -1, 1, 2)
     )
-    # At both ends, and beside a gap, the two turns on one side continue.
+    # At both ends, and next to a gap, the two turns on one side continue.
     for found in (2 * last - before, 2 * following - after, (last + following) / 2):
         values = np.where(np.isfinite(found), found, values)
     return values
