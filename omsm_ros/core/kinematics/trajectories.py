@@ -235,8 +235,7 @@ class StepPlan:
 
     def positions(self, time: FloatArray) -> AxisPositions:
         """Return the commanded axes at ``time`` [s]; only Z moves."""
-        zero = np.zeros_like(time)
-        return AxisPositions(zero, zero, self.z(time), zero, zero)
+        return _z_only(self.z(time))
 
 
 def plan_steps(

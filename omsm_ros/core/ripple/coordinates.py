@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from omsm_ros.core.ripple.density import noise_floor
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -155,11 +154,6 @@ def power_over(
         spectrum = fourier_sum(coordinate.values, values, spacing, max(size, 16))
     power = abs(spectrum) ** 2 * (2 / count) ** 2
     return np.asarray(power, np.float64), spacing
-
-
-def floor_of(power: FloatArray) -> FloatArray:
-    """Return the mean squared amplitude of noise at each frequency of :func:`power_over`."""
-    return noise_floor(power, OVERSAMPLING)
 
 
 def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[float, float]:

@@ -167,11 +167,6 @@ class FormFit:
         return [(float(k), _HARMONIC_WIDTH + 0.5 * radial[k]) for k in range(1, highest + 1)]
 
 
-def without_form(signal: ScanSignal) -> FormRemoved:
-    """Remove form, drift and spindle harmonics from the heights of ``signal``."""
-    return FormFit(signal).without()
-
-
 @dataclass(frozen=True, eq=False)
 class _Basis:
     """Columns of the fit, named by kind (drift, order or form), degree and harmonic."""

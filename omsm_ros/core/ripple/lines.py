@@ -17,11 +17,10 @@ from omsm_ros.core.ripple.coordinates import (
     OVERSAMPLING,
     Coordinate,
     coordinates_of,
-    floor_of,
     power_over,
     same_line,
 )
-from omsm_ros.core.ripple.density import ratio_at, significance
+from omsm_ros.core.ripple.density import noise_floor, ratio_at, significance
 from omsm_ros.core.ripple.scan_signal import PATH, TIME, TURN, ScanSignal
 from omsm_ros.core.ripple.spectral_line import (
     CLOSEST,
@@ -146,7 +145,7 @@ def _strongest(
     for coordinate in searched:
         power, spacing = power_over(signal, residual, coordinate)
         tried = len(power) / OVERSAMPLING
-        ratio = power / floor_of(power)
+        ratio = power / noise_floor(power, OVERSAMPLING)
         least = np.arange(len(power)) * spacing < LEAST_WAVES * coordinate.resolution
         ratio[least] = 0.0
         lines = [(k.frequency, CLOSEST) for k in known if k.coordinate == coordinate.name]
@@ -235,7 +234,7 @@ def _judged(
     for name in {TIME, *(line.coordinate for line in lines)}:
         power, spacing = power_over(signal, residual, coordinates[name])
         grid = np.asarray(np.arange(len(power)) * spacing, np.float64)
-        floors[name] = grid, floor_of(power)
+        floors[name] = grid, noise_floor(power, OVERSAMPLING)
     found = []
     for line in lines:
         frequency, floor = floors[line.coordinate]

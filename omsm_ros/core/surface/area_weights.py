@@ -64,11 +64,6 @@ def area_weights(
     return np.asarray(weights / np.mean(weights), np.float64)
 
 
-def turns(x: FloatArray, y: FloatArray) -> float:
-    """Return the number of turns of the path about the origin."""
-    return _turns(np.unwrap(np.arctan2(y, x)))
-
-
 def _along_line(x: FloatArray, y: FloatArray) -> FloatArray | None:
     """Return the position of each point (n,) along a common line [m]; None if there is none."""
     across = np.stack([x - np.mean(x), y - np.mean(y)])

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.ripple.coordinates import (
+    OVERSAMPLING,
     Coordinate,
     coordinates_of,
-    floor_of,
     power_over,
     same_line,
 )
+from omsm_ros.core.ripple.density import noise_floor
 from omsm_ros.core.ripple.scan_signal import PATH, RADIUS, TIME, TURN, ScanSignal
 
 COUNT, PERIOD = 3000, 1e-3
@@ -123,7 +124,8 @@ class TestPower:
         signal = scan()
         values = np.random.default_rng(3).normal(0, 2.0, COUNT)
         power, _ = power_over(signal, values, coordinates_of(signal)[TIME])
-        assert np.mean(floor_of(power)) == pytest.approx(4 * 4.0 / COUNT, rel=0.05)
+        floor = noise_floor(power, OVERSAMPLING)
+        assert np.mean(floor) == pytest.approx(4 * 4.0 / COUNT, rel=0.05)
 
 
 class TestSameLine:

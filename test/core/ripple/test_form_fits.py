@@ -5,11 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.form_removal import FormFit, SpindleOrder, without_form
+from omsm_ros.core.ripple.form_removal import FormFit, SpindleOrder
 from omsm_ros.core.ripple.scan_signal import ScanSignal
 
 NM = 1e-9
 COUNT = 6000
+
+
+def without_form(signal):
+    return FormFit(signal).without()
 
 
 def scan(turns=30.0, inner=0.0, height=None, seed=1, noise=1 * NM):

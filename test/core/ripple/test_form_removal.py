@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.ripple.form_removal import without_form
+from omsm_ros.core.ripple.form_removal import FormFit
 from omsm_ros.core.ripple.scan_signal import scan_signal
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.twin.scenario import Scenario, scan_of
+
+
+def without_form(signal):
+    return FormFit(signal).without()
 
 
 def test_a_millimetre_of_mirror_leaves_its_nanometres(made):

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.ripple.density import noise_floor, ratio_at, significance
-from omsm_ros.core.ripple.form_removal import without_form
+from omsm_ros.core.ripple.form_removal import FormFit
 from omsm_ros.core.ripple.lines import find_lines
 
 NM = 1e-9
+
+
+def without_form(signal):
+    return FormFit(signal).without()
 
 
 def lines_of(signal):
