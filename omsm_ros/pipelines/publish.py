@@ -83,9 +83,9 @@ def map_of(view: CloudView | None, nominal: Surface | None, out: Path) -> Embedd
         seated, _ = levelled(view, nominal, tilt=False)
         corrected, raw = levelled(view, nominal)
         for name, away in (
-            ("corrected, tilt removed", corrected),
-            ("uncorrected, same tilt removed", raw),
-            ("corrected, as it sits", seated),
+            ("corrected", corrected),
+            ("uncorrected", raw),
+            ("corrected, tilt kept", seated),
         ):
             unit = unit_for(float(np.max(np.abs(away))))
             layers.append(Layer(name, view.x, view.y, away, unit))

@@ -7,6 +7,7 @@ samples would absorb errors of the starts that repeat with the sample period.
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -29,6 +30,8 @@ _LARGEST_GAP, _MOST_MISFIT = 0.3, 3.0
 _AXES = ((50.0, 2e-4), (200.0, 2e-4), (100.0, 5e-3))
 _MODES_HZ = (150.0, 250.0, 400.0, 600.0, 800.0, 1000.0, 1300.0, 1800.0)
 _REAL = (600.0, 6000.0, 40_000.0)
+# Latency of the probe [samples].
+_LATENCIES = -1.0, 3.0
 # Fall of χ² by the mode, and relative uncertainty of its frequency, from which it is there.
 _LEAST_FALL, _MOST_UNCERTAIN = 25.0, 0.2
 # Damping ratio from which two poles are no resonance.
@@ -71,7 +74,11 @@ def fast_mode(record: MotionRecord) -> FastMode:
     Raises StepTestError for a record without motion.
     """
     period, steps = record.sample_period, find_steps(record.z, record.sample_period)
-    whole = [e for e in steps.edges if e.start >= 40 and e.start + 80 < len(record)]
+    whole = [
+        edge
+        for edge in steps.edges
+        if edge.start >= 40 and edge.start + 80 < len(record) and _is_read(record, edge)
+    ]
     if len(whole) < _LEAST_EDGES:
         return FastMode(
             finding=Notice("estimation.few_edges", edges=len(whole), least=_LEAST_EDGES)
@@ -86,6 +93,12 @@ def fast_mode(record: MotionRecord) -> FastMode:
     if gap > _LARGEST_GAP:
         return FastMode(finding=Notice("estimation.not_dithered", gap=gap))
     return _mode(edges, grid, command, edges.place - start[:, np.newaxis], period)
+
+
+def _is_read(record: MotionRecord, edge: Edge) -> bool:
+    """Return whether the probe has readings on the level before an edge, and of the edge."""
+    level = record.ok[edge.start + _LEVEL.start : edge.start + _LEVEL.stop]
+    return bool(np.mean(level) > 0.5 and record.ok[edge.start : edge.stop].any())
 
 
 def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
@@ -159,25 +172,32 @@ class _ProbeFit:
     command: FloatArray
     step: float
 
-    def _through(self, pole: complex) -> list[FloatArray]:
-        """Return the edge through 1/(s - p), linear between values of the grid."""
+    def _through(self, pole: complex, at: FloatArray) -> list[FloatArray]:
+        """Return the edge through 1/(s - p) at places ``at``, linear between values of the grid."""
         from scipy import signal
         from scipy.interpolate import CubicSpline
 
         grown = np.exp(pole * self.step)
         end = (grown - 1 - pole * self.step) / (pole**2 * self.step)
         b = abs(pole) * np.array([end, (grown - 1) / pole - end])
-        moved = CubicSpline(self.grid, signal.lfilter(b, [1.0, -grown], self.command + 0j))(self.at)
+        moved = CubicSpline(self.grid, signal.lfilter(b, [1.0, -grown], self.command + 0j))(at)
         return [moved.real, moved.imag] if pole.imag else [moved.real]
 
     def residual(self, p: FloatArray) -> FloatArray:
-        """Return the residual (m,) at p: log of a real pole [rad/s]; log frequency and damping."""
-        parts = [np.ones(len(self.at)), np.interp(self.at, self.grid, self.command)]
-        parts += self._through(complex(-np.exp(p[0])))
-        if len(p) > 1:
-            damping = p[2]
-            omega = 2 * np.pi * np.exp(p[1])
-            parts += self._through(omega * complex(-damping, np.sqrt(1 - damping**2)))
+        """Return the residual (m,) at p.
+
+        p: latency [samples], log of a real pole [rad/s], and log of another one, or log frequency
+            and damping of a mode
+        """
+        at = np.clip(self.at - p[0], self.grid[0], self.grid[-1])
+        parts = [np.ones(len(at)), np.interp(at, self.grid, self.command)]
+        poles = [complex(-np.exp(p[1]))]
+        if len(p) > 3:
+            poles.append(2 * np.pi * np.exp(p[2]) * complex(-p[3], np.sqrt(1 - p[3] ** 2)))
+        else:
+            poles.append(complex(-np.exp(p[2])))
+        for pole in poles:
+            parts += self._through(pole, at)
         columns = np.column_stack(parts)
         return np.asarray(self.seen - columns @ least_squares(columns, self.seen))
 
@@ -188,26 +208,30 @@ def _mode(
     from scipy import optimize
 
     known = np.isfinite(edges.probe)
-    at = np.clip(place[known], grid[0], grid[-1])
     seen = edges.probe[known] / edges.probe_noise
-    residual = _ProbeFit(at, seen, grid, command, period / _FINE).residual
-    tried = [np.array([np.log(a), np.log(f), 0.2]) for f in _MODES_HZ for a in _REAL]
+    residual = _ProbeFit(place[known], seen, grid, command, period / _FINE).residual
+    tried = [np.array([0.0, np.log(a), np.log(f), 0.2]) for f in _MODES_HZ for a in _REAL]
     start = min(tried, key=lambda p: float(np.sum(residual(p) ** 2)))
-    bounds = [np.log(10.0), np.log(30.0), 1e-3], [np.log(1e6), np.log(2.5 / period), 0.98]
+    low, high = _LATENCIES
+    bounds = (
+        [low, np.log(10.0), np.log(30.0), 1e-3],
+        [high, np.log(1e6), np.log(2.5 / period), 0.98],
+    )
     best = optimize.least_squares(residual, start, bounds=bounds)
-    without = min(2 * optimize.least_squares(residual, [np.log(a)]).cost for a in _REAL)
-    reduced = 2 * best.cost / (len(seen) - 8)
+    alone = [[0.0, *np.log(pair)] for pair in combinations(_REAL, 2)]
+    without = min(2 * optimize.least_squares(residual, first).cost for first in alone)
+    reduced = 2 * best.cost / (len(seen) - 9)
     sigma = np.sqrt(np.diag(np.linalg.pinv(best.jac.T @ best.jac)) * max(reduced, 1.0)).tolist()
-    frequency, damping = float(np.exp(best.x[1])), float(best.x[2])
+    frequency, damping = float(np.exp(best.x[2])), float(best.x[3])
     values = {
         "frequency": frequency,
-        "frequency_uncertainty": frequency * sigma[1],
+        "frequency_uncertainty": frequency * sigma[2],
         "damping": damping,
-        "damping_uncertainty": sigma[2],
+        "damping_uncertainty": sigma[3],
         "fall": float((without - 2 * best.cost) / max(reduced, 1.0)),
         "reduced_chi_squared": float(reduced),
     }
     code = "estimation.fast_mode" if reduced <= _MOST_MISFIT else "estimation.doubtful_fast_mode"
-    if values["fall"] <= _LEAST_FALL or sigma[1] >= _MOST_UNCERTAIN or damping >= _MOST_DAMPED:
+    if values["fall"] <= _LEAST_FALL or sigma[2] >= _MOST_UNCERTAIN or damping >= _MOST_DAMPED:
         code = "estimation.no_fast_mode"
     return FastMode(finding=Notice(code, **values), **values)

@@ -1,5 +1,7 @@
 """A mode at 804 Hz from edges sampled at 1 kHz, against closed forms of axis and mode."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -59,9 +61,9 @@ def step_test(
     )
 
 
-@pytest.mark.parametrize("rounded", [False, True])
-def test_sharp_edges_show_the_mode_at_804_hz(rounded):
-    found = fast_mode(step_test(rounded=rounded))
+@pytest.mark.parametrize(("rounded", "late"), [(False, 0.0), (True, 0.23e-3)])
+def test_sharp_edges_show_the_mode_at_804_hz_also_of_a_late_probe(rounded, late):
+    found = fast_mode(step_test(rounded=rounded, response=lambda t: mode_step(t - late)))
     assert found.finding.code == "estimation.fast_mode"
     assert found.frequency == pytest.approx(804.0, abs=4 * found.frequency_uncertainty)
     assert found.damping == pytest.approx(0.19, abs=4 * found.damping_uncertainty)
@@ -91,3 +93,10 @@ def test_edges_that_start_with_a_sample_or_that_are_soft_show_nothing():
 
     codes = fast_mode(step_test(response=lambda t: slow(t - 0.3e-3), axis=slow)).finding.code
     assert codes in ("estimation.no_fast_mode", "estimation.other_axis")
+
+
+def test_edges_without_a_reading_of_the_probe_do_not_count():
+    blind = step_test()
+    nothing = np.full(len(blind.z), np.nan)
+    finding = fast_mode(replace(blind, distance=nothing, ok=np.isfinite(nothing))).finding
+    assert finding.code == "estimation.few_edges"
