@@ -52,8 +52,8 @@ def scanned(folder: Path, part: FigureError, way: tuple[float, float], seed: int
     bag = folder / "scan.mcap"
     with BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(made):
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     measure(bag, _calibration(), folder, report=False)
     return folder
 

@@ -42,8 +42,8 @@ def write_spiral(path: Path, samples: int, block: int = _BLOCK, seed: int = 0) -
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first in range(0, samples, block):
             n = min(block, samples - first)
-            bag.write_axes(_axes(first, n, samples))
-            bag.write_distance(_distance(first, noise[:n]))
+            bag.write_block(_axes(first, n, samples))
+            bag.write_block(_distance(first, noise[:n]))
 
 
 def write_two_drivers(path: Path, samples: int, seed: int = 0) -> None:

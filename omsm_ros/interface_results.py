@@ -184,8 +184,8 @@ class Recording(Result):
 
         with BagWriter(Path(path), [AXES_TOPIC, DISTANCE_TOPIC]) as bag:
             for axes, distance in self.blocks():
-                bag.write_axes(axes)
-                bag.write_distance(distance)
+                bag.write_block(axes)
+                bag.write_block(distance)
         return None
 
 

@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from omsm_ros.core.streams.blocks import AccelerationBlock
+from omsm_ros.core.streams.blocks import AccelerationBlock, part_of
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.emulator import (
     AXIS_SCALING,
@@ -18,7 +18,7 @@ from omsm_ros.instruments.registry import PROBES, REFERENCES, loaded
 from omsm_ros.instruments.scaling import AXES, ProbeReading
 from omsm_ros.quantities import TCP_PORT
 from omsm_ros.twin.cell import Probe, Recording
-from omsm_ros.units import MICROMETRE_M, NANOSECONDS_PER_S
+from omsm_ros.units import MICROMETRE_M
 
 _TCP = "tcp://127.0.0.1:"
 # Most digits of a port, since ``int`` refuses thousands of them.
@@ -161,7 +161,7 @@ class AccelerationFeed:
 
     def __init__(self, recording: Recording, start_ns: int) -> None:
         """start_ns: begin of the motion [ns]."""
-        self._whole, self._start_ns, self._nonempty_channels = recording.acceleration, start_ns, 0
+        self._whole, self._start_ns, self._taken = recording.acceleration, start_ns, 0
         self._period = recording.axes.sample_period
 
     def due(self, played: int) -> AccelerationBlock | None:
@@ -170,18 +170,7 @@ class AccelerationFeed:
         if whole is None:
             return None
         until = min(int(played * self._period / whole.sample_period), len(whole))
-        if until <= self._nonempty_channels:
+        if until <= self._taken:
             return None
-        part = slice(self._nonempty_channels, until)
-        stamp = self._start_ns + round(
-            self._nonempty_channels * whole.sample_period * NANOSECONDS_PER_S
-        )
-        first, self._nonempty_channels = whole.first_sample + self._nonempty_channels, until
-        return AccelerationBlock(
-            stamp_ns=stamp,
-            first_sample=first,
-            sample_period=whole.sample_period,
-            x=whole.x[part],
-            y=whole.y[part],
-            z=whole.z[part],
-        )
+        begin, self._taken = self._taken, until
+        return part_of(replace(whole, stamp_ns=self._start_ns), begin, until)

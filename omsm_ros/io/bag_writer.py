@@ -19,7 +19,7 @@ from mcap.records import ChunkIndex, DataEnd, Footer
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, DistanceBlock
+from omsm_ros.core.streams.blocks import AccelerationBlock, AxisBlock, Block, DistanceBlock
 from omsm_ros.errors import BagError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.files import exception_text, make_folder, temporary_sibling
@@ -105,6 +105,9 @@ class GrowingFile:
             os.close(self._descriptor)
 
 
+_BLOCK_TOPICS = {
+    AxisBlock: AXES_TOPIC, DistanceBlock: DISTANCE_TOPIC, AccelerationBlock: ACCELERATION_TOPIC,
+}  # fmt: skip
 # A crash loses at most one chunk; smaller chunks are slower to read.
 CHUNK_BYTES = 1024 * 1024
 _INDEX_PIECE_BYTES = 32 * 1024
@@ -217,20 +220,10 @@ class BagWriter:
         """Append one message of a class of :func:`bag_messages`."""
         self.write_raw(topic, stamp_ns, typestore().serialize_cdr(message, TOPIC_TYPES[topic]))
 
-    def write_axes(self, block: AxisBlock) -> None:
-        """Append a block of the axes at its own stamp."""
+    def write_block(self, block: Block, topic: str = "") -> None:
+        """Append a block at its own stamp, on the topic of its kind or of another sensor."""
         message = message_mapping.block_message(bag_messages(), block)
-        self.write(AXES_TOPIC, block.stamp_ns, message)
-
-    def write_distance(self, block: DistanceBlock, topic: str = DISTANCE_TOPIC) -> None:
-        """Append a block of the probe, or of another sensor's ``topic``, at its own stamp."""
-        message = message_mapping.block_message(bag_messages(), block)
-        self.write(topic, block.stamp_ns, message)
-
-    def write_acceleration(self, block: AccelerationBlock) -> None:
-        """Append a block of the accelerometer at its own stamp."""
-        message = message_mapping.block_message(bag_messages(), block)
-        self.write(ACCELERATION_TOPIC, block.stamp_ns, message)
+        self.write(topic or _BLOCK_TOPICS[type(block)], block.stamp_ns, message)
 
     def __exit__(self, *_: object) -> None:
         try:

@@ -160,10 +160,7 @@ def _write_bag(
         # Ordered by time, as in a recording, so that readers need not buffer one stream.
         merged = heapq.merge(*(s.blocks() for s in streams), key=lambda block: block.stamp_ns)
         for block in merged:
-            if isinstance(block, AxisBlock):
-                bag.write_axes(block)
-            else:
-                bag.write_distance(block)
+            bag.write_block(block)
             done += len(block)
             progress(done, 0)
         _check_counted(streams)

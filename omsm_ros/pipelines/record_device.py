@@ -47,11 +47,10 @@ def record_device(
         def deliver(pairs: Sequence[BlockPair]) -> None:
             nonlocal samples, last, flushed
             for pair in pairs:
-                if pair.axes is not None:
-                    bag.write_axes(pair.axes)
-                if pair.distance is not None:
-                    bag.write_distance(pair.distance)
-                samples += max(map(len, filter(None, pair)))
+                blocks = [block for block in pair if block is not None]
+                for block in blocks:
+                    bag.write_block(block)
+                samples += max(map(len, blocks))
             last = time.monotonic()
             if last - flushed > _FLUSH_S:
                 bag.flush()

@@ -41,14 +41,12 @@ def write_recording(path: Path, recording: Recording) -> Path:
     topics += [bags.ACCELERATION_TOPIC] if recording.acceleration is not None else []
     with BagWriter(path, topics) as bag:
         for axes, distance in blocks_of(recording, _BLOCK_SAMPLES):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
-        if recording.reference is not None:
-            for reference in pieces(recording.reference, _BLOCK_SAMPLES):
-                bag.write_distance(reference, bags.REFERENCE_TOPIC)
-        if recording.acceleration is not None:
-            for block in pieces(recording.acceleration, _BLOCK_SAMPLES):
-                bag.write_acceleration(block)
+            bag.write_block(axes)
+            bag.write_block(distance)
+        for block in pieces(recording.reference, _BLOCK_SAMPLES):
+            bag.write_block(block, bags.REFERENCE_TOPIC)
+        for block in pieces(recording.acceleration, _BLOCK_SAMPLES):
+            bag.write_block(block)
     return path
 
 

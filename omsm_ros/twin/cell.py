@@ -6,8 +6,8 @@ the noise of the encoder, and all ``Disturbances``. The file of each family stat
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,10 +16,12 @@ from omsm_ros.core.kinematics.kinematics import Geometry, Surface, workpiece_poi
 from omsm_ros.core.kinematics.trajectories import AxisPositions, Motion
 from omsm_ros.core.streams.blocks import (
     AccelerationBlock,
+    AnyBlock,
     AxisBlock,
     DistanceBlock,
     FloatArray,
     IntArray,
+    part_of,
 )
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
 from omsm_ros.errors import ConfigurationError, DataError
@@ -32,11 +34,10 @@ from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
 from omsm_ros.twin.structure import deform
 from omsm_ros.twin.trajectory import Trajectory
-from omsm_ros.units import NANOMETRE_M, NANOSECONDS_PER_S
+from omsm_ros.units import NANOMETRE_M
 
 __all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]
 
-_B = TypeVar("_B", AxisBlock, DistanceBlock, AccelerationBlock)
 Random = Mapping[str, np.random.Generator]
 
 # Sample periods simulated in addition, for the four points of a cubic.
@@ -397,16 +398,10 @@ def _further_channels(
     return channels
 
 
-def pieces(block: _B, size: int) -> Iterator[_B]:
-    """Cut a block into blocks of ``size`` samples, as a driver publishes them."""
-    arrays = [f.name for f in fields(block) if isinstance(getattr(block, f.name), np.ndarray)]
-    for start in range(0, len(block), size):
-        yield replace(
-            block,
-            stamp_ns=block.stamp_ns + round(start * block.sample_period * NANOSECONDS_PER_S),
-            first_sample=block.first_sample + start,
-            **{name: getattr(block, name)[start : start + size] for name in arrays},
-        )
+def pieces(block: AnyBlock | None, size: int) -> Iterator[AnyBlock]:
+    """Cut a block, if there is one, into blocks of ``size`` samples, as a driver does."""
+    if block is not None:
+        yield from (part_of(block, k, k + size) for k in range(0, len(block), size))
 
 
 def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, DistanceBlock]]:

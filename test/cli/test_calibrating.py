@@ -74,8 +74,8 @@ def test_verify_finds_the_offset_of_two_counters(capsys, tmp_path, calibration, 
     path = tmp_path / "chirp.mcap"
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(record(Cell(), Chirp(duration=10.0), Flat()), 100):
-            bag.write_axes(axes)
-            bag.write_distance(replace(distance, first_sample=distance.first_sample + ahead))
+            bag.write_block(axes)
+            bag.write_block(replace(distance, first_sample=distance.first_sample + ahead))
     known = ("verify", path, "--calibration", calibration)
     found = facts(capsys, *known, "--find-offset")
     assert found["counter_offset"]["samples"] == -ahead

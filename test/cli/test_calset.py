@@ -33,8 +33,8 @@ def scan(tmp_path, small_scan):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, (AXES_TOPIC, DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(small_scan, 1000)[:10]:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     return path
 
 

@@ -23,8 +23,8 @@ def second(tmp_path_factory, small_scan_blocks):
     names = {bags.AXES_TOPIC: "/cell2/axes", bags.DISTANCE_TOPIC: "/cell2/confocal"}
     with BagWriter(path, TOPICS, names) as bag:
         for axes, distance in small_scan_blocks[:10]:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     return path
 
 

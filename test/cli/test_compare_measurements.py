@@ -30,8 +30,8 @@ def scan_into(folder, calibration, seed, rpm, feed, astigmatism):
     bag = folder.parent / f"{folder.name}.mcap"
     with BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(scan):
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     folder.mkdir()
     measure(bag, calibration, folder, report=False)
     return folder

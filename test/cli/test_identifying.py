@@ -140,8 +140,8 @@ def test_a_bag_behind_a_hold_gives_a_model_and_no_calibration(capsys, step_test,
     bag = tmp_path / "steps.mcap"
     with BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test):
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     arguments = ("--hold", "zero-order", "--duration", 3, "--order", 2, "--max-delay", 0)
     run(capsys, bag, *arguments, "--out", tmp_path / "model.json", "--json")
     (path,) = tmp_path.glob("model*.json")
@@ -194,8 +194,8 @@ def test_a_rejected_model_replaces_none(capsys, tmp_path):
 def test_a_bag_of_two_counters_is_identified_by_its_stamps(capsys, step_test, tmp_path):
     with BagWriter(tmp_path / "two.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(step_test):
-            bag.write_axes(axes)
-            bag.write_distance(replace(distance, first_sample=distance.first_sample + 10**6))
+            bag.write_block(axes)
+            bag.write_block(replace(distance, first_sample=distance.first_sample + 10**6))
     arguments = (tmp_path / "two.mcap", "--order", 2, "--out", tmp_path / "cal.json")
     status, said = run(capsys, *arguments)
     assert status == 2

@@ -20,8 +20,8 @@ def folder(tmp_path_factory, step_test, small_scan_blocks, true_calibration):
     for name, blocks in (("steps", blocks_of(step_test)), ("scan", small_scan_blocks)):
         with BagWriter(folder / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
             for axes, distance in blocks:
-                bag.write_axes(axes)
-                bag.write_distance(distance)
+                bag.write_block(axes)
+                bag.write_block(distance)
     calibration_file.save_calibration(folder / "cal.json", true_calibration)
     (folder / "mirror.yaml").write_text(
         "shape: off_axis_paraboloid\nparent_focal_length: 0.0254\noff_axis_distance: 0.0508\n"
@@ -78,9 +78,9 @@ def test_a_scan_of_which_nothing_can_be_corrected_is_reported(
 ):
     with BagWriter(tmp_path / "dark.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in small_scan_blocks[:20]:
-            bag.write_axes(axes)
+            bag.write_block(axes)
             dark = np.full(len(distance.distance), np.nan)
-            bag.write_distance(dataclasses.replace(distance, distance=dark))
+            bag.write_block(dataclasses.replace(distance, distance=dark))
     arguments = ("correct", tmp_path / "dark.mcap", "--calibration", folder / "cal.json")
     status, text, err = run(capsys, *arguments, "--out", tmp_path / "out")
     assert (status, err) == (0, "")
@@ -301,9 +301,9 @@ def test_a_rejected_identification_leaves_a_good_calibration_alone(capsys, tmp_p
         for axes, distance in blocks_of(step_test):
             at = slice(distance.first_sample, distance.first_sample + len(distance))
             moving = np.abs(np.gradient(axes.z)).max() > 1e-9
-            bag.write_axes(axes)
+            bag.write_block(axes)
             shaken = distance.distance + (wobble[at] if moving else 0.0)
-            bag.write_distance(dataclasses.replace(distance, distance=shaken))
+            bag.write_block(dataclasses.replace(distance, distance=shaken))
     short = ("--order", 2, "--duration", 6)
     status, text, err = run(capsys, "identify", path, "--out", good, *short, "--json")
     facts = json.loads(text)

@@ -17,8 +17,8 @@ POLARITY_MIRRORED, SLIP, LATE_S = -1, 37, 3e-3
 def bag_of(path, blocks, of_axes=lambda block: block, of_distance=lambda block: block):
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks:
-            bag.write_axes(of_axes(axes))
-            bag.write_distance(of_distance(distance))
+            bag.write_block(of_axes(axes))
+            bag.write_block(of_distance(distance))
     return path
 
 

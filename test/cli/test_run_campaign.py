@@ -31,8 +31,8 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
             folder / "bags" / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
         ) as bag:
             for axes, distance in islice(iter(small_scan_blocks), 30):
-                bag.write_axes(axes)
-                bag.write_distance(distance)
+                bag.write_block(axes)
+                bag.write_block(distance)
     (folder / "bags" / "torn.mcap").write_bytes(b"\x89MCAP0\r\n and then nothing")
     calibration_file.save_calibration(folder / "cal.json", true_calibration)
     return folder

@@ -40,7 +40,7 @@ def test_predict_over_a_gap_judges_the_longest_run_and_names_the_rest(
     with BagWriter(path, (bags.AXES_TOPIC,)) as bag:
         for axes, _ in blocks_of(small_scan, 1000):
             if axes.first_sample != 2000:
-                bag.write_axes(axes)
+                bag.write_block(axes)
                 kept += len(axes)
     found = facts(capsys, "predict", path, "--calibration", calibration)
     truth = (small_scan.probe_motion - small_scan.axes.z)[3000:]
@@ -57,7 +57,7 @@ def test_predict_judges_at_the_period_of_the_longest_run(capsys, tmp_path, small
     made[-1] = (replace(made[-1][0], sample_period=4e-3), made[-1][1])
     with BagWriter(path, (bags.AXES_TOPIC,)) as bag:
         for axes, _ in made:
-            bag.write_axes(axes)
+            bag.write_block(axes)
     found = facts(capsys, "predict", path, "--calibration", calibration)
     truth = (small_scan.probe_motion - small_scan.axes.z)[: -len(made[-1][0])]
     assert found["peak_to_valley"] == pytest.approx(np.ptp(truth), rel=0.1)
@@ -210,9 +210,9 @@ def test_streams_of_different_rates_are_joined_by_their_stamps(
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, _ in blocks_of(fast, 1000):
             stamp, count = axes.stamp_ns + 10**9 + ahead_ns, axes.first_sample + 77
-            bag.write_axes(replace(axes, stamp_ns=stamp, first_sample=count))
+            bag.write_block(replace(axes, stamp_ns=stamp, first_sample=count))
         for _, distance in blocks_of(small_scan, 1000):
-            bag.write_distance(replace(distance, stamp_ns=distance.stamp_ns + 10**9))
+            bag.write_block(replace(distance, stamp_ns=distance.stamp_ns + 10**9))
     arguments = ["correct", path, "--calibration", calibration, "--out", tmp_path / "out"]
     arguments += ["--by-stamps", "--delay", "0.3e-3", "--no-report", "--json"]
     assert cli.main([*map(str, arguments)]) == 0

@@ -13,8 +13,8 @@ SPHERE_RADIUS_M = 0.05
 def write(path, recording):
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(recording, 1000):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     return path
 
 

@@ -55,8 +55,8 @@ def place(tmp_path_factory, small_scan_blocks, step_test, true_calibration) -> P
     for name, blocks in (("scan", small_scan_blocks[:BLOCKS]), ("steps", blocks_of(step_test))):
         with BagWriter(folder / f"{name}.mcap", bag_inputs.TOPICS) as bag:
             for axes, distance in blocks:
-                bag.write_axes(axes)
-                bag.write_distance(distance)
+                bag.write_block(axes)
+                bag.write_block(distance)
     save_calibration(folder / "cal.json", true_calibration)
     save_geometry(folder / "geometry.yaml", Geometry(centre_x=1e-6))
     save_model(folder / "model.json", MODEL)

@@ -30,8 +30,8 @@ def place(tmp_path_factory, step_test, true_calibration: Calibration) -> Path:
     (folder / "surface.yaml").write_text("shape: sphere\nradius: -0.1\n")
     with BagWriter(folder / "steps.mcap", ("/omsm/axes", "/omsm/confocal")) as bag:
         for axes, distance in blocks_of(step_test):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     return folder
 
 

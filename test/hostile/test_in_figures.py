@@ -39,8 +39,8 @@ def test_a_machine_may_have_any_name(tmp_path: Path, true_calibration, name):
 def test_a_scan_may_have_any_name(tmp_path: Path, small_scan_blocks, name):
     with BagWriter(tmp_path / f"{name}.mcap", ("/omsm/axes", "/omsm/confocal")) as bag:
         for axes, distance in small_scan_blocks[:30]:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     answer = ask(Case(("spectrum", f"{name}.mcap", "--out", "out", "--json")), tmp_path)
     assert (answer.status, answer.err) == (0, "")
     assert (tmp_path / "out" / "report.html").exists()

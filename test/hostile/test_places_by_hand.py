@@ -141,8 +141,8 @@ def test_a_radius_in_steps_is_judged_soon(place, small_scan_blocks, words, statu
         (place / f"{name}.mcap").unlink(missing_ok=True)
         with BagWriter(place / f"{name}.mcap", TOPICS) as bag:
             for axes, distance in small_scan_blocks[:12]:
-                bag.write_axes(replace(axes, x=change(axes.x)))
-                bag.write_distance(distance)
+                bag.write_block(replace(axes, x=change(axes.x)))
+                bag.write_block(distance)
     case = Case((*words, "--json"))
     answer = ask(case, place)
     judge(case, answer, place)

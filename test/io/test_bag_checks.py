@@ -37,8 +37,8 @@ def written(tmp_path, small_scan_blocks):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in small_scan_blocks[:40]:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     return path
 
 

@@ -32,8 +32,8 @@ def whole(tmp_path, small_scan_blocks):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, TOPICS) as bag:
         for index, (axes, distance) in enumerate(small_scan_blocks[:BLOCKS], start=1):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
             if index % CHUNK == 0:
                 bag.flush()
     return path
@@ -118,8 +118,8 @@ def test_a_message_that_no_command_reads_is_left_out_and_named(tmp_path, small_s
     ]
     with BagWriter(path, TOPICS) as bag:
         for axes, distance in blocks:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     rewritten(path, spoilt, lambda *m: spoil(*m) if m[1] == 0 else m[2])
     with pytest.raises(BagError, match="omsm inspect --repair"):
         first_samples(spoilt)
@@ -172,7 +172,7 @@ def test_a_bag_without_index_gets_one(tmp_path, small_scan_blocks):
     path = tmp_path / "scan.mcap"
     bag = BagWriter(path, TOPICS).__enter__()
     for axes, _ in small_scan_blocks[:3]:
-        bag.write_axes(axes)
+        bag.write_block(axes)
     bag.flush()
     made = repair(path)
     assert made.lost == []

@@ -54,7 +54,7 @@ def test_the_bag_can_be_read_while_it_grows(tmp_path, axes):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, TOPICS) as bag:
         for index, block in enumerate(axes, start=1):
-            bag.write_axes(block)
+            bag.write_block(block)
             bag.flush()
             assert first_samples(path) == [b.first_sample for b in axes[:index]]
     assert first_samples(path) == [b.first_sample for b in axes]
@@ -65,7 +65,7 @@ def test_a_second_reader_agrees_with_index_and_all_checksums(tmp_path, axes):
     path = tmp_path / "scan.mcap"
     with BagWriter(path, TOPICS) as bag:
         for index, block in enumerate(axes):
-            bag.write_axes(block)
+            bag.write_block(block)
             if index % 5 == 0:
                 bag.flush()
     with path.open("rb") as stream:
@@ -108,7 +108,7 @@ def test_the_bag_says_which_topics_are_latched(tmp_path):
 def test_topics_may_have_other_names_in_the_bag(tmp_path, axes):
     path = tmp_path / "second.mcap"
     with BagWriter(path, TOPICS, {bags.AXES_TOPIC: "/cell2/axes"}) as bag:
-        bag.write_axes(axes[0])
+        bag.write_block(axes[0])
     with bags.BagReader(path) as reader:
         assert [(t.topic, t.messages) for t in reader.topics()] == [
             ("/cell2/axes", 1),
@@ -122,7 +122,7 @@ def test_what_was_written_stays_however_the_writing_ends(tmp_path, axes, reason)
 
     def interrupted():
         with BagWriter(path, TOPICS) as bag:
-            bag.write_axes(axes[0])
+            bag.write_block(axes[0])
             raise reason
 
     with pytest.raises(reason):
@@ -143,7 +143,7 @@ def test_a_killed_writer_leaves_all_that_was_flushed(tmp_path):
         zeros = {name: np.zeros(100) for name in "xyzbc"}
         bag = BagWriter(sys.argv[1], ("/omsm/axes",)).__enter__()
         for n in range(10**9):
-            bag.write_axes(
+            bag.write_block(
                 AxisBlock(stamp_ns=n, first_sample=100 * n, sample_period=1e-3, **zeros)
             )
             bag.flush()
@@ -177,14 +177,14 @@ def test_a_whole_bag_appears_when_all_went_well_or_not_at_all(tmp_path, axes):
 
     def interrupted():
         with atomic_bag(path, TOPICS) as bag:
-            bag.write_axes(axes[0])
+            bag.write_block(axes[0])
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
         interrupted()
     assert list(tmp_path.iterdir()) == []
     with atomic_bag(path, TOPICS) as bag:
-        bag.write_axes(axes[0])
+        bag.write_block(axes[0])
         assert not path.exists()
     assert first_samples(path) == [axes[0].first_sample]
     with pytest.raises(BagError, match=r"made\.mcap' exists"):
@@ -200,14 +200,14 @@ def test_a_limit_of_size_ends_with_a_readable_bag_and_one_line(tmp_path, axes):
     path = tmp_path / "scan.mcap"
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     bag = BagWriter(path, TOPICS).__enter__()
-    bag.write_axes(axes[0])
+    bag.write_block(axes[0])
     bag.flush()
     resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 2000, hard))
     try:
-        bag.write_axes(axes[1])
+        bag.write_block(axes[1])
         with pytest.raises(BagError, match=r"holds the first 1 messages, the last 1 are lost"):
             bag.flush()
-        bag.write_axes(axes[2])  # says nothing more
+        bag.write_block(axes[2])  # says nothing more
         bag.__exit__(None, None, None)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -229,7 +229,7 @@ def test_a_full_disk_at_any_byte_leaves_what_was_flushed(tmp_path, axes, monkeyp
     size["room"] = 10**9
     with BagWriter(tmp_path / "whole.mcap", TOPICS) as bag:
         for block in axes[:3]:
-            bag.write_axes(block)
+            bag.write_block(block)
             bag.flush()
     whole = (tmp_path / "whole.mcap").stat().st_size
     seen = set()
@@ -239,7 +239,7 @@ def test_a_full_disk_at_any_byte_leaves_what_was_flushed(tmp_path, axes, monkeyp
         try:
             with BagWriter(path, TOPICS) as bag:
                 for block in axes[:3]:
-                    bag.write_axes(block)
+                    bag.write_block(block)
                     bag.flush()
                     kept += 1
         except BagError as err:
@@ -257,7 +257,7 @@ def test_a_full_disk_at_any_byte_leaves_what_was_flushed(tmp_path, axes, monkeyp
 def record(path, blocks):
     with BagWriter(path, TOPICS) as bag:
         for block in blocks:
-            bag.write_axes(block)
+            bag.write_block(block)
             bag.flush()
 
 

@@ -16,8 +16,8 @@ def bag(tmp_path_factory, small_scan_blocks):
     path = tmp_path_factory.mktemp("bags") / "scan.mcap"
     with BagWriter(path, TOPICS) as writer:
         for axes, distance in small_scan_blocks[:20]:
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     return path
 
 

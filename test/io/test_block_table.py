@@ -137,8 +137,8 @@ def test_a_bag_gives_the_same_samples_either_way(tmp_path) -> None:
     starts = np.cumsum([0, *sizes])
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first, n in zip(starts.tolist(), sizes, strict=False):
-            bag.write_axes(axes(first, n))
-            bag.write_distance(replace(distance(first, n), stamp_ns=first * 1_000_000))
+            bag.write_block(axes(first, n))
+            bag.write_block(replace(distance(first, n), stamp_ns=first * 1_000_000))
     with bags.BagReader(path) as bag:
         short = list(bag.records(bags.AXES_TOPIC, bags.DISTANCE_TOPIC))
         long = list(bag.blocks(bags.AXES_TOPIC, bags.DISTANCE_TOPIC))

@@ -278,8 +278,8 @@ def test_a_bag_of_ours_holds_the_bytes_of_the_standard(tmp_path, small_scan_bloc
     pairs = small_scan_blocks[:3]
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in pairs:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"

@@ -24,8 +24,8 @@ def record(path, blocks, temperatures, start_ns=NOON_NS):
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC, TEMPERATURE_TOPIC)) as bag:
         for axes, distance in islice(iter(blocks), 30):
             late = start_ns - blocks[0][0].stamp_ns
-            bag.write_axes(replace(axes, stamp_ns=axes.stamp_ns + late))
-            bag.write_distance(replace(distance, stamp_ns=distance.stamp_ns + late))
+            bag.write_block(replace(axes, stamp_ns=axes.stamp_ns + late))
+            bag.write_block(replace(distance, stamp_ns=distance.stamp_ns + late))
         for k, value in enumerate(temperatures):
             reading = types["sensor_msgs/msg/Temperature"](header, value, 0.0)
             bag.write(TEMPERATURE_TOPIC, start_ns + k * 10**8, reading)

@@ -102,9 +102,9 @@ def test_axes_that_go_on_without_the_probe_are_no_error(
     path = tmp_path / "stopped.mcap"
     with BagWriter(path, TOPICS) as writer:
         for k, (axes, distance) in enumerate(small_scan_blocks):
-            writer.write_axes(axes)
+            writer.write_block(axes)
             if k < 100:
-                writer.write_distance(distance)
+                writer.write_block(distance)
     points, account = points_of(path, true_calibration)
     assert len(points) == 10_000 - account.distance.counted["settling"]
     waiting = account.axes.counted["overdue"] + account.axes.counted["unmatched"]
@@ -146,9 +146,9 @@ def test_a_bag_without_samples_is_refused(tmp_path, small_scan_blocks, true_cali
     axes, distance = small_scan_blocks[0]
     with BagWriter(path, TOPICS) as writer:
         if held == "axes":
-            writer.write_axes(axes)
+            writer.write_block(axes)
         if held == "distance":
-            writer.write_distance(distance)
+            writer.write_block(distance)
     with pytest.raises(BagError, match="no samples on"):
         correct_bag(path, true_calibration, tmp_path / "cloud.ply")
 
@@ -173,8 +173,8 @@ def test_a_probe_whose_counter_is_off_gives_no_points_and_is_reported(
     path = tmp_path / "off.mcap"
     with BagWriter(path, TOPICS) as bag:
         for axes, distance in small_scan_blocks[:20]:
-            bag.write_axes(axes)
-            bag.write_distance(replace(distance, first_sample=distance.first_sample + samples))
+            bag.write_block(axes)
+            bag.write_block(replace(distance, first_sample=distance.first_sample + samples))
     summary = measure(path, true_calibration, tmp_path / "out", report=False)
     account = summary["samples"]["distance"]
     assert account["corrected"] == 0
@@ -190,8 +190,8 @@ def test_trigger_numbers_missing_from_both_streams_take_the_green_away(
     path = tmp_path / "gap.mcap"
     with BagWriter(path, TOPICS) as bag:
         for axes, distance in small_scan_blocks[:8] + small_scan_blocks[10:20]:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     said = reasons_of(path, true_calibration, tmp_path)
     assert [s for s in said if "200 trigger numbers are missing (800 to 999)" in s]
     stream, _ = inspect_bag(path)["topics"]

@@ -77,8 +77,8 @@ def test_a_row_holds_what_its_calibration_says(tmp_path, address, true_calibrati
 def _bag(path, day, block):
     axes, distance = block
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
-        bag.write_axes(dataclasses.replace(axes, stamp_ns=FIRST_NS + day * DAY_NS))
-        bag.write_distance(dataclasses.replace(distance, stamp_ns=FIRST_NS + day * DAY_NS))
+        bag.write_block(dataclasses.replace(axes, stamp_ns=FIRST_NS + day * DAY_NS))
+        bag.write_block(dataclasses.replace(distance, stamp_ns=FIRST_NS + day * DAY_NS))
     return path
 
 

@@ -40,12 +40,12 @@ def write(path, ahead=0, *, late=0.0, stamp_off=0.0, lost=(), start=0, size=100,
             time = (start + k + np.arange(size)) * PERIOD
             stamp = round((10 + time[0]) * 1e9)
             still = dict.fromkeys("xybc", np.zeros(size))
-            bag.write_axes(AxisBlock(stamp_ns=stamp, first_sample=start + k, sample_period=PERIOD,
+            bag.write_block(AxisBlock(stamp_ns=stamp, first_sample=start + k, sample_period=PERIOD,
                                      z=motion(time), **still))  # fmt: skip
             if k // size in lost:
                 continue
             distance = 5e-4 - motion(time - late) + noise.normal(0, 2e-9, size)
-            bag.write_distance(DistanceBlock(
+            bag.write_block(DistanceBlock(
                 stamp_ns=stamp + round(stamp_off * 1e9), first_sample=start + k + ahead,
                 sample_period=PERIOD, distance=distance, intensity=np.empty(0, np.float32),
                 status=np.empty(0, np.uint8),
@@ -105,9 +105,9 @@ def test_two_recordings_in_one_are_reported(tmp_path):
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for first in (0, 10**9):
             zeros = dict.fromkeys("xyzbc", np.zeros(100))
-            bag.write_axes(AxisBlock(stamp_ns=first, first_sample=first, sample_period=PERIOD,
+            bag.write_block(AxisBlock(stamp_ns=first, first_sample=first, sample_period=PERIOD,
                                      **zeros))  # fmt: skip
-        bag.write_distance(DistanceBlock(
+        bag.write_block(DistanceBlock(
             stamp_ns=0, first_sample=0, sample_period=PERIOD, distance=np.zeros(100),
             intensity=np.empty(0, np.float32), status=np.empty(0, np.uint8),
         ))  # fmt: skip

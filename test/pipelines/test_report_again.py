@@ -25,8 +25,8 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
     folder = tmp_path_factory.mktemp("shop")
     with BagWriter(folder / "scan.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in islice(iter(small_scan_blocks), 10):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     write_nominal(folder / "mirror.yaml")
     calibration_file.save_calibration(folder / "cal.json", true_calibration)
     measure(folder / "scan.mcap", true_calibration, folder / "result", nominal=PAPER_MIRROR)
@@ -63,8 +63,8 @@ def test_a_rate_that_was_overridden_is_drawn_over_its_own_time(
     with BagWriter(tmp_path / "scan.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in islice(iter(small_scan_blocks), 10):
             slower = {"sample_period": 2e-3, "stamp_ns": 2 * axes.stamp_ns}
-            bag.write_axes(replace(axes, **slower))
-            bag.write_distance(replace(distance, **slower))
+            bag.write_block(replace(axes, **slower))
+            bag.write_block(replace(distance, **slower))
     measure(
         tmp_path / "scan.mcap", true_calibration, tmp_path / "out",
         options=CorrectionOptions(accept_other_rate=True), admission=Admission(override=True),

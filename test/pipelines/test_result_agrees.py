@@ -38,8 +38,8 @@ def result(tmp_path_factory, small_scan_blocks, true_calibration):
     folder = tmp_path_factory.mktemp("result")
     with BagWriter(folder / "scan.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in islice(iter(small_scan_blocks), 100):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     out = folder / "out"
     measure(
         folder / "scan.mcap", true_calibration, out, nominal=PAPER_MIRROR, accuracy=1e-6,

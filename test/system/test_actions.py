@@ -22,8 +22,8 @@ def bag(tmp_path, step_test):
     path = tmp_path / "steps.mcap"
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test):
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     return path
 
 

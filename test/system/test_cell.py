@@ -224,8 +224,8 @@ def test_calibrator_identifies_from_a_bag(cell, tmp_path, step_test):
     bag = tmp_path / "steps.mcap"
     with BagWriter(bag, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test):
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     output = tmp_path / "cal.json"
     cell.processes.start("calibrator", output=str(output))
     answer = cell.call(Identify, "calibrator/identify", bag=str(bag), order=2)

@@ -19,8 +19,8 @@ from omsm_ros.twin.scenario import Scenario
 def _bag(path, rise):
     with BagWriter(path, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as writer:
         for axes, distance in blocks_of(step_test_of(Scenario(step_rise=rise))):
-            writer.write_axes(axes)
-            writer.write_distance(distance)
+            writer.write_block(axes)
+            writer.write_block(distance)
     return str(path)
 
 

@@ -184,7 +184,7 @@ def test_predict_error_of_a_sine_is_that_of_its_frequency(cell, true_calibration
     zero = np.zeros(5000)
     with BagWriter(bag, (bags.AXES_TOPIC,)) as writer:
         for first in range(0, 5000, 500):
-            writer.write_axes(
+            writer.write_block(
                 AxisBlock(
                     stamp_ns=first * 1_000_000,
                     first_sample=first,

@@ -34,8 +34,8 @@ def record(path, pairs, calibration=None, names=None):
             message = message_mapping.calibration_message(bag_messages(), calibration, stamp)
             bag.write(bags.CALIBRATION_TOPIC, stamp, message)
         for axes, distance in pairs:
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     return path
 
 
@@ -203,7 +203,7 @@ def test_recorded_points_go_elsewhere_and_only_if_asked_for(cell, small_scan_blo
     path = cell.folder / "scan.mcap"
     with BagWriter(path, (bags.AXES_TOPIC, bags.POINTS_TOPIC)) as bag:
         for axes, _ in pairs:
-            bag.write_axes(axes)
+            bag.write_block(axes)
             cloud = message_mapping.cloud_message(
                 bag_messages(), np.zeros(3, message_mapping.POINT_DTYPE), axes.stamp_ns
             )

@@ -54,8 +54,8 @@ class Hour:
         self.steps = cell.folder / "steps.mcap"
         with BagWriter(self.steps, (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
             for axes, distance in blocks_of(step_test):
-                bag.write_axes(axes)
-                bag.write_distance(distance)
+                bag.write_block(axes)
+                bag.write_block(distance)
         self.calibration_file = cell.folder / "cal.json"
         save_calibration(self.calibration_file, calibration)
         self.bags, self.readings = [], []

@@ -4,16 +4,20 @@ Velocities follow from the axes by a local polynomial (Savitzky-Golay). A missin
 point, a missing axis sample its neighbours too.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, signal
 
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
-from omsm_ros.core.streams.blocks import AxisBlock, BoolArray, FloatArray, uninterrupted
+from omsm_ros.core.streams.blocks import (
+    AxisBlock,
+    BoolArray,
+    FloatArray,
+    known_parts,
+    uninterrupted,
+)
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.errors import DataError
 
@@ -84,7 +88,8 @@ class ScanReader:
         """Add an axis block, before the points that are computed from it."""
         if self._first is None:
             self._first = block.first_sample
-        self._axes += _known_parts(block)
+        known = np.all(np.isfinite([getattr(block, name) for name in "xyzbc"]), axis=0)
+        self._axes += known_parts(block, known)
 
     def add(self, points: SurfacePoints) -> None:
         """Add points that were corrected without geometry and without latency."""
@@ -141,20 +146,6 @@ class ScanReader:
         return np.asarray(
             ndimage.convolve1d(values, self._kernels[kernel], mode="nearest"), np.float64
         )
-
-
-def _known_parts(block: AxisBlock) -> Iterator[AxisBlock]:
-    """Yield the parts of ``block`` between lost samples."""
-    columns = {name: getattr(block, name) for name in "xyzbc"}
-    known = np.all(np.isfinite([*columns.values()]), axis=0)
-    edges = [0, *(np.flatnonzero(np.diff(known)) + 1), len(block)]
-    for start, stop in pairwise(map(int, edges)):
-        if known[start]:
-            yield replace(
-                block,
-                first_sample=block.first_sample + start,
-                **{name: values[start:stop] for name, values in columns.items()},
-            )
 
 
 def read_scan(axes: AxisBlock, points: SurfacePoints) -> ScanColumns:

@@ -1,12 +1,18 @@
 """Path of a scan, with the bandwidth and the derivatives of its Z motion."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import SAME_PERIOD, AxisBlock, Block, DistanceBlock, FloatArray
+from omsm_ros.core.streams.blocks import (
+    SAME_PERIOD,
+    AxisBlock,
+    Block,
+    DistanceBlock,
+    FloatArray,
+    known_parts,
+)
 from omsm_ros.errors import Notice
 
 # Number of gaps that a message names.
@@ -56,7 +62,7 @@ class ScanPathReader:
         if isinstance(block, AxisBlock):
             self._passed += len(block)
             if self._kept < self._most:
-                for part in _known(block):
+                for part in known_parts(block, np.isfinite(block.z)):
                     self._keep(part)
         elif isinstance(block, DistanceBlock) and self._readings_kept < self._most:
             readings = np.where(block.ok, block.distance, np.nan)
@@ -108,17 +114,6 @@ class ScanPathReader:
             gaps=Notice("kinematics.longest_run", gaps=named) if named else "",
             most=Notice("kinematics.most", most=self._most) if self._passed > self._most else "",
         )
-
-
-def _known(block: AxisBlock) -> Iterator[AxisBlock]:
-    known = np.isfinite(block.z)
-    if np.all(known):
-        yield block
-        return
-    edges = np.flatnonzero(np.diff(known, prepend=False, append=False))
-    for begin, end in edges.reshape(-1, 2).tolist():
-        channels = {name: getattr(block, name)[begin:end] for name in "xyzbc"}
-        yield replace(block, first_sample=block.first_sample + begin, **channels)
 
 
 def _break(last: AxisBlock, block: AxisBlock) -> Notice | None:

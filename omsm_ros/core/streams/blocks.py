@@ -8,7 +8,7 @@ that never came are ``missing`` and not part of this sum.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from enum import IntEnum
 from types import MappingProxyType
@@ -327,25 +327,38 @@ def _continues(first: B, length: int, block: B) -> bool:
         return False
     off_ns = block.stamp_ns - first.stamp_ns - length * period * NANOSECONDS_PER_S
     close = abs(off_ns) <= _STAMP_TOLERANCE_S * NANOSECONDS_PER_S
-    one, other = ([bool(len(getattr(b, c))) for c in _channels(b)] for b in (first, block))
-    return close and one == other
+    return close and _channels(first) == _channels(block)
 
 
-def _channels(block: B) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(block) if f.name not in _NOT_CHANNELS)
+def _channels(block: Block) -> list[str]:
+    """Return the channels that the block has: the device may not report an intensity."""
+    names = (f.name for f in fields(block) if f.name not in _NOT_CHANNELS)
+    return [name for name in names if len(getattr(block, name))]
+
+
+def part_of(block: AnyBlock, begin: int, end: int) -> AnyBlock:
+    """Return samples ``begin`` to ``end`` of a block, stamped as they follow from its first."""
+    return replace(
+        block,
+        first_sample=block.first_sample + begin,
+        stamp_ns=block.stamp_ns + round(begin * block.sample_period * NANOSECONDS_PER_S),
+        **{name: getattr(block, name)[begin:end] for name in _channels(block)},
+    )
+
+
+def known_parts(block: AnyBlock, known: BoolArray) -> Iterator[AnyBlock]:
+    """Yield the parts of ``block`` between samples that are not ``known``, (n,)."""
+    edges = np.flatnonzero(np.diff(known, prepend=False, append=False))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        yield part_of(block, begin, end)
 
 
 def joined(run: Sequence[B]) -> B:
     """Return one block of the samples of consecutive blocks, with the stamp of the first."""
     if len(run) == 1:
         return run[0]
-    return replace(
-        run[0],
-        **{
-            name: np.concatenate([getattr(block, name) for block in run])
-            for name in _channels(run[0])
-        },
-    )
+    names = _channels(run[0])
+    return replace(run[0], **{n: np.concatenate([getattr(b, n) for b in run]) for n in names})
 
 
 def without_first_message(block: B, messages: int) -> B:

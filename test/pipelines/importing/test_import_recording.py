@@ -89,8 +89,8 @@ def test_a_step_test_as_csv_gives_the_calibration_of_its_bag(capsys, tmp_path, s
     assert reported["files"][0]["rows"] == len(steps["z"])
     with BagWriter(tmp_path / "b.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)) as bag:
         for axes, distance in blocks_of(step_test):
-            bag.write_axes(axes)
-            bag.write_distance(distance)
+            bag.write_block(axes)
+            bag.write_block(distance)
     calibrations = []
     for name in "ab":
         out = tmp_path / f"{name}.json"
