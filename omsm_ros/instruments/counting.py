@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,111 @@ class WireCounts(SimpleNamespace):
         super().__init__(
             bytes_received=received, bytes_discarded=discarded, bytes_pending=pending, **counts
         )
+
+
+class PacketFinder:
+    """Finds packets in bytes of any portions; it never raises, memory is a packet and a portion.
+
+    The result does not depend on the portions. So a packet without a check of its own waits until
+    the next one has begun, or for :meth:`settle`: bytes lost or added inside it show there. A
+    protocol states ``magics`` (beginnings of packets, of one length), ``head`` and ``longest``
+    [bytes], and implements ``_measure`` and ``_take``.
+    """
+
+    magics: tuple[bytes, ...] = ()
+    longest = 0
+    head: struct.Struct
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._received = self._understood = self._packets = self._malformed = 0
+
+    def reset(self) -> None:
+        """Discard an incomplete packet, as after a new connection."""
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> list[Any]:
+        """Return what the packets completed by ``data`` hold, in order."""
+        self._received += len(data)
+        self._buffer += data
+        found: list[Any] = []
+        start = 0
+        while (place := self._find(start)) >= 0:
+            size = self._size(place)
+            if size is None:
+                start = place
+                break
+            start = place + self._take(place, size, found)
+        else:
+            start = max(start, len(self._buffer) - len(self.magics[0]) + 1)
+        self._flush(found)
+        self._buffer = self._buffer[start:]
+        return found
+
+    def settle(self) -> list[Any]:
+        """Return what the packet holds that waited for the next one."""
+        size = len(self._buffer)
+        if self._find(0) != 0 or self._size(0, last=True) != size:
+            return []
+        found: list[Any] = []
+        self._buffer = self._buffer[self._take(0, size, found) :]
+        self._flush(found)
+        return found
+
+    @property
+    def statistics(self) -> WireCounts:
+        """Return the counts of bytes, packets, and malformed ones."""
+        counts = {"packets": self._packets, "malformed": self._malformed}
+        return WireCounts(self._received, self._understood, len(self._buffer), **counts)
+
+    def _measure(self, place: int) -> tuple[int, bool]:
+        """Return the length by the head at ``place``, 0 = no head, and whether it has to wait."""
+        raise NotImplementedError
+
+    def _take(self, place: int, size: int, found: list[Any]) -> int:
+        """Add the content of a packet to ``found``; return how many bytes to go on.
+
+        size: of the packet at ``place``; 0 = there is none
+        """
+        raise NotImplementedError
+
+    def _flush(self, found: list[Any]) -> None:
+        """Add content that waited for further packets of the same portion."""
+
+    def _find(self, start: int, end: int | None = None) -> int:
+        places = [self._buffer.find(magic, start, end) for magic in self.magics]
+        return min((place for place in places if place >= 0), default=-1)
+
+    def _size(self, place: int, *, last: bool = False) -> int | None:
+        """Return the bytes of the packet at ``place``; 0 = no packet; None = wait for more.
+
+        last: no bytes follow it
+        """
+        if place + self.head.size > len(self._buffer):
+            return None
+        size, waits = self._measure(place)
+        end = place + size
+        if not 0 < size <= self.longest or self._cut_off(place, end, waits):
+            return 0
+        if end > len(self._buffer):
+            return None
+        after = self._buffer[end : end + len(self.magics[0])]
+        if not waits or after in self.magics or (last and not after):
+            return size
+        return None if any(magic.startswith(after) for magic in self.magics) else 0
+
+    def _cut_off(self, place: int, end: int, waits: bool) -> bool:
+        """Return whether the next packet begins inside the one up to ``end``: its end is missing.
+
+        Bytes that have not arrived must not change the answer, so only those before ``end`` are
+        used. Of a packet that does not wait the magic of the next one alone counts at its end.
+        """
+        inside = self._find(place + 1, end)
+        while 0 <= inside <= min(end, len(self._buffer)) - self.head.size:
+            if self._measure(inside)[0]:
+                return True
+            inside = self._find(inside + 1, end)
+        return not waits and inside > end - self.head.size
 
 
 # Arrivals are uneven, so a gap and the time that passed may differ by this much [s].

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.errors import ConfigurationError, ProtocolError
 from omsm_ros.instruments.chrocodile.telegram import FLOAT, S16, S32, U16, U32, Records
-from omsm_ros.instruments.counting import WireCounts
+from omsm_ros.instruments.counting import PacketFinder, WireCounts
 from omsm_ros.units import NANOSECONDS_PER_S
 
 MAGIC = 0xAA55AA55
@@ -184,117 +184,56 @@ def decode_format(body: bytes) -> DataFormat:
     return DataFormat(counter, rate, signals, stream)
 
 
-class PacketDecoder:
-    """Decodes bytes in any portions to messages; it never raises, memory is a packet and a portion.
+class PacketDecoder(PacketFinder):
+    """Decodes bytes in any portions to messages; consecutive samples of a format are joined.
 
-    The messages do not depend on the portions. So samples wait until the next packet has begun,
-    or for :meth:`settle`; commands and formats do not.
+    Samples have no checksum, so they wait for the next packet; commands and formats do not.
     """
 
+    magics, head, longest = (MAGIC_BYTES,), HEADER, MAX_PACKET_BYTES
+
     def __init__(self) -> None:
-        self._buffer = b""
+        super().__init__()
         self._formats: dict[int, DataFormat] = {}
-        self._received = self._understood = self._packets = 0
-        self._malformed = self._unformatted = 0
+        self._waiting: list[tuple[bytes, int, int]] = []  # samples, time [ns], stream
+        self._unformatted = 0
 
     def reset(self) -> None:
         """Discard an incomplete packet and all formats, as after a new connection."""
-        self._buffer = b""
+        super().reset()
         self._formats.clear()
-
-    def feed(self, data: bytes) -> list[Message]:
-        """Return messages completed by ``data``; consecutive samples of a format are joined."""
-        self._received += len(data)
-        self._buffer += data
-        found: list[Message] = []
-        waiting: list[tuple[bytes, int, int]] = []
-        start = 0
-        while (place := self._buffer.find(MAGIC_BYTES, start)) >= 0:
-            length = self._length(place)
-            if length is None:
-                start = place
-                break
-            start = place + (self._open(place, length, found, waiting) if length else 1)
-        else:
-            start = max(start, len(self._buffer) - len(MAGIC_BYTES) + 1)
-        self._flush(found, waiting)
-        self._buffer = self._buffer[start:]
-        return found
-
-    def settle(self) -> list[Message]:
-        """Return the packet that waited for the next one."""
-        size = len(self._buffer)
-        if not (self._buffer.startswith(MAGIC_BYTES) and self._length(0, last=True) == size):
-            return []
-        found: list[Message] = []
-        waiting: list[tuple[bytes, int, int]] = []
-        self._buffer = self._buffer[self._open(0, size, found, waiting) :]
-        self._flush(found, waiting)
-        return found
 
     @property
     def statistics(self) -> WireCounts:
         """Return the counts of bytes, packets, malformed ones, and samples without their format."""
-        counts = {"malformed": self._malformed, "unformatted": self._unformatted}
-        pending, packets = len(self._buffer), self._packets
-        return WireCounts(self._received, self._understood, pending, packets=packets, **counts)
+        counts = super().statistics
+        counts.unformatted = self._unformatted
+        return counts
 
-    def _length(self, place: int, *, last: bool = False) -> int | None:
-        """Return the length of the packet at ``place``; 0 = no packet; None = wait for more.
-
-        last: no bytes follow it
-        """
-        if place + HEADER.size > len(self._buffer):
-            return None
-        length: int
+    def _measure(self, place: int) -> tuple[int, bool]:
         _, length, kind = HEADER.unpack_from(self._buffer, place)
-        if not _is_head(length, kind) or self._cut_off(place, place + length, kind):
-            return 0
-        end = place + length
-        if end > len(self._buffer):
-            return None
-        after = self._buffer[end : end + len(MAGIC_BYTES)]
-        if kind != DATA or after == MAGIC_BYTES or (last and not after):
-            return length
-        # Samples have no checksum; the next packet shows whether bytes were lost or added.
-        return None if MAGIC_BYTES.startswith(after) else 0
+        known = kind in KINDS and HEADER.size < length <= MAX_PACKET_BYTES
+        return length if known else 0, kind == DATA
 
-    def _cut_off(self, place: int, end: int, kind: int) -> bool:
-        """Return whether the next packet begins inside the one up to ``end``: its end is missing.
-
-        Bytes that have not arrived must not change the answer, so only those before ``end`` are
-        used. Only samples wait for the next packet; in the end of others the magic alone counts.
-        """
-        inside = self._buffer.find(MAGIC_BYTES, place + len(MAGIC_BYTES), end)
-        while 0 <= inside <= len(self._buffer) - HEADER.size and inside <= end - HEADER.size:
-            _, size, other = HEADER.unpack_from(self._buffer, inside)
-            if _is_head(size, other):
-                return True
-            inside = self._buffer.find(MAGIC_BYTES, inside + 1, end)
-        return kind != DATA and inside > end - HEADER.size
-
-    def _open(
-        self, place: int, length: int, found: list[Message], waiting: list[tuple[bytes, int, int]]
-    ) -> int:
-        """Decode the packet at ``place``; return how many bytes to go on."""
-        body = self._buffer[place + HEADER.size : place + length]
+    def _take(self, place: int, size: int, found: list[Message]) -> int:
+        if not size:
+            return 1
+        body = self._buffer[place + HEADER.size : place + size]
         (kind,) = NUMBER.unpack_from(self._buffer, place + HEADER.size - 4)
         try:
-            self._understand(kind, body, found, waiting)
+            self._understand(kind, body, found)
         except (ProtocolError, struct.error):
             self._malformed += 1
             return 1
         self._packets += 1
-        self._understood += length
-        return length
+        self._understood += size
+        return size
 
-    def _understand(
-        self, kind: int, body: bytes, found: list[Message], waiting: list[tuple[bytes, int, int]]
-    ) -> None:
+    def _understand(self, kind: int, body: bytes, found: list[Message]) -> None:
         if kind == DATA:
-            self._data(body, found, waiting)
+            self._data(body, found)
             return
-        self._flush(found, waiting)
+        self._flush(found)
         if kind == COMMAND:
             found.append(decode_command(body))
         else:
@@ -302,9 +241,7 @@ class PacketDecoder:
             self._formats[form.stream] = form
             found.append(form)
 
-    def _data(
-        self, body: bytes, found: list[Message], waiting: list[tuple[bytes, int, int]]
-    ) -> None:
+    def _data(self, body: bytes, found: list[Message]) -> None:
         stream, counter, fixed, count = DATA_BODY.unpack_from(body)
         form = self._formats.get(stream)
         if count < 0:
@@ -315,12 +252,13 @@ class PacketDecoder:
         payload = body[DATA_BODY.size :]
         if not 0 <= len(payload) - count * form.dtype.itemsize < 4:  # padding
             raise ProtocolError(f"{count!r} samples in {len(payload)} bytes")
-        if waiting and waiting[0][2] != stream:
-            self._flush(found, waiting)
+        if self._waiting and self._waiting[0][2] != stream:
+            self._flush(found)
         time_ns = fixed * NANOSECONDS_PER_S // FIXED_POINT
-        waiting.append((payload[: count * form.dtype.itemsize], time_ns, stream))
+        self._waiting.append((payload[: count * form.dtype.itemsize], time_ns, stream))
 
-    def _flush(self, found: list[Message], waiting: list[tuple[bytes, int, int]]) -> None:
+    def _flush(self, found: list[Message]) -> None:
+        waiting, self._waiting = self._waiting, []
         if not waiting:
             return
         form = self._formats[waiting[0][2]]
@@ -329,12 +267,7 @@ class PacketDecoder:
         counts = np.array([len(payload) // size for payload, _, _ in waiting])
         starts = np.repeat([time_ns for _, time_ns, _ in waiting], counts).astype(np.int64)
         within = np.arange(len(records)) - np.repeat(np.cumsum(counts) - counts, counts)
-        waiting.clear()
         found.append(Data(form, records, starts + _after(form, records, within)))
-
-
-def _is_head(length: int, kind: int) -> bool:
-    return kind in KINDS and HEADER.size < length <= MAX_PACKET_BYTES
 
 
 def _after(form: DataFormat, records: Records, within: NDArray[np.int64]) -> NDArray[np.int64]:

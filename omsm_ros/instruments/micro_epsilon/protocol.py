@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray, Status
 from omsm_ros.errors import ProtocolError
-from omsm_ros.instruments.counting import WireCounts
+from omsm_ros.instruments.counting import PacketFinder, WireCounts
 
 # Manuals give both: "MEAS" as text, and as a 32-bit number sent low byte first.
 PREAMBLES = (b"MEAS", b"SAEM")
@@ -131,116 +131,43 @@ def encode_block(form: str, block: MeasurementBlock, preamble: bytes = PREAMBLES
     return head + block.frames.tobytes()
 
 
-class BlockDecoder:
-    """Decodes bytes in any portions to blocks; it never raises, memory is a block and a portion.
+class BlockDecoder(PacketFinder):
+    """Decodes bytes in any portions to blocks, each of which waits for the next one."""
 
-    The blocks do not depend on the portions. So a block waits until the next one has begun, or for
-    :meth:`settle`: bytes lost or added inside it show there.
-    """
+    magics, longest = PREAMBLES, MAX_BLOCK_BYTES
 
     def __init__(self, form: str, dtype_of: Callable[[tuple[int, int]], np.dtype[np.void]]) -> None:
         """form: of HEADERS;  dtype_of: fields of frames by their kind; may raise ProtocolError."""
-        self._header = HEADERS[form]
+        super().__init__()
+        self.head = HEADERS[form]
         self._dtype_of = dtype_of
-        self._buffer = b""
-        self._received = self._understood = self._packets = self._malformed = 0
 
-    def reset(self) -> None:
-        """Discard an incomplete block, as after a new connection."""
-        self._buffer = b""
+    def _measure(self, place: int) -> tuple[int, bool]:
+        count, width = self._shape(self.head.unpack_from(self._buffer, place))
+        return self.head.size + count * width if count else 0, True
 
-    def feed(self, data: bytes) -> list[MeasurementBlock]:
-        """Return the blocks completed by ``data``, in order."""
-        self._received += len(data)
-        self._buffer += data
-        found: list[MeasurementBlock] = []
-        start = 0
-        while (place := self._find(start)) >= 0:
-            size = self._size(place)
-            if size is None:
-                start = place
-                break
-            if size == 0:
-                self._malformed += 1
-                start = place + 1
-                continue
-            found.append(self._block(place, size))
-            start = place + size
-        else:
-            start = max(start, len(self._buffer) - len(PREAMBLES[0]) + 1)
-        self._buffer = self._buffer[start:]
-        return found
-
-    def settle(self) -> list[MeasurementBlock]:
-        """Return the block that waited for the next one."""
-        size = len(self._buffer)
-        if self._find(0) != 0 or self._size(0, last=True) != size:
-            return []
-        found = self._block(0, size)
-        self._buffer = b""
-        return [found]
-
-    @property
-    def statistics(self) -> WireCounts:
-        """Return the counts of bytes, blocks, and headers that are not valid."""
-        counts = {"packets": self._packets, "malformed": self._malformed}
-        return WireCounts(self._received, self._understood, len(self._buffer), **counts)
-
-    def _find(self, start: int) -> int:
-        places = [self._buffer.find(preamble, start) for preamble in PREAMBLES]
-        return min((place for place in places if place >= 0), default=-1)
-
-    def _size(self, place: int, *, last: bool = False) -> int | None:
-        """Return the bytes of the block at ``place``; 0 = no block; None = wait for more.
-
-        last: no bytes follow it
-        """
-        if place + self._header.size > len(self._buffer):
-            return None
-        shape = self._shape(self._header.unpack_from(self._buffer, place))
-        if shape is None:
-            return 0
-        size = self._header.size + shape[0] * shape[1]
-        end = place + size
-        if size > MAX_BLOCK_BYTES or self._cut_off(place, end):
-            return 0
-        if end > len(self._buffer):
-            return None
-        after = self._buffer[end : end + len(PREAMBLES[0])]
-        if after in PREAMBLES or (last and not after):
-            return size
-        return None if any(preamble.startswith(after) for preamble in PREAMBLES) else 0
-
-    def _shape(self, fields: tuple[int, ...]) -> tuple[int, int] | None:
-        """Return number and length of the frames, in either order; None if neither fits."""
+    def _shape(self, fields: tuple[int, ...]) -> tuple[int, int]:
+        """Return number and length of the frames, in either order; (0, 0) if neither fits."""
         try:
             width = self._dtype_of((fields[3], fields[4])).itemsize
         except ProtocolError:
-            return None
+            return 0, 0
         first, second = fields[-3], fields[-2]
         count = first if second == width else second if first == width else 0
-        return (count, width) if count else None
+        return (count, width) if count else (0, 0)
 
-    def _cut_off(self, place: int, end: int) -> bool:
-        """Return whether another block's header is inside the block up to ``end``."""
-        inside = self._find(place + 1)
-        while 0 <= inside <= min(end, len(self._buffer)) - self._header.size:
-            if self._shape(self._header.unpack_from(self._buffer, inside)) is not None:
-                return True
-            inside = self._find(inside + 1)
-        return False
-
-    def _block(self, place: int, size: int) -> MeasurementBlock:
-        fields = self._header.unpack_from(self._buffer, place)
-        shape = self._shape(fields)
-        assert shape is not None  # _size has checked it
-        count, width = shape
-        raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self._header.size)
+    def _take(self, place: int, size: int, found: list[MeasurementBlock]) -> int:
+        if not size:
+            self._malformed += 1
+            return 1
+        fields = self.head.unpack_from(self._buffer, place)
+        count, width = self._shape(fields)
+        raw = np.frombuffer(self._buffer, np.uint8, count * width, place + self.head.size)
         self._packets += 1
         self._understood += size
-        return MeasurementBlock(
-            fields[1], fields[2], (fields[3], fields[4]), fields[-1], raw.reshape(shape)
-        )
+        kind, frames = (fields[3], fields[4]), raw.reshape(count, width)
+        found.append(MeasurementBlock(fields[1], fields[2], kind, fields[-1], frames))
+        return size
 
 
 LOW, MIDDLE, HIGH_FIRST, HIGH_OTHER = 0b00, 0b01, 0b10, 0b11
