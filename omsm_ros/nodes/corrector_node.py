@@ -450,7 +450,11 @@ class CorrectorNode(ManagedNode):
                 self._corrector, self._topic.calibration, self._sources, accuracy_of(self.values)
             )
             report.values |= verdict_values(verdict)
-            self._publish_verdict(verdict)
+            used, now_ns = self._in_force_id(), self.get_clock().now().nanoseconds
+            steps, accuracy = next_steps(verdict), accuracy_of(self.values)
+            self._verdicts.publish(
+                verdict_message(self._messages, verdict, steps, used, accuracy, now_ns)
+            )
         self._publish_account()
         report.values["points_subscribers"] = self._points.get_subscription_count()
         report.values["requests_waiting"] = self._worker.waiting
@@ -464,12 +468,6 @@ class CorrectorNode(ManagedNode):
             report.add(WARN, f"a calibration was refused: {self._topic.refused}")
         return report
 
-    def _publish_verdict(self, verdict: Mapping[str, Any]) -> None:
-        used, now_ns = self._in_force_id(), self.get_clock().now().nanoseconds
-        steps, accuracy = next_steps(verdict), accuracy_of(self.values)
-        self._verdicts.publish(
-            verdict_message(self._messages, verdict, steps, used, accuracy, now_ns)
-        )
 
     def _publish_account(self) -> None:
         state = self._state

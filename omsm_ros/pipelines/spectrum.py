@@ -172,7 +172,8 @@ def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress)
     count = np.concatenate([np.arange(len(b)) + b.first_sample for b in axes])
     x, y, z, c = (np.concatenate([getattr(b, n) for b in axes]) for n in "xyzc")
     signal = scan_signal(name, period, (points.sample, height), (count, x, y, c))
-    motion = _motion_density(z, period)
+    known = z[np.isfinite(z)]
+    motion = density(known - np.mean(known), period)
     return ReadScan(signal, shaken, points, motion, account, len(every))
 
 
@@ -183,9 +184,6 @@ def _acceleration(recording: Recording) -> list[AccelerationBlock]:
     return [b for b in blocks if isinstance(b, AccelerationBlock)]
 
 
-def _motion_density(z: FloatArray, period: float) -> Density:
-    known = z[np.isfinite(z)]
-    return density(known - np.mean(known), period)
 
 
 def cleaned_points(scan: SpectrumOfScan) -> SurfacePoints:

@@ -268,7 +268,7 @@ class TriggerSlipDetector:
         self._note_step(count, steps)
         off = abs(skew) >= self._steady() * period_ns
         self._note(count, skew, begun, off)
-        stride = int(count // self._stride(period_ns))
+        stride = int(count // max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0))
         judged, self._judged = self._judged, stride
         early_days = count - self._start < _FIRST_S * per_s
         if stride != judged:
@@ -326,9 +326,6 @@ class TriggerSlipDetector:
                 least = _STEP_PERIODS * self._period_ns
                 self._least_steps[stream] = least if usual < least else math.inf
 
-    @staticmethod
-    def _stride(period_ns: float) -> float:
-        return max(_STRIDE_S * NANOSECONDS_PER_S / period_ns, 1.0)
 
     def _judge(self, count: int) -> None:
         if not (self._odd or self._state.samples or self._starting):

@@ -122,7 +122,11 @@ class TopicTable(ForeignTable):
         self, names: Sequence[str], dates: frozenset[str]
     ) -> Iterator[dict[str, FloatArray]]:
         fields = [name.removeprefix(f"{self._topic}.") for name in names]
-        self._check_dates(dict(zip(names, fields, strict=True)), dates)
+        for name, field in dict(zip(names, fields, strict=True)).items():
+            is_date = field == LOG_TIME or field.endswith("stamp")
+            if is_date != (name in dates):
+                expected = "unit: date" if is_date else "another unit than date"
+                raise FileError(f"{self}: {name!r} needs {expected} in the map")
         take = [_getter(field, self._kind) for field in fields]
         rows: list[list[float]] = []
         for number, (logged_ns, message) in enumerate(self._messages()):
@@ -143,12 +147,6 @@ class TopicTable(ForeignTable):
         if rows:
             yield _columns(names, rows)
 
-    def _check_dates(self, fields: dict[str, str], dates: frozenset[str]) -> None:
-        for name, field in fields.items():
-            is_date = field == LOG_TIME or field.endswith("stamp")
-            if is_date != (name in dates):
-                expected = "unit: date" if is_date else "another unit than date"
-                raise FileError(f"{self}: {name!r} needs {expected} in the map")
 
     @staticmethod
     def _taken(get: _Get | None, message: Any, logged_ns: int) -> float | None:
