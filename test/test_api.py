@@ -8,7 +8,7 @@ import pytest
 
 import omsm_ros as omsm
 from omsm_ros.errors import BagError, ConfigurationError, DataError, FileError
-from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.twin.plant import PAPER_DYNAMICS
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
 

@@ -19,10 +19,10 @@ from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import DataError
 from omsm_ros.io import bags
 from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
-from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.twin.cell import Cell, record
+from omsm_ros.twin.plant import Trajectory
 from omsm_ros.twin.scenario import Scenario
-from omsm_ros.twin.trajectory import Trajectory
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,7 @@ from omsm_ros.io.files import save_text
 from omsm_ros.io.gcode_file import steps_gcode
 from omsm_ros.pipelines import demonstrate, plan_scans
 from omsm_ros.pipelines.adjust import adjust_bags, adjustment_facts, write_adjustment
-from omsm_ros.pipelines.record_device import record_device
-from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
+from omsm_ros.pipelines.record_bags import NOMINAL, record_device, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.twin.cell import Cell
 from omsm_ros.twin.scenario import Scenario

@@ -23,7 +23,7 @@ from omsm_ros.core.streams.blocks import AxisBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.io.gcode_file import path_gcode
 from omsm_ros.pipelines.plan_scans import scan_program
-from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal, write_recording
+from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal, write_recording
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances
 

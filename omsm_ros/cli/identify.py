@@ -28,8 +28,7 @@ from omsm_ros.cli.command import (
     written,
 )
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
-from omsm_ros.core.calibration.certificate import NOTE, Origin, of_severity
-from omsm_ros.core.calibration.typed_json import from_json
+from omsm_ros.core.calibration.certificate import NOTE, Origin, from_json, of_severity
 from omsm_ros.core.estimation.equivalent_time import fast_mode
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, HOLDS
 from omsm_ros.core.estimation.preparation import joined_recordings

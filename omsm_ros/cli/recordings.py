@@ -176,7 +176,7 @@ def _declare_record(add: Arguments) -> None:
 
 def _record(args: argparse.Namespace) -> Facts:
     # Imported on demand, because 'inspect' needs no devices.
-    from omsm_ros.pipelines.record_device import record_device
+    from omsm_ros.pipelines.record_bags import record_device
 
     given: Facts = {"device": args.device, "port": args.port}
     for text in args.set:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, say_lines
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.pipelines.record_twin import record_sources, record_twin
+from omsm_ros.pipelines.record_bags import record_sources, record_twin
 from omsm_ros.quantities import FEED, RADIUS, SEED, SPEED
 from omsm_ros.twin.scenario import PASSES, SPHERE, STAND_OFFS, STILL, TURNED, Scenario
 

@@ -468,7 +468,6 @@ class CorrectorNode(ManagedNode):
             report.add(WARN, f"a calibration was refused: {self._topic.refused}")
         return report
 
-
     def _publish_account(self) -> None:
         state = self._state
         outside = {"uncalibrated": state.uncalibrated, "refused": state.refused}

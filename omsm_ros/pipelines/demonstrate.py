@@ -45,7 +45,7 @@ from omsm_ros.pipelines.correct import correct_bag
 from omsm_ros.pipelines.form import RegistrationOptions
 from omsm_ros.pipelines.measure import Judgement, with_sources
 from omsm_ros.pipelines.publish import publish_scan
-from omsm_ros.pipelines.record_twin import NOMINAL, write_nominal
+from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report.verdict import headline
 from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth

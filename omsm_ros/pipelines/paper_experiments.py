@@ -19,7 +19,7 @@ from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.io.files import EXPERIMENT, REPORT, save_json, save_text
 from omsm_ros.io.folders import EXPERIMENT_FILES, result_folder
 from omsm_ros.pipelines.paper_mirror import calibrated, mirror
-from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.pipelines.spectrum import SpectrumOfScan, SpectrumOptions, spectra_of, summary_of
 from omsm_ros.pipelines.verify_calibration import path_check_of
 from omsm_ros.readable import plain, quantity

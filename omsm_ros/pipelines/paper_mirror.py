@@ -24,7 +24,7 @@ from omsm_ros.io.results import CloudFile
 from omsm_ros.pipelines.correct import MOST_DRAWN
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.publish import view_of
-from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.readable import plain, quantity
 from omsm_ros.report.experiments import Compared, Done, Panel, compared, done, panels, psd
 from omsm_ros.report.measurement.figures import surface_figures

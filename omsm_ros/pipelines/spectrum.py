@@ -184,8 +184,6 @@ def _acceleration(recording: Recording) -> list[AccelerationBlock]:
     return [b for b in blocks if isinstance(b, AccelerationBlock)]
 
 
-
-
 def cleaned_points(scan: SpectrumOfScan) -> SurfacePoints:
     """Return the points of ``scan`` without the vibration and the bands that were removed.
 

@@ -28,12 +28,11 @@ from omsm_ros.errors import ConfigurationError, DataError
 from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part import UnderSpot, mounted_surface
-from omsm_ros.twin.plant import Plant, TimeGrid, move
+from omsm_ros.twin.plant import Plant, TimeGrid, Trajectory, move
 from omsm_ros.twin.probe import LEVEL, Probe, ProbeRandom, read, slope_of
 from omsm_ros.twin.record_checks import is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
 from omsm_ros.twin.structure import deform
-from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.units import NANOMETRE_M
 
 __all__ = ["Cell", "Probe", "Recording", "Truth", "blocks_of", "record"]

@@ -13,8 +13,8 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.kinematics.trajectories import AxisPositions
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.twin.part import PartPose
+from omsm_ros.twin.plant import Trajectory
 from omsm_ros.twin.record_checks import check_numbers
-from omsm_ros.twin.trajectory import Trajectory
 
 
 class Shift(NamedTuple):

@@ -14,8 +14,8 @@ from scipy import signal
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import AccelerationBlock, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.plant import Trajectory
 from omsm_ros.twin.record_checks import check_numbers, is_default
-from omsm_ros.twin.trajectory import Trajectory
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
 
 # Accelerometers measure up to 100 kHz.

@@ -18,9 +18,8 @@ from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.plant import Movement
+from omsm_ros.twin.plant import Movement, Trajectory
 from omsm_ros.twin.record_checks import check_numbers, is_default
-from omsm_ros.twin.trajectory import Trajectory
 
 # A smaller change between two steps is rounding, not a reversal [m].
 _STILL_M = 1e-16

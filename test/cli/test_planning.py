@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.pipelines.record_twin import write_nominal
+from omsm_ros.pipelines.record_bags import write_nominal
 
 
 @pytest.fixture

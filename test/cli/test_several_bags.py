@@ -9,7 +9,7 @@ from omsm_ros.core.kinematics.trajectories import StepTest
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_multisine
-from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.twin.cell import Cell, record
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from omsm_ros import cli
-from omsm_ros.pipelines.record_twin import write_nominal, write_recording
+from omsm_ros.pipelines.record_bags import write_nominal, write_recording
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.part import PartPose

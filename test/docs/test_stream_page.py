@@ -12,7 +12,7 @@ import pytest
 
 from omsm_ros.io.bags import BagReader
 from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
-from omsm_ros.pipelines.record_device import record_device
+from omsm_ros.pipelines.record_bags import record_device
 
 PAGE = (Path(__file__).parents[2] / "docs" / "stream.md").read_text()
 PER_UNIT = dict(re.findall(r"(\w\.counts_per_unit)=([\d.]+)", PAGE))

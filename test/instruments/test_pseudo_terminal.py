@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from omsm_ros.errors import ConfigurationError, DeviceError
-from omsm_ros.instruments.emulator_ports import Pty
+from omsm_ros.instruments.emulator_factory import Pty
 from omsm_ros.instruments.transport import SerialTransport
 
 SOON = 5.0

@@ -15,8 +15,7 @@ import pytest
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator
 from omsm_ros.instruments.emulator import Instrument
-from omsm_ros.instruments.emulator_factory import emulated, line_for
-from omsm_ros.instruments.emulator_ports import TcpServer
+from omsm_ros.instruments.emulator_factory import TcpServer, emulated, line_for
 from omsm_ros.instruments.factory import make_device, make_reference
 from omsm_ros.instruments.micro_epsilon.emulator import CapaNcdtEmulator
 from omsm_ros.instruments.parameters import REFERENCE_PARAMETERS, defaults

@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from omsm_ros.errors import DeviceError
-from omsm_ros.instruments.emulator_ports import TcpServer
+from omsm_ros.instruments.emulator_factory import TcpServer
 from omsm_ros.instruments.transport import Transport, transport_for
 
 SOON = 5.0

@@ -24,8 +24,7 @@ from omsm_ros.io.bag_writer import AXES_TOPIC
 from omsm_ros.io.bags import BagReader
 from omsm_ros.io.gcode_file import steps_gcode
 from omsm_ros.pipelines.plan_scans import scan_path, scan_program, write_scans
-from omsm_ros.pipelines.record_device import record_device
-from omsm_ros.pipelines.record_twin import write_nominal, write_recording
+from omsm_ros.pipelines.record_bags import record_device, write_nominal, write_recording
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances
 

@@ -17,7 +17,7 @@ from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.pipelines.correct import Admission
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.publish import report_again
-from omsm_ros.pipelines.record_twin import write_nominal
+from omsm_ros.pipelines.record_bags import write_nominal
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from omsm_ros.core.kinematics.trajectories import Chirp
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.disturbances import Vibration, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple, PartPose
-from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, move
+from omsm_ros.twin.plant import PAPER_DYNAMICS, Movement, Plant, TimeGrid, Trajectory, move
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.record_checks import check_numbers, is_default
 from omsm_ros.twin.sensors import (
@@ -29,7 +29,6 @@ from omsm_ros.twin.structure import (
     friction,
     hardened,
 )
-from omsm_ros.twin.trajectory import Trajectory
 
 STEP = 1e-3
 EXACT = {"rtol": 1e-9, "atol": 1e-16, "method": "LSODA"}

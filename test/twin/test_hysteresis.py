@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from omsm_ros.twin.plant import Trajectory
 from omsm_ros.twin.structure import backlash, friction
-from omsm_ros.twin.trajectory import Trajectory
 
 
 def behind(position, width):

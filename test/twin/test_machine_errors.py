@@ -21,7 +21,7 @@ from omsm_ros.twin.machine_errors import (
     Straightness,
     random_walk,
 )
-from omsm_ros.twin.trajectory import Trajectory
+from omsm_ros.twin.plant import Trajectory
 
 QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0, half_range=1e-3)
 RADIUS = 8e-3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.plant import Movement
+from omsm_ros.twin.plant import Movement, Trajectory
 from omsm_ros.twin.structure import (
     Creep,
     Friction,
@@ -16,7 +16,6 @@ from omsm_ros.twin.structure import (
     deform,
     hardened,
 )
-from omsm_ros.twin.trajectory import Trajectory
 
 STEP_S = 1e-3
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.trajectory import Trajectory
+from omsm_ros.twin.plant import Trajectory
 
 
 def _of(function, start=-1.0, step=1e-2, count=301):

@@ -27,10 +27,10 @@ from omsm_ros.core.calibration.certificate import (
     Certificate,
     Residual,
     Response,
+    from_json,
 )
 from omsm_ros.core.calibration.latency import Latency, unresolved_latency
 from omsm_ros.core.calibration.plausibility import check_covariance, check_dynamics
-from omsm_ros.core.calibration.typed_json import from_json
 from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray

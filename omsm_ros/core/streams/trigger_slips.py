@@ -326,7 +326,6 @@ class TriggerSlipDetector:
                 least = _STEP_PERIODS * self._period_ns
                 self._least_steps[stream] = least if usual < least else math.inf
 
-
     def _judge(self, count: int) -> None:
         if not (self._odd or self._state.samples or self._starting):
             return

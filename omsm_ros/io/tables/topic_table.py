@@ -147,7 +147,6 @@ class TopicTable(ForeignTable):
         if rows:
             yield _columns(names, rows)
 
-
     @staticmethod
     def _taken(get: _Get | None, message: Any, logged_ns: int) -> float | None:
         if get is None:

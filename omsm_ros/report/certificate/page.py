@@ -6,8 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedEntry
-from omsm_ros.core.calibration.typed_json import to_json
+from omsm_ros.core.calibration.certificate import REJECTED, Certificate, UndetectedEntry, to_json
 from omsm_ros.core.identification.fitted_record import FittedRecord
 from omsm_ros.core.lti.frequency_response import (
     COVERAGE_FACTOR,

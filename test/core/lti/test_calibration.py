@@ -22,10 +22,9 @@ from omsm_ros.core.calibration.calibration import (
     with_latency,
 )
 from omsm_ros.core.calibration.calibration_set import calibration_set
-from omsm_ros.core.calibration.certificate import Certificate
+from omsm_ros.core.calibration.certificate import Certificate, from_json, to_json
 from omsm_ros.core.calibration.latency import Latency, declared_latency, unresolved_latency
 from omsm_ros.core.calibration.repeatability import compare_calibrations
-from omsm_ros.core.calibration.typed_json import from_json, to_json
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.calibration.certificate import Certificate
+from omsm_ros.core.calibration.certificate import Certificate, to_json
 from omsm_ros.core.calibration.latency import unresolved_latency
 from omsm_ros.core.calibration.plausibility import MAX_TIME_CONSTANT_SAMPLES
-from omsm_ros.core.calibration.typed_json import to_json
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import CalibrationError

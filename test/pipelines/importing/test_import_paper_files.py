@@ -12,7 +12,7 @@ from omsm_ros import cli
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.io import calibration_file, results
-from omsm_ros.pipelines.record_twin import write_recording
+from omsm_ros.pipelines.record_bags import write_recording
 from omsm_ros.twin.cell import blocks_of
 from omsm_ros.twin.scenario import Scenario, scan_of
 
