@@ -177,8 +177,9 @@ def block_settings(values: Values) -> dict[str, Any]:
 
 
 def probe_reading_of(values: Values) -> ProbeReading:
-    """Return how the probe's readings become distances."""
-    return ProbeReading(**{f.name: values[f"probe.{f.name}"] for f in fields(ProbeReading)})
+    """Return how the probe's readings become distances; not each probe has an intensity."""
+    names = [f.name for f in fields(ProbeReading) if f"probe.{f.name}" in values]
+    return ProbeReading(**{name: values[f"probe.{name}"] for name in names})
 
 
 def command_transport(address: str, port: int) -> Transport | None:

@@ -15,6 +15,7 @@ from omsm_ros.instruments.analog.device import (
     SyntheticInput,
     analog_input,
 )
+from omsm_ros.instruments.scaling import ProbeReading
 
 PERIOD_NS = 500_000
 SETTINGS = BlockSettings(sample_period=5e-4, block_size=50)
@@ -127,7 +128,7 @@ def test_a_loss_is_a_gap_of_the_time_that_passed(host):
 def test_a_capacitive_probe_beyond_its_range_tells_no_distance(host):
     source = Source()
     device = AnalogReference(
-        source, SETTINGS, sensitivity=80e3, full_scale=250e-6, polarity=-1, zero=125e-6,
+        source, SETTINGS, 80e3, ProbeReading(full_scale=250e-6, polarity=-1, zero=125e-6),
         now_ns=host.now_ns, monotonic=host.monotonic,
     )  # fmt: skip
     device.open()

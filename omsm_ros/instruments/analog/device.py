@@ -12,7 +12,8 @@ from omsm_ros.core.streams.blocks import AccelerationBlock, Block, DistanceBlock
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.arrivals import DeviceClock
 from omsm_ros.instruments.blocks import BlockPair, BlockSettings
-from omsm_ros.instruments.parameters import NowNs, Values, block_settings
+from omsm_ros.instruments.parameters import NowNs, Values, block_settings, probe_reading_of
+from omsm_ros.instruments.scaling import ProbeReading
 from omsm_ros.instruments.transport import parts_of
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -307,24 +308,18 @@ class AnalogReference(AnalogDevice):
         self,
         source: Converter,
         settings: BlockSettings,
-        *,
         sensitivity: float,
-        full_scale: float,
-        polarity: int = 1,
-        zero: float = 0.0,
+        probe: ProbeReading,
         **clocks: Any,
     ) -> None:
-        """sensitivity: [V/m], the paper's CPL190 has 80 mV/µm;  full_scale: range, from 0 V [m]
-        polarity: +1 if the reading falls as z rises;  zero: reading that is distance zero [m]
-        """
+        """sensitivity: [V/m], the paper's CPL190 has 80 mV/µm;  probe: its range begins at 0 V."""
         super().__init__(source, settings, **clocks)
-        self._sensitivity, self._full_scale = sensitivity, full_scale
-        self._polarity, self._zero = polarity, zero
+        self._sensitivity, self._probe = sensitivity, probe
 
     def _block(self, volts: FloatArray, common: dict[str, Any]) -> BlockPair:
         reading = volts[:, 0] / self._sensitivity
-        outside = ~((reading >= 0) & (reading <= self._full_scale))
-        distance = np.where(outside, np.nan, self._polarity * (reading - self._zero))
+        outside = ~((reading >= 0) & (reading <= self._probe.full_scale))
+        distance = np.where(outside, np.nan, self._probe.distance(reading))
         status = np.where(outside, Status.OUT_OF_RANGE, Status.OK).astype(np.uint8)
         return BlockPair(None, DistanceBlock(**common, distance=distance, status=status))
 
@@ -343,9 +338,7 @@ def make_reference(values: Values, now_ns: NowNs) -> AnalogReference:
     return AnalogReference(
         analog_input(values["port"], 1),
         BlockSettings(**block_settings(values)),
-        sensitivity=values["sensitivity"],
-        full_scale=values["probe.full_scale"],
-        polarity=values["probe.polarity"],
-        zero=values["probe.zero"],
+        values["sensitivity"],
+        probe_reading_of(values),
         now_ns=now_ns,
     )

@@ -10,13 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import Status
-from omsm_ros.errors import ConfigurationError, DeviceError, NoSamplesError
+from omsm_ros.core.streams.blocks import IntArray, Status
+from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels
 from omsm_ros.instruments.counting import SAMPLE, Samples
 from omsm_ros.instruments.micro_epsilon.device import BlockStreamDevice
-from omsm_ros.instruments.micro_epsilon.protocol import channel_dtype
-from omsm_ros.instruments.parameters import NowNs, Values, block_settings, command_transport
+from omsm_ros.instruments.micro_epsilon.protocol import Frames, channel_dtype
+from omsm_ros.instruments.parameters import (
+    NowNs,
+    Values,
+    block_settings,
+    command_transport,
+    probe_reading_of,
+)
 from omsm_ros.instruments.scaling import ProbeReading
 from omsm_ros.instruments.transport import CommandPort, Transport, transport_for
 from omsm_ros.units import MICROMETRE_M, MICROSECOND_S
@@ -99,9 +105,7 @@ class CapaNcdtDevice(BlockStreamDevice):
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         return channel_dtype(kind[0])
 
-    def _samples_of(
-        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
-    ) -> Samples:
+    def _samples_of(self, frames: Frames, counter: IntArray) -> Samples:
         name = f"channel {self._wanted.channel}"
         if name not in (frames.dtype.names or ()):
             raise DeviceError(
@@ -117,24 +121,12 @@ class CapaNcdtDevice(BlockStreamDevice):
         samples["status"] = np.where(outside, Status.OUT_OF_RANGE, Status.OK)
         return samples
 
-    def _listen_in(self, silent: float) -> None:
-        super()._listen_in(silent)
-        if not self._wanted.triggered and silent > self._wanted.patience:
-            raise NoSamplesError(
-                f"{self._transport.name} sent nothing for {silent:.1f} s; check power and network"
-            )
-
 
 def make(values: Values, now_ns: NowNs) -> CapaNcdtDevice:
     """Return the device that ``values`` describe."""
-    probe = ProbeReading(
-        full_scale=values["probe.full_scale"],
-        zero=values["probe.zero"],
-        polarity=values["probe.polarity"],
-    )
     settings = CapaNcdtSettings(
         **block_settings(values),
-        probe=probe,
+        probe=probe_reading_of(values),
         channel=values["channel"],
         triggered=values["triggered"],
     )

@@ -22,15 +22,16 @@ from omsm_ros.instruments.micro_epsilon.protocol import (
     FIRST_ERROR,
     HEADERS,
     INTENSITY_FULL,
-    INTENSITY_MASK,
     VALUE_BITS,
     BlockDecoder,
+    Frames,
     MeasurementBlock,
     PlausibleValueFilter,
     SerialDecoder,
     confocal_dtype,
     distance_of,
     intensity_leads,
+    intensity_of,
 )
 from omsm_ros.instruments.parameters import (
     NowNs,
@@ -91,7 +92,7 @@ class BlockStreamDevice(StreamDevice):
         self._undescribed = False
         self._next: int | None = None  # counter of the next block
         self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
-        self._commands, self._answers_within = commands, patience
+        self._commands, self._answers_within, self._period = commands, patience, period
         self._identity: dict[str, str] = {}
 
     @property
@@ -160,20 +161,20 @@ class BlockStreamDevice(StreamDevice):
         return np.concatenate(parts) if parts else np.empty(0, SAMPLE)
 
     def _listen_in(self, silent: float) -> None:
+        """Raise NoSamplesError for another controller, or a free-running one that is silent."""
         if silent > UNREADABLE_S and self._undescribed:
             raise NoSamplesError(
                 f"{self._transport.name} sends blocks {_UNDESCRIBED.decode()!r}, which do not "
                 "describe their content; read this controller over RS-422 (device: confocaldt)"
             )
         super()._listen_in(silent)
+        _check_not_silent(self._transport.name, self._period, self._answers_within, silent)
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         """Return the fields of a frame, by the flags in the block's header."""
         raise NotImplementedError
 
-    def _samples_of(
-        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
-    ) -> Samples:
+    def _samples_of(self, frames: Frames, counter: IntArray) -> Samples:
         """Return the samples of the frames (n,) of a block, with their ``counter`` (n,)."""
         raise NotImplementedError
 
@@ -260,10 +261,7 @@ class ConfocalDtDevice(StreamDevice):
         self._check_order(columns["distance"])
         raw, samples["status"] = distance_of(columns["distance"], self._wanted.probe.full_scale)
         samples["distance"] = self._wanted.probe.distance(raw)
-        samples["intensity"] = np.nan
-        if "intensity" in columns:
-            light = (columns["intensity"] & INTENSITY_MASK) / INTENSITY_FULL
-            samples["intensity"] = np.minimum(light, 1.0)
+        samples["intensity"] = intensity_of(columns.get("intensity"))
         if "counter" in columns:
             samples["counter"] = columns["counter"]
         elif len(samples):
@@ -285,7 +283,7 @@ class ConfocalDtDevice(StreamDevice):
         if "counter" not in self._wanted.values:
             self._tracker.restart_count()
         super()._listen_in(silent)
-        _check_not_silent(self._transport.name, self._wanted, silent)
+        _check_not_silent(self._transport.name, self._wanted.period, self._wanted.patience, silent)
 
 
 class ConfocalDtEthernetDevice(BlockStreamDevice):
@@ -356,9 +354,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
                 f"at {answered[-1]:g} kHz; set sample_period to {1e-3 / answered[-1]:.9g} s"
             )
 
-    def _samples_of(
-        self, frames: np.ndarray[tuple[int], np.dtype[np.void]], counter: np.ndarray
-    ) -> Samples:
+    def _samples_of(self, frames: Frames, counter: IntArray) -> Samples:
         names = frames.dtype.names or ()
         samples = np.zeros(len(frames), SAMPLE)
         samples["counter"] = frames["counter"] if "counter" in names else counter
@@ -371,16 +367,12 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         samples["status"] = np.select(
             [beyond, nothing], [Status.OUT_OF_RANGE, Status.NO_TARGET], Status.OK
         )
-        samples["intensity"] = np.nan
-        if light is not None:
-            samples["intensity"] = np.minimum((light & INTENSITY_MASK) / INTENSITY_FULL, 1.0)
+        samples["intensity"] = intensity_of(light)
         for number, axis in enumerate(self._wanted.wired, start=1):
             samples["counts"][:, axis] = self._encoder(frames, number)
         return samples
 
-    def _peak(
-        self, frames: np.ndarray[tuple[int], np.dtype[np.void]]
-    ) -> tuple[IntArray, IntArray | None]:
+    def _peak(self, frames: Frames) -> tuple[IntArray, IntArray | None]:
         distance: IntArray = frames["distance 1"].astype(np.int64)
         if "intensity 1" not in (frames.dtype.names or ()):
             return distance, None
@@ -391,7 +383,7 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         first, second = words.T
         return (second, first) if self._intensity_leads else (first, second)
 
-    def _encoder(self, frames: np.ndarray[tuple[int], np.dtype[np.void]], number: int) -> IntArray:
+    def _encoder(self, frames: Frames, number: int) -> IntArray:
         if f"encoder {number}" not in (frames.dtype.names or ()):
             raise DeviceError(
                 f"{self._transport.name} sends no encoder {number}; select it "
@@ -400,13 +392,10 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
         counts: IntArray = frames[f"encoder {number}"].astype(np.int64)
         return counts
 
-    def _listen_in(self, silent: float) -> None:
-        super()._listen_in(silent)
-        _check_not_silent(self._transport.name, self._wanted, silent)
 
-
-def _check_not_silent(name: str, settings: ConfocalDtSettings, silent: float) -> None:
-    if settings.period and silent > settings.patience:
+def _check_not_silent(name: str, period: float, patience: float, silent: float) -> None:
+    """Raise NoSamplesError for a controller that keeps a period itself and sends nothing."""
+    if period and silent > patience:
         raise NoSamplesError(
             f"{name} sent no readable data for {silent:.1f} s; check power, output "
             "interface and (RS-422) baud rate"

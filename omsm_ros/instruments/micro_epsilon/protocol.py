@@ -13,7 +13,7 @@ So a missing byte always shows.
 import itertools
 import struct
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,10 @@ FIRST_ERROR = 0x7FFFFF00
 # Codes of a peak before, and of one behind the measuring range.
 BEFORE_RANGE_NM, BEHIND_RANGE_NM = 0x7FFFFF05, 0x7FFFFF06
 _SIGNED = ("distance", "thickness", "minimum", "maximum", "encoder")
+
+
+Frames: TypeAlias = NDArray[np.void]
+"""Structured array of shape (n,), its fields as the header of a block describes them."""
 
 
 class MeasurementBlock(NamedTuple):
@@ -113,6 +117,11 @@ def intensity_leads(words: NDArray[np.int64], furthest: float) -> bool | None:
     leads, follows = light[:, 0] & distance[:, 1], distance[:, 0] & light[:, 1]
     votes = int(np.sum(leads & ~follows)) - int(np.sum(follows & ~leads))
     return votes > 0 if votes else None
+
+
+def intensity_of(light: IntArray | None) -> FloatArray | float:
+    """Return the intensity (n,), 0 to 1, of values of a peak; NaN where there are none."""
+    return np.nan if light is None else np.minimum((light & INTENSITY_MASK) / INTENSITY_FULL, 1.0)
 
 
 def channel_dtype(field: int) -> np.dtype[np.void]:

@@ -256,13 +256,12 @@ class AdsRing:
             self._taken = self._written(self._snapshot())
         except (pyads.ADSError, OSError, ValueError, TypeError) as err:
             self.close()
+            if isinstance(err, DeviceError):
+                raise
             raise DeviceError(
                 f"{self.name} does not answer: {err}; check address, net id, and the PLC's route "
                 "to this computer"
             ) from err
-        except DeviceError:
-            self.close()
-            raise
 
     def read(self, timeout: float) -> bytes:
         """Return new samples as frames of the six-channel stream, b"" if none came in time."""
