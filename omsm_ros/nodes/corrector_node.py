@@ -1,7 +1,6 @@
 """``corrector``: computes corrected surface points from axes and distance, continuously."""
 
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
@@ -22,7 +21,7 @@ from omsm_ros.core.correction.correct import Corrector
 from omsm_ros.core.correction.counter_offset import LiveOffset
 from omsm_ros.core.correction.predict import Prediction
 from omsm_ros.core.correction.surface_points import SurfacePoints, pack_points
-from omsm_ros.core.streams.blocks import Account, StreamAccount, consecutive
+from omsm_ros.core.streams.blocks import Account, consecutive
 from omsm_ros.core.streams.monitoring import LoadMeter, RecentIncrease, SampleFlow
 from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.errors import BagError, CalibrationError, Notice, OmsmError
@@ -85,11 +84,11 @@ class CorrectionState:
 
     def keep(self, account: Account) -> None:
         """Add the account of a correction that has ended to those before it."""
-        self._ended = _sum_of(self._ended, account)
+        self._ended += account
 
     def account(self, corrector: Corrector | None) -> Account:
         """Return the account of all corrections since the node was configured."""
-        return _sum_of(self._ended, corrector.account) if corrector else self._ended
+        return self._ended + corrector.account if corrector else self._ended
 
     def heard(self, stream: str, first: int, samples: int, period: float, now: float) -> None:
         """Count a block; first: its trigger number;  now: [s]."""
@@ -182,23 +181,6 @@ class CorrectionState:
                 report.add(STALE, f"no sample of {stream} yet")
             elif silent > patience:
                 report.add(STALE, f"no sample of {stream} for {silent:.0f} s")
-
-
-def _sum_of(one: Account, other: Account) -> Account:
-    return Account(
-        axes=_sum_of_stream(one.axes, other.axes),
-        distance=_sum_of_stream(one.distance, other.distance),
-    )
-
-
-def _sum_of_stream(one: StreamAccount, other: StreamAccount) -> StreamAccount:
-    return StreamAccount(
-        received=one.received + other.received,
-        corrected=one.corrected + other.corrected,
-        pending=one.pending + other.pending,
-        counted=dict(Counter(one.counted) + Counter(other.counted)),
-        missing=one.missing + other.missing,
-    )
 
 
 def _add_motion(report: StateReport, slip: TriggerSlip, motion: LiveOffset) -> None:

@@ -16,7 +16,6 @@ from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import (
     MOST_TRACED,
-    ScanFields,
     ScanTrace,
     resolves_per_turn_waves,
     scan_fields,
@@ -217,53 +216,6 @@ LATERAL_SOURCES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class LateralErrors:
-    """Effect of lateral errors on a cloud without a nominal surface.
-
-    heights: rms effect of each source on the heights [m]
-    largest: largest standard uncertainty of a point [m]
-    points: evenly chosen rows of the updated cloud
-    warnings: sources that could not be evaluated
-    """
-
-    heights: dict[str, float]
-    largest: float
-    points: NDArray[np.void]
-    warnings: tuple[str, ...] = ()
-
-
-def add_lateral_errors(
-    cloud: Path, options: CorrectionOptions, trace: ScanTrace, most: int
-) -> LateralErrors | None:
-    """Add the effect of lateral errors to the uncertainty of each point of ``cloud``.
-
-    Lateral errors change heights by the slope of the surface. Without a nominal surface the slope
-    is that of a polynomial through all points, so the cloud is rewritten in a second pass.
-
-    most: points to return. Return None if there is no such source or a nominal surface is given.
-    """
-    sources = [source for source in options.systematic if source.needs_slope]
-    if not sources or options.surface is not None or not trace.seen:
-        return None
-    points = trace.points()
-    if not resolves_per_turn_waves(points):
-        names = ", ".join(dict.fromkeys(source.name for source in sources))
-        return LateralErrors({}, 0.0, np.empty(0), (LATERAL_SOURCES.format(names=names),))
-    by_source = standard_fields(sources, points.with_slopes(None))
-    fields = scan_fields(by_source, trace.every)
-    kept, largest = EvenSelection(most), 0.0
-    for rows in with_added_variance(cloud, lambda first, count: _variance(fields, first, count)):
-        kept.add(rows)
-        largest = max(largest, float(rows["uncertainty"].max()))
-    heights = {name: float(np.sqrt(np.mean(np.sum(f**2, axis=0)))) for name, f in by_source.items()}
-    return LateralErrors(heights, largest, kept.rows())
-
-
-def _variance(fields: ScanFields, first: int, count: int) -> FloatArray:
-    return np.asarray(np.sum(fields.at(first, count) ** 2, axis=0), np.float64)
-
-
 # A quarter of an hour at 1 kHz, whose adjustment needs 1 GB; longer scans are not adjusted.
 _MOST_ADJUSTED = 1_000_000
 # More than the pixels of a figure; the numbers of a summary come from all points.
@@ -305,6 +257,41 @@ class Correction:
     scan: ScanData | None = None
 
 
+def with_lateral_errors(
+    done: Correction, cloud: Path, options: CorrectionOptions, most: int = MOST_DRAWN
+) -> Correction:
+    """Add the effect of lateral errors to the uncertainty of each point of ``cloud``.
+
+    Lateral errors change heights by the slope of the surface. Without a nominal surface the slope
+    is that of a polynomial through all points, so the cloud is rewritten in a second pass.
+
+    most: points to keep for figures
+
+    Return ``done`` with their budget, largest uncertainty and points; unchanged if there is no
+    such source, or a nominal surface is given.
+    """
+    sources = [source for source in options.systematic if source.needs_slope]
+    if not sources or options.surface is not None or not done.trace.seen:
+        return done
+    points = done.trace.points()
+    if not resolves_per_turn_waves(points):
+        names = ", ".join(dict.fromkeys(source.name for source in sources))
+        return replace(done, faults=(*done.faults, LATERAL_SOURCES.format(names=names)))
+    by_source = standard_fields(sources, points.with_slopes(None))
+    fields = scan_fields(by_source, done.trace.every)
+    kept, largest = EvenSelection(most), 0.0
+
+    def variance(first: int, count: int) -> FloatArray:
+        return np.asarray(np.sum(fields.at(first, count) ** 2, axis=0), np.float64)
+
+    for rows in with_added_variance(cloud, variance):
+        kept.add(rows)
+        largest = max(largest, float(rows["uncertainty"].max()))
+    heights = {name: float(np.sqrt(np.mean(np.sum(f**2, axis=0)))) for name, f in by_source.items()}
+    budget = done.budget | heights
+    return replace(done, budget=budget, largest_uncertainty=largest, points=kept.rows())
+
+
 def correct_bag(
     path: AnyBag,
     calibration: Calibration,
@@ -344,9 +331,7 @@ def correct_bag(
                     if nominal is not None and lateral:
                         points = with_lateral_uncertainty(points, nominal, lateral)
                     found.add(points, ply.write(points))
-        shifted = add_lateral_errors(cloud, scan.options, scan.trace, MOST_DRAWN)
-        done = _correction(scan, found)
-        return done if shifted is None else _with_lateral_errors(done, shifted)
+        return with_lateral_errors(_correction(scan, found), cloud, scan.options)
 
 
 class _RunningResults:
@@ -434,17 +419,6 @@ class _RunningResults:
         if not len(self.drawn):
             return {}
         return {name: running.statistics() for name, running in self._running.items()}
-
-
-def _with_lateral_errors(done: Correction, shifted: LateralErrors) -> Correction:
-    if not shifted.heights:
-        return replace(done, faults=(*done.faults, *shifted.warnings))
-    return replace(
-        done,
-        budget=done.budget | shifted.heights,
-        largest_uncertainty=shifted.largest,
-        points=shifted.points,
-    )
 
 
 def _correction(scan: CorrectedScan, found: _RunningResults) -> Correction:

@@ -48,6 +48,7 @@ from omsm_ros.pipelines.adjust import conformity_entry, figures_entry, priors_of
 from omsm_ros.pipelines.correct import Admission, Correction, StampJoining, correct_bag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
+from omsm_ros.report.verdict import registered_figures
 
 if TYPE_CHECKING:
     from omsm_ros.pipelines.form import RegistrationOptions
@@ -145,7 +146,7 @@ def add_verdict(
         systematic = summary["budget"]["systematic"]
         verdict = untested_verdict(2 * systematic, judgement.accuracy, calibration)
         if form is not None:
-            summary["figures"] = _registered_figures(form)
+            summary["figures"] = registered_figures(form)
     else:
         nominal = judgement.options.surface
         found = adjust(
@@ -204,15 +205,6 @@ def _posed(nominal: Surface, form: Mapping[str, Any]) -> Surface:
     angles, shifts = (found.tip, found.tilt, found.clocking), (found.x, found.y)
     small = max(map(abs, angles)) < _SMALL_ANGLE_RAD and max(map(abs, shifts)) < _SMALL_SHIFT_M
     return nominal if small else PosedSurface(nominal, found)
-
-
-def _registered_figures(form: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        name: {"value": given["value"], "standard_uncertainty": given["uncertainty"]}
-        for name in ("peak_to_valley", "rms")
-        if (given := form["deviation"].get(name)) is not None and given["value"] is not None
-    }
-    return {**found, "removed": form["removed"]["fitted"], "terms": []} if len(found) == 2 else {}
 
 
 def live_verdict(

@@ -98,6 +98,17 @@ def covered(form: Mapping[str, Any] | None) -> str:
     return " of the covered part" * any(doubt["peak_to_valley"] is None for doubt in found)
 
 
+def registered_figures(form: Mapping[str, Any]) -> dict[str, Any]:
+    """Return PV and rms of a registered form, as an adjustment states them; none without both."""
+    found: dict[str, Any] = {
+        key: {"value": one["value"], "standard_uncertainty": one["uncertainty"]}
+        for key in ("peak_to_valley", "rms")
+        if (one := part(form, "deviation", key)) and one["value"] is not None
+    }
+    removed = part(form, "removed", "fitted") or ()
+    return {**found, "removed": removed, "terms": []} if len(found) == 2 else {}
+
+
 def headline(facts: Mapping[str, Any]) -> str:
     """Return the result in one line: "PV 175 nm ± 12 nm (k = 2), tolerance held"."""
     pv = facts["figures"]["peak_to_valley"]

@@ -10,7 +10,7 @@ from omsm_ros.core.correction.machine_sources import MachineSources, StatedSourc
 from omsm_ros.core.correction.systematic import ScanTrace
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io.results import CloudFile
-from omsm_ros.pipelines.correct import add_lateral_errors, correct_bag
+from omsm_ros.pipelines.correct import Correction, correct_bag, with_lateral_errors
 from omsm_ros.pipelines.measure import live_verdict, with_sources
 
 from .test_corrected_scan import write
@@ -72,11 +72,12 @@ def test_points_too_far_apart_for_the_turns_say_so(tmp_path, small_scan, true_ca
         np.zeros((2, len(points))),
         np.zeros(len(points)),
     )
-    found = add_lateral_errors(tmp_path / "none.ply", options, trace, 10)
-    assert found is not None
-    assert not found.heights
-    assert "centre_x" in found.warnings[0]
-    assert "--nominal" in found.warnings[0]
+    done = Correction({}, {}, None, {}, (), {}, 0.0, np.empty(0), trace, None, 1e-3, None,
+                      np.empty(0))  # fmt: skip
+    found = with_lateral_errors(done, tmp_path / "none.ply", options)
+    assert not found.budget
+    assert "centre_x" in found.faults[0]
+    assert "--nominal" in found.faults[0]
 
 
 def test_live_without_a_surface_the_verdict_says_what_is_not_in_the_points(

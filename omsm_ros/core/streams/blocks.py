@@ -240,6 +240,12 @@ class StreamAccount:
     counted: Mapping[str, int] = field(default_factory=dict)
     missing: int = 0
 
+    def __add__(self, other: "StreamAccount") -> "StreamAccount":
+        names = ("received", "corrected", "pending", "missing")
+        sums = {name: getattr(self, name) + getattr(other, name) for name in names}
+        counted = Counter(self.counted) + Counter(other.counted)
+        return StreamAccount(**sums, counted=dict(counted))
+
 
 @dataclass(frozen=True)
 class Account:
@@ -251,6 +257,9 @@ class Account:
     def as_dict(self) -> dict[str, dict[str, object]]:
         """Return JSON values: stream -> received, corrected, pending, counted {reason: samples}."""
         return asdict(self)
+
+    def __add__(self, other: "Account") -> "Account":
+        return Account(self.axes + other.axes, self.distance + other.distance)
 
 
 class Tally:

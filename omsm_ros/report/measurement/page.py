@@ -21,7 +21,7 @@ from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
 from omsm_ros.report.page_parts import Headline, check_places, fill, picture, title_block
 from omsm_ros.report.tables import Table, part, unit_of_parameter
-from omsm_ros.report.verdict import PageVerdict, covered, verdict_on_measurement
+from omsm_ros.report.verdict import PageVerdict, covered, registered_figures, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
 
 _SLOPES = ("slope_rms", "slope_largest", "slope_rms_without_second_order")
@@ -40,7 +40,7 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
     The figures are those of the summary, which its verdict holds for; of a form that has no
     summary, its own.
     """
-    figures = part(summary, "figures") or _form_figures(form)
+    figures = part(summary, "figures") or registered_figures(form)
     if not figures:
         return None
     open_ = covered(form or part(summary, "form"))
@@ -60,20 +60,6 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
         level, word = "care", f"Not verified: {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
     return PageVerdict(level, f"{word} of {tolerance} on the peak to valley", tuple(words))
-
-
-def _form_figures(form: Mapping[str, Any]) -> dict[str, Any]:
-    """Return PV and rms of a registered form; none without them."""
-    found = {key: part(form, "deviation", key) for key in ("peak_to_valley", "rms")}
-    if not all(one and one["value"] is not None for one in found.values()):
-        return {}
-    return {
-        **{
-            key: {"value": one["value"], "standard_uncertainty": one["uncertainty"]}
-            for key, one in found.items()
-        },
-        "removed": part(form, "removed", "fitted") or (),
-    }
 
 
 def _expanded(figure: Mapping[str, Any]) -> str:
