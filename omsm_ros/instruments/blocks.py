@@ -6,14 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import (
-    MAX_BLOCK_SAMPLES,
-    AxisBlock,
-    DistanceBlock,
-    FloatArray,
-    IntArray,
-)
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray, IntArray
 from omsm_ros.instruments.arrivals import DeviceClock, MissedTriggerDetector
 from omsm_ros.instruments.counting import SAMPLE, CountedRun, Samples, Turns
 from omsm_ros.instruments.scaling import AXES, AxisScaling
@@ -56,16 +49,6 @@ class BlockSettings:
     pause: float = 0.2
     renew: float = 0.0
     free_running: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("sample_period", "pause"):
-            value = getattr(self, name)
-            if not 0 < value < np.inf:
-                raise ConfigurationError(f"{name} {value!r} s, expected a positive number")
-        if not 0 < self.block_size <= MAX_BLOCK_SAMPLES:
-            raise ConfigurationError(
-                f"block_size {self.block_size!r}, expected 1 to {MAX_BLOCK_SAMPLES}"
-            )
 
 
 class Channels(NamedTuple):

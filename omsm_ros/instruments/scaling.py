@@ -1,4 +1,7 @@
-"""Counts of encoders and readings of probes, to and from metres and radians."""
+"""Counts of encoders and readings of probes, to and from metres and radians.
+
+The ranges of these figures are those of the drivers' parameters, which check them.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,16 +9,10 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.errors import DataError
 from omsm_ros.units import MICROMETRE_M
 
 AXES = ("x", "y", "z", "b", "c")
-
-
-def check_sign(name: str, sign: int) -> None:
-    """Raise ConfigurationError, which calls the sign ``name``, unless it is +1 or -1."""
-    if sign not in (1, -1):
-        raise ConfigurationError(f"{name} {sign!r}, expected 1 or -1")
 
 
 def whole_counts(name: str, values: FloatArray, kind: type[np.signedinteger[Any]]) -> FloatArray:
@@ -43,18 +40,6 @@ class AxisScaling:
     offset: float = 0.0
     wrap: int = 0
 
-    def __post_init__(self) -> None:
-        if not 0 < self.counts_per_unit < np.inf:
-            raise ConfigurationError(
-                f"counts_per_unit {self.counts_per_unit!r}, expected a positive finite number; "
-                "use sign to turn an axis round"
-            )
-        check_sign("sign", self.sign)
-        if not np.isfinite(self.offset):
-            raise ConfigurationError(f"offset {self.offset!r}, expected a finite number")
-        if self.wrap < 0:
-            raise ConfigurationError(f"wrap {self.wrap!r} counts, expected 0 (never) or more")
-
     def values(self, counts: IntArray) -> FloatArray:
         """Return the positions [m or rad] of unwrapped ``counts`` (n,)."""
         return self.offset + counts / (self.sign * self.counts_per_unit)
@@ -80,16 +65,6 @@ class ProbeReading:
     zero: float = 0.0
     polarity: int = 1
     intensity_full_scale: float = 100.0
-
-    def __post_init__(self) -> None:
-        for name in ("full_scale", "intensity_full_scale"):
-            value = getattr(self, name)
-            if not 0 < value < np.inf:
-                raise ConfigurationError(f"{name} {value!r}, expected a positive finite number")
-        if self.polarity not in (1, -1):
-            raise ConfigurationError(f"polarity {self.polarity!r}, expected 1 or -1")
-        if not np.isfinite(self.zero):
-            raise ConfigurationError(f"zero {self.zero!r} m, expected a finite number")
 
     def distance(self, raw: FloatArray) -> FloatArray:
         """Return the distance [m] of a reading [m]."""

@@ -285,13 +285,8 @@ def test_a_line_too_slow_for_the_telegrams_is_named(cell: Any) -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"trigger": "often"}, "trigger 'often'"),
-        ({"format": "xml"}, "format 'xml'"),
-        ({"latch": "late"}, "latch 'late'"),
-        ({"encoders": (0, 0, 1, 2, 3)}, "encoders"),
         ({"signals": (256, 257)}, "lack 83"),
         ({"signals": (83, 256, 65, 67), "axes": AXIS_SCALING}, "lack \\[66, 68, 69\\]"),
-        ({"sample_period": -1.0}, "sample_period"),
     ],
 )
 def test_senseless_settings_are_refused(arguments: dict[str, Any], named: str) -> None:

@@ -157,21 +157,6 @@ def test_trigger_flags_have_their_bits():
     assert (SATURATED, TRIGGER_LOST, TRIGGER_DELAYED) == (1 << 0, 1 << 1, 1 << 2)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "named"),
-    [
-        ({"full_scale": 0.0}, "full_scale 0.0"),
-        ({"full_scale": float("inf")}, "full_scale inf"),
-        ({"intensity_full_scale": -1.0}, "intensity_full_scale -1.0"),
-        ({"polarity": 0}, "polarity 0"),
-        ({"zero": float("nan")}, "zero nan"),
-    ],
-)
-def test_a_probe_that_cannot_be_is_refused(wrong, named):
-    with pytest.raises(ConfigurationError, match=named):
-        ProbeReading(**wrong)
-
-
 def test_a_selection_without_distance_counter_or_encoders_is_refused():
     with pytest.raises(ConfigurationError, match="hold no distance"):
         distance_of(telegram(s83=np.uint16([1])), [83], ProbeReading())

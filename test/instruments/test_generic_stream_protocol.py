@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as npst
 
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.instruments.parameters import PARAMETERS
 from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.protocol import (
     ENCODED_SIZE,
@@ -280,22 +281,29 @@ def test_no_distance_is_sent_as_the_sentinel() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "arguments", "named"),
+    ("name", "value"),
     [
-        (AxisScaling, {"counts_per_unit": 0.0}, "counts_per_unit 0.0"),
-        (AxisScaling, {"counts_per_unit": -1e9}, "use sign"),
-        (AxisScaling, {"counts_per_unit": float("nan")}, "nan"),
-        (AxisScaling, {"counts_per_unit": 1e9, "sign": 0}, "sign 0"),
-        (AxisScaling, {"counts_per_unit": 1e9, "offset": float("inf")}, "offset inf"),
-        (AxisScaling, {"counts_per_unit": 1e9, "wrap": -1}, "wrap -1"),
-        (ProbeScaling, {"full_scale": 0.0}, "full_scale 0.0"),
-        (ProbeScaling, {"polarity": 2}, "polarity 2"),
-        (ProbeScaling, {"invalid": 2**31}, "2147483648"),
+        ("x.counts_per_unit", -1e9),
+        ("x.counts_per_unit", float("nan")),
+        ("x.sign", 0),
+        ("x.offset", float("inf")),
+        ("x.wrap", -1),
+        ("probe.full_scale", 0.0),
+        ("probe.full_scale", float("inf")),
+        ("probe.polarity", 2),
+        ("probe.zero", float("nan")),
+        ("probe.intensity_full_scale", -1.0),
+        ("sample_period", -1.0),
+        ("block_size", 0),
+        ("trigger", "often"),
+        ("format", "xml"),
+        ("latch", "late"),
     ],
 )
-def test_senseless_scaling_is_refused(kind: type, arguments: dict[str, float], named: str) -> None:
-    with pytest.raises(ConfigurationError, match=named):
-        kind(**arguments)
+def test_senseless_parameters_are_refused(name: str, value: object) -> None:
+    parameter = next(p for p in PARAMETERS if p.name == name)
+    with pytest.raises(ConfigurationError, match=name):
+        parameter.checked(value)
 
 
 def test_default_resolution() -> None:

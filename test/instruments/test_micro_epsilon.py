@@ -231,11 +231,9 @@ def test_a_channel_it_does_not_have_is_named(bench: Any) -> None:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: CapaNcdtSettings(channel=0),
         lambda: ConfocalDtSettings(values=("counter",)),
         lambda: ConfocalDtSettings(values=("distance", "exposure")),
         lambda: ConfocalDtSettings(values=("distance", "distance")),
-        lambda: ConfocalDtSettings(wired=(0, 0)),
     ],
 )
 def test_senseless_settings_are_refused(make: Callable[[], object]) -> None:

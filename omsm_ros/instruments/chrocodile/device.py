@@ -86,14 +86,6 @@ class ChrocodileSettings(BlockSettings):
     patience: float = 2.0
 
     def __post_init__(self) -> None:
-        BlockSettings.__post_init__(self)
-        for name, choice in (("trigger", TRIGGERS), ("format", FORMATS), ("latch", LATCHES)):
-            if getattr(self, name) not in choice:
-                raise ConfigurationError(
-                    f"{name} {getattr(self, name)!r}, expected one of {sorted(choice)}"
-                )
-        if sorted(self.encoders) != [0, 1, 2, 3, 4]:
-            raise ConfigurationError(f"encoders {self.encoders!r}, expected 0 to 4, each once")
         if self.signals:
             check_selection(self.signals, self.latched)
 

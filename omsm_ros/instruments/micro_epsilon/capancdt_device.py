@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.core.streams.blocks import IntArray, Status
-from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.blocks import RATE_TOLERANCE, BlockSettings, Channels
 from omsm_ros.instruments.counting import SAMPLE, Samples
 from omsm_ros.instruments.micro_epsilon.device import BlockStreamDevice
@@ -46,11 +46,6 @@ class CapaNcdtSettings(BlockSettings):
     channel: int = 1
     triggered: bool = False
     patience: float = 2.0
-
-    def __post_init__(self) -> None:
-        BlockSettings.__post_init__(self)
-        if not 1 <= self.channel <= 8:
-            raise ConfigurationError(f"channel {self.channel!r}, expected 1 to 8")
 
 
 class CapaNcdtDevice(BlockStreamDevice):

@@ -41,7 +41,7 @@ from omsm_ros.instruments.parameters import (
     command_transport,
     probe_reading_of,
 )
-from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
+from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
 from omsm_ros.instruments.stream import UNREADABLE_S, StreamDevice
 from omsm_ros.instruments.transport import CommandPort, Transport
 from omsm_ros.units import NANOMETRE_M
@@ -203,7 +203,6 @@ class ConfocalDtSettings(BlockSettings):
     patience: float = 2.0
 
     def __post_init__(self) -> None:
-        BlockSettings.__post_init__(self)
         named = [value for value in self.values if value != SKIPPED_VALUES]
         unknown, doubled = set(named) - set(SERIAL_VALUES), len(set(named)) < len(named)
         if "distance" not in named or unknown or doubled:
@@ -211,8 +210,6 @@ class ConfocalDtSettings(BlockSettings):
                 f"values {self.values!r}, expected 'distance' and more of {SERIAL_VALUES!r}, each "
                 f"once, in the order of the frame; {SKIPPED_VALUES!r} for another value"
             )
-        if len(set(self.wired)) < len(self.wired) or set(self.wired) - set(range(len(AXES))):
-            raise ConfigurationError(f"wired {self.wired!r}, expected axes 0 to 4, each once")
 
     @property
     def period(self) -> float:

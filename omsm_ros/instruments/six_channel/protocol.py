@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.streams.blocks import FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.instruments.counting import WireCounts
-from omsm_ros.instruments.scaling import AXES, AxisScaling, check_sign, whole_counts
+from omsm_ros.instruments.scaling import AXES, AxisScaling, whole_counts
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 FRAME = np.dtype(
@@ -119,14 +119,6 @@ class ProbeScaling:
     full_scale: float = 100 * MICROMETRE_M
     polarity: int = 1
     invalid: int = -(2**31)
-
-    def __post_init__(self) -> None:
-        if not self.full_scale > 0:
-            raise ConfigurationError(f"full_scale {self.full_scale!r} m is not positive")
-        check_sign("polarity", self.polarity)
-        limits = np.iinfo(np.int32)
-        if not limits.min <= self.invalid <= limits.max:
-            raise ConfigurationError(f"invalid {self.invalid!r} nm does not fit an int32")
 
     def readings(self, frames: FrameArray) -> tuple[FloatArray, NDArray[np.uint8]]:
         """Return the distance [m], NaN where there is none, and status, each of shape (n,).
