@@ -13,13 +13,13 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.machine_errors import MachineErrors
 from omsm_ros.twin.probe import Probe, ProbeErrors
-from omsm_ros.twin.record_checks import check_numbers
+from omsm_ros.twin.record_checks import CheckedNumbers
 from omsm_ros.twin.sensors import AccelerationSensor, ClockErrors, EncoderErrors, ReferenceSensor
 from omsm_ros.twin.structure import StructureErrors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VibrationLine:
+class VibrationLine(CheckedNumbers):
     """Line ``amplitude_m · sin(2π frequency_hz t + per_turn · c + phase_rad)``.
 
     amplitude_m: half of peak to valley
@@ -31,9 +31,10 @@ class VibrationLine:
     frequency_hz: float = 0.0
     per_turn: float = 0.0
     phase_rad: float | None = None
+    not_negative = ("frequency_hz",)
 
     def __post_init__(self) -> None:
-        check_numbers(self, not_negative=("frequency_hz",))
+        CheckedNumbers.__post_init__(self)
         if not self.frequency_hz and not self.per_turn:
             raise ConfigurationError(
                 "VibrationLine: frequency_hz and per_turn are both zero; give one of them"

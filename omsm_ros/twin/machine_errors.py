@@ -14,7 +14,7 @@ from omsm_ros.core.kinematics.trajectories import AxisPositions
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.plant import Trajectory
-from omsm_ros.twin.record_checks import check_numbers
+from omsm_ros.twin.record_checks import CheckedNumbers
 
 
 class Shift(NamedTuple):
@@ -26,7 +26,7 @@ class Shift(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drift:
+class Drift(CheckedNumbers):
     """Drift of the height of the workpiece, zero at time 0.
 
     ramp_m_per_s: constant rate
@@ -41,13 +41,8 @@ class Drift:
     sine_m: float = 0.0
     period_s: float = 60.0
     random_walk_m_per_root_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("time_constant_s", "period_s"),
-            not_negative=("random_walk_m_per_root_s",),
-        )
+    positive = ("time_constant_s", "period_s")
+    not_negative = ("random_walk_m_per_root_s",)
 
     def height(self, time: FloatArray, walk: Trajectory) -> FloatArray:
         """Return the height [m] at ``time`` [s]; ``walk``: random, one metre per root second."""
@@ -62,7 +57,7 @@ class Drift:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Harmonic:
+class Harmonic(CheckedNumbers):
     """Rotating vector ``amplitude · (cos φ, sin φ)`` with ``φ = per_turn · c + phase_rad``.
 
     amplitude: in the unit of its quantity; for a single direction only the cosine counts
@@ -72,9 +67,6 @@ class Harmonic:
     amplitude: float
     per_turn: int
     phase_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
 
     def along(self, c: FloatArray) -> FloatArray:
         """Return the first component at spindle angle ``c`` [rad], of its shape."""
@@ -86,7 +78,7 @@ class Harmonic:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SpindleError:
+class SpindleError(CheckedNumbers):
     """Synchronous and asynchronous error motion of the spindle (ISO 230-7).
 
     axial_m, radial_m, tilt_rad: harmonics;  tilt rotates about the origin of X and Y
@@ -100,10 +92,7 @@ class SpindleError:
     axial_noise_m: float = 0.0
     radial_noise_m: float = 0.0
     tilt_noise_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        names = ("axial_noise_m", "radial_noise_m", "tilt_noise_rad")
-        check_numbers(self, not_negative=names)
+    not_negative = ("axial_noise_m", "radial_noise_m", "tilt_noise_rad")
 
     @property
     def is_noisy(self) -> bool:
@@ -127,7 +116,7 @@ class SpindleError:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Straightness:
+class Straightness(CheckedNumbers):
     """Straightness deviation of a slide over its position p.
 
     ``bow_m · (p / half_travel_m)² + periodic_m · sin(2π p / period_m)``
@@ -137,9 +126,7 @@ class Straightness:
     half_travel_m: float = 0.1
     periodic_m: float = 0.0
     period_m: float = 0.01
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("half_travel_m", "period_m"))
+    positive = ("half_travel_m", "period_m")
 
     def deviation(self, position: FloatArray) -> FloatArray:
         """Return the error [m] at ``position`` [m], of its shape."""
@@ -148,7 +135,7 @@ class Straightness:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MachineErrors:
+class MachineErrors(CheckedNumbers):
     """Errors of the machine; none by default.
 
     pose: of the part on the chuck;  mount: true place and direction of the probe
@@ -164,9 +151,7 @@ class MachineErrors:
     drift: Drift = field(default_factory=Drift)
     b_wobble_rad: float = 0.0
     b_wobble_hz: float = 1.0
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("b_wobble_hz",))
+    positive = ("b_wobble_hz",)
 
     def slides_shift(self, slides: AxisPositions) -> Shift:
         """Return the shift of the workpiece by straightness errors of the slides."""

@@ -7,7 +7,7 @@ import numpy as np
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.record_checks import check_numbers, is_default
+from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
 # Each iteration reduces the error by tilt times slope, at most 1/100; it ends at the rounding of a
@@ -17,7 +17,7 @@ _SETTLED_M = 1e-13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PartPose:
+class PartPose(CheckedNumbers):
     """Deviation of the part from its nominal pose on the chuck.
 
     x_m, y_m, z_m: shift of its origin
@@ -30,9 +30,6 @@ class PartPose:
     tilt_x_rad: float = 0.0
     tilt_y_rad: float = 0.0
     clocking_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_numbers(self)
 
     @property
     def rotation(self) -> FloatArray:

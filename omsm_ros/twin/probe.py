@@ -9,7 +9,7 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
-from omsm_ros.twin.record_checks import LONGEST_LAG_S, check_numbers
+from omsm_ros.twin.record_checks import LONGEST_LAG_S, CheckedNumbers
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M
 
 # Gauss-Legendre nodes of an exposure: exact to the seventh power of time, within 1e-4 for an
@@ -38,7 +38,7 @@ class Probe:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ProbeErrors:
+class ProbeErrors(CheckedNumbers):
     """Errors of timing, distance and light; none by default.
 
     spot_m: diameter of the spot, a disc over which the height of the part is averaged
@@ -67,14 +67,12 @@ class ProbeErrors:
     intensity_slope_rad: float | None = None
     dropout_slope_rad: float | None = None
     dropout_probability: float = 0.0
+    positive = ("period_m", "intensity_slope_rad", "dropout_slope_rad")
+    not_negative = ("spot_m", "latency_s", "exposure_s", "noise_m", "dropout_probability")
+    lags = ("latency_s", "exposure_s")
 
     def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("period_m", "intensity_slope_rad", "dropout_slope_rad"),
-            not_negative=("spot_m", "latency_s", "exposure_s", "noise_m", "dropout_probability"),
-            lags=("latency_s", "exposure_s"),
-        )
+        CheckedNumbers.__post_init__(self)
         if self.averages < 1 or self.window_s > LONGEST_LAG_S:
             raise ConfigurationError(
                 f"ProbeErrors: averages is {self.averages!r}, exposure_s {self.exposure_s!r}; "

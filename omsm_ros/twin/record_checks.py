@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -21,33 +21,36 @@ LONGEST_LAG_S = 1.0
 """Largest delay of a sample [s]; the simulation starts earlier by this time."""
 
 
-def check_numbers(
-    record: Any,
-    *,
-    positive: tuple[str, ...] = (),
-    not_negative: tuple[str, ...] = (),
-    lags: tuple[str, ...] = (),
-) -> None:
-    """Raise ConfigurationError for a number of a record that is not finite or beyond its limits.
+class CheckedNumbers:
+    """Base of records, which refuses a number that is not finite or beyond its limits.
 
     positive, not_negative: names of such fields
     lags: names of times of at most a second, of either sign
+
+    Raises ConfigurationError.
     """
-    for field in fields(record):
-        value = getattr(record, field.name)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            continue
-        limit = LONGEST_LAG_S if field.name in lags else _limit(field.name)
-        least = -limit
-        if field.name in positive or field.name in not_negative:
-            least = 0.0
-        zero_refused = field.name in positive and value == 0
-        if not least <= value <= limit or zero_refused:
-            expected = "a positive number" if field.name in positive else "a number"
-            raise ConfigurationError(
-                f"{type(record).__name__}: {field.name} is {value!r}, expected {expected} from "
-                f"{least:g} to {limit:g}; check its unit"
-            )
+
+    __slots__ = ()
+    positive: ClassVar[tuple[str, ...]] = ()
+    not_negative: ClassVar[tuple[str, ...]] = ()
+    lags: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]  # each is a dataclass
+            value = getattr(self, field.name)
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                continue
+            limit = LONGEST_LAG_S if field.name in self.lags else _limit(field.name)
+            least = -limit
+            if field.name in self.positive or field.name in self.not_negative:
+                least = 0.0
+            zero_refused = field.name in self.positive and value == 0
+            if not least <= value <= limit or zero_refused:
+                expected = "a positive number" if field.name in self.positive else "a number"
+                raise ConfigurationError(
+                    f"{type(self).__name__}: {field.name} is {value!r}, expected {expected} from "
+                    f"{least:g} to {limit:g}; check its unit"
+                )
 
 
 def _limit(name: str) -> float:

@@ -15,7 +15,7 @@ from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import AccelerationBlock, DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import Trajectory
-from omsm_ros.twin.record_checks import check_numbers, is_default
+from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 from omsm_ros.units import MICROMETRE_M, NANOMETRE_M, PPM
 
 # Accelerometers measure up to 100 kHz.
@@ -25,7 +25,7 @@ _JITTER_LIMIT = 7.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReferenceSensor:
+class ReferenceSensor(CheckedNumbers):
     """Capacitive sensor on the motion of the slide, as a CPL190 (250 µm).
 
     latency_s: of the reading;  scale_ppm: relative error, positive for a long reading
@@ -38,14 +38,9 @@ class ReferenceSensor:
     noise_m: float = 2 * NANOMETRE_M
     half_range_m: float = 125 * MICROMETRE_M
     cubic_m: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_numbers(
-            self,
-            positive=("half_range_m",),
-            not_negative=("latency_s", "noise_m"),
-            lags=("latency_s",),
-        )
+    positive = ("half_range_m",)
+    not_negative = ("latency_s", "noise_m")
+    lags = ("latency_s",)
 
     def read(
         self, slide: Trajectory, time: FloatArray, period: float, random: np.random.Generator
@@ -65,7 +60,7 @@ class ReferenceSensor:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AccelerationSensor:
+class AccelerationSensor(CheckedNumbers):
     """Piezoelectric accelerometer on the probe, as a PCB 356A17.
 
     sample_period_s: of the sensor, None for that of the trigger
@@ -79,11 +74,11 @@ class AccelerationSensor:
     high_pass_hz: float = 0.5
     scale_ppm: float = 0.0
     cross_talk: float = 0.0
+    positive = ("sample_period_s", "high_pass_hz")
+    not_negative = ("noise_m_per_s2",)
 
     def __post_init__(self) -> None:
-        check_numbers(
-            self, positive=("sample_period_s", "high_pass_hz"), not_negative=("noise_m_per_s2",)
-        )
+        CheckedNumbers.__post_init__(self)
         if self.sample_period_s is not None and self.sample_period_s < _SHORTEST_PERIOD_S:
             raise ConfigurationError(
                 f"AccelerationSensor: sample_period_s is {self.sample_period_s!r}, expected "
@@ -127,7 +122,7 @@ class Instants(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClockErrors:
+class ClockErrors(CheckedNumbers):
     """Deviations of the sampling instants from the trigger count; none by default.
 
     trigger_jitter_s: rms of all devices in common;  probe_jitter_s: rms of the probe alone
@@ -142,11 +137,8 @@ class ClockErrors:
     probe_drift_ppm: float = 0.0
     z_latch_late_s: float = 0.0
     c_latch_late_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        jitter = ("trigger_jitter_s", "probe_jitter_s")
-        late = ("probe_offset_s", "z_latch_late_s", "c_latch_late_s")
-        check_numbers(self, not_negative=jitter, lags=(*jitter, *late))
+    not_negative = ("trigger_jitter_s", "probe_jitter_s")
+    lags = (*not_negative, "probe_offset_s", "z_latch_late_s", "c_latch_late_s")
 
     @property
     def lag_s(self) -> float:
@@ -175,7 +167,7 @@ class ClockErrors:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pitch:
+class Pitch(CheckedNumbers):
     """Pitch α of the slide, by which the encoder measures ``E = L α`` in addition (Abbe error).
 
     arm_m: L, offset of the encoder from the line of the probe
@@ -190,9 +182,7 @@ class Pitch:
     rad_per_m_s2: float = 0.0
     frequency_hz: float = 60.0
     damping_ratio: float = 0.05
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("period_m", "frequency_hz", "damping_ratio"))
+    positive = ("period_m", "frequency_hz", "damping_ratio")
 
     @property
     def _mode(self) -> tuple[list[float], list[float]]:
@@ -217,7 +207,7 @@ class Pitch:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EncoderErrors:
+class EncoderErrors(CheckedNumbers):
     """Errors of the encoder of Z; none by default.
 
     scale_ppm: relative error, positive for a long reading
@@ -231,9 +221,8 @@ class EncoderErrors:
     signal_period_m: float = 4e-6
     resolution_m: float = 0.0
     pitch: Pitch | None = None
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("signal_period_m",), not_negative=("resolution_m",))
+    positive = ("signal_period_m",)
+    not_negative = ("resolution_m",)
 
     def seen(self, slide: Trajectory) -> Trajectory:
         """Return the position under the encoder [m], without errors of the encoder itself."""

@@ -19,7 +19,7 @@ from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import Movement, Trajectory
-from omsm_ros.twin.record_checks import check_numbers, is_default
+from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 
 # A smaller change between two steps is rounding, not a reversal [m].
 _STILL_M = 1e-16
@@ -97,7 +97,7 @@ def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Creep:
+class Creep(CheckedNumbers):
     """Creep of a share of each move: ``1 - ε + ε / (1 + sτ)``.
 
     fraction: ε of the move [1];  time_constant_s: τ
@@ -105,13 +105,11 @@ class Creep:
 
     fraction: float
     time_constant_s: float
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("time_constant_s",))
+    positive = ("time_constant_s",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LogCreep:
+class LogCreep(CheckedNumbers):
     """Creep proportional to the logarithm of time, as of piezos and grease.
 
     fraction_per_decade: of the move, in each decade from shortest_s to longest_s [1]
@@ -120,9 +118,10 @@ class LogCreep:
     fraction_per_decade: float
     shortest_s: float = 0.01
     longest_s: float = 1000.0
+    positive = ("shortest_s", "longest_s")
 
     def __post_init__(self) -> None:
-        check_numbers(self, positive=("shortest_s", "longest_s"))
+        CheckedNumbers.__post_init__(self)
         if not _SHORTEST_RELAXATION_S <= self.shortest_s <= self.longest_s:
             raise ConfigurationError(
                 f"LogCreep: from {self.shortest_s!r} to {self.longest_s!r} s, expected to begin at "
@@ -140,7 +139,7 @@ class LogCreep:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SoftMode:
+class SoftMode(CheckedNumbers):
     """Weak mode of base or isolator: ``1 - p + p ω² / (s² + 2ζω s + ω²)``.
 
     participation: p, static share of the motion [1]
@@ -149,9 +148,7 @@ class SoftMode:
     frequency_hz: float
     damping_ratio: float
     participation: float
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("frequency_hz", "damping_ratio"))
+    positive = ("frequency_hz", "damping_ratio")
 
     @property
     def omega(self) -> float:
@@ -160,7 +157,7 @@ class SoftMode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Friction:
+class Friction(CheckedNumbers):
     """Pre-sliding friction (Dahl 1968) that retards the probe by up to ``drag_m``.
 
     dF/dz = (1 - F sgn ż) / presliding_m, F from -1 to 1
@@ -168,13 +165,11 @@ class Friction:
 
     drag_m: float
     presliding_m: float
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("presliding_m",))
+    positive = ("presliding_m",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StructureErrors:
+class StructureErrors(CheckedNumbers):
     """Errors between slide and probe; none by default.
 
     creep, log_creep, soft_modes: linear, slow
@@ -193,9 +188,8 @@ class StructureErrors:
     hardening_deflection_m: float | None = None
     backlash_m: float = 0.0
     friction: Friction | None = None
-
-    def __post_init__(self) -> None:
-        check_numbers(self, positive=("hardening_deflection_m",), not_negative=("backlash_m",))
+    positive = ("hardening_deflection_m",)
+    not_negative = ("backlash_m",)
 
     @property
     def relaxations(self) -> tuple[Creep, ...]:
