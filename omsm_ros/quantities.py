@@ -6,9 +6,11 @@ that all results stay finite and fit into memory. A number outside has a wrong u
 damaged or forged file.
 """
 
+from __future__ import annotations
+
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +49,15 @@ class Quantity:
         if number is None or not self._in_range(number):
             raise error(self._refusal(value, name))
         return number
+
+    @property
+    def metadata(self) -> dict[str, Quantity]:
+        """Metadata of a field of a :class:`CheckedRecord` that holds this quantity."""
+        return {"quantity": self}
+
+    def of_field(self, default: Any) -> Any:
+        """Return such a field with a default."""
+        return field(default=default, metadata=self.metadata)
 
     def checked_all(
         self, values: NDArray[Any], error: type[OmsmError] = DataError, name: str = ""
@@ -93,6 +104,22 @@ class Quantity:
             f"{name or self.name} is {shown(value)}{unit}, expected {kind} {self.range_text}; "
             f"{self.remedy}"
         )
+
+
+class CheckedRecord:
+    """Base of dataclasses that checks each field against its quantity; None is not stated.
+
+    error: raised for a number outside its range
+    """
+
+    __slots__ = ()
+    error: ClassVar[type[OmsmError]] = ConfigurationError
+
+    def __post_init__(self) -> None:
+        for each in fields(self):  # type: ignore[arg-type]  # each is a dataclass
+            value = getattr(self, each.name)
+            if value is not None and "quantity" in each.metadata:
+                each.metadata["quantity"].checked(value, self.error, each.name)
 
 
 def _number(value: object, whole: bool) -> float | int | None:

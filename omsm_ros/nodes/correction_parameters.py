@@ -16,15 +16,9 @@ from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.io.descriptions import load_sources
 from omsm_ros.nodes.topics import FRAME_PREFIX
-from omsm_ros.quantities import Parameter, Quantity
+from omsm_ros.quantities import Parameter
 
 _FROM_CALIBRATION = _NOT_REQUESTED = -1.0
-_GEOMETRY_FIELDS = {"beam_x": quantities.SLOPE, "beam_y": quantities.SLOPE}
-_SOURCE_FIELDS: dict[str, Quantity] = {
-    "static_gain": quantities.GAIN_UNCERTAINTY,
-    "probe_latency": quantities.TIME_UNCERTAINTY,
-    "pitch": quantities.ANGLE_UNCERTAINTY,
-}
 
 TRIGGER = (
     Parameter(
@@ -76,7 +70,7 @@ PARAMETERS = (
             f"geometry.{field.name}",
             0.0,
             "of the probe, see `omsm align`",
-            _GEOMETRY_FIELDS.get(field.name, quantities.LENGTH),
+            field.metadata["quantity"],
         )
         for field in fields(Geometry)
     ),
@@ -94,7 +88,7 @@ PARAMETERS = (
             f"sources.{field.name}",
             0.0,
             "standard uncertainty, k = 1; 0 = what the certificate states",
-            _SOURCE_FIELDS.get(field.name, quantities.UNCERTAINTY),
+            field.metadata["quantity"],
         )
         for field in fields(ErrorSources)
     ),

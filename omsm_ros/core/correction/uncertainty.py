@@ -9,8 +9,7 @@ Z follows the surface, this is a height error of ``δ dH(z)/dt``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import polynomial
@@ -22,13 +21,13 @@ from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
 from omsm_ros.core.lti.recursion import past_motion, past_stationary
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.errors import DataError
 from omsm_ros.quantities import (
     ANGLE_UNCERTAINTY,
     GAIN_UNCERTAINTY,
     TIME_UNCERTAINTY,
     UNCERTAINTY,
-    Quantity,
+    CheckedRecord,
 )
 
 # Name of the scatter of a scan beyond the stated sources of single readings.
@@ -39,13 +38,8 @@ _NEGLIGIBLE = 1e-6
 _ORDER = 5
 
 
-def _source(quantity: Quantity = UNCERTAINTY) -> Any:
-    """Return a field of :class:`ErrorSources` with the plausible range ``quantity``."""
-    return field(default=0.0, metadata={"quantity": quantity})
-
-
 @dataclass(frozen=True, kw_only=True)
-class ErrorSources:
+class ErrorSources(CheckedRecord):
     """Standard uncertainties of single points, except those of the dynamics.
 
     probe_noise: of a reading [m];  probe_resolution: step of a reading [m]
@@ -58,21 +52,16 @@ class ErrorSources:
     pitch: of the Z slide's pitch [rad], which acts through the Abbe arm
     """
 
-    probe_noise: float = _source()
-    probe_resolution: float = _source()
-    encoder_noise: float = _source()
-    encoder_resolution: float = _source()
-    static_gain: float = _source(GAIN_UNCERTAINTY)
-    probe_latency: float = _source(TIME_UNCERTAINTY)
-    motion_error: float = _source()
-    discretisation: float = _source()
-    vibration: float = _source()
-    pitch: float = _source(ANGLE_UNCERTAINTY)
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            quantity = each.metadata["quantity"]
-            quantity.checked(getattr(self, each.name), ConfigurationError, each.name)
+    probe_noise: float = UNCERTAINTY.of_field(0.0)
+    probe_resolution: float = UNCERTAINTY.of_field(0.0)
+    encoder_noise: float = UNCERTAINTY.of_field(0.0)
+    encoder_resolution: float = UNCERTAINTY.of_field(0.0)
+    static_gain: float = GAIN_UNCERTAINTY.of_field(0.0)
+    probe_latency: float = TIME_UNCERTAINTY.of_field(0.0)
+    motion_error: float = UNCERTAINTY.of_field(0.0)
+    discretisation: float = UNCERTAINTY.of_field(0.0)
+    vibration: float = UNCERTAINTY.of_field(0.0)
+    pitch: float = ANGLE_UNCERTAINTY.of_field(0.0)
 
     @classmethod
     def of(cls, calibration: Calibration) -> ErrorSources:

@@ -6,7 +6,7 @@ the spindle, which is parallel to Z; x and y are slide positions relative to the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -14,12 +14,12 @@ from numpy.polynomial.polynomial import polyder, polyval2d
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import LENGTH, MAP_SPACING, SLOPE
+from omsm_ros.quantities import LENGTH, MAP_SPACING, SLOPE, CheckedRecord
 from omsm_ros.units import MICROMETRE_M
 
 
 @dataclass(frozen=True, kw_only=True)
-class Geometry:
+class Geometry(CheckedRecord):
     """Position and direction of the probe; all zero for a probe on the spindle axis, along Z.
 
     centre_x, centre_y: slide positions at which the beam meets the spindle axis [m]
@@ -28,18 +28,13 @@ class Geometry:
     abbe_arm: from the Z encoder's line to the beam [m], through which a pitch of the slide acts
     """
 
-    centre_x: float = 0.0
-    centre_y: float = 0.0
-    probe_x: float = 0.0
-    probe_z: float = 0.0
-    beam_x: float = 0.0
-    beam_y: float = 0.0
-    abbe_arm: float = 0.0
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            quantity = SLOPE if field.name.startswith("beam") else LENGTH
-            quantity.checked(getattr(self, field.name), ConfigurationError, field.name)
+    centre_x: float = LENGTH.of_field(0.0)
+    centre_y: float = LENGTH.of_field(0.0)
+    probe_x: float = LENGTH.of_field(0.0)
+    probe_z: float = LENGTH.of_field(0.0)
+    beam_x: float = SLOPE.of_field(0.0)
+    beam_y: float = SLOPE.of_field(0.0)
+    abbe_arm: float = LENGTH.of_field(0.0)
 
 
 class WorkpiecePoints(NamedTuple):

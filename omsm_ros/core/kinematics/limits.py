@@ -17,8 +17,7 @@ from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.recursion import through
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError
-from omsm_ros.quantities import Quantity
+from omsm_ros.quantities import CheckedRecord, Quantity
 from omsm_ros.units import MICROMETRE_M, RPM_RAD_S
 
 FASTEST = 100.0
@@ -29,23 +28,12 @@ _PRECISION = 1e-4
 # Least ratio of a value to its limit, because zero has no logarithm.
 _TINY = 1e-12
 
-# Plausible ranges, so that a value in another unit, such as 100 for micrometres, is refused.
-_DECLARED = {
-    "servo_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
-    "probe_range": Quantity("limit", "m", 1e-9, 1.0, "give it in metres"),
-    "spindle_speed_rpm": Quantity("limit", "rpm", 1e-3, 1e6, "give it in turns a minute"),
-    "motion_frequency": Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz"),
-    "z_acceleration": Quantity("limit", "m/s²", 1e-9, 1e5, "give it in m/s²"),
-    "z_jerk": Quantity("limit", "m/s³", 1e-9, 1e9, "give it in m/s³"),
-    "point_spacing": Quantity("limit", "m", 1e-10, 1.0, "give it in metres"),
-    "exposure": Quantity("limit", "s", 1e-9, 10.0, "give it in seconds"),
-    "timing": Quantity("limit", "s", 1e-15, 1.0, "give it in seconds"),
-}
-
 
 @dataclass(frozen=True, kw_only=True)
-class MachineLimits:
+class MachineLimits(CheckedRecord):
     """Limits of machine and probe; None if not declared.
+
+    Ranges are plausible ones: a value in another unit, as 100 for micrometres, is refused.
 
     servo_frequency: natural frequency of the Z servo, taken as critically damped [Hz]; typical
         of a slow tool servo, and that of the paper, are 50 Hz
@@ -55,20 +43,27 @@ class MachineLimits:
     exposure: of one reading [s];  timing: standard uncertainty of a trigger [s]
     """
 
-    servo_frequency: float | None = 50.0
-    probe_range: float | None = 100 * MICROMETRE_M
-    spindle_speed_rpm: float | None = 120.0
-    motion_frequency: float | None = 50.0
-    z_acceleration: float | None = None
-    z_jerk: float | None = None
-    point_spacing: float | None = None
-    exposure: float | None = None
-    timing: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, declared in _DECLARED.items():
-            if (value := getattr(self, name)) is not None:
-                declared.checked(value, ConfigurationError, name)
+    servo_frequency: float | None = Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz").of_field(
+        50.0
+    )
+    probe_range: float | None = Quantity("limit", "m", 1e-9, 1.0, "give it in metres").of_field(
+        100 * MICROMETRE_M
+    )
+    spindle_speed_rpm: float | None = Quantity(
+        "limit", "rpm", 1e-3, 1e6, "give it in turns a minute"
+    ).of_field(120.0)
+    motion_frequency: float | None = Quantity(
+        "limit", "Hz", 1e-3, 1e6, "give it in hertz"
+    ).of_field(50.0)
+    z_acceleration: float | None = Quantity("limit", "m/s²", 1e-9, 1e5, "give it in m/s²").of_field(
+        None
+    )
+    z_jerk: float | None = Quantity("limit", "m/s³", 1e-9, 1e9, "give it in m/s³").of_field(None)
+    point_spacing: float | None = Quantity("limit", "m", 1e-10, 1.0, "give it in metres").of_field(
+        None
+    )
+    exposure: float | None = Quantity("limit", "s", 1e-9, 10.0, "give it in seconds").of_field(None)
+    timing: float | None = Quantity("limit", "s", 1e-15, 1.0, "give it in seconds").of_field(None)
 
 
 @dataclass(frozen=True, slots=True)

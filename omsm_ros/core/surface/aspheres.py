@@ -11,7 +11,7 @@ the shape of freeform optics", Opt. Express 20, 2483 (2012).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -21,7 +21,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import Gradient
 from omsm_ros.core.surface.zernike_terms import jacobi_step
 from omsm_ros.errors import SurfaceError
-from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, Quantity
+from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, CheckedRecord, Quantity
 
 # Most coefficients: twelve even powers are already nearly linearly dependent (condition 3e16).
 MOST_TERMS = 20
@@ -46,7 +46,7 @@ def real_root(argument: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True)
-class Asphere:
+class Asphere(CheckedRecord):
     """A conic with aspheric terms (ISO 10110-12), its vertex at the origin.
 
     ``z = s/R / (1 + √(1 − (1 + k) s/R²)) + Σ even_i s^(i+1) + r Σ odd_i s^i``, ``s = r²``
@@ -55,15 +55,14 @@ class Asphere:
     even_terms: of r², r⁴, r⁶ …;  odd_terms: of r, r³, r⁵ … [m^(1 - power)]
     """
 
-    radius: float | None = None
-    conic_constant: float = 0.0
+    radius: float | None = RADIUS.of_field(None)
+    conic_constant: float = CONIC_CONSTANT.of_field(0.0)
     even_terms: tuple[float, ...] = ()
     odd_terms: tuple[float, ...] = ()
+    error = SurfaceError
 
     def __post_init__(self) -> None:
-        if self.radius is not None:
-            RADIUS.checked(self.radius, SurfaceError)
-        CONIC_CONSTANT.checked(self.conic_constant, SurfaceError)
+        CheckedRecord.__post_init__(self)
         checked_terms(self.even_terms, "even_terms")
         checked_terms(self.odd_terms, "odd_terms")
 
@@ -94,7 +93,7 @@ class Asphere:
 
 
 @dataclass(frozen=True, slots=True)
-class Toroid:
+class Toroid(CheckedRecord):
     """A conic in the plane of y and z, rotated about a line parallel to y above its vertex.
 
     ``z = R_x − √((R_x − g(y))² − x²)``, g the conic of ``radius_y`` and ``conic_constant``
@@ -102,15 +101,10 @@ class Toroid:
     radius_x: from the vertex to the line [m];  radius_y: of the conic [m], None for a cylinder
     """
 
-    radius_x: float
-    radius_y: float | None = None
-    conic_constant: float = 0.0
-
-    def __post_init__(self) -> None:
-        RADIUS.checked(self.radius_x, SurfaceError, "radius_x")
-        if self.radius_y is not None:
-            RADIUS.checked(self.radius_y, SurfaceError, "radius_y")
-        CONIC_CONSTANT.checked(self.conic_constant, SurfaceError)
+    radius_x: float = field(metadata=RADIUS.metadata)
+    radius_y: float | None = RADIUS.of_field(None)
+    conic_constant: float = CONIC_CONSTANT.of_field(0.0)
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN beyond the tube."""
@@ -136,7 +130,7 @@ class Toroid:
 
 
 @dataclass(frozen=True, slots=True)
-class Biconic:
+class Biconic(CheckedRecord):
     """A surface with one conic along x and another along y.
 
     ``z = (C_x x² + C_y y²) / (1 + √(1 − (1 + k_x) C_x² x² − (1 + k_y) C_y² y²))``
@@ -144,17 +138,11 @@ class Biconic:
     radius_x, radius_y: at the vertex [m], None for flat;  conic_x, conic_y: k_x, k_y [1]
     """
 
-    radius_x: float | None = None
-    radius_y: float | None = None
-    conic_x: float = 0.0
-    conic_y: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("radius_x", "radius_y"):
-            if (value := getattr(self, name)) is not None:
-                RADIUS.checked(value, SurfaceError, name)
-        for name in ("conic_x", "conic_y"):
-            CONIC_CONSTANT.checked(getattr(self, name), SurfaceError, name)
+    radius_x: float | None = RADIUS.of_field(None)
+    radius_y: float | None = RADIUS.of_field(None)
+    conic_x: float = CONIC_CONSTANT.of_field(0.0)
+    conic_y: float = CONIC_CONSTANT.of_field(0.0)
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the conics have ended."""

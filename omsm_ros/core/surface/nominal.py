@@ -7,7 +7,7 @@ along the spindle axis, all in metres.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -48,6 +48,7 @@ from omsm_ros.quantities import (
     RADIUS,
     TERM_ORDER,
     TERM_SIZE,
+    CheckedRecord,
 )
 
 # Most Zernike terms, up to order 27; a picture of them takes 2 s and 400 MB.
@@ -55,28 +56,22 @@ MOST_ZERNIKES = 400
 
 
 @dataclass(frozen=True, slots=True)
-class XYTerm:
+class XYTerm(CheckedRecord):
     """``value`` [m] times (x/radius)^``x`` (y/radius)^``y``."""
 
-    x: int
-    y: int
-    value: float
-
-    def __post_init__(self) -> None:
-        TERM_ORDER.checked(self.x, SurfaceError, "power of x")
-        TERM_ORDER.checked(self.y, SurfaceError, "power of y")
-        TERM_SIZE.checked(self.value, SurfaceError, "value")
+    x: int = field(metadata=TERM_ORDER.metadata)
+    y: int = field(metadata=TERM_ORDER.metadata)
+    value: float = field(metadata=TERM_SIZE.metadata)
+    error = SurfaceError
 
 
 @dataclass(frozen=True, slots=True)
-class XYPolynomial:
+class XYPolynomial(CheckedRecord):
     """``z = Σ value (x/radius)^i (y/radius)^j``; ``radius`` [m] makes every value a length."""
 
-    radius: float
+    radius: float = field(metadata=DISC_RADIUS.metadata)
     terms: tuple[XYTerm, ...]
-
-    def __post_init__(self) -> None:
-        DISC_RADIUS.checked(self.radius, SurfaceError, "radius")
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""
@@ -155,7 +150,7 @@ class ZernikeSurface:
 
 
 @dataclass(frozen=True, slots=True)
-class QBfs:
+class QBfs(CheckedRecord):
     """Forbes' mild asphere: a best-fit sphere and a deviation along its normal.
 
     ``z = sphere + u²(1 − u²) Σ a_m Q_m^bfs(u²) / √(1 − r²/R²)``, ``u = r/aperture_radius``
@@ -164,12 +159,14 @@ class QBfs:
     coefficients: a_0, a_1 … [m]
     """
 
-    aperture_radius: float
+    aperture_radius: float = field(metadata=DISC_RADIUS.metadata)
     coefficients: tuple[float, ...]
-    radius: float | None = None
+    radius: float | None = RADIUS.of_field(None)
+    error = SurfaceError
 
     def __post_init__(self) -> None:
-        _check_series(self.aperture_radius, self.radius, self.coefficients)
+        CheckedRecord.__post_init__(self)
+        checked_terms(self.coefficients, "coefficients", TERM_SIZE)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
@@ -185,7 +182,7 @@ class QBfs:
 
 
 @dataclass(frozen=True, slots=True)
-class QCon:
+class QCon(CheckedRecord):
     """Forbes' strong asphere: a conic and a deviation along the axis.
 
     ``z = conic + u⁴ Σ a_m Q_m^con(u²)``, ``u = r/aperture_radius``
@@ -194,14 +191,15 @@ class QCon:
     aperture_radius: where u is one [m];  coefficients: a_0, a_1 … [m]
     """
 
-    aperture_radius: float
+    aperture_radius: float = field(metadata=DISC_RADIUS.metadata)
     coefficients: tuple[float, ...]
-    radius: float | None = None
-    conic_constant: float = 0.0
+    radius: float | None = RADIUS.of_field(None)
+    conic_constant: float = CONIC_CONSTANT.of_field(0.0)
+    error = SurfaceError
 
     def __post_init__(self) -> None:
-        _check_series(self.aperture_radius, self.radius, self.coefficients)
-        CONIC_CONSTANT.checked(self.conic_constant, SurfaceError)
+        CheckedRecord.__post_init__(self)
+        checked_terms(self.coefficients, "coefficients", TERM_SIZE)
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN where the conic has ended."""
@@ -222,15 +220,6 @@ class QCon:
         return Asphere(self.radius, self.conic_constant)
 
 
-def _check_series(
-    aperture_radius: float, radius: float | None, coefficients: tuple[float, ...]
-) -> None:
-    DISC_RADIUS.checked(aperture_radius, SurfaceError, "aperture_radius")
-    if radius is not None:
-        RADIUS.checked(radius, SurfaceError)
-    checked_terms(coefficients, "coefficients", TERM_SIZE)
-
-
 @dataclass(frozen=True, slots=True)
 class QTerm:
     """``value`` [m] of the term of degree ``n`` in u² and angular order ``m``.
@@ -249,7 +238,7 @@ class QTerm:
 
 
 @dataclass(frozen=True, slots=True)
-class QFreeform:
+class QFreeform(CheckedRecord):
     """Forbes' freeform: a sphere and a deviation along its normal (2012, eq. 2.2).
 
     ``z = sphere + δ / √(1 − r²/R²)``, ``u = r/aperture_radius``, ``δ = u²(1 − u²) Σ a_n Q_n^bfs(u²)
@@ -259,14 +248,10 @@ class QFreeform:
     terms: those with m = 0 are those of QBfs; terms of equal n and m add up
     """
 
-    aperture_radius: float
+    aperture_radius: float = field(metadata=DISC_RADIUS.metadata)
     terms: tuple[QTerm, ...]
-    radius: float | None = None
-
-    def __post_init__(self) -> None:
-        DISC_RADIUS.checked(self.aperture_radius, SurfaceError, "aperture_radius")
-        if self.radius is not None:
-            RADIUS.checked(self.radius, SurfaceError)
+    radius: float | None = RADIUS.of_field(None)
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN beyond the sphere's equator."""
@@ -329,13 +314,11 @@ def _angular(
 
 
 @dataclass(frozen=True, slots=True)
-class Flat:
+class Flat(CheckedRecord):
     """A plane at constant ``level`` [m]."""
 
-    level: float = 0.0
-
-    def __post_init__(self) -> None:
-        LENGTH.checked(self.level, SurfaceError, "level")
+    level: float = LENGTH.of_field(0.0)
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""
@@ -348,13 +331,11 @@ class Flat:
 
 
 @dataclass(frozen=True, slots=True)
-class Sphere:
+class Sphere(CheckedRecord):
     """A sphere of ``radius`` [m] touching the plane at the origin; concave if positive."""
 
-    radius: float
-
-    def __post_init__(self) -> None:
-        RADIUS.checked(self.radius, SurfaceError)
+    radius: float = field(metadata=RADIUS.metadata)
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]; NaN from the equator on."""
@@ -366,7 +347,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, slots=True)
-class OffAxisParaboloid:
+class OffAxisParaboloid(CheckedRecord):
     """A section of a paraboloid, with the height along the normal at its centre.
 
     parent_focal_length: f of the parent ``Z = R²/4f`` [m]
@@ -377,12 +358,9 @@ class OffAxisParaboloid:
     ``4 f q w = ((u - m w)/q)² + v²``. The smaller root of this quadratic is the height.
     """
 
-    parent_focal_length: float
-    off_axis_distance: float
-
-    def __post_init__(self) -> None:
-        FOCAL_LENGTH.checked(self.parent_focal_length, SurfaceError, "parent_focal_length")
-        LENGTH.checked(self.off_axis_distance, SurfaceError, "off_axis_distance")
+    parent_focal_length: float = field(metadata=FOCAL_LENGTH.metadata)
+    off_axis_distance: float = field(metadata=LENGTH.metadata)
+    error = SurfaceError
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m]."""

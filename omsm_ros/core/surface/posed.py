@@ -4,7 +4,7 @@ Heights stay along the machine's z. A point q of the machine is ``p = Ráµ€ (q âˆ
 the part; the height over x, y solves ``p_z = h(p_x, p_y)`` by Newton's method.
 """
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import Gradient, gradient_of
 from omsm_ros.errors import SurfaceError
-from omsm_ros.quantities import LENGTH, TURN
+from omsm_ros.quantities import LENGTH, TURN, CheckedRecord
 
 # Iterations of Newton's method, which doubles the digits each time; NaN if it does not converge.
 _MOST_STEPS = 25
@@ -20,24 +20,20 @@ _SETTLED = 4 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pose:
+class Pose(CheckedRecord):
     """Pose of a part relative to the frame of the machine.
 
     x, y, piston: position of its origin along x, y, z [m]
     tip, tilt, clocking: rotation about x, then about y, then about z [rad]
     """
 
-    x: float = 0.0
-    y: float = 0.0
-    piston: float = 0.0
-    tip: float = 0.0
-    tilt: float = 0.0
-    clocking: float = 0.0
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            quantity = LENGTH if each.name in ("x", "y", "piston") else TURN
-            quantity.checked(getattr(self, each.name), SurfaceError, each.name)
+    x: float = LENGTH.of_field(0.0)
+    y: float = LENGTH.of_field(0.0)
+    piston: float = LENGTH.of_field(0.0)
+    tip: float = TURN.of_field(0.0)
+    tilt: float = TURN.of_field(0.0)
+    clocking: float = TURN.of_field(0.0)
+    error = SurfaceError
 
     @property
     def origin(self) -> FloatArray:
