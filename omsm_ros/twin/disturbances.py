@@ -86,7 +86,7 @@ class Vibration:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Disturbances:
+class Disturbances(CheckedNumbers):
     """Disturbances by family; the name of each quantity ends with its unit.
 
     servo_bandwidth_hz: of Z, None for that of the plant
@@ -106,13 +106,7 @@ class Disturbances:
     vibration: tuple[VibrationLine, ...] = ()
     reference: ReferenceSensor | None = None
     accelerometer: AccelerationSensor | None = None
-
-    def __post_init__(self) -> None:
-        width = self.servo_bandwidth_hz
-        if width is not None and not 0 < width < float("inf"):
-            raise ConfigurationError(
-                f"Disturbances: servo_bandwidth_hz is {width!r}, expected None or a positive number"
-            )
+    positive = ("servo_bandwidth_hz",)
 
 
 NOTHING = Disturbances()

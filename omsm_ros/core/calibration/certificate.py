@@ -19,7 +19,7 @@ from omsm_ros.core.calibration.intended_use import IntendedUse
 from omsm_ros.core.calibration.latency import Latency
 from omsm_ros.core.lti.transfer_function import Structure
 from omsm_ros.errors import CalibrationError, OmsmError, text_of
-from omsm_ros.quantities import GAIN_UNCERTAINTY, UNCERTAINTY
+from omsm_ros.quantities import GAIN_UNCERTAINTY, UNCERTAINTY, CheckedRecord
 
 REJECTS, RESERVATION, WARNING, NOTE = "rejects", "reservation", "warning", "note"
 SEVERITIES = (REJECTS, RESERVATION, WARNING, NOTE)
@@ -70,11 +70,6 @@ def of_severity(findings: Iterable[Finding], severity: str) -> tuple[Finding, ..
     return tuple(finding for finding in findings if finding.severity == severity)
 
 
-def _check_uncertainty(value: float | None, name: str) -> None:
-    if value is not None:
-        UNCERTAINTY.checked(value, CalibrationError, name)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Origin:
     """Origin of a calibration: machine, probe, operator, method and time.
@@ -103,7 +98,7 @@ class Origin:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Validity:
+class Validity(CheckedRecord):
     """The band in which the response may be used, with ``valid_up_to`` of the calibration.
 
     from_hz: below it the response is taken as the static gain
@@ -112,14 +107,12 @@ class Validity:
     use: what the verdict was made for
     """
 
-    from_hz: float | None = None
+    from_hz: float | None = UNCERTAINTY.of_field(None)
     excited_up_to_hz: float | None = None
     gain: float | None = None
     phase_rad: float | None = None
     use: IntendedUse | None = None
-
-    def __post_init__(self) -> None:
-        _check_uncertainty(self.from_hz, "valid_from")
+    error = CalibrationError
 
 
 @dataclass(frozen=True)
@@ -132,7 +125,7 @@ class CandidateFit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Residual:
+class Residual(CheckedRecord):
     """Statistics of the residual of the fitted model.
 
     rms_m: of the residual;  noise_m: standard deviation of a reading where the axis rests
@@ -145,7 +138,7 @@ class Residual:
     """
 
     rms_m: float | None = None
-    noise_m: float | None = None
+    noise_m: float | None = UNCERTAINTY.of_field(None)
     chi_square: float | None = None
     edges: int | None = None
     whiteness_p: float | None = None
@@ -155,9 +148,7 @@ class Residual:
     axis_timing_scatter_s: float | None = None
     encoder_noise_m: float | None = None
     samples: Mapping[str, int] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        _check_uncertainty(self.noise_m, "noise_m")
+    error = CalibrationError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,21 +199,18 @@ class GainEstimate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StaticGain:
+class StaticGain(CheckedRecord):
     """How well the static gain is known, and the ratios of travel between plateaus.
 
     polarity: 1 where the distance falls when Z rises, -1 where it rises
     """
 
-    uncertainty: float | None = None
+    uncertainty: float | None = GAIN_UNCERTAINTY.of_field(None)
     polarity: int | None = None
     probe_per_encoder: GainEstimate | None = None
     probe_per_reference: GainEstimate | None = None
     reference_per_encoder: GainEstimate | None = None
-
-    def __post_init__(self) -> None:
-        if self.uncertainty is not None:
-            GAIN_UNCERTAINTY.checked(self.uncertainty, CalibrationError, "static_gain_uncertainty")
+    error = CalibrationError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,19 +228,17 @@ class ModelError:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelErrors:
+class ModelErrors(CheckedRecord):
     """All deviations that were modelled, and what they cost.
 
     motion_error_m: standard uncertainty of a height of a scan from them
     """
 
     modelled: tuple[ModelError, ...] = ()
-    motion_error_m: float | None = None
+    motion_error_m: float | None = UNCERTAINTY.of_field(None)
     backlash_m: float | None = None
     drift_m_s: float | None = None
-
-    def __post_init__(self) -> None:
-        _check_uncertainty(self.motion_error_m, "motion_error_m")
+    error = CalibrationError
 
 
 @dataclass(frozen=True, kw_only=True)

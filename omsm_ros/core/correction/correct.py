@@ -47,12 +47,12 @@ from omsm_ros.core.streams.pairing import Pairing, SampleRun, StreamInput
 from omsm_ros.core.streams.statistics import RunningScatter
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger, TriggerSlipDetector
 from omsm_ros.errors import CalibrationError, ConfigurationError
-from omsm_ros.quantities import GAIN, LAG, WAIT
+from omsm_ros.quantities import GAIN, LAG, WAIT, CheckedRecord
 from omsm_ros.units import NANOSECONDS_PER_S
 
 
 @dataclass(frozen=True, kw_only=True)
-class CorrectionOptions:
+class CorrectionOptions(CheckedRecord):
     """Options of the correction.
 
     polarity: 1 if the distance falls when z rises, -1 for a probe mounted the other way
@@ -71,11 +71,11 @@ class CorrectionOptions:
     """
 
     polarity: int = 1
-    static_gain: float | None = None
+    static_gain: float | None = GAIN.of_field(None)
     accept_other_rate: bool = False
-    max_pending: float = 10.0
+    max_pending: float = WAIT.of_field(10.0)
     sources: ErrorSources | None = None
-    probe_latency: float | None = None
+    probe_latency: float | None = LAG.of_field(None)
     geometry: Geometry = field(default_factory=Geometry)
     systematic: tuple[SystematicSource, ...] = ()
     surface: Surface | None = None
@@ -85,11 +85,7 @@ class CorrectionOptions:
     def __post_init__(self) -> None:
         if self.polarity not in (1, -1):
             raise ConfigurationError("correction.polarity", polarity=self.polarity)
-        if self.static_gain is not None:
-            GAIN.checked(self.static_gain, ConfigurationError, "static_gain")
-        if self.probe_latency is not None:
-            LAG.checked(self.probe_latency, ConfigurationError, "probe_latency")
-        WAIT.checked(self.max_pending, ConfigurationError, "max_pending")
+        CheckedRecord.__post_init__(self)
 
 
 class Corrector:

@@ -35,8 +35,8 @@ import numpy as np
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.stamps import PAUSE_NS, StampHistory, StampLine
 from omsm_ros.core.streams.statistics import median, spread_about_median
-from omsm_ros.errors import ConfigurationError, Notice
-from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE
+from omsm_ros.errors import Notice
+from omsm_ros.quantities import COUNTER_OFFSET, STAMP_TOLERANCE, CheckedRecord
 from omsm_ros.units import NANOSECONDS_PER_S
 
 # Stamps of a driver are within 0.1 ms of the truth after 10 s (devices/clock.py); two drivers.
@@ -70,7 +70,7 @@ _END_OF_LINE = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
-class CommonTrigger:
+class CommonTrigger(CheckedRecord):
     """Statement about the trigger that two devices count.
 
     counter_offset: added to the distance's count, it gives the axes' count [samples]
@@ -79,12 +79,8 @@ class CommonTrigger:
     Raises ConfigurationError for implausible numbers.
     """
 
-    counter_offset: int = 0
-    stamp_tolerance: float = TWO_DRIVERS_S
-
-    def __post_init__(self) -> None:
-        COUNTER_OFFSET.checked(self.counter_offset, ConfigurationError, "counter_offset")
-        STAMP_TOLERANCE.checked(self.stamp_tolerance, ConfigurationError, "stamp_tolerance")
+    counter_offset: int = COUNTER_OFFSET.of_field(0)
+    stamp_tolerance: float = STAMP_TOLERANCE.of_field(TWO_DRIVERS_S)
 
 
 EQUAL_COUNTS = CommonTrigger()
