@@ -199,18 +199,21 @@ class GainEstimate:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StaticGain(CheckedRecord):
+class StaticGain:
     """How well the static gain is known, and the ratios of travel between plateaus.
 
     polarity: 1 where the distance falls when Z rises, -1 where it rises
     """
 
-    uncertainty: float | None = GAIN_UNCERTAINTY.of_field(None)
+    uncertainty: float | None = None
     polarity: int | None = None
     probe_per_encoder: GainEstimate | None = None
     probe_per_reference: GainEstimate | None = None
     reference_per_encoder: GainEstimate | None = None
-    error = CalibrationError
+
+    def __post_init__(self) -> None:
+        if self.uncertainty is not None:
+            GAIN_UNCERTAINTY.checked(self.uncertainty, CalibrationError, "static_gain_uncertainty")
 
 
 @dataclass(frozen=True, kw_only=True)

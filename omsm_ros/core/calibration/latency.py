@@ -5,18 +5,18 @@ the other axes must be delayed too. A step test measures the sum of both and can
 scans of one part at several speeds or in both directions can.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from math import sqrt
 
 from omsm_ros.errors import ConfigurationError, text_of
-from omsm_ros.quantities import LAG, SHARE, TIME_UNCERTAINTY, CheckedRecord, shown
+from omsm_ros.quantities import LAG, SHARE, TIME_UNCERTAINTY, shown
 
 UNRESOLVED, REVERSAL, SPEEDS, DECLARED = "unresolved", "reversal", "several speeds", "declared"
 SOURCES = (UNRESOLVED, REVERSAL, SPEEDS, DECLARED)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Latency(CheckedRecord):
+class Latency:
     """The part of the lag by which X, Y, B and C are delayed.
 
     delay_s: of the probe against the slides;  uncertainty_s: of it, k = 1, None if unknown
@@ -28,15 +28,20 @@ class Latency(CheckedRecord):
     Raises ConfigurationError for values that no probe has.
     """
 
-    delay_s: float = field(metadata=LAG.metadata)
-    uncertainty_s: float | None = TIME_UNCERTAINTY.of_field(None)
-    unshared_s: float = field(metadata=TIME_UNCERTAINTY.metadata)
-    share: float | None = SHARE.of_field(None)
+    delay_s: float
+    uncertainty_s: float | None = None
+    unshared_s: float
+    share: float | None = None
     source: str
     reason: str = ""
 
     def __post_init__(self) -> None:
-        CheckedRecord.__post_init__(self)
+        LAG.checked(self.delay_s, ConfigurationError, "latency")
+        TIME_UNCERTAINTY.checked(self.unshared_s, ConfigurationError, "latency unshared with Z")
+        if self.uncertainty_s is not None:
+            TIME_UNCERTAINTY.checked(self.uncertainty_s, ConfigurationError, "latency")
+        if self.share is not None:
+            SHARE.checked(self.share, ConfigurationError, "share of the latency")
         if self.source not in SOURCES:
             raise ConfigurationError(
                 "calibration.latency_source", source=shown(self.source), known=", ".join(SOURCES)

@@ -272,7 +272,7 @@ def test_an_entry_that_is_no_latency_is_named(entry: object, said: str) -> None:
 
 
 def test_a_latency_that_is_typed_is_the_callers_to_correct() -> None:
-    with pytest.raises(ConfigurationError, match="share is"):
+    with pytest.raises(ConfigurationError, match="share of the latency"):
         Latency(
             delay_s=1e-4, uncertainty_s=None, unshared_s=0.0, share=float("nan"),
             source="declared", reason="typed",

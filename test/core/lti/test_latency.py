@@ -52,8 +52,8 @@ def test_what_is_declared_counts_with_its_uncertainty() -> None:
 @pytest.mark.parametrize(
     ("delay", "uncertainty", "reason", "named"),
     [
-        (-1e-6, 1e-6, "because", "delay_s is -1e-06 s"),
-        (1e-6, -1e-6, "because", "unshared_s is -1e-06 s"),
+        (-1e-6, 1e-6, "because", "latency is -1e-06 s"),
+        (1e-6, -1e-6, "because", "latency unshared with Z is -1e-06 s"),
         (1e-6, 1e-6, "  ", "needs a reason"),
     ],
 )
