@@ -92,14 +92,12 @@ def test_an_accelerometer_is_made_from_its_defaults() -> None:
         ({"device": "ruler"}, "device 'ruler', expected one of"),
         ({"device": "chrocodile", "signals": "83 x"}, "signals '83 x'"),
         ({"device": "chrocodile", "encoders": "XYZ"}, "encoders 'XYZ'"),
-        ({"device": "chrocodile", "trigger": "never"}, "trigger 'never'"),
         ({"port": "tcp://host"}, "tcp://host:port"),
         ({"z.counts_per_unit": 0.0}, "'z.counts_per_unit' is not stated"),
         (
             {"device": "six_channel_text", "b.counts_per_unit": 0.0},
             "'b.counts_per_unit' is not stated",
         ),
-        ({"x.sign": 0}, "sign 0"),
     ],
 )
 def test_senseless_parameters_are_named(wrong: dict[str, Any], named: str) -> None:
