@@ -38,6 +38,7 @@ from omsm_ros.core.form.texture import (
     edge_roll_off,
     power_density,
     profiles,
+    short_waves,
     slopes,
     texture,
 )
@@ -246,7 +247,7 @@ def analyse_form(
         map=map_,
         deviation=_figures(map_, gathered, found, outline, even)
         | optical_terms(map_, zernike)
-        | _textures(map_, cells, bands, found, even),
+        | _textures(map_, cells, bands, found, None if even else outline),
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -285,14 +286,21 @@ def _figures(
 
 
 def _textures(
-    map_: DeviationMap, cells: GridCells, bands: Bands, found: Registration, even: bool
+    map_: DeviationMap,
+    cells: GridCells,
+    bands: Bands,
+    found: Registration,
+    outline: Aperture | None,
 ) -> dict[str, UncertainValue]:
-    formless, rest = (
-        GridCells.of(part, even=even)
-        for part in (without_form(map_, found.disc), without_second_order(map_))
-    )
+    parts = without_form(map_, found.disc), without_second_order(map_)
+    formless, rest = (GridCells.of(part, even=outline is None) for part in parts)
     steep = slopes(rest, bands)["slope_rms"]
-    return texture(cells, formless, bands) | {"slope_rms_without_second_order": steep}
+    points = short_waves(parts[0], formless, bands)
+    made = texture(cells, formless, bands, points) | {"slope_rms_without_second_order": steep}
+    if points is not None:
+        whole, _, beyond = extents_of_parts([points], found.disc, outline, found.spacing)[0]
+        made |= {"Sq": rms_of_part(points, beyond), "Sz": whole}
+    return made
 
 
 class _Gathered:

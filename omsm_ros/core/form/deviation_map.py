@@ -264,6 +264,17 @@ class GridCells:
         made = rows @ (images * self.present) @ columns
         return np.asarray(made / np.maximum(weight, np.finfo(np.float64).tiny) * self.present)
 
+    def smoothed_at(self, x: FloatArray, y: FloatArray, cutoff: float) -> FloatArray:
+        """Return means and effects (1 + e, n) [m] at x, y (n,) [m] after :meth:`smoothed`."""
+        from scipy.ndimage import map_coordinates
+
+        rows, columns = self._weights(cutoff)
+        images = np.concatenate([self.mean[np.newaxis], self.effects]) * self.present
+        weight = np.maximum(rows @ self.present @ columns, np.finfo(np.float64).tiny)
+        made = rows @ images @ columns / weight
+        at = [(y - self.y[0]) / self.steps[1], (x - self.x[0]) / self.steps[0]]
+        return np.array([map_coordinates(m, at, order=1, mode="nearest") for m in made])
+
     def smoothed_square(self, variance: FloatArray, cutoff: float) -> FloatArray:
         """Return the variance (r, c) of independent cells after :meth:`smoothed`."""
         rows, columns = self._weights(cutoff)

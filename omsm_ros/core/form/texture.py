@@ -10,7 +10,7 @@ density is the mean square per radian of half a turn.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -140,13 +140,16 @@ class _FilteredBand:
         return UncertainValue(figure.value, float(whole))
 
 
-def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, UncertainValue]:
+def texture(
+    cells: GridCells, formless: GridCells, bands: Bands, points: DeviationMap | None = None
+) -> dict[str, UncertainValue]:
     """Return Sa, Sq, Sz [m], Ssk, Sku [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation
+    points: the S-L surface, None for that of the cells
     """
     waves = _waves(formless, bands.s_filter)
-    surface = waves.without(bands.l_filter)
+    surface = waves.without(bands.l_filter) if points is None else _of_points(points)
     found = {name: surface.figure(of) for name, of in _SIZES.items()}
     found |= {
         f"S{name}": surface.figure(lambda v, n=order: _moment(v, n), square=False)  # type: ignore[misc]
@@ -156,6 +159,27 @@ def texture(cells: GridCells, formless: GridCells, bands: Bands) -> dict[str, Un
         band = waves if long and not short else _waves(formless if long else cells, short)
         found[f"rms_{name}"] = band.without(long).figure(_rms)
     return found | slopes(cells, bands)
+
+
+def short_waves(map_: DeviationMap, cells: GridCells, bands: Bands) -> DeviationMap | None:
+    """Return the points of a map without form, less what the L-filter passes of its ``cells``.
+
+    None with an S-filter, and if each point has its own cell: the cells then resolve the surface.
+    """
+    if bands.s_filter or cells.width == 0:
+        return None
+    low = cells.smoothed_at(map_.x, map_.y, bands.l_filter)
+    return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
+
+
+def _of_points(map_: DeviationMap) -> _FilteredBand:
+    """Return the points, each as often as its area demands, as a band that no S-filter changed."""
+    ends = np.cumsum(map_.area)
+    even = np.searchsorted(ends, (np.arange(len(map_)) + 0.5) / len(map_) * ends[-1])
+    noise = np.random.default_rng(_NOISE_SEED).normal(0, map_.noise, (_DRAWS, len(map_)))
+    noisy = (map_.deviation + noise)[:, np.newaxis, even]
+    values = map_.deviation[np.newaxis, even]
+    return _FilteredBand(values, noisy, map_.effects[:, even], map_.noise_known)
 
 
 def slopes(cells: GridCells, bands: Bands) -> dict[str, UncertainValue]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, profile_noise, repeated_noise
-from omsm_ros.core.form.texture import bands_of, power_density, texture
+from omsm_ros.core.form.texture import bands_of, power_density, short_waves, texture
 from omsm_ros.errors import DataError
 
 SIDE = 20e-3
@@ -215,3 +215,21 @@ def test_noise_of_a_profile_is_not_its_texture():
     places = np.tile(along, 3), np.zeros(12_000)
     assert repeated_noise(*places, again.ravel()) == pytest.approx(0.1e-9, rel=0.03)
     assert repeated_noise(along, 0 * along, texture_) is None
+
+
+def test_waves_shorter_than_the_cells_count_in_the_texture_of_points():
+    """Rings of 10 nm and half a millimetre under 2 nm of noise, on cells of a third of one."""
+    rng = np.random.default_rng(4)
+    share = np.linspace(1, 0, 20_000)
+    x, y = (8e-3 * share * f(200 * np.pi * share) for f in (np.cos, np.sin))
+    rings = 10e-9 * np.sin(2 * np.pi * np.hypot(x, y) / 0.5e-3)
+    map_ = DeviationMap(x=x, y=y, deviation=rings + rng.normal(0, 2e-9, len(x)), area=share + 1e-9,
+                        effects=np.empty((0, len(x))), noise=2e-9)  # fmt: skip
+    cells = GridCells.of(map_)
+    bands = bands_of(cells)
+    points = short_waves(map_, cells, bands)
+    found = texture(cells, cells, bands, points)
+    assert found["Sq"].value == pytest.approx(10e-9 / np.sqrt(2), rel=0.03)
+    assert found["Sa"].value == pytest.approx(20e-9 / np.pi, rel=0.05)
+    # Each point of an even grid has its own cell, and a filter that is asked for needs cells.
+    assert short_waves(map_, cells, bands_of(cells, 3e-3)) is None
