@@ -25,6 +25,7 @@ from omsm_ros.core.form.part_figures import (
     asymmetric,
     best_fit,
     rms_of_part,
+    short_waves,
     without_form,
     without_power,
     without_second_order,
@@ -38,7 +39,6 @@ from omsm_ros.core.form.texture import (
     edge_roll_off,
     power_density,
     profiles,
-    short_waves,
     slopes,
     texture,
 )
@@ -295,7 +295,10 @@ def _textures(
     parts = without_form(map_, found.disc), without_second_order(map_)
     formless, rest = (GridCells.of(part, even=outline is None) for part in parts)
     steep = slopes(rest, bands)["slope_rms"]
-    points = short_waves(parts[0], formless, bands)
+    points = None
+    # Without an S-filter the surface has waves that the cells do not resolve.
+    if cells.width > 0 and bands.s_filter is None:
+        points = short_waves(parts[0], formless, bands.l_filter)
     made = texture(cells, formless, bands, points) | {"slope_rms_without_second_order": steep}
     if points is not None:
         whole, _, beyond = extents_of_parts([points], found.disc, outline, found.spacing)[0]

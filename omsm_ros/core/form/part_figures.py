@@ -11,7 +11,7 @@ from math import comb
 
 import numpy as np
 
-from omsm_ros.core.form.deviation_map import DeviationMap, UncertainValue
+from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
 from omsm_ros.core.form.zernike_fit import passes
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
@@ -175,6 +175,12 @@ def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     A Gaussian filter would leave form at the rim, where its window is cut off.
     """
     return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), _FORM))
+
+
+def short_waves(map_: DeviationMap, cells: GridCells, longest: float) -> DeviationMap:
+    """Return the points less the waves of their ``cells`` longer than ``longest`` [m]."""
+    low = cells.smoothed_at(map_.x, map_.y, longest)
+    return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
 
 
 def asymmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:

@@ -10,7 +10,7 @@ density is the mean square per radian of half a turn.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -159,17 +159,6 @@ def texture(
         band = waves if long and not short else _waves(formless if long else cells, short)
         found[f"rms_{name}"] = band.without(long).figure(_rms)
     return found | slopes(cells, bands)
-
-
-def short_waves(map_: DeviationMap, cells: GridCells, bands: Bands) -> DeviationMap | None:
-    """Return the points of a map without form, less what the L-filter passes of its ``cells``.
-
-    None with an S-filter, and if each point has its own cell: the cells then resolve the surface.
-    """
-    if bands.s_filter or cells.width == 0:
-        return None
-    low = cells.smoothed_at(map_.x, map_.y, bands.l_filter)
-    return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
 
 
 def _of_points(map_: DeviationMap) -> _FilteredBand:

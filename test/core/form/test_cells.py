@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, profile_noise, repeated_noise
-from omsm_ros.core.form.texture import bands_of, power_density, short_waves, texture
+from omsm_ros.core.form.part_figures import short_waves
+from omsm_ros.core.form.texture import bands_of, power_density, texture
 from omsm_ros.errors import DataError
 
 SIDE = 20e-3
@@ -227,9 +228,6 @@ def test_waves_shorter_than_the_cells_count_in_the_texture_of_points():
                         effects=np.empty((0, len(x))), noise=2e-9)  # fmt: skip
     cells = GridCells.of(map_)
     bands = bands_of(cells)
-    points = short_waves(map_, cells, bands)
-    found = texture(cells, cells, bands, points)
+    found = texture(cells, cells, bands, short_waves(map_, cells, bands.l_filter))
     assert found["Sq"].value == pytest.approx(10e-9 / np.sqrt(2), rel=0.03)
     assert found["Sa"].value == pytest.approx(20e-9 / np.pi, rel=0.05)
-    # Each point of an even grid has its own cell, and a filter that is asked for needs cells.
-    assert short_waves(map_, cells, bands_of(cells, 3e-3)) is None
