@@ -61,7 +61,7 @@ def step_test(
     )
 
 
-@pytest.mark.parametrize(("rounded", "late"), [(False, 0.0), (True, 0.23e-3)])
+@pytest.mark.parametrize(("rounded", "late"), [(False, 0.23e-3), (True, 0.0)])
 def test_sharp_edges_show_the_mode_at_804_hz_also_of_a_late_probe(rounded, late):
     found = fast_mode(step_test(rounded=rounded, response=lambda t: mode_step(t - late)))
     assert found.finding.code == "estimation.fast_mode"
