@@ -433,21 +433,28 @@ class RandomWalk:
     def variance_if_shown(self, residual: FloatArray) -> float:
         """Return the variance per sample of the walk's increments, 0 where none shows."""
         none = np.empty((0, len(residual)))
-        return self.variance(residual, none, replaces=False) if self.shows(residual) else 0.0
+        return self.variance(residual, none)[0] if self.shows(residual) else 0.0
 
-    def variance(self, residual: FloatArray, rows: FloatArray, *, replaces: bool) -> float:
-        """Return the variance per sample of the walk's increments.
+    def variance(self, residual: FloatArray, rows: FloatArray) -> tuple[float, float]:
+        """Return the variance per sample of the walk's increments, and χ² of ``rows`` (c, n).
 
-        residual: (n,), 0 where not compared;  rows: (c, n), fitted together with the walk
-        replaces: return zero if ``rows`` explain the residual so well that no walk is left
+        residual: (n,), 0 where not compared
+
+        The walk is estimated together with ``rows`` only where they describe clearly more than a
+        walk alone, because they were chosen for what they take of it. The variance is zero if no
+        walk is left then. χ² is the likelihood ratio of a walk with ``rows`` to one without.
         """
-        likelihood, white, explained = self._likelihood(residual, rows)
-        best, price = int(np.argmax(likelihood)), float(np.log(len(self.ratios)))
-        left = 2 * (likelihood[best] - likelihood[0])
-        odds = 0.5 * (explained[best] - left - (len(rows) - 1) * price)
-        if replaces and odds > _VERY_STRONG and left < price:
-            return 0.0
-        return float(self._tried[best] * white[best])
+        restricted, white, alone = self._likelihood(residual, rows[:0])
+        explained = 0.0
+        if len(rows):
+            with_rows, white_then, together = self._likelihood(residual, rows)
+            explained, price = 2 * float(np.max(together) - np.max(alone)), np.log(len(self.ratios))
+            if 0.5 * (explained - len(rows) * price) > _VERY_STRONG:
+                restricted, white = with_rows, white_then
+                if 2 * np.max(with_rows - with_rows[0]) < price:
+                    return 0.0, explained
+        best = int(np.argmax(restricted))
+        return float(self._tried[best] * white[best]), explained
 
     @cached_property
     def _tried(self) -> FloatArray:
@@ -457,7 +464,7 @@ class RandomWalk:
     def _likelihood(
         self, residual: FloatArray, rows: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return, by ratio: log restricted likelihood, white variance, χ² explained by ``rows``."""
+        """Return, by ratio: log restricted likelihood, white variance, log likelihood."""
         sums = np.add.reduceat(np.vstack([rows, residual]), self.starts, axis=1)
         shares = (sums / np.sqrt(self.counts)) @ self.contrasts
         variances = 1 + np.outer(self._tried, self.ratios)
@@ -467,10 +474,10 @@ class RandomWalk:
         # The last diagonal element of the factor is the part that the rows do not explain.
         factor = np.linalg.cholesky(unit + _FOLLOWED**2 * np.eye(len(shares)))
         diagonal = np.log(scale * np.diagonal(factor, axis1=1, axis2=2))
-        degrees = len(self.ratios) - len(rows)
-        spread = 0.5 * np.sum(np.log(variances), axis=1) + np.sum(diagonal[:, :-1], axis=1)
-        white = np.exp(2 * diagonal[:, -1]) / degrees
-        return -degrees * diagonal[:, -1] - spread, white, scale[:, -1] ** 2 / white - degrees
+        spread = 0.5 * np.sum(np.log(variances), axis=1)
+        degrees, rest = len(self.ratios) - len(rows), diagonal[:, -1]
+        restricted = -degrees * rest - spread - np.sum(diagonal[:, :-1], axis=1)
+        return restricted, np.exp(2 * rest) / degrees, -len(self.ratios) * rest - spread
 
 
 def with_walk(noise: FloatArray, walk: float, length: int) -> FloatArray:

@@ -54,21 +54,21 @@ def close_period(motion: FloatArray, period: float) -> FloatArray:
 
 
 def denoised(spectrum: ComplexArray, noise_power: float) -> ComplexArray:
-    """Return ``spectrum`` (k,) after a Wiener filter, up to its last frequency above the noise.
+    """Return ``spectrum`` (k,) without lines of noise, up to its last frequency above the noise.
 
     Where the encoder reads only its own noise, a fit that took it for motion would be biased
-    towards a response that vanishes there.
+    towards a response that vanishes there. A Wiener filter would also shrink the motion near that
+    frequency, and the residual would follow what it took.
     """
     if noise_power <= 0:
         return spectrum
     width = min(_SMOOTHING_BINS, len(spectrum))
     power = np.abs(spectrum) ** 2
     smooth = ndimage.uniform_filter1d(power, width, mode="nearest")
-    weight = np.clip(1 - noise_power / np.maximum(smooth, np.finfo(np.float64).tiny), 0.0, 1.0)
-    # The mean of m exponential variables has the relative deviation 1/√m; 3 of them are noise.
-    weight[weight < 3 / np.sqrt(width)] = 0.0
-    last = int(np.flatnonzero(weight)[-1]) if np.any(weight) else 0
-    return np.asarray((weight * spectrum)[: last + 1], np.complex128)
+    # The mean of m exponential variables has the relative deviation 1/√m; none exceeds 5 of them.
+    moved = smooth > (1 + 5 / np.sqrt(width)) * noise_power
+    last = int(np.flatnonzero(moved)[-1]) if np.any(moved) else 0
+    return np.asarray(np.where(moved, spectrum, 0.0)[: last + 1], np.complex128)
 
 
 # Linear columns weaker than this part of the strongest are rounding.

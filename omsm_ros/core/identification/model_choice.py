@@ -24,7 +24,8 @@ from omsm_ros.core.estimation.optimisation import EvaluationBudget
 from omsm_ros.core.estimation.output_error import Fit, Problem, evaluated, fit
 from omsm_ros.core.estimation.preparation import Prepared
 from omsm_ros.core.identification.residual_tests import follows_beyond, noise_colour
-from omsm_ros.core.lti.transfer_function import Structure
+from omsm_ros.core.lti.transfer_function import Structure, TransferFunction
+from omsm_ros.core.model_errors.families import FASTEST_CREEP_S
 from omsm_ros.linear_algebra import triangle
 
 # χ² that each column must explain to be significant: four sigma.
@@ -220,7 +221,22 @@ def _chosen_on_subset(
 
 def _identifiable(problem: Problem, candidates: Sequence[Candidate]) -> Sequence[Candidate]:
     duration = len(problem.input) * problem.period
-    return [c for c in candidates if identifiable(c.fit.dynamics, problem.period, duration)]
+    return [
+        c
+        for c in candidates
+        if identifiable(c.fit.dynamics, problem.period, duration) and not _relaxes(c.fit.dynamics)
+    ]
+
+
+def _relaxes(dynamics: TransferFunction) -> bool:
+    """Return True if a zero nearly cancels a slow pole that does not ring.
+
+    It describes creep or a drift of the machine: the search for model errors tells them apart.
+    """
+    poles = dynamics.poles()
+    slow = poles[(-poles.real * FASTEST_CREEP_S < 1) & (np.abs(poles.imag) < -poles.real)]
+    apart = np.abs(slow[:, np.newaxis] - dynamics.zeros())
+    return bool(np.any(apart < 0.5 * np.abs(slow[:, np.newaxis])))
 
 
 def model_from_start(

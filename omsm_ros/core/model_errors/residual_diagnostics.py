@@ -155,15 +155,15 @@ class ResidualSpace:
         rows /= unit[:, np.newaxis]
         inverse, degrees = _pseudo_inverse(rows @ rows.T, _COLLINEAR_SHARE**2)
         found = inverse @ (rows @ self._residual)
-        walk = 0.0
+        walk = explained = 0.0
         # Drift is what walks.
         if self._walk is not None and family != DRIFT:
-            walk = self._walk.variance(self._residual, rows, replaces=family == CREEP)
+            walk, explained = self._walk.variance(self._residual, rows)
         spread = inverse @ self._noise_of(rows, found, walk) @ inverse.T
         chi_square = float(found @ np.linalg.pinv(spread, rcond=1e-9, hermitian=True) @ found)
         size[free] = found / unit
         covariance[np.ix_(free, free)] = spread / np.outer(unit, unit)
-        return Score(size, covariance, chi_square, degrees)
+        return Score(size, covariance, max(chi_square, explained), degrees)
 
     @cached_property
     def _residual(self) -> FloatArray:

@@ -110,10 +110,14 @@ def test_the_share_of_slow_poles_is_their_partial_fraction(share):
 
 
 def test_next_to_a_relaxation_lag_and_roll_off_stay_independent():
-    """With a lag alone beside it the band would close at the upper end, where nothing is known."""
-    crept = 1e-3 * (low_pass_response(LATE, PERIOD / 1.0) - LATE)
+    """With a lag alone beside it the band would close at the upper end, where nothing is known.
+
+    The relaxation is weighed against drift: the choice of the order does not make a pole of it.
+    """
+    crept = 1e-2 * (low_pass_response(LATE, PERIOD / 0.3) - LATE)
     searched = search_model_errors(prepare(late_record(-crept), "encoder"), model_from_start)
     assert [term.family for term in searched.added_poles] == [CREEP]
+    assert fitted_relaxation(searched.model.chosen.fit.dynamics) == pytest.approx(1e-2, rel=0.02)
     pole_and_zero, lag_and_roll_off = 2, 3
     structure = searched.model.chosen.fit.structure
     assert structure.size >= pole_and_zero + lag_and_roll_off
@@ -129,16 +133,27 @@ def test_a_random_walk_is_no_relaxation_and_no_soft_mode(seed):
     assert {modelled.term.family for modelled in searched.nuisance_terms} <= {DRIFT}
 
 
+def strongest_line(residual):
+    """Return sine and cosine (2, n) at the strongest line with two periods or more in a record."""
+    power = np.abs(np.fft.rfft(residual, 4 * len(residual))) ** 2
+    angle = 2 * np.pi * (8 + np.argmax(power[8:])) / (4 * len(residual)) * np.arange(len(residual))
+    return np.array([np.sin(angle), np.cos(angle)])
+
+
 def test_the_rate_of_a_random_walk_is_estimated_beside_what_the_fit_follows():
     """Mean of 20 walks, against the rate with which they were drawn."""
     model = search_model_errors(prepare(late_record(0.0), "encoder"), model_from_start)
     space = model.diagnostics.space
     walks = RandomWalk.of(space.problem, np.linalg.qr(space.problem.sensitivity(space.fitted))[0])
-    rows = np.empty((0, len(TIME)))
+    rows, used = np.empty((0, len(TIME))), space.problem.used
     found = []
     for seed in range(20):
         noise = np.random.default_rng(seed).normal(0, NOISE, len(TIME))
-        residual = np.where(space.problem.used, walk(6e-9, seed) + noise, 0.0)
-        found.append(walks.variance(residual, rows, replaces=False))
+        residual = np.where(used, walk(6e-9, seed) + noise, 0.0)
+        found.append(walks.variance(residual, rows)[0])
+        # The strongest line takes much of a walk; only one that is no part of it leaves less.
+        line = strongest_line(residual) * used
+        assert walks.variance(residual, line)[0] == found[-1]
+        assert walks.variance(residual + 100e-9 * line[0], line)[0] < 1.5 * found[-1]
     assert np.mean(found) / (6e-9**2 * PERIOD) == pytest.approx(1, abs=0.2)
     assert not walks.shows(np.where(space.problem.used, noise, 0.0))
