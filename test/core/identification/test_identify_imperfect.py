@@ -147,7 +147,7 @@ class TestRefusals:
     def test_micrometres_for_metres(self):
         z, distance = self.arrays()
         self.refuse(StepTestError, "metres", z * 1e6, distance * 1e6)
-        self.refuse(IdentificationError, "metres", z, distance * 1e6)
+        self.refuse(IdentificationError, "the units of both", z, distance * 1e6)
         self.refuse(StepTestError, "metres", z * 1e6, distance)
 
     def test_a_probe_that_does_not_follow(self):

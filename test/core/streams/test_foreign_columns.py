@@ -125,7 +125,7 @@ class TestPeriods:
             (
                 [0.0, 1.0, 1.0],
                 None,
-                "time does not rise from 1 s to 1 s at row 2; import the parts",
+                "time does not rise from 1 s to 1 s at row 2; sort the rows by time",
             ),
             ([0.0, 2.0, 1.0], None, "time does not rise from 2 s to 1 s at row 2"),
             ([0.0, np.nan, 1.0], None, r"time\[1\] is nan"),
@@ -180,7 +180,7 @@ class TestCounting:
         ("times", "said"),
         [
             ([0.0, 1e-3, 2.5e-3], r"time 0\.0025 s comes 1\.5 periods of 0\.001 s after the row"),
-            ([0.0, 1e-3, 1e-3], r"time 0\.001 s does not rise; import the parts"),
+            ([0.0, 1e-3, 1e-3], r"time 0\.001 s does not rise; sort the rows by time"),
             ([0.0, 2e-3, 1e-3], "does not rise"),
             ([0.0, 1e11], r"time\[1\] is 100000000000"),
         ],
