@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.streams.blocks import Status
-from omsm_ros.errors import ConfigurationError, DeviceError
+from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.scaling import AxisScaling
 from omsm_ros.instruments.six_channel.device import GenericStreamDevice, StreamSettings
 from omsm_ros.instruments.six_channel.protocol import StreamScaling, encode_frames
@@ -107,17 +107,3 @@ def test_a_lost_connection_costs_nothing_that_had_arrived() -> None:
     assert_consistent(blocks, device)
     found = device.statistics
     assert (found.lost, found.gaps, device._decoder.statistics.bad_length) == (2, 1, 1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "named"),
-    [
-        ({"sample_period": 0.0}, r"sample_period 0\.0"),
-        ({"pause": -1.0}, r"pause -1\.0"),
-        ({"block_size": 0}, "block_size 0"),
-        ({"block_size": 10**7}, "block_size 10000000"),
-    ],
-)
-def test_senseless_settings_are_refused(arguments: dict[str, float], named: str) -> None:
-    with pytest.raises(ConfigurationError, match=named):
-        StreamSettings(**arguments)

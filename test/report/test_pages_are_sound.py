@@ -55,7 +55,8 @@ def report(text, calibration):
         "bag": text, "calibration": text, "files": {text: text}, "warnings": [text],
         "settings": {text: text, "list": [text, {text: 1.5}]}, "versions": {text: text},
         "samples": {text: {"received": 7, "corrected": 4, "counted": {text: 3}}},
-        "verdict": {"code": "contradicted", "text": text, "reasons": [{"text": text}],
+        "verdict": {"code": "contradicted", "text": text,
+                    "reasons": [{"code": "recording", "text": text}],
                     "add": {"text": text, "reached": 1e-9}},
         "admission": {"overridden": True},
         "budget": {"sources": [{
