@@ -1,4 +1,4 @@
-"""Make the pictures of the manual anew: ``python docs/pictures.py``, five minutes, needs chromium.
+"""Make the pictures of the manual anew: ``python docs/pictures.py``, two minutes, needs chromium.
 
 overview.png is drawn; the others are screenshots of pages that the commands of the tutorial and
 ``omsm demo --view`` make.
@@ -111,6 +111,7 @@ def _answers(page: str) -> bool:
 
 
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as place:
+    # The browser may still write into its profile when it has been told to end.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as place:
         for make in (overview, pages, live):
             make(Path(place))
