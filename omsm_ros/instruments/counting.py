@@ -134,7 +134,7 @@ class PacketFinder:
         """Return whether the next packet begins inside the one up to ``end``: its end is missing.
 
         Bytes that have not arrived must not change the answer, so only those before ``end`` are
-        used. Of a packet that does not wait the magic of the next one alone counts at its end.
+        used. At the end of a packet that does not wait, the next one shows by its magic alone.
         """
         inside = self._find(place + 1, end)
         while 0 <= inside <= min(end, len(self._buffer)) - self.head.size:

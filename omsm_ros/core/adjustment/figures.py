@@ -432,7 +432,7 @@ def _resembled(
     """Return families that the scans leave open and that the form speaks for, likeliest first.
 
     Each has its name, twice the logarithm of its odds, and its change of the map as one standard
-    uncertainty (n,) [m]. Of ten declarations that no scan shows, one is taken to be wrong.
+    uncertainty (n,) [m]. One of ten declarations that no scan shows is taken to be wrong.
     """
     if not np.any(made.height):
         return []

@@ -97,7 +97,7 @@ def reasons_of(
             code = REFUTED if base_name(cause.name) in declared else UNDECLARED_EFFECT
             found.append(Reason(code, (cause.name, *cause.alike), cause.evidence.deviate, 3.0))
     else:
-        # What is found with a cause that no family explains may be a part of it.
+        # A cause that no family explains may stand behind all others that were found.
         largest = max(r.evidence.deviate for r in causes)
         found.append(Reason(UNIDENTIFIED, (), largest, 3.0))
     for one in agreement:

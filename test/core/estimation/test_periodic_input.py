@@ -39,7 +39,7 @@ def test_noise_is_taken_out_of_the_motion_and_motion_is_not():
     noisy = np.fft.rfft(motion + rng.normal(0, noise, len(motion)))
     kept = denoised(noisy, len(motion) * noise**2)
     assert len(kept) < 0.6 * len(noisy)
-    # What is kept is not shrunk: the residual of a fit would follow what is missing.
+    # Lines are kept whole: the residual of a fit would follow a missing share.
     strong = np.abs(clean[: len(kept)]) > 20 * noise * np.sqrt(len(motion))
     np.testing.assert_array_equal(kept[strong], noisy[: len(kept)][strong])
     error = np.sum(np.abs(kept - clean[: len(kept)]) ** 2)
