@@ -229,6 +229,8 @@ class Points(Result):
             left = [f"{count} {why}" for why, count in account["counted"].items() if count]
             lost = f", without {', '.join(left)}" if left else ""
             yield f"samples of {stream}", f"{account['received']} received{lost}"
+        across = (f"{1e3 * np.ptp(along):.4g} mm" for along in (self.x, self.y))
+        yield "extent", " × ".join(across)
         error = self.dynamic_error - self.dynamic_error.mean()
         yield "removed error", f"{quantity(float(np.ptp(error)), 'm')} PV"
         if np.any(np.isfinite(self.uncertainty)):

@@ -124,11 +124,11 @@ def measured(value: object, uncertainty: object, unit: str = "", digits: int = 4
     if unit in _WITH_POWER and largest < _LEAST_PLAIN:
         exponent = math.floor(math.log10(_rounded(largest, 2)))
         power = f" · 10{superscript(exponent)}"
-    decimals = min(max(1 - math.floor(math.log10(spread)) + exponent, 0), _MOST_DECIMALS)
+    decimals = min(1 - math.floor(math.log10(spread)) + exponent, _MOST_DECIMALS)
     tail = power + (f" {'' if power else _PREFIXES[exponent]}{unit}" if unit else "")
     # Adding 0 removes the sign of -0.
     shown = (round(part / 10.0**exponent, decimals) + 0.0 for part in (known, spread))
-    return " ± ".join(f"{part:.{decimals}f}{tail}" for part in shown)
+    return " ± ".join(f"{part:.{max(decimals, 0)}f}{tail}" for part in shown)
 
 
 def expanded(value: object, uncertainty: object, unit: str = "", signed: bool = False) -> str:

@@ -41,7 +41,7 @@ from omsm_ros.pipelines.history import record_in_catalogue
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import BUDGET, EXPOSURE, LAG, RADIUS, STAMP_DELAY, UNCERTAINTY
-from omsm_ros.readable import measured, percent, plain, quantity, rounded_down
+from omsm_ros.readable import measured, plain, quantity, rounded_down
 from omsm_ros.report.verdict import headline, next_steps
 
 
@@ -229,7 +229,8 @@ def _show_predict(facts: Facts) -> None:
             ("dynamic error", f"{quantity(facts['peak_to_valley'], 'm', 4)} PV, "
                               f"{quantity(facts['rms'], 'm', 4)} rms"),
             ("after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
-            ("motion outside the band", percent(facts["outside_band_fraction"])),
+            ("Z above the valid band", f"{quantity(facts['outside_band_rms'], 'm', 2)} rms, noise "
+                                       "of the encoder included"),
             ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
                               f"{facts['binding']}"),
             *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),

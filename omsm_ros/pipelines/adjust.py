@@ -137,6 +137,8 @@ def priors_of(stated: MachineSources, abbe_arm: float = 0.0) -> tuple[Source, ..
     """Return the declared sources as priors of the adjustment, but zeros and ``NOT_ADJUSTED``.
 
     abbe_arm: over which pitch acts, unless it is stated with its own [m]
+
+    Raises ConfigurationError for pitch without an arm, which would count as evaluated.
     """
     found: dict[str, Source] = {}
     for source in stated.stated:
@@ -155,7 +157,13 @@ def _prior(source: StatedSource, abbe_arm: float) -> Source:
     if "per_turn" in source.parameters:
         name = f"{name}/{source.parameters['per_turn']:.3g}"
     if name == "pitch":
-        size *= source.parameters.get("arm", abbe_arm)
+        arm = source.parameters.get("arm", abbe_arm)
+        if not arm:
+            raise ConfigurationError(
+                "source 'pitch' has no arm, over which it acts; state arm, the distance of the beam "
+                "from the line of the Z encoder [m], or abbe_arm in --geometry"
+            )
+        size *= arm
     parameters = source.parameters
     return Source(name, size, parameters.get("correlation_length"), source.how == EVALUATED,
                   parameters.get("period"))  # fmt: skip

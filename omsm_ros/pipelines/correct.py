@@ -43,6 +43,7 @@ from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording, scan_data
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import quantity
+from omsm_ros.units import MICROMETRE_M
 
 # Samples by which one stream may be recorded ahead of the other: a quarter of a gigabyte.
 MAX_PENDING_SAMPLES = 4_000_000
@@ -216,6 +217,8 @@ LATERAL_SOURCES = (
 )
 
 
+# Extent of points that are no scan: the spot of a probe, and the jitter of axes that do not move.
+_SPOT_M = 10 * MICROMETRE_M
 # A quarter of an hour at 1 kHz, whose adjustment needs 1 GB; longer scans are not adjusted.
 _MOST_ADJUSTED = 1_000_000
 # More than the pixels of a figure; the numbers of a summary come from all points.
@@ -378,7 +381,17 @@ class _RunningResults:
                 found.append(f"{samples} samples were not corrected: {scan.slip}")
             else:
                 found += skew_fault(skew, scan.sample_period, scan.options.trigger)
-        return (*map(str, found), *self._beyond(scan.options.pitch))
+        return (*self._on_one_spot(), *map(str, found), *self._beyond(scan.options.pitch))
+
+    def _on_one_spot(self) -> Iterator[str]:
+        """Yield a fault if all points lie on one spot, as those of a step test."""
+        rows = self.drawn.rows()
+        if len(rows) and max(np.ptp(rows["x"]), np.ptp(rows["y"])) < _SPOT_M:
+            yield (
+                f"all points lie within {quantity(_SPOT_M, 'm')}: X and C did not scan a surface; "
+                "evaluate a step test with 'omsm identify', and test a calibration on one with "
+                "'omsm verify'"
+            )
 
     def _beyond(self, pitch: PitchCurve | None) -> Iterator[str]:
         """Yield a fault if Z left the range in which its pitch was measured."""

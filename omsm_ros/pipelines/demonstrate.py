@@ -76,6 +76,7 @@ _EVALUATED = {
     "drift_walk": 0.2e-9,
 }
 _LENGTHS = {
+    "pitch": {"arm": 1e-3},
     "straightness_x": {"correlation_length": 0.01},
     "straightness_z": {"correlation_length": 1e-3},
 }

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from omsm_ros.core.adjustment import Adjustment
+from omsm_ros.core.adjustment.sources import WITH_CALIBRATION
 from omsm_ros.messages import sentence
 from omsm_ros.readable import column, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
@@ -121,7 +122,8 @@ def declared_text(source: Mapping[str, Any]) -> str:
     declared = source["declared"]
     if declared is None:
         return "not declared"
-    return sized(declared, source["unit"], 2) if declared else "no effect"
+    added = " with that of the calibration" if source["name"] in WITH_CALIBRATION else ""
+    return f"{sized(declared, source['unit'], 2)}{added}"
 
 
 def _status(source: Mapping[str, Any]) -> str:

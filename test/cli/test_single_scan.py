@@ -118,6 +118,24 @@ def test_a_part_in_any_pose_has_the_figure_of_the_part(capsys, shop):
     assert other["standard_uncertainty"] < 0.5 * other["value"]
 
 
+def test_a_step_test_is_no_scan(capsys, shop):
+    words = ["correct", "steps.mcap", "--calibration", "cal.json", "--out", "spot", "--json"]
+    cli.main([str(shop / w) if "." in w or w == "spot" else w for w in words])
+    first, *_ = json.loads(capsys.readouterr().out)["verdict"]["reasons"]
+    assert "'omsm identify'" in first["text"]
+
+
+def test_pitch_without_an_arm_evaluates_nothing(capsys, shop):
+    pitch = (
+        "  - {source: pitch, value: 1.0e-6, unit: rad, how: evaluated, reason: autocollimator}\n"
+    )
+    (shop / "pitch.yaml").write_text(STATED + pitch, encoding="utf-8")
+    words = ["correct", "scan.mcap", "--calibration", "cal.json", "--sources", "pitch.yaml",
+             "--out", "pitched"]  # fmt: skip
+    assert cli.main([str(shop / w) if "." in w or w == "pitched" else w for w in words]) == 2
+    assert "has no arm" in capsys.readouterr().err
+
+
 def test_a_wrong_sign_from_tables_is_contradicted(capsys, shop):
     """The step test imported with the sign -1, the scan without, of logs that agree."""
     for name, sign in (("steps", -1), ("scan", -1), ("scan_wrong", 1)):

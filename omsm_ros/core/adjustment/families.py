@@ -274,7 +274,8 @@ def _of_the_probe(r: Ranges) -> list[Family]:
         _one("probe_square", "m", lambda v: (v.distance / r.distance) ** 2, 1e-7, OTHER_STAND_OFF),
         _one("probe_linearity", "m", lambda v: (v.distance / r.distance) ** 3, 1e-7,
              OTHER_STAND_OFF),
-        _one("probe_slope_square", "m", lambda v: v.slope_x**2 + v.slope_y**2, 1e-5, REFERENCE),
+        _one("probe_slope_square", "m/rad", lambda v: v.slope_x**2 + v.slope_y**2, 1e-5,
+             REFERENCE),
         Family("beam", "1", 2, lambda v: np.stack(
             [v.across(v.distance, 0.0), v.across(0.0, v.distance)]), 1e-2, OTHER_STAND_OFF),
     ]  # fmt: skip

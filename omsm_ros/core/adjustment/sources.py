@@ -91,6 +91,9 @@ def prior_sizes(families: Sequence[Family], priors: Sequence[Source]) -> dict[st
     return sizes
 
 
+# Sources whose uncertainty contains that of the calibration.
+LAG_CHANGE, LAG_CURVATURE = "lag_change", "lag_curvature"
+WITH_CALIBRATION = (LAG_CHANGE, LAG_CURVATURE)
 # Where the gain's growth with the square of the frequency is read from its covariance [Hz].
 _CURVATURE_HZ = 10.0
 
@@ -103,7 +106,7 @@ def with_dynamics(priors: Sequence[Source], calibration: Calibration) -> tuple[S
     curvature = spread / (2 * np.pi * _CURVATURE_HZ) ** 2
     changed = (
         replace(p, uncertainty=float(np.hypot(p.uncertainty, lag)))
-        if p.name == "lag_change" else p
+        if p.name == LAG_CHANGE else p
         for p in priors
     )  # fmt: skip
-    return *changed, Source("lag_curvature", curvature, evaluated=True)
+    return *changed, Source(LAG_CURVATURE, curvature, evaluated=True)

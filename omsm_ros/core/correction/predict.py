@@ -163,6 +163,7 @@ class Prediction:
     residual: largest standard uncertainty after the correction [m], k = 1
     residual_undetected: its part from undetected model error [m], k = 1; a key of summary.json
     outside_band_fraction: share of the mean square velocity above the valid band [1]
+    outside_band_rms: of Z above the valid band [m], noise of the encoder included
     speed_factor: of the path within all limits, at most 100; 0 if it may not be run at any speed
     safe: True if no limit is exceeded;  binding: name of the limit that is reached first
     limits: evaluated ones, that of the dynamics first;  not_evaluated: names of the others
@@ -174,6 +175,7 @@ class Prediction:
     residual: float
     residual_undetected: float
     outside_band_fraction: float
+    outside_band_rms: float
     speed_factor: float
     safe: bool
     binding: str
@@ -207,12 +209,14 @@ def predict_error(
     binding = min(every, key=lambda limit: limit.speed_factor)
     message = _message(calibration, spread, (dynamics.value, undetected), budget, binding)
     left_out = path.left_out
+    outside, outside_rms = _outside_band(calibration, path)
     return Prediction(
         peak_to_valley=spread,
         rms=float(np.std(error)),
         residual=dynamics.value,
         residual_undetected=undetected,
-        outside_band_fraction=_outside_fraction(calibration, path),
+        outside_band_fraction=outside,
+        outside_band_rms=outside_rms,
         speed_factor=binding.speed_factor,
         safe=binding.speed_factor >= 1,
         binding=binding.name,
@@ -269,17 +273,20 @@ def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
     return [z[start : start + _STRETCH_SAMPLES] for start in sorted(starts)]
 
 
-def _outside_fraction(calibration: Calibration, path: ScanPath) -> float:
+def _outside_band(calibration: Calibration, path: ScanPath) -> tuple[float, float]:
+    """Return the share of the mean square velocity above the valid band, and rms of Z there [m]."""
     frequency, velocity = velocity_spectrum(path.z, path.sample_period)
     power = np.abs(velocity) ** 2
-    total = float(power.sum())
-    return float(power[frequency > calibration.valid_up_to].sum()) / total if total > 0 else 0.0
+    above = frequency > calibration.valid_up_to
+    total, beyond = float(power.sum()), power[above]
+    rms = np.sqrt(np.sum(beyond / (2 * np.pi * frequency[above]) ** 2) / 2)
+    return (float(beyond.sum()) / total if total > 0 else 0.0), float(rms)
 
 
-def _longer_rest(
+def _longer_dwell(
     calibration: Calibration, residual: float, undetected: float, budget: float
 ) -> float | None:
-    """Return the rest between steps [s] at which undetected model error would fit the budget.
+    """Return the dwell after a step [s] at which undetected model error would fit the budget.
 
     None if it does not dominate. The uncertainty of a slow term falls with the square root of the
     duration of the step test, and so does the largest relaxation that remains undetected.
@@ -307,7 +314,7 @@ def _message(
         code = "no_speed"
     advice = Notice(f"correction.{code}", **values)
     if binding.speed_factor < 1 and binding.name == DYNAMICS:
-        dwell = _longer_rest(calibration, residual, undetected, budget)
+        dwell = _longer_dwell(calibration, residual, undetected, budget)
         better = Notice("correction.better" if dwell is None else "correction.dwell", dwell=dwell)
         advice = Notice(f"correction.{code}_dynamics", better=better, **values)
     largest = calibration.certificate.undetected.largest

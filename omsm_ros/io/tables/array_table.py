@@ -27,7 +27,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import library_errors, open_regular
 from omsm_ros.io.optional_libraries import walk_in_subprocess
-from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable
+from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable, micro_sign
 from omsm_ros.units import NANOSECONDS_PER_S
 
 
@@ -74,7 +74,7 @@ class ArrayTable(ForeignTable):
         if size > _MAX_WHOLE_BYTES and read != self._hdf5:
             raise FileError(f"{self} has {size} bytes, at most {_MAX_WHOLE_BYTES}; split it")
         with library_errors(str(self), _AGAIN):
-            self._arrays = dict(_flat("", read()))
+            self._arrays = {micro_sign(name): array for name, array in _flat("", read())}
         for name, array in self._arrays.items():
             self._name(name, array)
 
@@ -273,7 +273,9 @@ class TdmsTable(ForeignTable):
                 scales = known_properties.properties.get(_SCALES, 0)
                 if isinstance(scales, int | float | np.number) and not scales <= _MOST_SCALES:
                     raise ValueError(f"{_SCALES} is {scales}, expected at most {_MOST_SCALES}")
-        self._channels = {f"{g.name}/{c.name}": c for g in file.groups() for c in g.channels()}
+        self._channels = {
+            micro_sign(f"{g.name}/{c.name}"): c for g in file.groups() for c in g.channels()
+        }
         self.names = [n for n, c in self._channels.items() if _kind(c) in "fiuM"]
         properties = {name: self._channels[name].properties for name in self.names}
         self.units = {n: str(p[_UNIT]) for n, p in properties.items() if p.get(_UNIT)}

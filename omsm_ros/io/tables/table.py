@@ -108,6 +108,11 @@ class ForeignTable(ABC):
         return ""
 
 
+def micro_sign(name: str) -> str:
+    """Return ``name`` with a Greek mu as the micro sign, which looks the same."""
+    return name.replace("\u03bc", "\u00b5")
+
+
 def stated_unit(table: ForeignTable, name: str) -> str:
     """Return the unit that a file states of a column, also as "Z [mm]" or z_mm; empty if none."""
     if name in table.units:
@@ -193,7 +198,9 @@ def _column(channel: str, given: Mapping[str, Any]) -> Column:
             )
         constant = SIGNAL.checked(float(given["constant"]), DataError, f"{channel}: constant")
         return Column("", constant=constant and constant * _factor(channel, given, sign))
-    return Column(given["name"], _factor(channel, given, sign), unit=given.get("unit", ""))
+    return Column(
+        micro_sign(given["name"]), _factor(channel, given, sign), unit=given.get("unit", "")
+    )
 
 
 def _factor(channel: str, given: Mapping[str, Any], sign: float) -> float:

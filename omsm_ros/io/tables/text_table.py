@@ -17,7 +17,7 @@ import numpy as np
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.io.files import open_regular
-from omsm_ros.io.tables.table import ForeignTable, TableForm
+from omsm_ros.io.tables.table import ForeignTable, TableForm, micro_sign
 from omsm_ros.quantities import SIGNAL, shown
 from omsm_ros.units import NANOSECONDS_PER_S, WORDS
 
@@ -79,6 +79,8 @@ _NO_TEXT = {
     b"\x89HDF": "it is HDF5; name it .h5",
     b"\x89MCA": "it is a ROS bag; name it .mcap",
 }
+# µm, µs and [°] in DOS; in Windows they would be æm, æs and [ø].
+_DOS_UNIT = re.compile(rb"(?<![A-Za-z\x80-\xff])\xe6[ms]\b|[\[(]\xf8[\])]")
 _DELIMITERS = (";", "\t", ",", "|")
 # 1 234, 1'234 or 1,234.5, of which 1,234 alone may be a decimal comma; spaces may be narrow.
 _GROUPED = re.compile("[+-]?\\d{1,3}(?:[ '\u2019\u00a0\u202f]\\d{3})+(?:\\.\\d*)?|.*,.*\\..*")
@@ -144,7 +146,8 @@ class TextTable(ForeignTable):
         try:
             codecs.getincrementaldecoder("utf-8")().decode(start)
         except UnicodeDecodeError:
-            return "cp1252"  # western Windows: its µ and ° are in names of columns
+            # Names of columns hold µ and °, of western Windows or DOS.
+            return "cp437" if _DOS_UNIT.search(start) else "cp1252"
         return "utf-8-sig"
 
     def _lines(self) -> Iterator[tuple[int, list[str]]]:
@@ -178,7 +181,7 @@ class TextTable(ForeignTable):
         cells = self._cells(line)
         if '"' in line and self._form.delimiter != " ":
             cells = next(csv.reader([line], delimiter=self._form.delimiter), cells)
-        return [cell.strip().strip('"') for cell in cells]
+        return [micro_sign(cell.strip().strip('"')) for cell in cells]
 
     def _stated_units(self, line: str) -> dict[str, str]:
         """Return the units that a line below the names holds, as mm, [mm] or (mm)."""

@@ -100,7 +100,7 @@ def test_the_prediction_states_the_undetected_error_and_the_dwell_that_would_rev
     assert found.residual == pytest.approx(found.residual_undetected, rel=0.01)
     assert "cannot detect, mostly slow relaxation (creep) of 10.5 s" in found.message
     # 100 nm against 50 nm: four times as long.
-    assert "rests of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message
+    assert "dwells of 2.1 s or more (omsm plan steps --dwell 2.1)" in found.message
 
 
 def calibration() -> Calibration:

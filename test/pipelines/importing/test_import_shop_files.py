@@ -66,10 +66,16 @@ def test_the_same_two_numbers_however_they_are_written(read, text, more):
     assert read(text, PROBE + more) == pytest.approx([1.5, -2.0])
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252", "cp437"])
 def test_a_name_with_a_mu_in_any_encoding(read, encoding):
     mapping = "sample_period: 0.001\ncolumns:\n  distance: {name: 'gap [µm]', unit: µm}\n"
     assert read("gap [µm]\n1.5\n-2\n", mapping, encoding) == pytest.approx([1.5, -2.0])
+
+
+@pytest.mark.parametrize(("mapped", "named"), ["\u03bc\u00b5", "\u00b5\u03bc"])
+def test_a_greek_mu_is_a_micro_sign(read, mapped, named):
+    mapping = f"sample_period: 0.001\ncolumns:\n  distance: {{name: 'gap [{mapped}m]', unit: um}}\n"
+    assert read(f"gap [{named}m]\n1.5\n2\n", mapping) == pytest.approx([1.5, 2.0])
 
 
 def test_a_text_without_names_is_read_by_place(read):
