@@ -160,8 +160,8 @@ def _prior(source: StatedSource, abbe_arm: float) -> Source:
         arm = source.parameters.get("arm", abbe_arm)
         if not arm:
             raise ConfigurationError(
-                "source 'pitch' has no arm, over which it acts; state arm, the distance of the beam "
-                "from the line of the Z encoder [m], or abbe_arm in --geometry"
+                "source 'pitch' has no arm, over which it acts; state arm, the distance of the "
+                "beam from the line of the Z encoder [m], or abbe_arm in --geometry"
             )
         size *= arm
     parameters = source.parameters
