@@ -196,7 +196,7 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
         nominal,
         load_sources(args.sources) if args.sources else NOTHING_STATED,
         args.accuracy,
-        load_limits(args.limits) if args.limits else MachineLimits(),
+        _limits(args),
     )
     return plan_facts(
         sets, args.accuracy, args.out, nominal, args.dialect, args.path_error, args.servo_period
@@ -205,7 +205,7 @@ def _plan_scans(args: argparse.Namespace) -> Facts:
 
 def _plan_motion(args: argparse.Namespace) -> Facts:
     from omsm_ros.core.adjustment import ScanDesign
-    from omsm_ros.pipelines.plan_scans import write_scans
+    from omsm_ros.pipelines.plan_scans import path_entry, refuse_beyond, write_scans
 
     nominal = _nominal(args)
     modes = [(frequency, 0.0) for frequency in args.mode]
@@ -220,13 +220,18 @@ def _plan_motion(args: argparse.Namespace) -> Facts:
     design = ScanDesign(
         rpm=best.rpm, start=_radius(args, nominal), end=0.0, pitch=best.feed, rate=best.rate
     )
-    write_scans([design], nominal, args.out, args.path_error, args.servo_period, args.dialect)
+    refuse_beyond(design, nominal, _limits(args), args.accuracy)
+    (path,) = write_scans(
+        [design], nominal, args.out, args.path_error, args.servo_period, args.dialect
+    )
     rows = [{**asdict(one), "score": one.score} for one in (asked, best)]
     return {
         "motion": [{k: v if np.isfinite(v) else None for k, v in row.items()} for row in rows],
         "modes": modes,
         "orders": orders.tolist(),
         "duration": design.duration,
+        "path_error": args.path_error,
+        "paths": [path_entry(path, design, nominal)],
         "files": [str(args.out / f"scan_1.{end}") for end in ("csv", "nc")],
     }
 
@@ -238,15 +243,29 @@ def _show_motion(facts: Facts) -> None:
         "phase": "vibration from turn to turn: {:.2f} of a wave",
         "pitch": "marks from turn to turn: {:.2f} of a pitch",
     }
-    for title, one in zip(("as asked", "proposed"), facts["motion"], strict=True):
+    asked, proposed = facts["motion"]
+    if all(asked[name] is None for name in names):
+        say("no mode, line or marks are known: nothing has to be avoided")
+    for title, one in zip(("as asked", "proposed"), (asked, proposed), strict=True):
         say(f"{title}: {one['rpm']:.5g} rpm, feed {quantity(one['feed'], 'm', 4)}, "
             f"rate {quantity(one['rate'], 'Hz')}")  # fmt: skip
         for name, text in names.items():
             if one[name] is not None:
                 say("  " + text.format(one[name]))
-    if facts["motion"][1]["score"] < 1:
+    if proposed["score"] < 1:
         say("no speed or feed within 20 % keeps all apart; give another --rate, --rpm or --feed")
-    table([("duration", quantity(facts["duration"], "s")), written(facts["files"])])
+    (path,) = facts["paths"]
+    table(
+        [
+            ("duration", quantity(facts["duration"], "s")),
+            ("scan_1.nc", _path_text(path, facts["path_error"])),
+            written(facts["files"]),
+        ]
+    )
+
+
+def _limits(args: argparse.Namespace) -> MachineLimits:
+    return load_limits(args.limits) if args.limits else MachineLimits()
 
 
 def _nominal(args: argparse.Namespace) -> Surface:

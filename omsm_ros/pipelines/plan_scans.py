@@ -26,7 +26,7 @@ from omsm_ros.units import RPM_RAD_S
 PATH_ERROR_M, SERVO_PERIOD_S = 100e-9, 1e-3
 # Samples a second at which limits of a path are judged, and turns that stand for all.
 _JUDGED_HZ, _JUDGED_TURNS = 1000.0, 20.0
-_HEAD = "t_s,x_m,z_m,c_rad"
+_HEAD = "time_s,x_m,z_m,c_rad"
 
 
 def scan_path(
@@ -39,7 +39,17 @@ def scan_path(
     return x, nominal.height(place.real, place.imag), c
 
 
-def within_limits(
+def refuse_beyond(
+    design: ScanDesign, nominal: Surface, limits: MachineLimits, accuracy: float
+) -> None:
+    """Raise ConfigurationError where ``design`` exceeds a limit of the machine."""
+    if exceeded := exceeded_limits(design, nominal, limits, accuracy):
+        raise ConfigurationError(
+            f"a scan at {design.rpm:.5g} rpm exceeds {', '.join(exceeded)}; give a smaller --rpm"
+        )
+
+
+def exceeded_limits(
     design: ScanDesign, nominal: Surface, limits: MachineLimits, accuracy: float
 ) -> list[str]:
     """Return the limits of the machine that ``design`` exceeds, none where it may be run.
@@ -76,14 +86,11 @@ def planned_sets(
 
     Raises ConfigurationError where the first scan exceeds a limit of the machine.
     """
-    if exceeded := within_limits(first, nominal, limits, accuracy):
-        raise ConfigurationError(
-            f"a scan at {first.rpm:g} rpm exceeds {', '.join(exceeded)}; give a smaller --rpm"
-        )
+    refuse_beyond(first, nominal, limits, accuracy)
     sets = {
         name: designs
         for name, designs in usual_sets(first).items()
-        if not any(within_limits(design, nominal, limits, accuracy) for design in designs)
+        if not any(exceeded_limits(design, nominal, limits, accuracy) for design in designs)
     }
     planned = plan_scans(list(sets.values()), priors_of(stated), nominal, accuracy)
     names = {designs: name for name, designs in sets.items()}
@@ -102,7 +109,7 @@ def plan_facts(
 ) -> dict[str, Any]:
     """Write the programs of the best set into ``out``, and return what was planned.
 
-    For each scan scan_N.csv (t_s, x_m, z_m, c_rad) and scan_N.nc (G-code).
+    For each scan scan_N.csv (time_s, x_m, z_m, c_rad) and scan_N.nc (G-code).
 
     bound: on the distance of the executed path from the surface [m];  cycle: of the servo [s]
     """
@@ -124,18 +131,24 @@ def plan_facts(
             for one, planned in sets
         ],
         "paths": [
-            {field: getattr(path, field) for field in ("error", "rms", "segment", "c_acceleration")}
-            | (
-                {"points": _on_the_part(design, nominal)}
-                if isinstance(nominal, BoundedSurface)
-                else {}
-            )
+            path_entry(path, design, nominal)
             for path, design in zip(paths, best.designs, strict=True)
         ],
         "files": [
             str(out / f"scan_{k + 1}.{end}") for k in range(len(paths)) for end in ("csv", "nc")
         ],
     }
+
+
+def path_entry(path: PlannedPath, design: ScanDesign, nominal: Surface) -> dict[str, float]:
+    """Return error [m], rms [m], segment [s] and acceleration of C [rad/s²] of a path.
+
+    Also its points on the part, where the aperture is known.
+    """
+    found = {f: getattr(path, f) for f in ("error", "rms", "segment", "c_acceleration")}
+    if isinstance(nominal, BoundedSurface):
+        found["points"] = _on_the_part(design, nominal)
+    return found
 
 
 def _on_the_part(design: ScanDesign, nominal: BoundedSurface) -> int:

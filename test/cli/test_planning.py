@@ -45,7 +45,7 @@ def test_the_programs_follow_the_nominal_surface(capsys, nominal, tmp_path):
     x, z, c = (table[name] for name in ("x_m", "z_m", "c_rad"))
     height = PAPER_MIRROR.height(x * np.cos(c), -x * np.sin(c))
     np.testing.assert_allclose(z, height, atol=1e-10)
-    speed = np.diff(c) / np.diff(table["t_s"]) * 30 / np.pi
+    speed = np.diff(c) / np.diff(table["time_s"]) * 30 / np.pi
     scan = found["sets"][0]["scans"][1]
     np.testing.assert_allclose(speed, scan["rpm"], rtol=1e-3)
     lines = (tmp_path / "scan_2.nc").read_text().splitlines()
@@ -55,10 +55,29 @@ def test_the_programs_follow_the_nominal_surface(capsys, nominal, tmp_path):
     assert last["Z"] == pytest.approx(z[-1] * 1e3, abs=1e-6)
 
 
-def test_a_scan_beyond_the_limits_is_refused_with_the_limit(capsys, nominal, tmp_path):
+def test_a_planned_motion_runs_at_its_speed_and_is_predicted(
+    capsys, nominal, tmp_path, calibration
+):
+    words = ["plan", "motion", "--nominal", nominal, "--out", tmp_path, "--radius", 3e-3,
+             "--line", 680.0, "--json"]  # fmt: skip
+    assert cli.main([str(w) for w in words]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["paths"][0]["error"] <= found["path_error"]
+    table = np.genfromtxt(tmp_path / "scan_1.csv", delimiter=",", names=True)
+    speed = np.diff(table["c_rad"]) / np.diff(table["time_s"]) * 30 / np.pi
+    np.testing.assert_allclose(speed, found["motion"][1]["rpm"], rtol=1e-5)
+    motion, known = str(tmp_path / "scan_1.csv"), str(calibration)
+    assert cli.main(["predict", motion, "--calibration", known, "--json"]) == 0
+    # The third harmonic of a turn is the highest; the window of the spectrum widens it.
+    content = json.loads(capsys.readouterr().out)["limits"][1]["value"]
+    assert content == pytest.approx(3 * speed[0] / 60, abs=0.2)
+
+
+@pytest.mark.parametrize("what", ["scans", "motion"])
+def test_a_scan_beyond_the_limits_is_refused_with_the_limit(what, capsys, nominal, tmp_path):
     limits = tmp_path / "limits.yaml"
     limits.write_text("spindle_speed_rpm: 20.0\n")
-    words = ["plan", "scans", "--nominal", nominal, "--out", tmp_path, "--limits", limits]
+    words = ["plan", what, "--nominal", nominal, "--out", tmp_path, "--limits", limits]
     assert cli.main([str(w) for w in words]) == 2
     assert "--rpm" in capsys.readouterr().err
 
