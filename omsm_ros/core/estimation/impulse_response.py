@@ -5,7 +5,7 @@ that is smooth and decays. Its parameters maximise the marginal likelihood (Pill
 """
 
 import numpy as np
-from scipy import linalg, signal
+from scipy import linalg, ndimage, signal
 
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 
@@ -13,6 +13,8 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 _MOST_TAPS = 800
 # Samples of the record per tap, and the fewest taps.
 _SAMPLES_PER_TAP, _LEAST_TAPS = 4, 10
+# Neighbouring lines whose mean is a power.
+AVERAGED_LINES = 9
 # Decays over the taps, and ratios of the variances of noise and response, that are tried.
 _DECAYS, _RATIOS = (3.0, 10.0, 40.0), 10.0 ** np.arange(-8.0, 2.0)
 
@@ -79,3 +81,24 @@ def _cross_gram(first: FloatArray, second: FloatArray, samples: int, taps: int) 
         found[i, 1:] = found[i - 1, :-1] + first[taps - 1 - i] * second[before]
         found[i, 1:] -= first[len(first) - i] * second[last]
     return found
+
+
+def coherent_power(inputs: FloatArray, output: FloatArray) -> FloatArray:
+    """Return the power of ``output`` (n,) that follows ``inputs`` (n, m), at each line of its rfft.
+
+    It is zero where the inputs explain less than half of the output.
+    """
+    samples, count = inputs.shape
+    window = np.hanning(samples + 2)[1:-1]
+    rows = np.vstack([inputs.T, output])
+    rows = rows - np.mean(rows, axis=1, keepdims=True)
+    spectra = np.fft.rfft(rows * window)
+    products = spectra[:, np.newaxis] * np.conj(spectra)
+    size = 2 * AVERAGED_LINES * count
+    mean = ndimage.uniform_filter1d(products.real, size) + 1j * ndimage.uniform_filter1d(
+        products.imag, size
+    )
+    every, cross = mean[:count, :count].transpose(2, 0, 1), mean[count, :count].T
+    found = np.linalg.pinv(every, rcond=1e-9, hermitian=True) @ np.conj(cross)[:, :, np.newaxis]
+    power = np.sum(cross * found[:, :, 0], axis=1).real
+    return np.asarray(np.where(2 * power > mean[count, count].real, power, 0.0))

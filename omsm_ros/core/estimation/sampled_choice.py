@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import signal
 
-from omsm_ros.core.estimation.impulse_response import impulse_response
+from omsm_ros.core.estimation.impulse_response import coherent_power, impulse_response
 from omsm_ros.core.estimation.parallel_sections import BAND_LIMITED, ParallelSections
 from omsm_ros.core.estimation.sampled_fit import (
     RATE,
@@ -145,7 +145,7 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
 
     Where the inputs are slow, the records are decimated. Samples of slow inputs are band-limited.
     """
-    every = min(_decimation(record.inputs) for record in whole.records)
+    every = min(_decimation(record) for record in whole.records)
     while True:
         records = [_exciting_part(_thinned(record, every)) for record in whole.records]
         try:
@@ -440,8 +440,14 @@ def _against_impulse_response(
     return float(shares[0]), float(shares[1]), bool(worse)
 
 
-def _decimation(inputs: FloatArray) -> int:
-    """Return how many samples of the record are one of a record with the content of ``inputs``."""
-    power = np.cumsum(np.sum(np.abs(np.fft.rfft(inputs, axis=0)) ** 2, axis=1))
-    share = float(np.searchsorted(power, _CONTENT * power[-1])) / len(power)
-    return max(int(1 / max(share * _ABOVE_CONTENT, 1e-3)), 1)
+def _decimation(record: SampledRecord) -> int:
+    """Return how many samples are one of a record with the content of the inputs.
+
+    That is their power, and the power of the output that follows them.
+    """
+    power = np.sum(np.abs(np.fft.rfft(record.inputs, axis=0)) ** 2, axis=1)
+    shares = []
+    for content in (power, coherent_power(record.inputs, _filled(record))):
+        total = np.cumsum(content)
+        shares.append(float(np.searchsorted(total, _CONTENT * total[-1])) / len(power))
+    return max(int(1 / max(max(shares) * _ABOVE_CONTENT, 1e-3)), 1)

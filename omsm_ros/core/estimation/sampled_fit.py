@@ -19,6 +19,7 @@ import numpy as np
 from scipy import fft, linalg, ndimage
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
+from omsm_ros.core.estimation.impulse_response import AVERAGED_LINES, coherent_power
 from omsm_ros.core.estimation.model_structure import ScaledStructure
 from omsm_ros.core.estimation.optimisation import Projection, descend
 from omsm_ros.core.estimation.parallel_sections import (
@@ -36,8 +37,8 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 RATE = 0.5
 # Directions of the linear columns weaker than this part of the strongest are rounding.
 _RANK_TOLERANCE = 1e-13
-# Least share of the largest power of the input at which a line is excited, and the lines averaged.
-_EXCITED, _AVERAGED = 1e-3, 9
+# Least share of the largest power at which a line is excited.
+_EXCITED = 1e-3
 # Most lines of one record for vector fitting, evenly among the excited ones.
 _MOST_LINES = 4000
 # Iterations of vector fitting: by then it has converged, or will not.
@@ -124,14 +125,17 @@ class _Spectra:
     def excited(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
         """Angles at which the inputs have power, their spectra there and that of the output.
 
-        They are those of the record as it is, without a bridge, whose output is not known.
+        Where their power is small, an output that follows them counts. The spectra are those of
+        the record as it is, without a bridge, whose output is not known.
         """
         inputs = self.record.inputs - np.mean(self.record.inputs, axis=0)
         spectra = np.asarray(fft.rfft(inputs.T), np.complex128)
-        power = ndimage.uniform_filter1d(np.sum(np.abs(spectra) ** 2, axis=0), _AVERAGED)
-        lines = np.flatnonzero(power[1:-1] > _EXCITED * np.max(power[1:-1])) + 1
-        lines = lines[np.linspace(0, len(lines) - 1, min(len(lines), _MOST_LINES)).astype(int)]
+        power = ndimage.uniform_filter1d(np.sum(np.abs(spectra) ** 2, axis=0), AVERAGED_LINES)
         filled = np.interp(np.arange(len(self.record)), self.places, self.output)
+        follows = coherent_power(inputs, filled)
+        excited = (v[1:-1] > _EXCITED * np.max(v[1:-1]) for v in (power, follows))
+        lines = np.flatnonzero(np.logical_or(*excited)) + 1
+        lines = lines[np.linspace(0, len(lines) - 1, min(len(lines), _MOST_LINES)).astype(int)]
         angle = 2 * np.pi * lines / len(self.record)
         return angle, spectra[:, lines], np.asarray(fft.rfft(filled)[lines], np.complex128)
 

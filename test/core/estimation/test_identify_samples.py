@@ -17,6 +17,7 @@ from omsm_ros.core.estimation.sampled_choice import (
     simplest_undominated,
 )
 from omsm_ros.core.estimation.sampled_fit import SampledRecord, SectionsProblem
+from omsm_ros.core.estimation.sampled_model import free_run
 from omsm_ros.core.identification.sampled_identification import (
     identify_samples,
     sampled_certificate,
@@ -358,3 +359,20 @@ def test_the_time_of_a_long_record_is_bounded(monkeypatch):
         identified(u, y)
         spent.append(time.process_time() - start)
     assert spent[1] < 6 * spent[0]
+
+
+def test_a_mode_beyond_the_strong_band_of_the_input_is_found():
+    rng, samples, poles = np.random.default_rng(3), 3000, []
+    for cycles, damping in ((0.02, 0.05), (0.3, 0.01)):
+        pole = np.exp(2 * np.pi * cycles * (1j - damping))
+        poles.append(np.array([1.0, -2 * pole.real, abs(pole) ** 2]))
+    strong = signal.lfilter(*signal.butter(6, 0.08), rng.normal(size=samples))
+    u = strong + 3e-3 * rng.normal(size=samples)
+    y = rng.normal(0, 1e-3, samples)
+    for gain, each in zip((1.0, 31.0), poles, strict=True):
+        y += gain * signal.lfilter([0.0, np.sum(each)], each, u)
+    half = samples // 2
+    model = identified(u[:half], y[:half], 1.0, order=4)
+    # Sampled for the strong band alone, the mode at 0.3 cycles would be lost.
+    assert free_run(model, u[half:], y[half:]).explained > 0.999
+    assert np.max(np.abs(model.sections.poles().imag)) == pytest.approx(2 * np.pi * 0.3, rel=1e-3)
