@@ -271,7 +271,7 @@ def _check_arguments(args: argparse.Namespace, of_table: bool) -> None:
         if missing:
             raise ConfigurationError(
                 f"a table needs --{' and --'.join(missing)}: the output column, and the sample "
-                "period in seconds"
+                "period in seconds; a log with units is read by 'omsm import' first"
             )
         _check_for_bags(args)
     elif args.output is not None or args.period is not None:

@@ -91,6 +91,10 @@ def test_the_looks_of_an_exposure_stand_for_its_mean():
     for power in range(8):
         exact = (0.7e-3 ** (power + 1) - 0.1e-3 ** (power + 1)) / (0.6e-3 * (power + 1))
         assert weight @ before**power == pytest.approx(exact, rel=1e-12, abs=0)
+    # Marks of 15.9 µm of the paper's scan F4: 1186 Hz, of which an exposure leaves sinc(f T).
+    before, weight = ProbeErrors(exposure_s=1e-3).exposure_instants()
+    share = weight @ np.cos(2 * np.pi * 1186.0 * (before - 0.5e-3))
+    assert share == pytest.approx(np.sinc(1.186), abs=1e-5)
 
 
 def test_what_sees_no_slope_says_so():
