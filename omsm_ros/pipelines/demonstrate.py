@@ -69,6 +69,7 @@ _EVALUATED = {
     "encoder_scale": 1e-6,
     "squareness": 1e-8,
     "parallelism": 1e-6,
+    "clocking": 1e-6,
     "pitch": 1e-6,
     "straightness_x": 2e-9,
     "straightness_z": 2e-9,

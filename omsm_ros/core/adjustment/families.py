@@ -328,11 +328,13 @@ def _of_the_spindle(priors: Sequence[Source]) -> list[Family]:
         ("spindle_radial", "m", 4, _RADIAL_HARMONICS, _radial, 1e-6),
         ("c_error", "rad", 2, _C_HARMONICS, _angular, 1e-4),
     )
+    # Every scale of C has errors of a few arc seconds; one that nobody looked at, of six.
+    defaults = {"c_error/1": 1e-5 if "clocking" in stated else 3e-5, "c_error/2": 1e-5,
+                # Looks like a decentred part: only its size tells.
+                "spindle_radial/1": 5e-8}  # fmt: skip
     return [
-        # Once a turn, a radial motion looks like a decentred part: only its size tells. Every scale
-        # of C has errors of a few arc seconds.
         Family(order_name(name, n), unit, size, columns(n), wide, RECLOCKED,
-               1e-5 if name == "c_error" else 5e-8 if (name, n) == ("spindle_radial", 1) else None)
+               defaults.get(order_name(name, n)))
         for name, unit, size, usual, columns, wide in table
         for n in orders(name, usual)
     ]  # fmt: skip

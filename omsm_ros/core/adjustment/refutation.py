@@ -211,7 +211,7 @@ def explained(one: Evidence, best: Evidence) -> float:
     A declared family counts against the odds that its declaration is wrong. Far beyond its
     plausible size it explains nothing.
     """
-    beyond = float(np.sqrt(np.mean(one.values**2))) > _FAR_BEYOND * one.family.wide
+    beyond = float(np.max(np.abs(one.values))) > _FAR_BEYOND * one.family.wide
     if not one.family.named or base_name(one.family.name) in FREE or (one.declared and beyond):
         return 0.0
     size = one.gain if one.declared else one.chi_square - one.dof

@@ -33,6 +33,7 @@ PRIORS = (
     Source("squareness", 1e-7, evaluated=True),
     Source("parallelism", 1e-5, evaluated=True),
     Source("encoder_scale", STRETCH, evaluated=True),
+    Source("clocking", 5e-7, evaluated=True),
     Source("probe_slope_square", 1e-8, evaluated=True),
     *(Source(f"spindle_axial/{n}", size) for n, size in SPINDLE.items()),
 )
