@@ -213,6 +213,41 @@ def test_filtered_commands_leave_what_is_predicted(tmp_path, rpm):
     assert np.max(np.abs(np.diff(plan.motion(np.arange(0.5, 2.0, 1e-3))[1], 2))) < 1e-6 * 10
 
 
+def test_a_rehearsal_shows_the_lag_and_how_the_probe_follows_the_segments(tmp_path):
+    """The reading is the path, late, and the ripple of the segments, smaller and late, in noise."""
+    design = ScanDesign(rpm=120.0, start=12.7e-3, end=12.5e-3, pitch=5e-6)
+
+    def path(time_):
+        return scan_path(design, PAPER_MIRROR, time_)
+
+    small = precompensate.reduced(path, design.duration)
+    plan = precompensate.planned_at(small, design.duration, 4e-3, 1e-3)
+    time_ = np.arange(int(plan.time[-1] / 1e-3)) * 1e-3
+    x, z, c = plan.motion(time_)
+    assert not np.any(x)
+    assert np.ptp(z) < 2.01 * precompensate.REACH_M
+    lag, gain = 3e-6, 2.0 * np.exp(-0.7j)
+    off = z - small(time_)[1]
+    followed = gain.real * off + gain.imag * np.imag(precompensate.hilbert(off))
+    noise = np.random.default_rng(1).normal(0.0, 1e-8, len(z))
+    found = record(Cell(), Wave(), Flat())
+    zero = np.zeros_like(z)
+    seen = replace(
+        found,
+        axes=in_cycles((x, zero, z, zero, c)),
+        distance=replace(
+            found.distance,
+            distance=noise - 0.99 * (small(time_ - lag)[1] + followed),
+            intensity=np.ones_like(z),
+            status=np.zeros(len(z), found.distance.status.dtype),
+        ),
+    )
+    write_recording(tmp_path / "rehearsal.mcap", seen)
+    late, gains = precompensate.rehearsed(tmp_path / "rehearsal.mcap", plan, small, small)
+    assert late == pytest.approx(lag, abs=5e-7)  # 0.13 us by noise
+    assert gains == pytest.approx([gain.real, gain.imag], abs=0.1)  # 0.03 by noise
+
+
 def test_a_motion_in_servo_cycles_is_the_motion():
     zero = np.zeros(1000)
     block = in_cycles((zero, zero, Wave().positions(np.arange(1000) * 1e-3).z, zero, zero))
