@@ -5,11 +5,12 @@ import subprocess
 import sys
 
 import pytest
+from soaked import soaked
 
 from omsm_ros import cli
 
 
-@pytest.mark.parametrize("asked", ["SIGTERM", "SIGHUP"])
+@pytest.mark.parametrize("asked", ["SIGTERM", *soaked("SIGHUP")])
 def test_a_command_that_is_asked_to_end_leaves_no_unfinished_file(tmp_path, asked):
     """The process ends by that signal, as its parent expects."""
     block = (

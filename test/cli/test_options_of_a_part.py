@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros import cli
 from omsm_ros.errors import ConfigurationError
@@ -68,7 +69,7 @@ def test_the_l_filter_takes_longer_waves_out_of_the_texture(facts):
     assert left[0] / left[1] == pytest.approx(expected, rel=0.03)
 
 
-@pytest.mark.parametrize("per_turn", [90, 240])
+@pytest.mark.parametrize("per_turn", [90, *soaked(240)])
 def test_the_spiral_of_the_next_cut_has_so_many_places_a_turn(facts, per_turn):
     feed = 5e-4
     found, out = facts(

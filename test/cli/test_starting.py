@@ -3,6 +3,7 @@ import subprocess
 import sys
 
 import pytest
+from soaked import soaked
 
 from omsm_ros import cli
 from omsm_ros.cli import doctor
@@ -78,14 +79,14 @@ def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
     assert prediction["residual"] < 0.7e-9
 
 
-@pytest.mark.parametrize("redirected", ["2>&-", "2>/dev/full", ">&- 2>&-"])
+@pytest.mark.parametrize("redirected", ["2>/dev/full", ">&- 2>&-", *soaked("2>&-")])
 def test_the_exit_status_is_right_without_a_readable_stderr(redirected, tmp_path):
     command = f"{sys.executable} -m omsm_ros.cli compare none.json none.json {redirected}"
     done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (2, b"", b"")
 
 
-@pytest.mark.parametrize("options", ["", "--json"])
+@pytest.mark.parametrize("options", ["--json", *soaked("")])
 def test_a_standard_output_that_is_full_is_named(options, tmp_path):
     """Standard output is a full disk."""
     command = f"{sys.executable} -m omsm_ros.cli plan steps --out p {options} >/dev/full"

@@ -25,7 +25,7 @@ from omsm_ros.instruments.six_channel.device import (
 from omsm_ros.instruments.six_channel.protocol import ENCODED_SIZE, FRAME, encode_frames
 
 # `OMSM_MISSED_TRIGGERS=200` tries as many.
-CASES = int(os.environ.get("OMSM_MISSED_TRIGGERS", "3"))
+CASES = int(os.environ.get("OMSM_MISSED_TRIGGERS", "1"))
 PERIOD, SECONDS = 1e-3, 7.0
 UPTIME_S = 123_456.0  # of the host, from which its monotonic clock counts
 EPOCH_NS = 1_700_000_000 * 10**9

@@ -57,17 +57,32 @@ def folder(tmp_path_factory):
     return folder
 
 
-def form(folder, out, *arguments):
+def form(folder, out, *arguments, report=False):
     words = ["form", folder, "--nominal", folder / "mirror.yaml", "--out", out, *arguments]
-    words += [] if "--tolerance" in arguments else ["--no-report"]
+    words += [] if report else ["--no-report"]
     status = main([str(word) for word in words])
     return status, out / "form.json"
 
 
-def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
-    status, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)
+@pytest.fixture(scope="module")
+def held(folder, tmp_path_factory):
+    """A result with piston, tip and tilt alone fitted."""
+    words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
+    status, path = form(folder, tmp_path_factory.mktemp("held"), *words)
     assert status == 0
-    found = json.loads(path.read_text())
+    return path
+
+
+@pytest.fixture(scope="module")
+def automatic(folder, tmp_path_factory):
+    """A result with what the points show fitted."""
+    words = ("--fit", "auto", "--aperture", f"{RADIUS},0,0")
+    _, path = form(folder, tmp_path_factory.mktemp("auto"), *words)
+    return json.loads(path.read_text())
+
+
+def test_known_terms_are_reported_within_their_uncertainty(folder, held):
+    found = json.loads(held.read_text())
     assert set(found) == {
         "pose",
         "shape",
@@ -103,10 +118,9 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, tmp_path):
     assert figures["rms_before_fit"]["value"] > 5e-6
 
 
-def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(folder, tmp_path):
+def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(automatic):
     """For an unmoved part the terms are the true ones within their stated uncertainty."""
-    _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
-    found = json.loads(path.read_text())
+    found = automatic
     assert found["removed"]["fitted"] == ["piston", "tip", "tilt"]
     assert set(found["removed"]["held"]) == {"x", "y"}
     assert "nm rms of form" in found["removed"]["held"]["y"]
@@ -123,10 +137,9 @@ def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(fold
     assert entry["uncertainty"] == pytest.approx(np.pi / 180)
 
 
-def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp_path):
+def test_what_no_move_explains_is_known_where_form_looks_like_a_move(automatic):
     """Compare with least squares by finite differences of the twin's part in six poses."""
-    _, path = form(folder, tmp_path, "--fit", "auto", "--aperture", f"{RADIUS},0,0")
-    figures = json.loads(path.read_text())["deviation"]
+    figures = automatic["deviation"]
     r, angle = RADIUS * np.sqrt(np.linspace(0, 1, 5000)), np.arange(5000) * 2.4
     x, y = r * np.cos(angle), r * np.sin(angle)
     small = {"x_m": 1e-6, "y_m": 1e-6, "tilt_x_rad": 1e-5, "tilt_y_rad": 1e-5, "z_m": 1e-6}
@@ -149,14 +162,16 @@ def test_what_no_move_explains_is_known_where_form_looks_like_a_move(folder, tmp
 def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS, "--tolerance", 1e-6)
     status, path = form(folder, tmp_path, *words)
-    held = json.loads(path.read_text())["conformity"]
-    assert held["verdict"] == "cannot tell"
-    assert "points left out as dust" in held["reasons"][0]
+    open_ = json.loads(path.read_text())["conformity"]
+    assert open_["verdict"] == "cannot tell"
+    assert "points left out as dust" in open_["reasons"][0]
     words += ("--dust", "isolated")
-    status, path = form(folder, tmp_path, *words)
+    status, path = form(folder, tmp_path, *words, report=True)
     assert status == 0
     assert json.loads(path.read_text())["conformity"]["verdict"] == "holds"
-    assert "holds" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    for text in ("holds", "rms of points", "not evaluated", f"{count(POINTS)} read"):
+        assert text in said
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == 8
     for text in (*("Form of the part", "Not verified", "Uncertainty budget incomplete", "Sku"),):
@@ -170,14 +185,6 @@ def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     inside = np.sum(2 * np.pi * f * s) * (f[1] - f[0])
     assert inside == pytest.approx(psd["mean_square_in_band"], rel=1e-9, abs=0)
     assert set(curves["profiles"]) == {"x", "y", "diagonal", "radius", "angle", "edge"}
-
-
-def test_people_read_the_figures_too(folder, tmp_path, capsys):
-    form(folder, tmp_path, "--fit", "piston,tip,tilt")
-    said = capsys.readouterr().out
-    assert "rms of points" in said
-    assert "not evaluated" in said
-    assert f"{count(POINTS)} read" in said
 
 
 @pytest.mark.parametrize(
@@ -204,7 +211,7 @@ def test_a_folder_without_a_cloud_is_named(tmp_path, folder, capsys):
     assert "no cloud at" in capsys.readouterr().err
 
 
-def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
+def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, held, tmp_path):
     """Write 20 nm of possible astigmatism of the instrument into the systematic fields."""
     known = tmp_path / "known"
     shutil.copytree(folder, known)
@@ -215,7 +222,7 @@ def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, tmp_path):
         ScanFields(("spindle", "spindle"), 20e-9 * np.stack([u**2 - v**2, 3 * u / 20]), 10),
     )
     words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
-    plain = json.loads(form(folder, tmp_path / "a", *words)[1].read_text())
+    plain = json.loads(held.read_text())
     reported = json.loads(form(known, tmp_path / "b", *words)[1].read_text())
     assert reported["removed"]["not_evaluated"] == []
     assert plain["removed"]["not_evaluated"]
@@ -254,11 +261,10 @@ def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path
     assert found["real"]["zernike"] == found["bound"]["zernike"]
 
 
-def test_the_deviations_are_left_for_other_programs(folder, tmp_path):
+def test_the_deviations_are_left_for_other_programs(held):
     """The deviation is written as a map over the part that the map reader accepts."""
-    _, path = form(folder, tmp_path, "--fit", "piston,tip,tilt", "--aperture", RADIUS)
-    left = read_points(tmp_path / "deviation.ply")
-    assert len(left.x) == json.loads(path.read_text())["points"]["used"]
+    left = read_points(held.parent / "deviation.ply")
+    assert len(left.x) == json.loads(held.read_text())["points"]["used"]
     off = left.height - Mirror.error.height(left.x, left.y)
     assert np.std(off) == pytest.approx(1e-8, rel=0.05)
 
@@ -298,7 +304,7 @@ def test_a_fitted_move_that_masks_form_gives_a_warning(folder, tmp_path):
 
 def test_a_missing_sector_keeps_the_tolerance_open(tmp_path):
     rng = np.random.default_rng(1)
-    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-10e-3, 10e-3, 150)] * 2))
+    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-10e-3, 10e-3, 80)] * 2))
     for sector, expected in ((np.pi, 0.0), (0.6 * np.pi, 0.4)):
         chosen = (np.hypot(x, y) <= 10e-3) & (np.abs(np.arctan2(y, x)) <= sector)
         batch = PointBatch(x[chosen], y[chosen], rng.normal(0, 1e-9, int(chosen.sum())),

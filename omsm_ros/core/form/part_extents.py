@@ -178,12 +178,16 @@ class _PartForm(NamedTuple):
 
 def _quantile_ranges(values: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the extents (k,) of the ``ROBUST`` share of the weight (n,) of ``values`` (n, k)."""
-    order = np.argsort(values, axis=0)
-    ordered, weight = np.take_along_axis(values, order, 0), weights[order]
-    below = np.cumsum(weight, axis=0) - weight / 2
-    ends = np.array(ROBUST) * np.sum(weights)
-    found = [np.interp(ends, b, v) for b, v in zip(below.T, ordered.T, strict=True)]
-    return np.array([high - low for low, high in found])
+    beyond, ends = ROBUST[0] * float(np.sum(weights)), []
+    # No more points lie beyond an end than of those with the least weights.
+    count = int(np.searchsorted(np.cumsum(np.sort(weights)), beyond, "right")) + 2
+    for rows in (np.ascontiguousarray(values.T), np.ascontiguousarray(-values.T)):
+        few = np.argpartition(rows, min(count, len(weights)) - 1, axis=1)[:, :count]
+        order = np.take_along_axis(few, np.argsort(np.take_along_axis(rows, few, 1), axis=1), 1)
+        below = np.cumsum(weights[order], axis=1) - weights[order] / 2
+        ordered = np.take_along_axis(rows, order, 1)
+        ends.append([np.interp(beyond, b, v) for b, v in zip(below, ordered, strict=True)])
+    return np.asarray(-np.sum(ends, axis=0), np.float64)
 
 
 class _Gaps(NamedTuple):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import signal
+from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.model_order import StartingPoints
@@ -174,13 +175,7 @@ def test_it_is_taken_out_once():
 
 
 @pytest.mark.parametrize(
-    ("rest", "noise"),
-    [
-        (500, 1e-9),
-        (2000, 4e-9),
-        pytest.param(500, 4e-9, marks=pytest.mark.soak),
-        pytest.param(2000, 1e-9, marks=pytest.mark.soak),
-    ],
+    ("rest", "noise"), [(500, 1e-9), (500, 4e-9), *soaked((2000, 4e-9), (2000, 1e-9))]
 )
 def test_a_lightly_damped_mode_is_known_in_addition(rest, noise):
     """No backlash, further mode or scale error is reported, although each could fit the noise."""

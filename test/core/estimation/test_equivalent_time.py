@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from soaked import soaked
 
 from omsm_ros.core.estimation.equivalent_time import fast_mode
 from omsm_ros.core.streams.motion_record import MotionRecord
@@ -61,7 +62,7 @@ def step_test(
     )
 
 
-@pytest.mark.parametrize(("rounded", "late"), [(False, 0.23e-3), (True, 0.0)])
+@pytest.mark.parametrize(("rounded", "late"), [(False, 0.23e-3), *soaked((True, 0.0))])
 def test_sharp_edges_show_the_mode_at_804_hz_also_of_a_late_probe(rounded, late):
     found = fast_mode(step_test(rounded=rounded, response=lambda t: mode_step(t - late)))
     assert found.finding.code == "estimation.fast_mode"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.estimation.noise import plateau_variance, plateaus, reading_step
@@ -68,7 +69,7 @@ def test_plateaus_are_counted_between_edges():
     assert np.all((plateau == -1) == steps.moving)
 
 
-@pytest.mark.parametrize("seed", [1, 2, pytest.param(3, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("seed", [1, *soaked(2, 3)])
 def test_coarse_readings_are_accepted_with_a_band_that_holds_the_truth(seed):
     found = identify(recorded(seed)).calibration
     # Rounding is an error periodic in the travel, and may be found as one beside the response.

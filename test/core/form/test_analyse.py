@@ -31,7 +31,7 @@ def test_any_arrangement_of_points_is_judged(arrangement):
         r = np.linspace(0.012, 0.02, n)
         x, y = r * np.cos(angle), r * np.sin(angle)
     elif arrangement == "raster":
-        x, y = (v.ravel() for v in np.meshgrid(*(np.linspace(-0.02, 0.02, 140),) * 2))
+        x, y = (v.ravel() for v in np.meshgrid(*(np.linspace(-0.02, 0.02, 100),) * 2))
     height = 1e-5 * x + 10e-9 * np.sin(2 * np.pi * x / 4e-3)
     found = form(x, y, height, even=arrangement == "raster")
     assert found.deviation["rms"].value == pytest.approx(10e-9 / np.sqrt(2), rel=0.05)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from benchmarks.free_path import Multisine
 from benchmarks.recorded import record_from_arrays
@@ -61,7 +62,7 @@ def test_the_truth_lies_in_the_band_as_far_as_the_motion_goes(motion, plant, par
     assert np.max(np.abs(error.imag) / band.phase) < 3.5
 
 
-@pytest.mark.parametrize(("frequency", "plant"), [(5.0, Plant()), (5.0, LIGHT_MODE)])
+@pytest.mark.parametrize(("frequency", "plant"), [(5.0, Plant()), *soaked((5.0, LIGHT_MODE))])
 @pytest.mark.parametrize(
     "seed", [1, pytest.param(2, marks=pytest.mark.soak), pytest.param(3, marks=pytest.mark.soak)]
 )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy import signal
+from soaked import soaked
 
 from omsm_ros.core.estimation.sampled_fit import SampledRecord
 from omsm_ros.core.estimation.sampled_model import SampledModel, free_run
@@ -122,7 +123,7 @@ def _by_scipy(sections, lines):
     return total * np.exp(-2j * np.pi * lines * sections.delays[0])
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, *soaked(1)])
 def test_what_is_accepted_of_a_random_plant_is_true(seed):
     assert judged(seed)[2] == []
 

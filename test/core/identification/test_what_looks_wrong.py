@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy import signal
+from soaked import soaked
 
 from benchmarks.recorded import record_from_arrays
 from omsm_ros.core.calibration.certificate import REJECTS
@@ -87,7 +88,7 @@ def test_what_is_not_linear_is_given_up_after_a_bounded_effort():
     assert 1000 < budget.evaluations < 2200
 
 
-@pytest.mark.parametrize("name", ["Creep", "crep", "backlash"])
+@pytest.mark.parametrize("name", ["crep", "backlash", *soaked("Creep")])
 def test_a_prior_on_a_detectable_family_is_refused(name):
     rng = np.random.default_rng(1)
     z = StepTest(count=2).positions(TIME).z

@@ -75,7 +75,7 @@ RECORDINGS: dict[str, Callable[[], tuple[Blocks, Blocks]]] = {
     "two drivers": two,
     "uneven": lambda: two(2e-4),
     "often off": lambda: two(8e-4),
-    "single samples": lambda: two(2e-5, (100, 3)),
+    "short blocks": lambda: two(2e-5, (100, 16)),
     "slip": slipped,
     "lost": lost,
     "pause": paused,
