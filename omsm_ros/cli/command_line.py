@@ -263,7 +263,8 @@ def _experiment(args: argparse.Namespace) -> int:
         print(json_and_yaml.text_of(json_and_yaml.unknown_as_null(facts)), flush=True)
         return DONE
     for row in facts["compared"]:
-        say(f"{row['name']}: {row['ours']} (paper: {row['paper'] or '-'}) {row['remark']}".rstrip())
+        paper = row["paper"] or "not printed"
+        say(f"{row['name']}: {row['ours']} (paper: {paper}) {row['remark']}".rstrip())
     table([written(["report.html"], str(args.out))])
     return DONE
 

@@ -66,8 +66,10 @@ def with_sources(
 ) -> CorrectionOptions:
     """Return ``options`` with the ``stated`` and assumed sources, and the surface ``nominal``."""
     known = options.sources or ErrorSources.of(calibration)
+    arm = options.geometry.abbe_arm or stated.abbe_arm
     return replace(
         options,
+        geometry=replace(options.geometry, abbe_arm=arm),
         sources=replace(known, **stated.point_uncertainties()),
         systematic=with_assumed(stated).scan_sources(),
         surface=nominal,

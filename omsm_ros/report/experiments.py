@@ -55,7 +55,7 @@ def done(
     page = StudyPage(
         title=title,
         subtitle="on the digital twin",
-        verdict=PageVerdict("unknown", "Result", (summary,)),
+        verdict=PageVerdict("neutral", "Result", (summary,)),
         sections=(
             Section("Comparison with the paper", tables=(first,)),
             Section("Measured", tuple(figures), tables),

@@ -11,7 +11,10 @@ from omsm_ros.report.tables import part
 
 @dataclass(frozen=True, slots=True)
 class PageVerdict:
-    """level: "good", "care", "bad" or "unknown";  word: the verdict as text;  reasons: for it."""
+    """Verdict of a page.
+
+    level: "good", "care", "bad", "unknown" or "neutral";  word: as text;  reasons: for it
+    """
 
     level: str
     word: str

@@ -134,6 +134,12 @@ def test_pitch_without_an_arm_evaluates_nothing(capsys, shop):
              "--out", "pitched"]  # fmt: skip
     assert cli.main([str(shop / w) if "." in w or w == "pitched" else w for w in words]) == 2
     assert "has no arm" in capsys.readouterr().err
+    (shop / "pitch.yaml").write_text(STATED + pitch.replace("rad,", "rad, arm: 0.02,"))
+    found = correct(capsys, shop, "scan.mcap", "--sources", str(shop / "pitch.yaml"))
+    (row,) = (s for s in found["budget"]["sources"] if s["source"] == "pitch")
+    assert row["status"] == "evaluated"
+    # Less than arm times pitch, as a curve of Z has no offset.
+    assert 2e-9 < row["height"] < 20e-9
 
 
 def test_a_wrong_sign_from_tables_is_contradicted(capsys, shop):

@@ -86,11 +86,12 @@ class StatedSource:
             raise ConfigurationError("correction.no_reason", source=self.source)
         if self.source in POINT_SOURCES:
             ErrorSources(**{self.source: self.standard_uncertainty})
-            if set(self.parameters) - {"correlation_length"}:
+            own = {"correlation_length"} | ({"arm"} if self.source == "pitch" else set())
+            if set(self.parameters) - own:
                 raise ConfigurationError(
                     "correction.no_parameter", source=self.source, parameters=self.parameters
                 )
-        else:
+        if self.source not in POINT_SOURCES or "arm" in self.parameters:
             self.systematic()
 
     @property
@@ -130,6 +131,11 @@ class MachineSources:
             for stated in self.stated
             if stated.source in POINT_SOURCES
         }
+
+    @property
+    def abbe_arm(self) -> float:
+        """Arm that is stated with the pitch of Z [m], 0 without one."""
+        return next((s.parameters.get("arm", 0.0) for s in self.of("pitch")), 0.0)
 
     def scan_sources(self) -> tuple[SystematicSource, ...]:
         """Return the stated sources of the whole scan."""

@@ -188,7 +188,7 @@ _SPAN_MODEL_FIGURES: dict[str, Any] = {
 
 
 def response(model: SampledModel) -> Figure:
-    """Draw gain and phase to half the sampling rate with their 95 % band; grey: not trusted."""
+    """Draw gain and phase to half the sampling rate with their 95 % band; grey: not valid."""
     frequency = np.geomspace(_LOWEST_SHARE, 1.0, _LINES) * 0.5 / model.sections.period
     value, band = model.sections.response(frequency)[0], model.sections.band(frequency)
     made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)

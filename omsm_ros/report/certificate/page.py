@@ -48,7 +48,7 @@ def mode_table(calibration: Calibration) -> Table:
         )
         for index, mode in enumerate(modes, start=1)
     ]
-    columns = ("frequency", "damping ratio", "residue [1/ms²]", "within the trusted band")
+    columns = ("frequency", "damping ratio", "residue [1/ms²]", "within the valid range")
     return Table("Modes (Eq. 8)", columns, rows)
 
 
@@ -99,8 +99,8 @@ def two_mass_table(certificate: Certificate) -> Table:
 
 
 _SHAPE_ROWS = (
-    ("gain off 1 by 1 %", "bandwidth_1_percent", None),
-    ("gain off 1 by 3 dB", "bandwidth_3db", None),
+    ("gain differs from 1 by 1 %", "bandwidth_1_percent", None),
+    ("gain differs from 1 by 3 dB", "bandwidth_3db", None),
     ("highest peak of the gain", "resonance", "resonance_gain"),
     ("lowest dip of the gain", "minimum", "minimum_gain"),
 )
@@ -117,8 +117,8 @@ def shape_table(calibration: Calibration) -> Table:
             rows.append((name, size + quantity(at, "Hz"), "yes" if at <= trusted else "no"))
     if found.modal_remainder is not None:
         remainder = percent(found.modal_remainder)
-        rows.append(("not in the terms of Eq. 8, of the greatest gain", remainder, "yes"))
-    return Table("Shape of the response", ("", "within the trusted band"), rows)
+        rows.append(("share of the greatest gain that Eq. 8 lacks", remainder, "yes"))
+    return Table("Shape of the response", ("", "within the valid range"), rows)
 
 
 def _size(term: UndetectedEntry) -> str:
@@ -148,12 +148,12 @@ def undetected_table(certificate: Certificate) -> Table:
         for term in found.terms
     ]
     further = (
-        ("plateau that would show the slowest", quantity(found.plateau_needed_s, "s")),
+        ("dwell that would show the slowest creep", quantity(found.plateau_needed_s, "s")),
         ("assumed: no relaxation slower than", quantity(found.slowest_creep_s, "s")),
         ("assumed: no mode below", quantity(found.lowest_mode_hz, "Hz", 2)),
     )
     rows += [(name, value, "", "") for name, value in known_rows(further, 1)]
-    columns = ("largest size missed", "its rms on the intended scan", "carried in the band")
+    columns = ("largest undetected size", "its rms on the intended scan", "part of the band")
     return Table("Undetected model errors", columns, rows)
 
 
@@ -161,7 +161,7 @@ BAND = "band"
 CAPTIONS = {
     BAND: (
         "Gain, phase, and the error of a sinusoidal motion before and after the correction. "
-        "Grey: not trusted."
+        "Grey: outside of the valid range."
     ),
     "step": "The steepest move: input, output, and the residual of the model.",
     "residual": (
@@ -273,7 +273,13 @@ def _all_headlines(calibration: Calibration) -> list[Headline]:
     )
     return [
         Headline("Low-frequency delay", delay, _k1(delay, "by which the probe lags slow motion")),
-        Headline("Latency in it", latency_text(calibration), "by which X and C are delayed"),
+        Headline(
+            "Latency in it",
+            latency_text(calibration),
+            "X and C are not delayed"
+            if calibration.latency.share is None
+            else "by which X and C are delayed",
+        ),
         _gain_headline(calibration.static_gain, spread),
         _range_headline(calibration),
         Headline(
@@ -322,9 +328,9 @@ def _model_errors(certificate: Certificate) -> Section:
             tables.consistency_table(certificate),
             undetected_table(certificate),
         ),
-        "This test would have shown anything larger than the largest size missed with a "
-        "probability of 95 %; the band carries what it cannot exclude. The rms is that of heights "
-        "on the intended scan; the report of a measurement has that of its own scan.",
+        "An effect larger than the largest undetected size would have been detected with a "
+        "probability of 95 %. The band contains what the test cannot exclude. The rms is that of "
+        "heights on the intended scan; the report of a measurement has that of its own scan.",
     )
 
 
@@ -333,9 +339,9 @@ def _order(certificate: Certificate) -> Section:
         "Order",
         ("order",),
         (tables.order_table(certificate),),
-        "Unless an order was asked for, the structure chosen has one parameter more than that "
-        "of the lowest BIC, and three at least: the smallest that fits is biased by about its "
-        "own uncertainty, and one parameter more trades that for a wider band.",
+        "The chosen structure has one parameter more than that of the lowest BIC, and at least "
+        "three, unless an order was requested. The smallest structure that fits is biased by "
+        "about its own uncertainty; one parameter more turns this bias into a wider band.",
     )
 
 

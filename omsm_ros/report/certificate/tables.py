@@ -150,7 +150,7 @@ def background_table(certificate: Certificate) -> Table:
         ("lag of the reference sensor", quantity(response.reference_lag_s, "s")),
         ("distance", NOTHING if polarity is None else _POLARITIES.get(polarity, NOTHING)),
     ]
-    return Table("Besides the motion", (), known_rows(rows, 1))
+    return Table("Drift, backlash and direction", (), known_rows(rows, 1))
 
 
 def _or_none(value: float | None, unit: str) -> str:
@@ -230,7 +230,7 @@ _LIMITS = (
     ("95 % band of the phase, half-width, at most", "phase_rad", "rad"),
     ("χ² where the axis moves, at least", "chi_square_least", ""),
     ("χ² where the axis moves, at most", "chi_square_greatest", ""),
-    ("trusted band, to at least", "valid_up_to_least_hz", "Hz"),
+    ("valid range, to at least", "valid_up_to_least_hz", "Hz"),
     ("delay that is harmless on the intended scan", "harmless_delay_s", "s"),
 )
 

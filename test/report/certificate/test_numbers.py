@@ -123,4 +123,4 @@ def test_undetected_error_states_its_time_or_frequency_and_its_unit():
         ["backlash", "3.00 nm"],
     ]
     assert [row[3] for row in rows[:3]] == ["11.0 nm", "5.00 nm", "2.00 nm"]
-    assert rows[3][:2] == ["plateau that would show the slowest", "60.0 s"]
+    assert rows[3][:2] == ["dwell that would show the slowest creep", "60.0 s"]
