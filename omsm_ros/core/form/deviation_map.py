@@ -85,16 +85,6 @@ def root_mean_square(map_: DeviationMap) -> float:
     return float(np.sqrt(np.average(map_.deviation**2, weights=map_.area)))
 
 
-def weighted_quantiles(
-    values: FloatArray, weights: FloatArray, shares: tuple[float, ...]
-) -> tuple[float, ...]:
-    """Return the values below which these ``shares`` of the weight lie."""
-    order = np.argsort(values)
-    below = np.cumsum(weights[order]) - weights[order] / 2
-    found = np.interp(np.array(shares) * weights.sum(), below, values[order])
-    return tuple(float(value) for value in found)
-
-
 def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
     """Return the noise of points (n,) in any order, from neighbours in strips of y."""
     span_x, span_y = float(np.ptp(x)), float(np.ptp(y))

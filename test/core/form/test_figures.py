@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from soaked import soaked
 
-from omsm_ros.core.form.deviation_map import (
-    DeviationMap,
-    neighbour_noise,
-    root_mean_square,
-    weighted_quantiles,
-)
+from omsm_ros.core.form.deviation_map import DeviationMap, neighbour_noise, root_mean_square
 from omsm_ros.core.form.part_extents import extents_of_part
 from omsm_ros.core.form.part_figures import rms_of_part
 from omsm_ros.core.streams.statistics import noise_of
@@ -180,11 +175,6 @@ def test_noise_is_distinguished_from_form_and_drift():
     noise = np.random.default_rng(2).normal(0, 1e-8, POINTS)
     assert noise_of(wave + slow + noise) == pytest.approx(1e-8, rel=0.03)
     assert noise_of(np.zeros(2)) == 0
-
-
-def test_quantiles_are_by_weight():
-    values, weights = np.array([3.0, 1.0, 2.0]), np.array([1.0, 2.0, 1.0])
-    assert weighted_quantiles(values, weights, (0.25, 0.625)) == (1.0, 2.0)
 
 
 def test_noise_is_distinguished_from_ripple_in_any_order_of_points():

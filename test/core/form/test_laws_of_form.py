@@ -14,7 +14,6 @@ from omsm_ros.core.form.deviation_map import (
     UncertainValue,
     neighbour_noise,
     root_mean_square,
-    weighted_quantiles,
 )
 from omsm_ros.core.form.part_extents import extents_of_part
 from omsm_ros.core.form.part_figures import (
@@ -64,23 +63,6 @@ def test_a_map_of_every_kth_point_keeps_what_belongs_to_each():
     assert len(whole.every(1001)) == 1000
     assert len(whole.every(2999)) == 1500
     assert len(whole.every(3000)) == 3000
-
-
-def test_quantiles_of_whole_weights_are_those_of_repeated_values():
-    values, weights = RNG.normal(size=200), RNG.integers(1, 6, 200)
-    repeated = np.repeat(values, weights)
-    shares = (0.1, 0.5, 0.9)
-    one = weighted_quantiles(values, weights.astype(float), shares)
-    other = weighted_quantiles(repeated, np.ones(len(repeated)), shares)
-    assert one == pytest.approx(other, abs=0.05)
-    assert weighted_quantiles(values, 1e-6 * weights, shares) == pytest.approx(one)
-    order = RNG.permutation(200)
-    assert weighted_quantiles(values[order], weights[order], shares) == pytest.approx(one)
-
-
-def test_quantiles_of_equal_weights_are_those_of_the_middles_of_their_shares():
-    found = weighted_quantiles(np.arange(10.0), np.ones(10), (0.05, 0.5, 0.95, 0.0, 1.0))
-    assert found == pytest.approx((0.0, 4.5, 9.0, 0.0, 9.0))
 
 
 def test_the_rms_is_by_area_and_about_zero():
