@@ -27,7 +27,7 @@ _DRIFT_SIGMA = 100 * PPM
 # A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
 # is played faster than it was recorded, or set to another rate.
 _LARGEST_CRYSTAL_DRIFT = 1000 * PPM
-# A clock was set if all arrivals are off the line by the first, to one side, during the second [s].
+# A clock was set if all arrivals are off the line to one side, by this, for the second time [s].
 _STEP_S, _STEP_AFTER_S = 0.02, 2.0
 # A busy host delays its first arrivals by less than this, so an arrival that is earlier by more
 # shows at once that a clock was set [s].
@@ -176,13 +176,13 @@ def _line(
     return offset, slope, float(uncertainty)
 
 
-# Span of arrivals that decides whether triggers were missed: it lasts for the first [s] and holds
-# the second number of arrivals, or lasts for the third; and the longest wait for a decision.
+# Arrivals of a span of _DECISION_S decide whether triggers were missed if there are _ARRIVALS, else
+# those of _LONG_DECISION_S; a decision waits no longer than _LONGEST_S.
 _DECISION_S, _ARRIVALS, _LONG_DECISION_S, _LONGEST_S = 0.2, 12, 0.6, 0.8
 _LEAST_ARRIVALS = 3
-# Spans whose earliest arrivals are the reference; how many it needs, and how many show a drift.
+# Earliest arrivals of so many spans are the reference; least number of it, and that for a drift.
 _SPANS, _LEAST_SPANS, _DRIFT_SPANS = 15, 4, 8
-# The last sample of a portion may be nearly a period old, so only a delay of this is one [period].
+# The last sample of a portion may be nearly a period old, so a delay counts from here on [period].
 _LATE_PERIODS, _AGE_PERIODS, _AGES_OF_FEW = 0.75, 0.25, 1.5
 # Limit of lateness over the range of the earliest arrivals, of many and of few spans [1].
 _RANGES, _RANGES_OF_FEW = 2.0, 3.0
@@ -287,7 +287,7 @@ class MissedTriggerDetector:
         rest = late - self._drift * since
         self._since, self._expected = float(begin[-1]), float(rest.min())
         scatter = float(np.ptp(rest))
-        if scatter < self._period:  # it is of the ages, which are below a period
+        if scatter < self._period:  # only the ages of samples scatter, by less than a period
             scatter = (1 if many else _AGES_OF_FEW) * scatter + _AGE_PERIODS * self._period
         else:
             scatter *= _RANGES if many else _RANGES_OF_FEW

@@ -19,15 +19,15 @@ from omsm_ros.units import NANOSECONDS_PER_S
 
 # Bytes that hold no sample for this long come from another device or at another baud rate [s].
 UNREADABLE_S = 2.0
-# A loss of so few samples, or a multiple, is likely enough to be stated.
+# A counter of so few counts misses losses that are likely enough to be stated.
 _SMALL_COUNTER = 16
-# Between two looks at the time-out of an answer [s].
+# Time between two checks of the time-out of an answer [s].
 _ANSWER_S = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamStatistics:
-    """Everything counted since construction, exact between two calls of ``poll``.
+    """All counts since construction, exact between two calls of ``poll``.
 
     decoded: samples that came whole
     delivered, pending: in blocks handed over, and waiting for their block to fill

@@ -282,7 +282,7 @@ def _texture_rows(scans: Sequence[SpectrumOfScan], options: SpectrumOptions) -> 
                  found["seconds"] if found else None, "s",
                  found["finding"] if found else "the marks are in fewer than two scans"),
         compared("F4: rms of the marks on the part, exposure and spot undone", "11 nm", 11e-9,
-                 (marks["amplitude_on_part"] or float("nan")) / 2**0.5, "m", "F1 is printed"),
+                 (marks["amplitude_on_part"] or float("nan")) / 2**0.5, "m", "printed for F1"),
         Compared("working distance", "1.4 mm", "", "", "no number here depends on it"),
         Compared("lateral resolution", "1.8 µm", "1.8 µm", "1",
                  f"as a disc it lowers waves of 15 µm by {100 * lowered:.1f} %, of 5 µm by "

@@ -22,7 +22,7 @@ SET_SCHEMA_1 = "omsm-calibration-set/1"
 AXES = ("x", "z", "b")
 # Every 13 mm of a travel of 250 mm; each costs its filter at every sample.
 MOST_MEMBERS = 20
-# Noise of the encoder at the last place, and a path that ends there, are not beyond it.
+# A path that ends at the last place may exceed it by the noise of the encoder.
 _MARGIN = 0.01
 
 
