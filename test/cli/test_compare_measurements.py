@@ -73,8 +73,6 @@ def test_twenty_nanometres_of_astigmatism_differ(results, tmp_path, capsys):
     sizes = {(t["n"], t["m"]): t["difference"] for t in facts["zernike"]["terms"]}
     edge = (RADIUS / facts["zernike"]["aperture"]["radius"]) ** 2
     assert np.hypot(sizes[2, 2], sizes[2, -2]) * edge == pytest.approx(20e-9, rel=0.15)
-    _, again = difference(capsys, tmp_path / "e", results["fast"], results["other"])
-    assert again["verdict"] == "differ"
 
 
 def interferometer(results, path, spread=None):

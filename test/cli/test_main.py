@@ -148,7 +148,14 @@ def test_a_truncated_bag_is_repaired_into_a_new_file_next_to_it(capsys, folder, 
 def test_every_command_speaks_to_people_too(capsys, folder, tmp_path, command):
     arguments = {
         "identify": [folder / "steps.mcap", "--out", tmp_path / "c.json", "--order", 2],
-        "correct": [folder / "scan.mcap", "--calibration", folder / "cal.json", "--out", tmp_path],
+        "correct": [
+            folder / "scan.mcap",
+            "--calibration",
+            folder / "cal.json",
+            "--out",
+            tmp_path,
+            "--no-report",
+        ],
         "inspect": [folder / "scan.mcap"],
     }
     status, text, _ = run(capsys, command, *arguments[command])

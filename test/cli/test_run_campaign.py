@@ -34,6 +34,9 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
                 bag.write_block(axes)
                 bag.write_block(distance)
     (folder / "bags" / "torn.mcap").write_bytes(b"\x89MCAP0\r\n and then nothing")
+    (folder / "few").mkdir()
+    for name in ("a", "b", "torn"):
+        shutil.copy(folder / "bags" / f"{name}.mcap", folder / "few")
     calibration_file.save_calibration(folder / "cal.json", true_calibration)
     return folder
 
@@ -95,10 +98,9 @@ def test_a_killed_process_costs_its_bag_and_no_other(shop, tmp_path, monkeypatch
         return run(command, **options)
 
     monkeypatch.setattr(campaign.subprocess, "run", sometimes_killed)
-    entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=2)
-    assert states(entries)["b.mcap"] == CRASHED
+    entries = run_campaign(shop / "few", shop / "cal.json", tmp_path, OPTIONS, jobs=2)
+    assert states(entries) == {"a.mcap": DONE, "b.mcap": CRASHED, "torn.mcap": REFUSED}
     assert "SIGKILL" in entries[1].said
-    assert states(entries)["a.mcap"] == states(entries)["monday/c.mcap"] == DONE
 
 
 def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monkeypatch):
@@ -123,7 +125,7 @@ def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monke
 
 def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
     command = [
-        sys.executable, "-m", "omsm_ros.cli", "batch", str(shop / "bags"), "--calibration",
+        sys.executable, "-m", "omsm_ros.cli", "batch", str(shop / "few"), "--calibration",
         str(shop / "cal.json"), "--out", str(tmp_path), "--jobs", "1", "--json", "--", *OPTIONS,
     ]  # fmt: skip
     running = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
@@ -133,10 +135,10 @@ def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
     os.killpg(running.pid, signal.SIGKILL)
     running.wait()
     before = load_campaign(tmp_path)
-    assert 1 <= len(before) < 4
+    assert 1 <= len(before) < 3
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     entries = json.loads(done.stdout)["entries"]
-    assert [e["state"] for e in entries] == [DONE, DONE, DONE, REFUSED]
+    assert [e["state"] for e in entries] == [DONE, DONE, REFUSED]
     assert done.returncode == 2
     assert "1 bags gave no result" in done.stderr
     page = (tmp_path / "index.html").read_text()

@@ -69,7 +69,7 @@ def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
 @pytest.mark.parametrize("form", ["binary", "ascii"])
 def test_a_telegram_that_waits_for_the_next_one_is_not_stamped_late(form: str, bench: Any) -> None:
     run = bench(ChrocodileEmulator, ChrocodileDevice, replace(SIX, format=form), interval=1e-3)
-    run.run(2.0)
+    run.run(1.0)
     block = run.blocks[-1].distance
     # Sample k is due k + 1 periods after the start, and read in the next millisecond.
     due = run.instrument._started + (block.first_sample + 2) * 1e-3

@@ -21,7 +21,7 @@ from omsm_ros.instruments.six_channel.protocol import StreamScaling
 from .scripted_stream import Script
 
 
-@pytest.mark.parametrize("portion", [1 << 20, 7])
+@pytest.mark.parametrize("portion", [1 << 20, 17])
 def test_every_sample_arrives_once_with_its_counter(bench: Any, portion: int) -> None:
     run = bench(CsvStreamEmulator, CsvStreamDevice, CsvSettings(), portion=portion)
     run.run(1.0)

@@ -149,14 +149,14 @@ class FormNormalEquations:
     def add(self, columns: FloatArray, deviation: FloatArray, systematic: FloatArray,
             residual: FloatArray) -> None:  # fmt: skip
         """Add points: columns (q, n), deviation (n,), systematic (s, n), residual (n,)."""
-        right = np.concatenate([columns, deviation[np.newaxis], systematic])
-        self.gram += columns @ right.T
+        self.gram[:, : self.columns] += columns @ columns.T
+        self.gram[:, self.columns :] += columns @ np.vstack([deviation, systematic]).T
         self.points += len(deviation)
         self.square += float(residual @ residual)
         self.total += float(deviation @ deviation)
-        edges = np.arange(0, len(residual), GROUP)
-        if len(edges):
-            self.scores += np.sum(np.add.reduceat(columns * residual, edges, axis=1) ** 2, axis=1)
+        for begin in range(0, len(residual), GROUP):
+            group = slice(begin, begin + GROUP)
+            self.scores += (columns[:, group] @ residual[group]) ** 2
 
 
 class Estimate(NamedTuple):
@@ -315,18 +315,20 @@ def best_matching_sum(columns: FloatArray, deviation: FloatArray) -> tuple[Float
     """
     scale = np.sqrt(np.mean(columns**2, axis=1))
     scale[scale == 0] = 1.0
-    columns = columns / scale[:, np.newaxis]
     limit, residual, fitted = np.inf, deviation, np.zeros(len(columns))
+    whole = columns @ columns.T
     for _ in range(_DUST_PASSES):
         chosen = np.abs(residual) <= limit
-        near = columns[:, chosen]
-        solve = np.linalg.pinv(near @ near.T, rcond=1e-12, hermitian=True)
-        fitted = np.asarray(solve @ (near @ deviation[chosen]), np.float64)
+        # Few are beyond the limit: to take them off is less work than to copy all others.
+        far = columns[:, ~chosen]
+        gram = (whole - far @ far.T) / np.outer(scale, scale)
+        right = columns @ np.where(chosen, deviation, 0.0) / scale
+        fitted = np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right / scale)
         residual = deviation - fitted @ columns
         limit = outlier_limit(residual)
         if np.array_equal(np.abs(residual) <= limit, chosen):
             break
-    return fitted / scale, limit
+    return fitted, limit
 
 
 def relaxation_factor(share: float, last: FloatArray, step: FloatArray) -> float:
