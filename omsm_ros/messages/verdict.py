@@ -4,9 +4,9 @@ from omsm_ros.messages import catalogue
 
 TEMPLATES = catalogue("""
 verdict.verified: verified by {scans:count} scans
-verdict.except: {text}, except for {number} sources as declared or assumed
+verdict.except: {text}, except for what counts as declared or assumed: {names}
 verdict.rests_on: not shown by these scans, counted as declared or assumed: {names} (in all
-    {value:m/2} of the heights, k = 1)
+    {value:m/2} of the heights, k = 1). To verify most of it, {remedy}
 verdict.not_verified: not verified
 verdict.contradicted: contradicted by the scans
 verdict.too_uncertain: uncertainty too large
@@ -22,6 +22,8 @@ verdict.scans_disagree: scan {names} differs from the others by E_n = {value:pla
     {limit:plain/1} is expected; look for what changed between the scans
 verdict.wrong_sign: scan {names}: the deviation follows the removed dynamic error ({value:plain/2}
     of it), as with a wrong sign of the probe; check the polarity of step test and scan
+verdict.wrong_sense: the scans agree only if C counts the other way, or the part was turned on the
+    chuck the other way: check the sense of C, and the sign of {opt.clocking}
 verdict.not_redundant: one speed and direction cannot show an error of the dynamics, a lag or a
     drift
 verdict.not_evaluated: not evaluated, and not shown by these scans: {names} (may change the heights

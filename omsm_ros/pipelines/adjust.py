@@ -380,15 +380,19 @@ def verdict_entry(verdict: Verdict, scans: int = 1, doubts: Iterable[str] = ()) 
         ],
     }
     if verdict.rests_on:
-        names = ", ".join(source_name(name) for name, _ in verdict.rests_on)
+        names = [source_name(name) for name, _ in verdict.rests_on]
+        remedy = sentence(f"verdict.add_{verdict.would_show}", {})
         size = math.hypot(*(effect for _, effect in verdict.rests_on))
         entry["rests_on"] = {
             "names": [name for name, _ in verdict.rests_on],
             "effect": number(size),
-            "text": sentence("verdict.rests_on", {"names": names, "value": size}),
+            "text": sentence(
+                "verdict.rests_on", {"names": ", ".join(names), "value": size, "remedy": remedy}
+            ),
         }
         if code == VERIFIED:
-            values = {"text": entry["text"], "number": len(verdict.rests_on)}
+            more = f" and {len(names) - 2} more" if len(names) > 2 else ""
+            values = {"text": entry["text"], "names": ", ".join(names[:2]) + more}
             entry["text"] = sentence("verdict.except", values)
     if verdict.add:
         entry["add"] = {

@@ -46,6 +46,8 @@ from omsm_ros.core.adjustment.scan_data import (
 )
 from omsm_ros.core.adjustment.sources import Family, Source, base_name, prior_sizes, with_dynamics
 from omsm_ros.core.adjustment.verdict import (
+    WRONG_SENSE,
+    Reason,
     Verdict,
     looks_like,
     not_evaluated,
@@ -208,8 +210,11 @@ def _adjusted(
     wrong = _wrong_signs(views)
     walk = _walk(detecting, priors)
     enough = redundant(scans)
+    reasons = reasons_of(refutations, {p.name for p in priors}, agreement, wrong, walk, accepted)
+    if reasons and _counts_the_other_way(scans, priors, surface, refutations):
+        reasons = (Reason(WRONG_SENSE),)
     verdict = verdict_of(
-        reasons_of(refutations, {p.name for p in priors}, agreement, wrong, walk, accepted),
+        reasons,
         not_evaluated(families, effects, priors, open_limit(accuracy))
         + looks_like(form.resembled, families, accepted),
         rests_on(families, effects, form.mean_uncertainty),
@@ -278,6 +283,23 @@ def _wrong_signs(views: Sequence[ScanView]) -> tuple[tuple[int, float], ...]:
     shares = [follows_removed(view) for view in views]
     found = [(v.index, s) for v, s in zip(views, shares, strict=True) if s is not None]
     return tuple(found) if len(found) == len(views) else ()
+
+
+def _counts_the_other_way(
+    scans: Sequence[ScanData], priors: Sequence[Source], surface: Surface,
+    refutations: Sequence[Refutation],
+) -> bool:  # fmt: skip
+    """Return whether the scans contradict each other, and would not if C had the other sense.
+
+    Only a part that was turned on the chuck tells it from its mirror image.
+    """
+    if all(r.minor for r in refutations) or len({s.clocking for s in scans}) == 1:
+        return False
+    mirrored = [replace(s, y=-s.y, c=-s.c) for s in scans]
+    zero = zero_of(mirrored, surface)
+    views = [view_of(s, k, zero, surface) for k, s in enumerate(mirrored)]
+    network, sizes = _network(mirrored, views, priors)
+    return all(r.minor for r in _fitted(network, views, sizes, priors)[1])
 
 
 def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[Evidence, ...]:

@@ -210,7 +210,8 @@ def _geometric(r: Ranges) -> list[Family]:
             [v.across(v.motion, 0.0), v.across(0.0, v.motion)]), 1e-3, BEYOND_CENTRE),
         _one("squareness", "rad", lambda v: v.slide_x, 3e-5, BEYOND_CENTRE),
         _one("encoder_scale", "1", lambda v: v.motion, 1e-4, REFERENCE),
-        _curve("straightness_x", "m", r.slide, r, lambda v, w: w(v.slide_x), 3e-7, BEYOND_CENTRE),
+        # A bow that is even in x is power of the part beyond the centre, too.
+        _curve("straightness_x", "m", r.slide, r, lambda v, w: w(v.slide_x), 3e-7, REFERENCE),
         _curve("straightness_z", "m", r.lift, r, lambda v, w: np.stack(
             [v.across(*way) for bow in w(v.motion) for way in ((bow, 0.0), (0.0, bow))]),
             1e-6, BEYOND_CENTRE, 2),

@@ -137,11 +137,18 @@ def fit_and_refute(
         )
         steps.append(solution)
         still = {e.family.name for e in refuted_by(solution, [r.name for r in found])}
-        alike = [e for e in beyond if e is not best and e.family.named and _as_good(e, best)
-                 and e.family.name not in still]  # fmt: skip
+        # Parsimony chooses the culprit; whatever explains as much may be it.
+        enough = best.chi_square - max(_ALIKE, _ALIKE_SHARE * best.chi_square)
+        alike = [e for e in beyond if e is not best and e.family.named and e.family.name not in
+                 still and (_as_good(e, best) or e.chi_square >= enough)]  # fmt: skip
         minor = best.effect < 2 * solution.scales.texture and best.gain < SURE
         rivals = [e for e in evidences if e is not best and e.deviate > _RARE and not minor
                   and explained(e, best) > _RIVAL_SHARE]  # fmt: skip
+        # As a centre that is off along X and along Y: two causes that together explain as much.
+        parts = [e for e in rivals if e not in alike and e.family.size < family.size
+                 and e.family.name not in still]  # fmt: skip
+        if sum(explained(e, best) for e in parts) > 1 - _ALIKE_SHARE:
+            alike += parts
         found.append(Refutation(best, tuple(alike), tuple(rivals), minor))
     left = max((e.gain for e in refuted_by(solution, [r.name for r in found])), default=0.0)
     return solution, *_grouped(found, steps, first, left)

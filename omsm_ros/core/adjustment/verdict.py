@@ -12,7 +12,7 @@ from omsm_ros.core.adjustment.agreement import ScanAgreement
 from omsm_ros.core.adjustment.figures import NO_EFFECT, Contribution, Effect
 from omsm_ros.core.adjustment.refutation import Refutation
 from omsm_ros.core.adjustment.scan_data import ScanData
-from omsm_ros.core.adjustment.sources import FREE, Family, Source, base_name
+from omsm_ros.core.adjustment.sources import FREE, VIBRATION, Family, Source, base_name
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.certificate import REJECTED
 
@@ -21,6 +21,7 @@ CONTRADICTED, TOO_UNCERTAIN, INVALID = "contradicted", "too_uncertain", "invalid
 
 # Reasons.
 REFUTED, DISAGREE, WRONG_SIGN = "refuted", "scans_disagree", "wrong_sign"
+WRONG_SENSE = "wrong_sense"
 UNDECLARED_EFFECT, NOT_REDUNDANT, UNCERTAINTY = "undeclared_effect", "not_redundant", "uncertainty"
 NOT_EVALUATED, DECLARED_ONLY = "not_evaluated", "declared_only"
 UNIDENTIFIED, LOOKS_LIKE = "unidentified", "looks_like"
@@ -52,7 +53,7 @@ class Verdict:
 
     code: of this module;  reasons: against green, none where it is verified
     rests_on: declared sources that these scans do not verify, name and standard uncertainty of
-        the heights by each [m], largest first
+        the heights by each [m], largest first;  would_show: code of what shows most of them
     add: code of the one scan to add that helps most, "" where none is needed
     reached: expanded uncertainty (k = 2) of the heights with that scan, rms over the part [m]
     """
@@ -62,6 +63,7 @@ class Verdict:
     rests_on: tuple[tuple[str, float], ...] = ()
     add: str = ""
     reached: float = float("nan")
+    would_show: str = ""
 
 
 def redundant(scans: Sequence[ScanData]) -> bool:
@@ -95,7 +97,10 @@ def reasons_of(
     if all(r.explains for r in causes):
         for cause in causes:
             code = REFUTED if base_name(cause.name) in declared else UNDECLARED_EFFECT
-            found.append(Reason(code, (cause.name, *cause.alike), cause.evidence.deviate, 3.0))
+            names: tuple[str, ...] = (cause.name, *cause.alike)
+            if not cause.evidence.family.named:
+                code, names = UNIDENTIFIED, ()
+            found.append(Reason(code, names, cause.evidence.deviate, 3.0))
     else:
         # A cause that no family explains may stand behind all others that were found.
         largest = max(r.evidence.deviate for r in causes)
@@ -107,9 +112,8 @@ def reasons_of(
     # Any other error that is left in the residuals passes for drift.
     alone = not found and walk[2] is not None and "drift_walk" not in accepted
     if alone and size > stated * (1 + _RARE_WALK * spread):
-        # In one scan to the centre, time and slide are one.
-        names = ("drift_walk",) if agreement else ("drift_walk", "straightness_x")
-        found.append(Reason(REFUTED, names, size, stated))
+        # To the centre time and slide are one, and a line whose phase wanders is none.
+        found.append(Reason(REFUTED, ("drift_walk", "straightness_x", VIBRATION), size, stated))
     return tuple(found)
 
 
@@ -167,24 +171,29 @@ def looks_like(
 
 def rests_on(
     families: Sequence[Family], effects: Mapping[str, Effect], limit: float
-) -> tuple[tuple[str, float], ...]:
+) -> tuple[tuple[tuple[str, float], ...], str]:
     """Return the sources that count as they were declared, for these scans do not show them.
 
-    Also what each does to the heights as declared, k = 1 [m], the largest first.
+    Also what each does to the heights as declared, k = 1 [m], the largest first; and the code of
+    the scan or artefact that would show most of that.
     limit: a source that may do more if its declaration is worth nothing is one of them [m]
     """
     found = [
-        (f.name, effects[f.name].left)
+        f
         for f in families
         if base_name(f.name) not in FREE and effects.get(f.name, NO_EFFECT).free > limit
     ]
-    return tuple(sorted(found, key=lambda pair: -pair[1]))
+    by: dict[str, float] = {}
+    for family in found:
+        by[family.shown_by] = by.get(family.shown_by, 0.0) + effects[family.name].left ** 2
+    resting = sorted(((f.name, effects[f.name].left) for f in found), key=lambda pair: -pair[1])
+    return tuple(resting), max(by, key=lambda code: by[code], default="")
 
 
 def verdict_of(
     contradictions: Sequence[Reason],
     open_sources: Sequence[Reason],
-    resting: tuple[tuple[str, float], ...],
+    resting: tuple[tuple[tuple[str, float], ...], str],
     is_redundant: bool,
     expanded: float,
     accuracy: float | None,
@@ -194,7 +203,7 @@ def verdict_of(
 ) -> Verdict:
     """Return the verdict.
 
-    open_sources: what is neither shown nor declared;  resting: what rests on declarations alone
+    open_sources: what is neither shown nor declared;  resting: of :func:`rests_on`
     expanded: uncertainty (k = 2) of PV [m];  accuracy: asked for [m], None: none
     addition: code of the scan to add and the standard uncertainty that is reached [m]
     calibration: that corrected the heights; where it was rejected they are not valid
@@ -221,4 +230,4 @@ def verdict_of(
         code = NOT_VERIFIED
     else:
         code = VERIFIED
-    return Verdict(code, tuple(reasons), resting, add, reached)
+    return Verdict(code, tuple(reasons), resting[0], add, reached, resting[1])

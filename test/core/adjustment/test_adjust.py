@@ -8,6 +8,7 @@ from coverage import CLOCKING_RAD, LAG_S, PRIORS, drawn, normalised, true_form
 from plain_world import MIRROR, RADIUS_M, Machine, rings
 
 from omsm_ros.core.adjustment import (
+    CONTRADICTED,
     NOT_VERIFIED,
     TOO_UNCERTAIN,
     VERIFIED,
@@ -16,7 +17,7 @@ from omsm_ros.core.adjustment import (
     adjust,
     corrected_heights,
 )
-from omsm_ros.core.adjustment.verdict import INVALID
+from omsm_ros.core.adjustment.verdict import INVALID, WRONG_SENSE
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import ConfigurationError, DataError
@@ -138,12 +139,23 @@ def test_what_is_only_declared_does_not_turn_green(table):
     assert found.verdict.code == NOT_VERIFIED
     names = {r.names[0]: r for r in found.verdict.reasons if r.names}
     assert names["straightness_x"].code == "declared_only"
-    assert names["straightness_x"].names[1] == "beyond_centre"
+    assert names["straightness_x"].names[1] == "reference_artefact"
     nothing = adjust(scans[:2], (), nominal=MIRROR, accuracy=25e-9)
     missing = {r.names[0]: r.code for r in nothing.verdict.reasons if r.names}
     assert missing["straightness_x"] == missing["encoder_scale"] == "not_evaluated"
     # 12, 9 and 5 nm of the spindle, which nobody declared, are seen all the same.
     assert missing["spindle_axial/2"] == missing["spindle_axial/3"] == "undeclared_effect"
+
+
+@pytest.mark.soak
+def test_a_turned_part_shows_that_c_counts_the_other_way(table):
+    """The mirror image of the mirror, whose clocking then has the other sign."""
+    _, scans, _ = table
+    assert len({s.clocking for s in scans}) == 2
+    reflected = [replace(s, y=-s.y, c=-s.c) for s in scans]
+    found = adjust(reflected, PRIORS, nominal=MIRROR)
+    assert found.verdict.code == CONTRADICTED
+    assert found.verdict.reasons[0].code == WRONG_SENSE
 
 
 def test_two_scans_of_one_speed_and_direction_are_not_redundant():
@@ -193,7 +205,7 @@ def test_stated_noise_and_walk_are_replaced_by_what_the_scans_show():
         found = adjust(scans, PRIORS, nominal=MIRROR, accuracy=25e-9)
         assert found.noise == pytest.approx(36e-9, rel=0.05)
         assert found.drift_walk == pytest.approx(6e-9, rel=0.35)
-        assert ("refuted", "drift_walk") in {(r.code, *r.names) for r in found.verdict.reasons}
+        assert ("refuted", "drift_walk") in {(r.code, *r.names[:1]) for r in found.verdict.reasons}
         truth = true_form(machine, found.form)
         errors.append(found.form.area @ (found.form.height - truth) ** 2)
         stated.append(found.form.mean_uncertainty**2)
