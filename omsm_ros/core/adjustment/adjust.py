@@ -208,13 +208,10 @@ def _adjusted(
     form = replace(form, pose=form.pose + zero.height * (np.array(removed) == "piston"))
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
-    walk = _walk(detecting, priors)
-    enough = redundant(scans)
+    walk, enough = _walk(detecting, priors), redundant(scans)
     reasons = reasons_of(refutations, {p.name for p in priors}, agreement, wrong, walk, accepted)
-    if reasons and _counts_the_other_way(scans, priors, surface, refutations):
-        reasons = (Reason(WRONG_SENSE),)
     verdict = verdict_of(
-        reasons,
+        _or_sense_of_c(reasons, scans, priors, surface, refutations),
         not_evaluated(families, effects, priors, open_limit(accuracy))
         + looks_like(form.resembled, families, accepted),
         rests_on(families, effects, form.mean_uncertainty),
@@ -285,21 +282,22 @@ def _wrong_signs(views: Sequence[ScanView]) -> tuple[tuple[int, float], ...]:
     return tuple(found) if len(found) == len(views) else ()
 
 
-def _counts_the_other_way(
-    scans: Sequence[ScanData], priors: Sequence[Source], surface: Surface,
-    refutations: Sequence[Refutation],
-) -> bool:  # fmt: skip
-    """Return whether the scans contradict each other, and would not if C had the other sense.
+def _or_sense_of_c(
+    reasons: tuple[Reason, ...], scans: Sequence[ScanData], priors: Sequence[Source],
+    surface: Surface, refutations: Sequence[Refutation],
+) -> tuple[Reason, ...]:  # fmt: skip
+    """Return ``reasons``, or the sense of C alone, if the scans agree where C has the other one.
 
     Only a part that was turned on the chuck tells it from its mirror image.
     """
     if all(r.minor for r in refutations) or len({s.clocking for s in scans}) == 1:
-        return False
+        return reasons
     mirrored = [replace(s, y=-s.y, c=-s.c) for s in scans]
     zero = zero_of(mirrored, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(mirrored)]
     network, sizes = _network(mirrored, views, priors)
-    return all(r.minor for r in _fitted(network, views, sizes, priors)[1])
+    agrees = all(r.minor for r in _fitted(network, views, sizes, priors)[1])
+    return (Reason(WRONG_SENSE),) if agrees else reasons
 
 
 def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[Evidence, ...]:
