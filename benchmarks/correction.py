@@ -11,7 +11,6 @@ from scipy import signal
 from benchmarks.row import Row, at_most, shown
 from benchmarks.twin_motions import step_test_of
 from omsm_ros.core.adjustment.resolved_calibration import reversal
-from omsm_ros.core.adjustment.scan_reader import read_scan
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
@@ -23,6 +22,7 @@ from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
 from omsm_ros.core.streams.motion_record import assemble
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.pipelines.recording import scan_data
 from omsm_ros.twin.cell import Cell, Recording, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
@@ -226,7 +226,7 @@ def probe_latency() -> list[Row]:
     for speed, seed in ((30.0, 1), (-30.0, 2)):
         made = scan(speed, seed, cell)
         points = corrected(calibration, made.axes, made.distance, probe_latency=0.0)
-        scans.append(read_scan(made.axes, points))
+        scans.append(scan_data([made.axes], [points], made.axes.sample_period)[0])
     found = reversal(scans, calibration)
     error = abs(found.lag - latency)
     put_right = corrected(calibration, made.axes, made.distance, probe_latency=found.lag)

@@ -16,7 +16,7 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.adjustment.scan_reader import ScanColumns, read_scan
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.self_calibration import self_calibrate
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -24,6 +24,7 @@ from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
 from omsm_ros.core.identification.identify import identify
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
+from omsm_ros.pipelines.recording import scan_data
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import NOTHING, Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import Drift, MachineErrors
@@ -62,9 +63,12 @@ def _points(made: Recording, known: Calibration, **options: object) -> SurfacePo
     return join_points([corrector.finish()])
 
 
-def _pair(seed: int, errors: Disturbances, known: Calibration) -> list[ScanColumns]:
+def _pair(seed: int, errors: Disturbances, known: Calibration) -> list[ScanData]:
     scans = (_scan(rpm, 1000 * seed + k, errors) for k, rpm in enumerate((30.0, 60.0)))
-    return [read_scan(s.axes, _points(s, known, probe_latency=0.0)) for s in scans]
+    return [
+        scan_data([s.axes], [_points(s, known, probe_latency=0.0)], s.axes.sample_period)[0]
+        for s in scans
+    ]
 
 
 def _error_left(known: Calibration, share: float) -> float:

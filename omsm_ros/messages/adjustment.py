@@ -7,11 +7,6 @@ adjustment.one_scan: {scans} scan, expected two or more of one part, at differen
     opposite directions
 adjustment.no_common_ring: the scans share no ring: one begins at a radius of {inner!r} m, another
     ends at {outer!r} m; scan the same part of the surface
-adjustment.no_points_in_ring: a scan has no points between the common radii of {inner!r} and
-    {outer!r} m; scan the same part of the surface
-adjustment.unknown_speed: the speed of C is not known at every point of a scan; record it again
-adjustment.short_scan: scan of {points} points, {used} of them with all their neighbours; expected
-    {least} or more: record a longer scan
 adjustment.remounted_part: a part that was mounted again is turned by an unknown angle, which has
     the effect of a lag; scan it at both speeds without removing it, or state its {opt.clocking}
 adjustment.equal_speeds: the scans all run at {speeds:list} rpm, so that a lag is the same in each

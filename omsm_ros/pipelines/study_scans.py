@@ -13,7 +13,7 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.adjustment.scan_reader import ScanColumns, ScanReader
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.self_calibration import SelfCalibration, self_calibrate
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
@@ -24,12 +24,12 @@ from omsm_ros.core.registration.probe_alignment import (
     SphereScan,
     align_on_sphere,
 )
-from omsm_ros.core.streams.blocks import Account, AxisBlock
+from omsm_ros.core.streams.blocks import Account
 from omsm_ros.errors import BagError
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import Recording
+from omsm_ros.pipelines.recording import Recording, scan_data
 from omsm_ros.readable import counts_text
 
 # The probe latency is what these tasks estimate, so it must not be corrected before.
@@ -85,18 +85,13 @@ def self_calibration_of(
 
 def _read_scans(
     recordings: Sequence[Recording], calibration: Calibration, options: CorrectionOptions
-) -> tuple[list[ScanColumns], list[Account]]:
+) -> tuple[list[ScanData], list[Account]]:
     scans, accounts = [], []
     for recording in recordings:
         scan = CorrectedScan(recording, calibration, options)
-        reader = ScanReader(scan.sample_period)
-        for block, points in scan.steps():
-            if isinstance(block, AxisBlock):
-                reader.add_axes(block)
-            if points is not None:
-                reader.add(points)
+        axes, parts = scan.read()
         _check_points(scan)
-        scans.append(reader.columns())
+        scans.append(scan_data(axes, parts, scan.sample_period)[0])
         accounts.append(scan.account)
     return scans, accounts
 

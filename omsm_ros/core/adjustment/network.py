@@ -21,7 +21,8 @@ from omsm_ros.core.adjustment.sources import Family
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 
 Sizes = Mapping[str, float | FloatArray]
-"""Prior standard deviations of the families that take part, of all columns or of each."""
+"""Prior standard deviations of the families that take part, of all columns or of each; a matrix is
+their covariance."""
 
 # A walk between two knots of half a turn stays below the noise of a block.
 _KNOTS_A_TURN, _MOST_KNOTS = 2, 300
@@ -176,8 +177,14 @@ class Network:
 
     def right_side(self, scales: Scales, y: FloatArray) -> FloatArray:
         """Return XᵀV⁻¹y with the cells eliminated, (size,)."""
-        weights = self.weights(scales)
-        pulled = weights * (y - self.cells_of(scales, y)[self.part.cell])
+        return self.sums_by_column(self.pulled(scales, y))
+
+    def pulled(self, scales: Scales, y: FloatArray) -> FloatArray:
+        """Return V⁻¹y with the cells eliminated, (b,) [1/m]."""
+        return np.asarray(self.weights(scales) * (y - self.cells_of(scales, y)[self.part.cell]))
+
+    def sums_by_column(self, pulled: FloatArray) -> FloatArray:
+        """Return Xᵀ times ``pulled`` (b,) or (b, k)."""
         return np.concatenate(
             [self.blocks.columns.T @ pulled, self._values.T @ pulled, self._hats.T @ pulled]
         )
@@ -225,7 +232,12 @@ class Network:
         """
         diagonal = np.zeros(self.size)
         for name, size in sizes.items():
-            diagonal[self.place[name]] = 1 / np.maximum(size, _LEAST_SIZE) ** 2
+            if np.ndim(size) == 2:
+                first = int(np.searchsorted(active, self.place[name].start))
+                own = slice(first, first + len(np.asarray(size)))
+                matrix[own, own] += Factor.of(np.array(size)).inverse()
+            else:
+                diagonal[self.place[name]] = 1 / np.maximum(size, _LEAST_SIZE) ** 2
         free, degrees = self.part.free, self.part.degrees
         variance = np.array(
             [f**2 if f else scales.bands[int(d)] for f, d in zip(free, degrees, strict=True)]
@@ -384,11 +396,12 @@ def estimate_scales(solution: Solution) -> Scales:
     net, scales = solution.network, solution.scales
     diagonal = np.diag(solution.covariance_of(net.terms))
     terms, degrees = solution.values[net.terms], net.part.degrees
+    least = _VANISHED * float(np.min(net.blocks.variance))
     bands = {}
     for degree, before in scales.bands.items():
         mine = degrees == degree
         determined = np.sum(1 - diagonal[mine] / before)
-        bands[degree] = _variance(float(np.sum(terms[mine] ** 2)), float(determined), before)
+        bands[degree] = _variance(float(np.sum(terms[mine] ** 2)), float(determined), before, least)
     residual = solution.residual()
     cells = net.cells_of(scales, residual)
     share = net.cell_share(net.weights(scales), scales)
@@ -396,20 +409,20 @@ def estimate_scales(solution: Solution) -> Scales:
     determined_cells = float(np.sum(1 - share[seen] / max(scales.cells, _LEAST_VARIANCE)))
     return replace(
         scales,
-        walk=_variance(*walk_squares(solution), scales.walk),
+        walk=_variance(*walk_squares(solution), scales.walk, least),
         bands=bands,
-        cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells),
+        cells=_variance(float(np.sum(cells**2)), determined_cells, scales.cells, least),
         noise=_noise(solution, residual - cells[net.part.cell], determined_cells),
     )
 
 
-# A step of a variance; what has vanished may come back.
-_LARGEST_STEP, _VANISHED = 30.0, 1e-22
+# A step of a variance; what has vanished, as a share of the variance of a block, may come back.
+_LARGEST_STEP, _VANISHED = 30.0, 1e-5
 
 
-def _variance(square: float, determined: float, before: float) -> float:
+def _variance(square: float, determined: float, before: float, least: float) -> float:
     found = square / max(determined, 1e-3)
-    return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), _VANISHED))
+    return float(max(np.clip(found, before / _LARGEST_STEP, before * _LARGEST_STEP), least))
 
 
 def walk_squares(solution: Solution) -> tuple[float, float]:

@@ -11,7 +11,6 @@ import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
 from omsm_ros.core.adjustment.network import Network, Scales, Solution, estimate_scales, solve
-from omsm_ros.core.adjustment.part_terms import FREE_DEGREE, HIGHEST_DEGREE, RINGS, SYMMETRIC
 from omsm_ros.core.adjustment.sources import FREE, base_name
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -87,8 +86,8 @@ def start_scales(network: Network, walk: float | None) -> Scales:
 
     walk: declared standard deviation of the drift after one second [m]
     """
-    bands = dict.fromkeys(range(FREE_DEGREE + 1, HIGHEST_DEGREE + 1), _BAND_START_M**2)
-    bands[RINGS] = bands[SYMMETRIC] = _BAND_START_M**2
+    estimated = network.part.degrees[network.part.free == 0]
+    bands = dict.fromkeys(map(int, estimated), _BAND_START_M**2)
     first = _WALK_START if not walk else walk**2
     return Scales(first, bands, _CELLS_START_M**2, np.ones(network.blocks.scans))
 

@@ -12,10 +12,15 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from scipy import stats
 
-from omsm_ros.core.adjustment.scan_model import CURVATURE, DYNAMIC, GAIN, LAG, LATENCY, OWN
-from omsm_ros.core.adjustment.scan_reader import ScanColumns
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.self_calibration import (
+    CURVATURE,
     DEFAULT_HARMONICS,
+    DYNAMIC,
+    GAIN,
+    LAG,
+    LATENCY,
+    OWN,
     UNINFORMATIVE_CURVATURE_S2,
     UNINFORMATIVE_GAIN,
     UNINFORMATIVE_S,
@@ -308,7 +313,7 @@ class Reversal:
 
 
 def reversal(
-    scans: Sequence[ScanColumns], calibration: Calibration, harmonics: int = DEFAULT_HARMONICS
+    scans: Sequence[ScanData], calibration: Calibration, harmonics: int = DEFAULT_HARMONICS
 ) -> Reversal:
     """Return the lag of the probe relative to X and C from scans in opposite directions.
 
@@ -318,8 +323,8 @@ def reversal(
     Raises DataError for scans in one direction, scans that are too short, or a surface without
     slope along the path.
     """
-    turns = [float(scan.angular_rate.sum()) for scan in scans]
-    if len(scans) > 1 and not min(turns) < 0 < max(turns):
+    speeds = [scan.speed for scan in scans]
+    if len(scans) > 1 and not min(speeds) < 0 < max(speeds):
         raise DataError("adjustment.one_direction")
     found = self_calibrate(scans, after_step_test(calibration), harmonics)
     lag, of_z = float(found.values[LATENCY]), calibration.dynamics.low_frequency_delay

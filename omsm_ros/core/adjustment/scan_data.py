@@ -24,7 +24,7 @@ from omsm_ros.errors import DataError
 
 # A turn at 30 rpm holds 2000 points at 1 kHz; two hundred determine neither form nor drift.
 LEAST_POINTS = 200
-# As in verification.scan_reader: at the 12th harmonic of a turn a second the rate is 1 % short.
+# At the 12th harmonic of a turn a second the rate is 1 % short.
 _HALF_WINDOW_S, _POLYNOMIAL = 12e-3, 4
 
 
@@ -212,6 +212,17 @@ def view_of(scan: ScanData, index: int, zero: Zero, nominal: Surface) -> ScanVie
         speed=scan.speed,
         index=index,
     )
+
+
+def delayed(scan: ScanData, latency: float) -> ScanData:
+    """Return ``scan`` with each reading where probe and part were ``latency`` [s] before."""
+    slide = (scan.x + 1j * scan.y) * np.exp(1j * scan.c)
+    rates = (_rate(scan.time, v) for v in (slide.real, slide.imag, scan.c))
+    x, y, c = (
+        v - latency * r for v, r in zip((slide.real, slide.imag, scan.c), rates, strict=True)
+    )
+    place = (x + 1j * y) * np.exp(-1j * c)
+    return replace(scan, x=place.real, y=place.imag)
 
 
 def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:

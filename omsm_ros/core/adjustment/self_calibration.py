@@ -1,9 +1,9 @@
 """Estimate the dynamics from scans of one part at different speeds or directions.
 
-The surface is common to all scans and is eliminated; effects that depend on speed or direction
-remain, see :mod:`omsm_ros.core.adjustment.scan_model`. Gauss-Newton on latency and clocking; all
-other parameters are linear. The covariance follows from the residuals of whole rings of the part,
-because texture, vibration and spindle error are correlated within a ring and between scans.
+A case of the adjustment: the surface is common to all scans, the parameters are those of the
+dynamics and the place of the part in each scan. Gauss-Newton on the latency, all else is linear.
+The covariance follows from the residuals of whole rings of the part, because texture, vibration
+and spindle error are correlated within a ring and between scans.
 """
 
 from __future__ import annotations
@@ -12,25 +12,35 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.polynomial import legendre
 
-from omsm_ros.core.adjustment.scan_model import (
-    CLOCKING,
-    CURVATURE,
-    DYNAMIC,
-    GAIN,
-    LAG,
-    LATENCY,
-    IntervalRows,
-    ScanModel,
-    ScanPlacement,
-    normal_equations,
+from omsm_ros.core.adjustment.blocks import Blocks, blocks_of
+from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
+from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
+from omsm_ros.core.adjustment.part_terms import part_model
+from omsm_ros.core.adjustment.refutation import settled, start_scales
+from omsm_ros.core.adjustment.scan_data import (
+    ScanData,
+    ScanView,
+    delayed,
+    fitted_surface,
+    view_of,
+    zero_of,
 )
-from omsm_ros.core.adjustment.scan_reader import ScanColumns
+from omsm_ros.core.adjustment.sources import Columns, Family
+from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.errors import DataError
 from omsm_ros.linear_algebra import one_blas_thread
 from omsm_ros.units import RPM_RAD_S
 
+# Parameters of the dynamics, and of the part in each scan.
+LAG, CURVATURE, GAIN, LATENCY = range(4)
+DYNAMIC = 4
+OWN = ("clocking", "shift_x", "shift_y", "tilt_x", "tilt_y")
+_DYNAMICS, _OWN = "dynamics", "own"
+# Drift of each scan but the first: a free polynomial over its time; the rest is a random walk.
+_DRIFT, _DRIFT_M = 3, 1e-3
 # Rings and harmonics of the residuals, coarser than the terms of the surface.
 RINGS, HARMONICS = 12, 8
 # Twice the power that noise predicts; clean scans of the twin give 0.5 to 1.1.
@@ -41,15 +51,13 @@ _LEAST_DISAGREEMENT_M = 2e-9
 _MOST_RINGS, _LEAST_RINGS = 60, 12
 # The off-axis mirror of the paper has 2 nm in the sixth harmonic, and 4 pm in the eighth.
 DEFAULT_HARMONICS = 12
+# Degrees of the surface's terms for each harmonic.
+_DEGREES = 2
 # A tenth of a second of arc, the repeatability of the index of a good rotary encoder.
 DEFAULT_CLOCKING_RAD = 5e-7
 # Motion of a part that stays on the chuck, by warming. On an off-axis paraboloid shift and tilt
 # together look like clocking, so these limit the result.
 DEFAULT_SHIFT_M, DEFAULT_TILT_RAD = 1e-6, 2e-6
-# Standard deviation of a prior without information that keeps the matrix regular.
-_FREE = 1e6
-# Start value of the noise, replaced after the first step.
-_NOISE_M = 10e-9
 # Change over the standard deviation of the prior that counts as harmless: some nanoseconds, below
 # what a step test resolves.
 _HARMLESS = 0.03
@@ -64,8 +72,8 @@ _MAY_REMAIN_UNDETERMINED = (LATENCY, CURVATURE)
 # Convergence is quadratic; 10 ns are 0.02 nm on a scan with 2 mm/s.
 _ITERATIONS = 6
 _CONVERGED_S = 1e-8
-# Points of the iteration; they give a lag to a microsecond.
-_ENOUGH_POINTS = 40_000
+# Estimates of drift and noise at each latency, at most.
+_STEPS = 40
 # A parameter is determined by the scans if they narrow its prior to this share.
 _KNOWN = 0.01
 # A larger uncertainty of the lag rests on terms that are not modelled.
@@ -83,7 +91,7 @@ class ScanConsistency:
 
     ratio: mean square of the residuals in rings and harmonics over the prediction from noise [1]
     disagreement: rms of the residuals in excess of noise [m]
-    noise: of a reading, from successive differences [m]
+    noise: of a reading, from differences of neighbours [m]
     """
 
     ratio: float
@@ -96,94 +104,34 @@ class ScanConsistency:
         return self.ratio < _GREATEST_RATIO or self.disagreement < _LEAST_DISAGREEMENT_M
 
 
-class ScanConsistencySums:
-    """Collects residuals of ``scans`` scans between the radii ``inner`` and ``outer`` [m]."""
-
-    def __init__(self, scans: int, inner: float, outer: float) -> None:
-        self._inner, self._width = inner, (outer - inner) / RINGS
-        self._sums = np.zeros((scans, RINGS, HARMONICS), np.complex128)
-        self._counts = np.zeros((scans, RINGS))
-        self._jumps, self._jump_count = 0.0, 0
-
-    def add(self, scan: int, radius: FloatArray, angle: FloatArray, residual: FloatArray) -> None:
-        """Add points (n,) of one scan, in the order of time."""
-        ring: IntArray = np.clip((radius - self._inner) // self._width, 0, RINGS - 1).astype(int)
-        wave = np.exp(-1j * angle)
-        turned = residual.astype(np.complex128)
-        for m in range(HARMONICS):
-            turned = turned * wave
-            real, imaginary = (np.bincount(ring, v, RINGS) for v in (turned.real, turned.imag))
-            self._sums[scan, :, m] += real + 1j * imaginary
-        self._counts[scan] += np.bincount(ring, minlength=RINGS)
-        self._jumps += float(np.sum(np.diff(residual) ** 2))
-        self._jump_count += max(len(residual) - 1, 0)
-
-    def result(self) -> ScanConsistency:
-        """Return the agreement of all residuals."""
-        variance = self._jumps / max(2 * self._jump_count, 1)
-        seen = self._counts > 0
-        count = self._counts[seen][:, np.newaxis]
-        power = abs(self._sums[seen]) ** 2
-        # The power of n values of white noise at a harmonic is n times their variance.
-        ratio = float(np.mean(power / (count * variance))) if variance > 0 else 0.0
-        excess = np.maximum(2 * (power - count * variance) / count**2, 0.0)
-        mean_square = np.average(np.sum(excess, axis=1), weights=count[:, 0])
-        return ScanConsistency(ratio, float(np.sqrt(mean_square)), float(np.sqrt(variance)))
+def consistency_of(blocks: Blocks, residual: FloatArray) -> ScanConsistency:
+    """Return the agreement of the scans by the ``residual`` of each block (b,) [m]."""
+    radius, wave = np.hypot(blocks.x, blocks.y), np.exp(-1j * np.arctan2(blocks.y, blocks.x))
+    ring = _rings(radius, RINGS)
+    place = blocks.scan * RINGS + ring
+    size = blocks.scans * RINGS
+    # The power of values of white noise at a harmonic is the sum of their variances.
+    predicted, count = (
+        np.bincount(place, v, size) for v in (blocks.count**2 * blocks.variance, blocks.count)
+    )
+    power = np.empty((HARMONICS, size))
+    turned = (blocks.count * residual).astype(np.complex128)
+    for m in range(HARMONICS):
+        turned = turned * wave
+        power[m] = sum(np.bincount(place, v, size) ** 2 for v in (turned.real, turned.imag))
+    seen = count > 0
+    power, predicted, count = power[:, seen], predicted[seen], count[seen]
+    excess = np.maximum(2 * (power - predicted) / count**2, 0.0)
+    mean_square = np.average(np.sum(excess, axis=0), weights=count)
+    noise = float(np.sqrt(np.mean(blocks.noise**2)))
+    return ScanConsistency(float(np.mean(power / predicted)), float(np.sqrt(mean_square)), noise)
 
 
-class RingScores:
-    """Collects scores of residuals by ring, for a covariance that is robust to correlation.
-
-    shares: of the terms of the surface in each column, from the normal equations
-    square: sum of squared residuals so far;  agreement: of the scans
-    """
-
-    def __init__(self, model: ScanModel, shares: FloatArray) -> None:
-        self._model, self._shares = model, shares
-        rings = int(np.clip(min(model.turns), _LEAST_RINGS, _MOST_RINGS))
-        self._scores = np.zeros((rings, model.size))
-        self._second = np.zeros((DYNAMIC, DYNAMIC))
-        self.square = 0.0
-        basis = model.basis
-        self.agreement = ScanConsistencySums(model.number, basis.inner, basis.outer)
-
-    def add(
-        self,
-        part: IntervalRows,
-        x: FloatArray,
-        y: FloatArray,
-        parameters: FloatArray,
-        surface: FloatArray,
-    ) -> None:
-        """Add a portion with columns x (n, parameters), heights y (n,), and the solution."""
-        model, basis = self._model, self._model.basis
-        terms, here = part.rows.matrix(), basis.terms(part.interval)
-        residual = y - x @ parameters - terms @ surface[here]
-        free = x - terms @ self._shares[here]
-        radius, angle = model.radius(part), model.angle(part)
-        depth = (radius - basis.inner) / (basis.outer - basis.inner)
-        ring = np.clip(depth * len(self._scores), 0, len(self._scores) - 1).astype(np.int64)
-        for number in np.unique(ring):
-            mine = ring == number
-            self._scores[number] += residual[mine] @ free[mine]
-        four = x[:, :DYNAMIC].copy()
-        four[:, GAIN] += terms @ surface[here]
-        self._second += four.T @ four
-        self.square += float(residual @ residual)
-        scan = model.scan[part.points]
-        for k in np.unique(scan):
-            mine = scan == k
-            self.agreement.add(int(k), radius[mine], angle[mine], residual[mine])
-
-    def score_covariance(self) -> FloatArray:
-        """Return the scores' covariance, (parameters, parameters); a ring varies as a whole."""
-        rings = len(self._scores)
-        return np.asarray(self._scores.T @ self._scores * (rings / (rings - 1)))
-
-    def followed(self, covariance: FloatArray) -> float:
-        """Return the rms standard uncertainty of the heights by the four parameters [m]."""
-        mean_square = float(np.sum(self._second * covariance)) / len(self._model)
-        return float(np.sqrt(max(mean_square, 0.0)))
+def _rings(radius: FloatArray, number: int) -> IntArray:
+    """Return in which of ``number`` rings of equal width each ``radius`` (n,) lies, (n,)."""
+    inner, outer = float(np.min(radius)), float(np.max(radius))
+    place = (radius - inner) / (outer - inner) * number
+    return np.clip(place.astype(np.int64), 0, number - 1)
 
 
 _NONE: BoolArray = np.zeros(DYNAMIC, np.bool_)
@@ -210,7 +158,7 @@ class SelfCalibration:
     values, covariance: of lag, curvature, gain, latency, with the prior, (4,) and (4, 4); the
         gain keeps its prior value and uncertainty
     known: which of them the scans or the prior determine, (4,);  speeds: of the scans [rad/s]
-    residual: rms [m];  agreement: of the scans with each other
+    residual: rms of the readings [m];  agreement: of the scans with each other
     followed: rms standard uncertainty of the heights of this surface from the four parameters [m]
     prior_conflict: χ² of lag and curvature against the prior, χ²(2) without a conflict
     own, own_uncertainty: clocking [rad], shift [m] and tilt [rad] of each scan except the first
@@ -242,63 +190,133 @@ class SelfCalibration:
 
 @one_blas_thread()
 def self_calibrate(
-    scans: Sequence[ScanColumns], prior: Prior, harmonics: int = DEFAULT_HARMONICS
+    scans: Sequence[ScanData], prior: Prior, harmonics: int = DEFAULT_HARMONICS
 ) -> SelfCalibration:
     """Return the estimate of the dynamics from two or more scans of one part.
 
     Raises DataError where they determine nothing: one speed and direction, a surface without slope
     along the path, a part that was mounted again, or data without noise.
     """
-    model = ScanModel(scans, harmonics)
-    fit = _DynamicsFit(model, prior)
+    _check_scans(scans)
+    fit = _DynamicsFit(scans, prior, harmonics)
     if not fit.determined:
-        raise _undetermined(model, prior)
+        raise _undetermined(scans, prior)
     for index in _MAY_REMAIN_UNDETERMINED:
         if fit.unknown[index]:
             fit = fit.without(index)
     return fit.result()
 
 
-def _undetermined(model: ScanModel, prior: Prior) -> DataError:
+def _check_scans(scans: Sequence[ScanData]) -> None:
+    if len(scans) < 2:
+        raise DataError("adjustment.one_scan", scans=len(scans))
+    radii = [np.hypot(scan.x, scan.y) for scan in scans]
+    inner, outer = (max(float(np.min(r)) for r in radii), min(float(np.max(r)) for r in radii))
+    if not inner < outer:
+        raise DataError("adjustment.no_common_ring", inner=inner, outer=outer)
+
+
+def _undetermined(scans: Sequence[ScanData], prior: Prior) -> DataError:
     if prior.clocking > _REMOUNTED_RAD:
         return DataError("adjustment.remounted_part")
-    speeds = [f"{speed / RPM_RAD_S:.1f}" for speed in model.speeds]
-    if np.ptp(model.speeds) < _KNOWN * max(map(abs, model.speeds)):
+    each = [scan.speed for scan in scans]
+    speeds = [f"{speed / RPM_RAD_S:.1f}" for speed in each]
+    if np.ptp(each) < _KNOWN * max(map(abs, each)):
         return DataError("adjustment.equal_speeds", speeds=speeds)
     return DataError("adjustment.symmetric_surface", speeds=speeds)
 
 
-class _DynamicsFit:
-    """Gauss-Newton fit with a prior; nonlinear in latency and clocking only."""
+def _families(durations: Sequence[float]) -> list[Family]:
+    """Return the columns of the dynamics, and of the part in each scan except the first.
 
-    def __init__(self, model: ScanModel, prior: Prior, omitted: BoolArray = _NONE) -> None:
-        self._model, self._prior, self._omitted = model, prior, omitted
-        self._precision = _precision(
-            model, replace(prior, covariance=_with_fixed(prior.covariance, GAIN))
-        )
-        self._place = ScanPlacement(0.0, np.zeros(model.number))
-        self._surface: FloatArray | None = None
-        self._variance = _NOISE_M**2
-        self._iterate()
+    durations: of the scans [s]
+    """
+
+    def dynamics(v: ScanView) -> FloatArray:
+        late = v.lateral_error(v.x_rate, v.y_rate)
+        return np.stack([v.motion_rate, -v.motion_acceleration, v.distance, late])
+
+    def own(v: ScanView) -> FloatArray:
+        moved = [v.lateral_error(-v.y, v.x), v.lateral_error(1.0, 0.0), v.lateral_error(0.0, 1.0)]
+        return np.stack([*moved, v.x, v.y])
+
+    def drift(v: ScanView) -> FloatArray:
+        course = 2 * v.since / durations[v.index] - 1
+        return np.asarray(legendre.legvander(course, _DRIFT)[:, 1:].T)
+
+    def spindle(v: ScanView) -> FloatArray:
+        turned = np.exp(1j * np.arange(1, HARMONICS + 1)[:, np.newaxis] * v.c)
+        return np.concatenate([turned.real, turned.imag])
+
+    columns: dict[str, tuple[int, Columns]] = {
+        _DYNAMICS: (DYNAMIC, dynamics),
+        "spindle_axial": (2 * HARMONICS, spindle),
+    }
+    for k in range(1, len(durations)):
+        columns[f"{_OWN}@{k}"] = len(OWN), only(k, len(OWN), own)
+        columns[f"drift@{k}"] = _DRIFT, only(k, _DRIFT, drift)
+    return [Family(n, "", size, c, 1.0, REPEATED_TRACK) for n, (size, c) in columns.items()]
+
+
+class _DynamicsFit:
+    """Adjustment of dynamics and place of the part; nonlinear in the latency only."""
+
+    def __init__(
+        self, scans: Sequence[ScanData], prior: Prior, harmonics: int, omitted: BoolArray = _NONE
+    ) -> None:
+        self._scans, self._prior, self._harmonics = scans, prior, harmonics
+        self._omitted = omitted
+        stated = [prior.clocking, prior.shift, prior.shift, prior.tilt, prior.tilt]
+        own = np.maximum(stated, _LEAST_STATED)
+        held = _with_fixed(prior.covariance, GAIN) + np.diag(_FLOOR**2)
+        self._sizes: dict[str, float | FloatArray] = {_DYNAMICS: held, "spindle_axial": 1e-6}
+        for k in range(1, len(scans)):
+            self._sizes |= {f"{_OWN}@{k}": own, f"drift@{k}": _DRIFT_M}
+        latency, scales = 0.0, None
+        for _ in range(_ITERATIONS):
+            before = latency
+            solution = self._solved(before, scales)
+            latency, scales = float(solution.values[LATENCY]), solution.scales
+            if abs(latency - before) < _CONVERGED_S:
+                break
+        self._solution = solution
+
+    def _solved(self, latency: float, scales: Scales | None) -> Solution:
+        """Return the solution that is linear about ``latency`` [s]."""
+        scans = [delayed(scan, latency) for scan in self._scans]
+        self._nominal = fitted_surface(scans[0])
+        zero = zero_of(scans, self._nominal)
+        views = [view_of(s, k, zero, self._nominal) for k, s in enumerate(scans)]
+        families = _families([scan.duration for scan in scans])
+        blocks = blocks_of(views, [1.0] * len(scans), families)
+        if not np.all(blocks.noise > 0):
+            raise DataError("adjustment.no_noise")
+        part = part_model(blocks, min(s.turns for s in scans), _DEGREES * self._harmonics)
+        # Texture counts with the residuals of its ring, not as cells of the part.
+        part = replace(part, cell=np.zeros(len(blocks), np.int64), cells=1)
+        network = Network(blocks, tuple(families), part)
+        # The values are linearised at ``latency``; this offset makes them absolute.
+        y = blocks.deviation + blocks.columns[:, LATENCY] * latency
+        first = solve(network, y, scales or start_scales(network, None), self._sizes)
+        return settled(first, _STEPS)
 
     def without(self, index: int) -> _DynamicsFit:
         """Return the fit with one of the four dynamic parameters held at its prior."""
-        covariance = _with_fixed(self._prior.covariance, index)
+        held = replace(self._prior, covariance=_with_fixed(self._prior.covariance, index))
         omitted = self._omitted | (np.arange(DYNAMIC) == index)
-        return _DynamicsFit(self._model, replace(self._prior, covariance=covariance), omitted)
+        return _DynamicsFit(self._scans, held, self._harmonics, omitted)
 
     @property
     def determined(self) -> bool:
         """True if the scans determine lag less latency."""
-        inverse, two = _inverse(self._matrix), [LAG, LATENCY]
-        (lag, mixed), (_, latency) = inverse[np.ix_(two, two)]
+        two = [LAG, LATENCY]
+        (lag, mixed), (_, latency) = self._solution.covariance[np.ix_(two, two)]
         return bool(lag - 2 * mixed + latency < _USEFUL_S**2)
 
     @property
     def unknown(self) -> BoolArray:
         """Which of the four parameters neither the prior nor the scans determine, (4,)."""
-        inverse = _inverse(self._matrix)
-        posterior = np.diag(inverse + self._by_gain(inverse))[:DYNAMIC]
+        posterior = np.diag(self._solution.covariance + self._by_gain())[:DYNAMIC]
         assumed = np.diag(self._prior.covariance)
         uninformative = (
             assumed
@@ -311,104 +329,75 @@ class _DynamicsFit:
             limit[LATENCY] = _USEFUL_S**2
         return np.asarray(self._omitted | (uninformative & (posterior > limit)))
 
-    def _iterate(self) -> None:
-        """Converge on a selection of the points, to find the point of linearisation."""
-        every = max(len(self._model) // _ENOUGH_POINTS, 1)
-        for _ in range(_ITERATIONS):
-            before, started = self._place.latency, self._surface is not None
-            self._step(every)
-            if started and abs(self._place.latency - before) < _CONVERGED_S:
-                return
-
-    def _step(self, every: int) -> None:
-        model, place, surface = self._model, self._place, self._surface
-        equations = normal_equations(
-            model.basis,
-            model.portions(place, every),
-            lambda part: model.columns(part, place, surface),
-        )
-        self._matrix = every * equations.matrix / self._variance + self._precision
-        parameters = _inverse(self._matrix) @ equations.right * (every / self._variance)
-        self._variance = every * equations.misfit(parameters) / len(model)
-        if not self._variance > 0:
-            raise DataError("adjustment.no_noise")
-        self._surface = equations.surface_of(parameters)
-        self._equations, self._parameters = equations, parameters
-        clocking = [parameters[model.own(k).start + CLOCKING] for k in range(1, model.number)]
-        self._place = ScanPlacement(float(parameters[LATENCY]), np.array([0.0, *clocking]))
-
     def result(self) -> SelfCalibration:
-        """Return the result from all points, with the covariance by rings."""
-        self._step(every=1)
-        model, parameters = self._model, self._parameters
-        seen = RingScores(model, self._equations.shares)
-        assert self._surface is not None
-        for part in model.portions(self._place, 1):
-            seen.add(
-                part, *model.columns(part, self._place, self._surface), parameters, self._surface
-            )
-        inverse = _inverse(self._matrix)
-        score_covariance = seen.score_covariance() / self._variance**2 + self._precision
-        by_rings = inverse @ score_covariance @ inverse
-        covariance = by_rings + self._by_gain(inverse)
+        """Return the result with the covariance by rings."""
+        solution, blocks = self._solution, self._solution.network.blocks
+        net, scales = solution.network, solution.scales
+        inverse, left = solution.covariance, solution.residual()
+        pulled = net.pulled(scales, left)
+        rings = int(np.clip(min(s.turns for s in self._scans), _LEAST_RINGS, _MOST_RINGS))
+        ring = _rings(np.hypot(blocks.x, blocks.y), rings)
+        scores = net.sums_by_column(
+            pulled[:, np.newaxis] * (ring[:, np.newaxis] == np.arange(rings))
+        )
+        moved = inverse @ scores[solution.active]
+        prior = np.zeros_like(inverse)
+        net.add_prior(prior, solution.active, scales, self._sizes)
+        by_rings = moved @ moved.T * (rings / (rings - 1)) + inverse @ prior @ inverse
+        covariance = by_rings + self._by_gain()
         two, four = slice(GAIN), slice(DYNAMIC)
-        own = np.array([model.own(k) for k in range(1, model.number)], object)
         deviation = np.sqrt(np.diag(covariance))
+        own = np.array([np.r_[net.place[f"{_OWN}@{k}"]] for k in range(1, len(self._scans))])
+        weighted = blocks.columns[:, four] * np.sqrt(blocks.count)[:, np.newaxis]
+        mean_square = np.sum(weighted.T @ weighted * covariance[four, four]) / np.sum(blocks.count)
+        left -= net.cells_of(scales, left)[net.part.cell]
         return SelfCalibration(
-            values=parameters[four],
+            values=solution.values[four],
             covariance=covariance[four, four],
             known=~self.unknown,
-            speeds=tuple(model.speeds),
-            residual=float(np.sqrt(seen.square / len(model))),
-            followed=seen.followed(covariance[four, four]),
-            agreement=seen.agreement.result(),
+            speeds=tuple(s.speed for s in self._scans),
+            residual=float(np.sqrt(np.mean(blocks.noise**2 * scales.noise))),
+            followed=float(np.sqrt(max(mean_square, 0.0))),
+            agreement=consistency_of(blocks, left),
             prior_conflict=_prior_conflict(
-                parameters[two],
+                solution.values[two],
                 self._prior.covariance[two, two],
                 inverse[two, two],
                 by_rings[two, two],
             ),
-            own=np.array([parameters[o] for o in own]),
-            own_uncertainty=np.array([deviation[o] for o in own]),
-            amplitudes=model.basis.amplitudes(self._surface),
-            points=len(model),
+            own=solution.values[own],
+            own_uncertainty=deviation[own],
+            amplitudes=_amplitudes(solution, self._nominal, self._harmonics),
+            points=int(np.sum(blocks.count)),
         )
 
-    def _by_gain(self, inverse: FloatArray) -> FloatArray:
+    def _by_gain(self) -> FloatArray:
         """Return the effect of the uncertain gain on the covariance, (parameters, parameters).
 
         The gain is not estimated: on a surface that Z follows its effect is of third order in the
         following error, like other terms that are not modelled.
         """
-        column = self._matrix[:, GAIN].copy()
+        solution = self._solution
+        column = solution.matrix[solution.active, GAIN].copy()
         column[GAIN] = 0.0
-        change = -inverse @ column
+        change = -solution.covariance @ column
         change[GAIN] = 1.0
         return np.asarray(np.outer(change, change) * self._prior.covariance[GAIN, GAIN])
 
 
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of a positive matrix whose rows have different units.
-
-    Eigenvalues are bounded from below by rounding.
-    """
-    scale = 1 / np.sqrt(np.diag(matrix))
-    values, vectors = np.linalg.eigh(matrix * scale * scale[:, np.newaxis])
-    known = np.maximum(values, len(values) * np.finfo(np.float64).eps * values[-1])
-    return np.asarray(scale[:, np.newaxis] * ((vectors / known) @ vectors.T) * scale)
+# Radii and angles at which the harmonics of the surface are looked at.
+_RADII, _ANGLES = 60, 256
 
 
-def _precision(model: ScanModel, prior: Prior) -> FloatArray:
-    """Return the inverse of the prior's covariance, (parameters, parameters)."""
-    precision = np.eye(model.size) / _FREE**2
-    four = slice(DYNAMIC)
-    precision[four, four] = _inverse(prior.covariance + np.diag(_FLOOR**2))
-    stated = np.array([prior.clocking, prior.shift, prior.shift, prior.tilt, prior.tilt])
-    stated = np.maximum(stated, _LEAST_STATED)
-    for k in range(1, model.number):
-        own = model.own(k)
-        precision[own, own] = np.diag(stated**-2.0)
-    return precision
+def _amplitudes(solution: Solution, nominal: Surface, harmonics: int) -> FloatArray:
+    """Return the rms over radius of each harmonic's amplitude, from 1, (harmonics,) [m]."""
+    net = solution.network
+    radius = np.linspace(net.part.inner, net.part.outer, _RADII)
+    turn = np.exp(2j * np.pi * np.arange(_ANGLES) / _ANGLES)
+    x, y = (np.outer(radius, part).ravel() for part in (turn.real, turn.imag))
+    height = nominal.height(x, y) + net.part.values(x, y) @ solution.values[net.terms]
+    waves = np.abs(np.fft.rfft(height.reshape(_RADII, _ANGLES), axis=1)) * 2 / _ANGLES
+    return np.asarray(np.sqrt(np.mean(waves[:, 1 : harmonics + 1] ** 2, axis=0)))
 
 
 def _with_fixed(covariance: FloatArray, index: int) -> FloatArray:

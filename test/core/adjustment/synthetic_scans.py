@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from omsm_ros.core.adjustment.scan_reader import ScanColumns
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.streams.blocks import FloatArray
 
 Surface = Callable[[FloatArray, FloatArray], FloatArray]
@@ -37,7 +37,7 @@ def scanned(
     moved: tuple[float, float] = (0.0, 0.0),
     noise: float = 1e-9,
     seed: int = 0,
-) -> ScanColumns:
+) -> ScanData:
     """Return a scan of ``surface`` by a probe that is late by ``latency`` [s].
 
     followed: by Z; the surface itself where none is given
@@ -61,14 +61,16 @@ def scanned(
     before, here, after = (seen(followed or surface, time + k * step) for k in (-1, 0, 1))
     rate, acceleration = (after - before) / (2 * step), (after - 2 * here + before) / step**2
     scatter = np.random.default_rng(seed).normal(0.0, noise, len(time))
-    return ScanColumns(
+    height = seen(surface, time - latency) + lag * rate - curvature * acceleration + scatter
+    at = place(time)
+    return ScanData(
         time=time,
-        radius=OUTER_M + feed * time,
-        angle=-omega * time,
-        radial_rate=np.full(len(time), feed),
-        angular_rate=np.full(len(time), -omega),
-        height=seen(surface, time - latency) + lag * rate - curvature * acceleration + scatter,
-        motion_rate=rate,
-        motion_acceleration=acceleration,
+        x=at.real,
+        y=at.imag,
+        height=height,
+        distance=height - here,
         motion=here,
+        removed=np.zeros(len(time)),
+        # No reading lies just where a turn begins.
+        c=omega * time + 1e-3,
     )

@@ -17,8 +17,14 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.adjustment.scan_model import CURVATURE, GAIN, LAG, LATENCY
-from omsm_ros.core.adjustment.self_calibration import ScanConsistency, SelfCalibration
+from omsm_ros.core.adjustment.self_calibration import (
+    CURVATURE,
+    GAIN,
+    LAG,
+    LATENCY,
+    ScanConsistency,
+    SelfCalibration,
+)
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.latency import REVERSAL, SPEEDS
 from omsm_ros.core.lti.transfer_function import TransferFunction, slow_motion_jacobian

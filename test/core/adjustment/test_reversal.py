@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.adjustment.resolved_calibration import reversal
-from omsm_ros.core.adjustment.scan_reader import ScanColumns, ScanReader, read_scan
+from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.surface_points import join_points
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.errors import DataError
+from omsm_ros.pipelines.recording import scan_data
 from omsm_ros.twin.cell import Cell, record
 from omsm_ros.twin.disturbances import Disturbances
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN, Plant
@@ -50,13 +50,13 @@ def scan(
     cell: Cell,
     surface: Surface = PAPER_MIRROR,
     feed: float = 1e-3,
-) -> ScanColumns:
+) -> ScanData:
     spiral = Spiral(surface, start_radius=12.7e-3, feed_per_turn=feed, spindle_speed=speed)
     recording = record(replace(cell, seed=seed), spiral, surface)
     corrector = Corrector(known, CorrectionOptions(probe_latency=0.0))
     corrector.push_axes(recording.axes)
     corrector.push_distance(recording.distance)
-    return read_scan(recording.axes, join_points([corrector.finish()]))
+    return scan_data([recording.axes], [corrector.finish()], 1e-3)[0]
 
 
 LATE_CELL = Cell(
@@ -65,11 +65,11 @@ LATE_CELL = Cell(
 
 
 @pytest.fixture(scope="module")
-def late_scans() -> list[ScanColumns]:
+def late_scans() -> list[ScanData]:
     return [scan(30.0, 1, LATE, LATE_CELL), scan(-30.0, 2, LATE, LATE_CELL)]
 
 
-def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[ScanColumns]) -> None:
+def test_a_latency_is_recovered_within_its_uncertainty(late_scans: list[ScanData]) -> None:
     found = reversal(late_scans, LATE)
     assert found.uncertainty < 1e-6
     assert abs(found.lag - LATENCY) < 3 * found.uncertainty
@@ -84,7 +84,7 @@ def test_a_mechanical_lag_is_not_probe_latency() -> None:
     assert found.lag_of_z == pytest.approx(0.3397e-3, abs=1e-7)
 
 
-def test_latency_is_reported_when_it_is_the_whole_lag(late_scans: list[ScanColumns]) -> None:
+def test_latency_is_reported_when_it_is_the_whole_lag(late_scans: list[ScanData]) -> None:
     total = LATE.dynamics.low_frequency_delay
     known = replace(LATE, covariance=calibration(LATE.dynamics, (20e-6) ** 2).covariance)
     found = reversal(late_scans, known)
@@ -93,25 +93,26 @@ def test_latency_is_reported_when_it_is_the_whole_lag(late_scans: list[ScanColum
 
 
 def test_a_poorly_known_delay_of_the_calibration_limits_the_estimate(
-    late_scans: list[ScanColumns],
+    late_scans: list[ScanData],
 ) -> None:
     vague = replace(LATE, covariance=calibration(LATE.dynamics, (50e-6) ** 2).covariance)
     assert reversal(late_scans, vague).uncertainty == pytest.approx(50e-6, rel=1e-3)
 
 
-def test_scans_in_one_direction_are_refused(late_scans: list[ScanColumns]) -> None:
+def test_scans_in_one_direction_are_refused(late_scans: list[ScanData]) -> None:
     with pytest.raises(DataError, match="turn in the same direction"):
         reversal([late_scans[0], late_scans[0]], LATE)
 
 
-def test_a_single_scan_is_refused(late_scans: list[ScanColumns]) -> None:
+def test_a_single_scan_is_refused(late_scans: list[ScanData]) -> None:
     with pytest.raises(DataError, match="1 scan"):
         reversal(late_scans[:1], LATE)
 
 
-def test_a_short_scan_is_refused() -> None:
-    with pytest.raises(DataError, match="scan of 0 points"):
-        ScanReader(1e-3).columns()
+def test_scans_of_different_rings_are_refused(late_scans: list[ScanData]) -> None:
+    elsewhere = replace(late_scans[1], x=late_scans[1].x + 40e-3)
+    with pytest.raises(DataError, match="share no ring"):
+        reversal([late_scans[0], elsewhere], LATE)
 
 
 @pytest.mark.parametrize("surface", [Flat(), Sphere(0.5)])

@@ -11,7 +11,7 @@ from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.agreement import agreement_of
 from omsm_ros.core.adjustment.network import solve
 from omsm_ros.core.adjustment.refutation import start_scales
-from omsm_ros.core.adjustment.scan_data import view_of, zero_of
+from omsm_ros.core.adjustment.scan_data import ScanData, delayed, view_of, zero_of
 
 
 @pytest.fixture(scope="module")
@@ -65,3 +65,24 @@ def test_scans_of_one_form_have_one_rms(scans):
     pose = ("piston", "tip", "tilt")
     one, other = (a.alone[1].value for a in agreement_of(solution, MIRROR, pose))
     assert one == pytest.approx(other, rel=2e-3)
+
+
+@pytest.mark.parametrize("lost", [[], [2000, 2001, 2500]])
+def test_motions_of_the_fourth_degree_have_exact_derivatives(lost):
+    """On a spiral, and next to readings that are missing."""
+    t = np.delete(1e-3 * np.arange(4000), lost)
+    z = 1e-6 * (3.0 + 2.0 * t - 4.0 * t**2 + 0.7 * t**3 - 0.2 * t**4)
+    place, rate = (10e-3 - 1e-3 * t) * np.exp(-6j * t), -1e-3 - 6j * (10e-3 - 1e-3 * t)
+    scan = ScanData(time=t, x=place.real, y=place.imag, height=z, distance=0 * z, motion=z,
+                    removed=0 * z, c=6 * t)  # fmt: skip
+    seen = view_of(scan, 0, zero_of([scan], MIRROR), MIRROR)
+    np.testing.assert_allclose(
+        seen.motion_rate, 1e-6 * (2.0 - 8.0 * t + 2.1 * t**2 - 0.8 * t**3), atol=1e-13
+    )
+    rate = rate * np.exp(-6j * t)
+    # A wave of one a second is no polynomial: a millionth at the ends of a run.
+    np.testing.assert_allclose(seen.x_rate + 1j * seen.y_rate, rate, atol=6e-8)
+    late = 3e-3
+    before = (10e-3 - 1e-3 * (t - late)) * np.exp(-6j * (t - late))
+    moved = delayed(scan, late)
+    np.testing.assert_allclose(moved.x + 1j * moved.y, before, atol=1e-15)

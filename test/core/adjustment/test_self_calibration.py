@@ -17,9 +17,15 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.adjustment.scan_model import CURVATURE, GAIN, LAG, LATENCY
-from omsm_ros.core.adjustment.scan_reader import ScanColumns, read_scan
-from omsm_ros.core.adjustment.self_calibration import Prior, self_calibrate
+from omsm_ros.core.adjustment.scan_data import ScanData
+from omsm_ros.core.adjustment.self_calibration import (
+    CURVATURE,
+    GAIN,
+    LAG,
+    LATENCY,
+    Prior,
+    self_calibrate,
+)
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.latency import REVERSAL, SPEEDS
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
@@ -28,6 +34,7 @@ from omsm_ros.core.kinematics.trajectories import Spiral
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.errors import DataError
+from omsm_ros.pipelines.recording import scan_data
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.machine_errors import Drift, MachineErrors, PartPose
@@ -59,8 +66,9 @@ def corrected(recording: Recording, known: Calibration, **options: object) -> Su
     return join_points([corrector.finish()])
 
 
-def scanned(recording: Recording, known: Calibration) -> ScanColumns:
-    return read_scan(recording.axes, corrected(recording, known, probe_latency=0.0))
+def scanned(recording: Recording, known: Calibration) -> ScanData:
+    points = corrected(recording, known, probe_latency=0.0)
+    return scan_data([recording.axes], [points], 1e-3)[0]
 
 
 def step_test(latency: float, off: float = 0.0) -> Calibration:
@@ -190,7 +198,7 @@ def test_scans_of_different_parts_contradict_each_other() -> None:
     known = step_test(0.0)
     one = scanned(made(30.0, 1, disturbed()), known)
     other = scanned(made(60.0, 2, disturbed()), known)
-    dented = replace(other, height=other.height + 30e-9 * np.cos(5 * other.angle))
+    dented = replace(other, height=other.height + 30e-9 * np.cos(5 * np.arctan2(other.y, other.x)))
     result = resolved(known, self_calibrate([one, dented], after_step_test(known)))
     assert result.certificate.verdict == "rejected"
     assert "contradict each other by" in str(result.certificate.reasons[0])
@@ -241,7 +249,7 @@ def test_scans_without_any_noise_say_that_nobody_measured() -> None:
     """A distance that is zero throughout, and a Z that stands: no surface, no scatter."""
     plain = unit_calibration(1e-3, TRUE_GAIN)
     pair = [scanned(made(rpm, s, disturbed()), plain) for s, rpm in ((1, 30.0), (2, 60.0))]
-    names = ("height", "motion", "motion_rate", "motion_acceleration")
+    names = ("height", "distance", "motion")
     still = [replace(scan, **{n: np.zeros(len(scan)) for n in names}) for scan in pair]
     with pytest.raises(DataError, match="without any noise"):
         self_calibrate(still, without_step_test())
