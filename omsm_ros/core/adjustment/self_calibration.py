@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import legendre
 
-from omsm_ros.core.adjustment.blocks import Blocks, blocks_of
+from omsm_ros.core.adjustment.blocks import SECTORS, Blocks, blocks_of
 from omsm_ros.core.adjustment.families import REPEATED_TRACK, only
 from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve
 from omsm_ros.core.adjustment.part_terms import part_model
@@ -38,7 +38,9 @@ from omsm_ros.units import RPM_RAD_S
 LAG, CURVATURE, GAIN, LATENCY = range(4)
 DYNAMIC = 4
 OWN = ("clocking", "shift_x", "shift_y", "tilt_x", "tilt_y")
-_DYNAMICS, _OWN = "dynamics", "own"
+_DYNAMICS, _OWN, _SPINDLE = "dynamics", "own", "spindle_axial"
+# Waves of the spindle come with C in all scans alike: more than any spindle has.
+_SPINDLE_M = 1e-6
 # Drift of each scan but the first: a free polynomial over its time; the rest is a random walk.
 _DRIFT, _DRIFT_M = 3, 1e-3
 # Rings and harmonics of the residuals, coarser than the terms of the surface.
@@ -73,7 +75,7 @@ _MAY_REMAIN_UNDETERMINED = (LATENCY, CURVATURE)
 _ITERATIONS = 6
 _CONVERGED_S = 1e-8
 # Estimates of drift and noise at each latency, at most.
-_STEPS = 40
+_STEPS = 10
 # A parameter is determined by the scans if they narrow its prior to this share.
 _KNOWN = 0.01
 # A larger uncertainty of the lag rests on terms that are not modelled.
@@ -211,7 +213,7 @@ def _check_scans(scans: Sequence[ScanData]) -> None:
     if len(scans) < 2:
         raise DataError("adjustment.one_scan", scans=len(scans))
     radii = [np.hypot(scan.x, scan.y) for scan in scans]
-    inner, outer = (max(float(np.min(r)) for r in radii), min(float(np.max(r)) for r in radii))
+    inner, outer = max(float(np.min(r)) for r in radii), min(float(np.max(r)) for r in radii)
     if not inner < outer:
         raise DataError("adjustment.no_common_ring", inner=inner, outer=outer)
 
@@ -250,7 +252,7 @@ def _families(durations: Sequence[float]) -> list[Family]:
 
     columns: dict[str, tuple[int, Columns]] = {
         _DYNAMICS: (DYNAMIC, dynamics),
-        "spindle_axial": (2 * HARMONICS, spindle),
+        _SPINDLE: (2 * HARMONICS, spindle),
     }
     for k in range(1, len(durations)):
         columns[f"{_OWN}@{k}"] = len(OWN), only(k, len(OWN), own)
@@ -269,7 +271,7 @@ class _DynamicsFit:
         stated = [prior.clocking, prior.shift, prior.shift, prior.tilt, prior.tilt]
         own = np.maximum(stated, _LEAST_STATED)
         held = _with_fixed(prior.covariance, GAIN) + np.diag(_FLOOR**2)
-        self._sizes: dict[str, float | FloatArray] = {_DYNAMICS: held, "spindle_axial": 1e-6}
+        self._sizes: dict[str, float | FloatArray] = {_DYNAMICS: held, _SPINDLE: _SPINDLE_M}
         for k in range(1, len(scans)):
             self._sizes |= {f"{_OWN}@{k}": own, f"drift@{k}": _DRIFT_M}
         latency, scales = 0.0, None
@@ -291,7 +293,9 @@ class _DynamicsFit:
         blocks = blocks_of(views, [1.0] * len(scans), families)
         if not np.all(blocks.noise > 0):
             raise DataError("adjustment.no_noise")
-        part = part_model(blocks, min(s.turns for s in scans), _DEGREES * self._harmonics)
+        # Sectors resolve half as many waves.
+        highest = min(_DEGREES * self._harmonics, SECTORS // 2)
+        part = part_model(blocks, min(s.turns for s in scans), highest)
         # Texture counts with the residuals of its ring, not as cells of the part.
         part = replace(part, cell=np.zeros(len(blocks), np.int64), cells=1)
         network = Network(blocks, tuple(families), part)
