@@ -7,6 +7,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from omsm_msgs.srv import Identify, LoadCalibration, PredictError
+from soaked import soaked
 
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import save_calibration
@@ -87,7 +88,7 @@ CALIBRATIONS = st.fixed_dictionaries(
 FUZZ = {"database": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(20_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [25, *soaked(20_000)])
 def test_messages(cell, true_calibration, small_scan_blocks, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
@@ -156,7 +157,7 @@ REQUESTS = st.one_of(
 )
 
 
-@pytest.mark.parametrize("count", [30, pytest.param(5_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("count", [20, *soaked(5_000)])
 def test_requests(cell, true_calibration, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
