@@ -91,13 +91,9 @@ def coherent_power(inputs: FloatArray, output: FloatArray) -> FloatArray:
     samples, count = inputs.shape
     window = np.hanning(samples + 2)[1:-1]
     rows = np.vstack([inputs.T, output])
-    rows = rows - np.mean(rows, axis=1, keepdims=True)
-    spectra = np.fft.rfft(rows * window)
+    spectra = np.fft.rfft((rows - np.mean(rows, axis=1, keepdims=True)) * window)
     products = spectra[:, np.newaxis] * np.conj(spectra)
-    size = 2 * AVERAGED_LINES * count
-    mean = ndimage.uniform_filter1d(products.real, size) + 1j * ndimage.uniform_filter1d(
-        products.imag, size
-    )
+    mean = ndimage.uniform_filter1d(products, 2 * AVERAGED_LINES * count)
     every, cross = mean[:count, :count].transpose(2, 0, 1), mean[count, :count].T
     found = np.linalg.pinv(every, rcond=1e-9, hermitian=True) @ np.conj(cross)[:, :, np.newaxis]
     power = np.sum(cross * found[:, :, 0], axis=1).real

@@ -24,15 +24,17 @@ from omsm_ros.core.estimation.sampled_fit import (
     SectionsProblem,
     grown_starts,
 )
+from omsm_ros.core.estimation.sampled_model import simulated
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.errors import IdentificationError
-from omsm_ros.linear_algebra import least_squares
 
 # Most poles. Orders that are tried: every one while it is low, then steps.
 MAX_ORDER = 40
 _ORDERS = (*range(7), *range(8, 21, 2), *range(24, MAX_ORDER + 1, 4))
 # Parts of each record: all but the first are held out in turn, and the last ones together.
 _PARTS = 6
+# Share of the deviation of an input below which it stands still.
+_STILL = 0.1
 # Share of the used samples to which every order is fitted first.
 _FIRST_PART = 0.75
 # Orders compared on every held-out part: the best over the last part, and the lowest orders within
@@ -47,16 +49,16 @@ _FRUITLESS, _NO_GAIN = 4, 0.98
 _IMPROVES_BY = 0.5
 # Factor on the error of the chosen model within which another predicts about as well.
 _ALIKE = 1.1
-# Order by which delays are chosen, and delays [samples] at which those that are free start.
-_DELAY_ORDER = 3
+# Order by which delays are chosen, that by which they are confirmed; delays [samples] at which free
+# ones start.
+_DELAY_ORDER, _CONFIRMING_ORDER = 3, 12
 _FREE_DELAYS = (0.0, 1.0, 4.0, 15.0)
 # Samples per parameter: with fewer, an order is not tried.
 _LEAST_SAMPLES_EACH = 3
 # Sixty columns of a record then take half a gigabyte.
 _MOST_SAMPLES = 1_000_000
-# Used samples on which orders are explored, and parts of a record whose excitation is compared.
+# Used samples on which orders are explored.
 EXPLORED_ON = 8000
-_MOST_PARTS = 16
 # Iterations of an explored fit, of one without a held-out part, and of the final one.
 _EXPLORING, _REFITTED, _FINAL = 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
@@ -75,11 +77,6 @@ class SampledCandidate:
 
     fit: SectionsFit
     held_out: FloatArray
-
-    @property
-    def order(self) -> int:
-        """Return the number of poles."""
-        return self.fit.order
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +116,8 @@ def choose_sampled(
     whole = SectionsProblem(records, hold, none)
     if hold != BAND_LIMITED and max_delay:
         parts = replace(whole, records=[_exciting_part(record) for record in records])
-        whole = replace(_with_delays(parts, max_delay)[0], records=records)
+        late = _confirmed(_with_delays(parts, max_delay)[0], min(_CONFIRMING_ORDER, most))
+        whole = replace(whole, delays=late.delays)
     explored, every, most = _explored(whole, order, most)
     explored, lag = _with_delays(explored, 0)
     early = replace(explored, records=[_early(record) for record in explored.records])
@@ -130,12 +128,12 @@ def choose_sampled(
         refitted = explored.fit(fitted.order, [fitted.nonlinear], _EXPLORING)
         judged.append(SampledCandidate(refitted, validation_errors(refitted)))
     free = simplest_undominated(judged)
-    chosen = free if not order else next(c for c in judged if c.order == order)
-    comparison = _against_impulse_response(explored, fits[orders.index(chosen.order)])
+    chosen = free if not order else next(c for c in judged if c.fit.order == order)
+    comparison = _against_impulse_response(explored, fits[orders.index(chosen.fit.order)])
     finished = _finished(whole, chosen, every)
     other = finished if chosen is free else _finished(whole, free, every)
-    bound = _ALIKE * float(np.mean(chosen.held_out))
-    alike = [c for c in judged if c.order > chosen.order and float(np.mean(c.held_out)) <= bound]
+    bound = _ALIKE * np.mean(chosen.held_out)
+    alike = [c for c in judged if c.fit.order > chosen.fit.order and np.mean(c.held_out) <= bound]
     larger = [c.fit.model(float(every)) for c in alike]
     return SampledChoice(finished, other, larger, orders, by_order, *comparison)
 
@@ -156,9 +154,8 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
                 return whole, 1, most
             every //= 2
         else:
-            if every == 1:
-                return replace(whole, records=records), 1, most
-            return SectionsProblem(records, BAND_LIMITED, 0 * whole.delays), every, most
+            held = (whole.hold, whole.delays) if every == 1 else (BAND_LIMITED, 0 * whole.delays)
+            return SectionsProblem(records, *held), every, most
 
 
 def _thinned(record: SampledRecord, every: int) -> SampledRecord:
@@ -167,14 +164,9 @@ def _thinned(record: SampledRecord, every: int) -> SampledRecord:
         return record
     inputs, output = (
         np.asarray(signal.resample_poly(values, 1, every, axis=0, padtype="line"))
-        for values in (record.inputs, _filled(record))
+        for values in (record.inputs, record.filled())
     )
     return SampledRecord(inputs, output, record.used[::every])
-
-
-def _filled(record: SampledRecord) -> FloatArray:
-    index = np.arange(len(record))
-    return np.asarray(np.interp(index, index[record.used], record.output[record.used]))
 
 
 def check_records(records: Sequence[SampledRecord], order: int) -> int:
@@ -230,14 +222,9 @@ def _exciting_part(record: SampledRecord) -> SampledRecord:
     count = len(places) // EXPLORED_ON
     if count < 2:
         return record
-    tried = np.unique(np.linspace(0, count - 1, min(count, _MOST_PARTS)).astype(int))
-    every = [
-        slice(int(places[i * EXPLORED_ON]), int(places[(i + 1) * EXPLORED_ON - 1]) + 1)
-        for i in tried
-    ]
-    return record.part(
-        max(every, key=lambda part: float(np.var(record.inputs[part], axis=0).sum()))
-    )
+    ends = places[: count * EXPLORED_ON].reshape(count, -1)[:, [0, -1]].tolist()
+    parts = [record.part(slice(first, last + 1)) for first, last in ends]
+    return max(parts, key=lambda part: float(np.var(part.inputs, axis=0).sum()))
 
 
 def _parts(used: BoolArray) -> FloatArray:
@@ -251,32 +238,52 @@ def _early(record: SampledRecord) -> SampledRecord:
 
 
 def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, SectionsFit]:
-    start = problem.spread_poles(_DELAY_ORDER)
-
-    def fitted(tried: SectionsProblem, late: FloatArray) -> SectionsFit:
-        poles = tried.relocated(start, late)
-        return tried.fit(_DELAY_ORDER, [tried.nonlinear_of(poles, late)], _EXPLORING)
-
-    delays, tiny = np.zeros(problem.inputs), np.finfo(float).tiny
-    best = fitted(problem, delays)
+    delays = np.zeros(problem.inputs)
+    best = _late(problem, delays, _DELAY_ORDER)
     for input in range(problem.inputs):
         tried = range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]
         for delay in tried:
             late = delays.copy()
             late[input] = delay
-            other = problem
-            if problem.hold != BAND_LIMITED:
-                other = replace(problem, delays=late.astype(np.int64))
-            found = fitted(other, late)
-            # A delay counts as a parameter. Errors per sample, as a longer delay leaves fewer.
-            count = len(found.residual)
-            gain = np.log(
-                max(np.mean(best.residual**2), tiny) / max(np.mean(found.residual**2), tiny)
-            )
-            if count * gain > np.log(count):
+            found = _late(problem, late, _DELAY_ORDER)
+            if _better(found, best):
                 best = found
         delays = best.problem.late(best.nonlinear, best.order)
     return best.problem, best
+
+
+def _late(problem: SectionsProblem, late: FloatArray, order: int) -> SectionsFit:
+    """Return a fit with delays ``late`` [samples]; those of a held input stay."""
+    if problem.hold != BAND_LIMITED:
+        problem = replace(problem, delays=late.astype(np.int64))
+    return problem.fit(order, [problem.spread_start(order, late)], _EXPLORING)
+
+
+def _better(found: SectionsFit, other: SectionsFit) -> bool:
+    """Return whether a fit with one parameter more is better.
+
+    Errors are per sample, as a longer delay leaves fewer.
+    """
+    count, tiny = len(found.residual), np.finfo(float).tiny
+    before, after = (max(np.mean(each.residual**2), tiny) for each in (other, found))
+    return bool(count * np.log(before / after) > np.log(count))
+
+
+def _confirmed(problem: SectionsProblem, order: int) -> SectionsProblem:
+    """Return ``problem`` with the delays that a fit of enough poles does not contradict.
+
+    Where poles are too few, a delay imitates the others; no poles make up for one that is too long.
+    """
+    for input in np.flatnonzero(problem.delays):
+        found = _late(problem, problem.delays.astype(np.float64), order)
+        while found.problem.delays[input]:
+            late = found.problem.delays - np.eye(problem.inputs)[input]
+            shorter = _late(problem, late, order)
+            if not _better(shorter, found):
+                break
+            found = shorter
+        problem = found.problem
+    return problem
 
 
 def _explore(
@@ -308,11 +315,10 @@ def _next_fit(
     if order == 0:
         return problem.fit(0, [problem.nonlinear_of(np.empty(0, np.complex128), late)])
     own = smaller[-1].problem.late(smaller[-1].nonlinear, smaller[-1].order)
-    starts = [problem.relocated(problem.spread_poles(order), late)]
-    starts += grown_starts(problem, smaller[-1], order)
-    poles = [problem.nonlinear_of(starts[0], late)]
-    poles += [problem.nonlinear_of(one, own) for one in starts[1:]]
-    return problem.fit(order, poles, _EXPLORING, race=3)
+    starts = [
+        problem.nonlinear_of(poles, own) for poles in grown_starts(problem, smaller[-1], order)
+    ]
+    return problem.fit(order, [problem.spread_start(order, late), *starts], _EXPLORING, race=3)
 
 
 def validation_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatArray]:
@@ -323,15 +329,11 @@ def validation_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[Flo
     """
     model, found = fitted.model(), []
     for record, own in zip(whole.records, fitted.problem.records, strict=True):
-        middle = np.mean(record.inputs, axis=0)
-        missed = record.output - model.driven(record.inputs - middle)
-        columns = np.column_stack([np.ones(len(record)), *model.decays(len(record))])
+        inputs = record.inputs - np.mean(record.inputs, axis=0)
         with np.errstate(all="ignore"):
-            state = least_squares(columns[own.used], missed[own.used], 1e-12)
-            missed = missed - columns @ state
-        held_out = record.used & ~own.used
+            missed = record.output - simulated(model, inputs, record.output, own.used)[0]
         scale = float(np.std(record.output[record.used])) or 1.0
-        found.append(np.where(held_out, missed / scale, np.nan))
+        found.append(np.where(record.used & ~own.used, missed / scale, np.nan))
     return found
 
 
@@ -353,21 +355,28 @@ def validation_errors(fitted: SectionsFit, evaluations: int = _REFITTED) -> Floa
     """Return the mean square error over each held-out part, refitted without it, (folds,).
 
     Some parts lie inside the records, others reach to their end. Parts inside alone would favour
-    models of a drift, because the data constrain the model on both sides.
+    models of a drift, because the data constrain the model on both sides. Where an input stands
+    still in the rest of the records, as before a single step, a part tells nothing.
     """
     problem = fitted.problem
     numbers = [np.floor(_parts(record.used)) for record in problem.records]
     folds = [[n == i for n in numbers] for i in range(1, _PARTS)]
     folds += [[n >= i for n in numbers] for i in range(_PARTS // 2, _PARTS - 1)]
-    errors = []
+    errors, counted = [], []
     for fold in folds:
         rest = [
             replace(record, used=record.used & ~part)
             for record, part in zip(problem.records, fold, strict=True)
         ]
+        counted.append(np.all(_variation(rest) > _STILL * _variation(problem.records)))
         found = replace(problem, records=rest).fit(fitted.order, [fitted.nonlinear], evaluations)
         errors.append(float(np.mean(_relative(validation_residual(found, problem)))))
-    return np.array(errors)
+    return np.array(errors)[counted if sum(counted) > 1 else slice(None)]
+
+
+def _variation(records: Sequence[SampledRecord]) -> FloatArray:
+    """Return the standard deviation of each input where the output counts, (m,)."""
+    return np.asarray(np.std(np.concatenate([r.inputs[r.used] for r in records]), axis=0))
 
 
 def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate:
@@ -383,7 +392,7 @@ def simplest_undominated(judged: Sequence[SampledCandidate]) -> SampledCandidate
         unbeaten = np.all(np.mean(worse, axis=2) <= allowed, axis=1)
     best = int(np.argmin(np.mean(errors, axis=1)))
     every = {best, *np.flatnonzero(unbeaten).tolist()}
-    return judged[min(every, key=lambda i: judged[i].order)]
+    return judged[min(every, key=lambda i: judged[i].fit.order)]
 
 
 def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -> SampledCandidate:
@@ -396,12 +405,11 @@ def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -
         held = whole.hold != BAND_LIMITED
         roots = np.asarray((2 * np.tanh(turned / 2) if held else turned) / RATE)
     roots = np.where(abs(roots.imag) < 1e-12 * abs(roots), roots.real + 0j, roots)
-    starts = [whole.nonlinear_of(roots, late)]
-    found = whole.fit(candidate.order, starts, _FINAL)
+    found = whole.fit(fitted.order, [whole.nonlinear_of(roots, late)], _FINAL)
     if every == 1:
         return replace(candidate, fit=found)
     part = replace(whole, records=[_early(record) for record in whole.records])
-    rest = part.fit(candidate.order, [found.nonlinear], _REFITTED)
+    rest = part.fit(fitted.order, [found.nonlinear], _REFITTED)
     return SampledCandidate(found, np.array([np.mean(_relative(validation_residual(rest, whole)))]))
 
 
@@ -418,7 +426,7 @@ def _against_impulse_response(
         [np.roll(u, d) for u, d in zip(inputs.T, fitted.problem.delays, strict=True)]
     )
     middle = np.mean(record.output[own.used])
-    output = _filled(record) - middle
+    output = record.filled() - middle
     residual = validation_residual(fitted, whole)[0] * np.std(record.output[record.used])
     held_out = ~np.isnan(residual)
     missed, used = np.where(held_out, residual, 0.0), own.used
@@ -441,13 +449,8 @@ def _against_impulse_response(
 
 
 def _decimation(record: SampledRecord) -> int:
-    """Return how many samples are one of a record with the content of the inputs.
-
-    That is their power, and the power of the output that follows them.
-    """
+    """Return how many samples are one that keeps the inputs, and the output that follows them."""
     power = np.sum(np.abs(np.fft.rfft(record.inputs, axis=0)) ** 2, axis=1)
-    shares = []
-    for content in (power, coherent_power(record.inputs, _filled(record))):
-        total = np.cumsum(content)
-        shares.append(float(np.searchsorted(total, _CONTENT * total[-1])) / len(power))
-    return max(int(1 / max(max(shares) * _ABOVE_CONTENT, 1e-3)), 1)
+    total = np.cumsum([power, coherent_power(record.inputs, record.filled())], axis=1)
+    share = float(np.max(np.mean(total < _CONTENT * total[:, -1:], axis=1)))
+    return max(int(1 / max(share * _ABOVE_CONTENT, 1e-3)), 1)

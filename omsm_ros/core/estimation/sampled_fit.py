@@ -62,6 +62,11 @@ class SampledRecord:
     def __len__(self) -> int:
         return len(self.output)
 
+    def filled(self) -> FloatArray:
+        """Return the output (n,), interpolated where it does not count."""
+        index = np.arange(len(self))
+        return np.asarray(np.interp(index, index[self.used], self.output[self.used]))
+
     def part(self, part: slice) -> SampledRecord:
         """Return the samples of ``part``."""
         return SampledRecord(self.inputs[part], self.output[part], self.used[part])
@@ -131,7 +136,7 @@ class _Spectra:
         inputs = self.record.inputs - np.mean(self.record.inputs, axis=0)
         spectra = np.asarray(fft.rfft(inputs.T), np.complex128)
         power = ndimage.uniform_filter1d(np.sum(np.abs(spectra) ** 2, axis=0), AVERAGED_LINES)
-        filled = np.interp(np.arange(len(self.record)), self.places, self.output)
+        filled = self.record.filled()
         follows = coherent_power(inputs, filled)
         excited = (v[1:-1] > _EXCITED * np.max(v[1:-1]) for v in (power, follows))
         lines = np.flatnonzero(np.logical_or(*excited)) + 1
@@ -204,20 +209,16 @@ class SectionsProblem:
         """Return the number of inputs."""
         return int(self.records[0].inputs.shape[1])
 
-    @property
-    def _free_delays(self) -> bool:
-        return self.hold == BAND_LIMITED
-
     def late(self, nonlinear: FloatArray, order: int) -> FloatArray:
         """Return the delay of each input [samples], (m,)."""
-        if self._free_delays:
+        if self.hold == BAND_LIMITED:
             return np.asarray(nonlinear[order:] / RATE)
         return np.asarray(self.delays, np.float64)
 
     def box(self, order: int) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of the nonlinear parameters."""
         ends = ScaledStructure(Structure(order, order, False), RATE).bounds()
-        count = self.inputs if self._free_delays else 0
+        count = self.inputs if self.hold == BAND_LIMITED else 0
         longest = max(len(record) for record in self.records) / 4 * RATE
         return (
             np.concatenate([ends[0], np.zeros(count)]),
@@ -271,7 +272,7 @@ class SectionsProblem:
         parts = parts * one.w / (1 + d1 * one.w + d2 * one.w**2)
         second = sections[:, 1] > 0
         rows = [-d1 * parts, -d2[second] * parts[second] * one.w]
-        if self._free_delays:
+        if self.hold == BAND_LIMITED:
             rows.append(-1j * one.angle / RATE * (linear @ basis) * drives)
         found = one.in_time(np.concatenate(rows))
         return np.asarray(found - (found @ free) @ free.T)
@@ -296,21 +297,24 @@ class SectionsProblem:
     def nonlinear_of(self, poles: ComplexArray, late: FloatArray) -> FloatArray:
         """Return the nonlinear parameters: stable ``poles`` in w, scaled, delays [samples]."""
         scaled = ScaledStructure(Structure(len(poles), len(poles), False), RATE)
-        tail = late * RATE if self._free_delays else np.empty(0)
+        tail = late * RATE if self.hold == BAND_LIMITED else np.empty(0)
         return np.concatenate([scaled.nonlinear_of(poles, 0.0), tail])
 
-    def relocated(self, poles: ComplexArray, late: FloatArray) -> ComplexArray:
-        """Return the poles that vector fitting reaches from ``poles``, in w, scaled."""
-        data = []
+    def spread_start(self, order: int, late: FloatArray) -> FloatArray:
+        """Return the nonlinear parameters that vector fitting reaches from spread poles.
+
+        late: delays [samples]
+        """
+        data, poles = [], self._spread_poles(order)
         for one in self.spectra:
             angle, drives, output = one.excited
             w = variable(self.hold, angle / (2 * np.pi)) / RATE
             data.append((w, drives * np.exp(-1j * angle * late[:, np.newaxis]), output))
         for _ in range(_RELOCATIONS):
             poles = _stable(_relocate(poles, data))
-        return poles
+        return self.nonlinear_of(poles, late)
 
-    def spread_poles(self, order: int) -> ComplexArray:
+    def _spread_poles(self, order: int) -> ComplexArray:
         """Return lightly damped pairs over the excited lines, in w, scaled."""
         ends = [
             np.abs(variable(self.hold, one.excited[0][[0, -1]] / (2 * np.pi))) / RATE
@@ -363,7 +367,7 @@ class SectionsProblem:
         down = np.arange(numerators, numerators + 2 * count, 2)
         turn[down, size + np.arange(count)] = sections[:, 0] / unit
         turn[down[:pairs] + 1, size + count + np.arange(pairs)] = sections[:pairs, 1] / unit**2
-        if self._free_delays:
+        if self.hold == BAND_LIMITED:
             turn[-inputs:, size + fitted.order :] = np.eye(inputs) / unit
         return turn
 

@@ -313,17 +313,17 @@ def free_run(
         )
     check_inputs(inputs)
     check_varies(output[counted], "output")
-    run, _ = _run(model.sections, inputs - model.working_point[:-1], output, counted)
+    run, _ = simulated(model.sections, inputs - model.working_point[:-1], output, counted)
     residual = np.where(counted, output - run, np.nan)
     rms = float(np.sqrt(np.mean(residual[counted] ** 2)))
     variance = float(np.var(output[counted]))
     return FreeRun(run, residual, 1 - rms**2 / variance, rms)
 
 
-def _run(
+def simulated(
     sections: ParallelSections, inputs: FloatArray, output: FloatArray, used: BoolArray
 ) -> tuple[FloatArray, float]:
-    """Return the run whose initial state and constant fit ``output``, and the constant."""
+    """Return the run whose initial state and constant fit ``output`` (n,), and the constant."""
     driven = sections.driven(inputs)
     columns = np.column_stack([*sections.decays(len(inputs)), np.ones(len(inputs))])
     # A column that has decayed where nothing is counted has no size.
@@ -336,7 +336,7 @@ def stationary_output(
     sections: ParallelSections, inputs: FloatArray, output: FloatArray, used: BoolArray
 ) -> float:
     """Return the steady output at the means of ``inputs`` (n, m)."""
-    return _run(sections, inputs - np.mean(inputs, axis=0), output, used)[1]
+    return simulated(sections, inputs - np.mean(inputs, axis=0), output, used)[1]
 
 
 def check_inputs(inputs: FloatArray) -> None:

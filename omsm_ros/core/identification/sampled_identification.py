@@ -45,7 +45,7 @@ SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
 _LEAST_PREDICTED = 0.5
 # Least p-value of a residual that is independent of the input.
 _LEAST_INDEPENDENCE_P = 1e-4
-# Frequencies over three decades: neighbours are 2 % apart.
+# Frequencies from the lowest line of the longest record on: neighbours are 2 to 3 % apart.
 _FREQUENCIES = 400
 # Number of lines in a block, added number for each input, largest ratio of its frequencies.
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
@@ -85,9 +85,9 @@ def identify_samples(
     records = [_checked(record) for record in records]
     choice = choose_sampled(records, hold, order=order, max_delay=max_delay)
     sections = _sections(choice.chosen, period)
-    sections, factor = _inflated_to_free_choice(sections, choice, period)
+    frequency = np.geomspace(1 / max(len(record) for record in records), 0.5, _FREQUENCIES) / period
+    sections, factor = _inflated_to_free_choice(sections, choice, frequency)
     blocks = _blocks(choice.chosen, period)
-    frequency = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
     missed = _missed_responses(choice.chosen, frequency * period)
     others = np.array(
         [other.response(frequency * period) for other in choice.alternatives], np.complex128
@@ -104,8 +104,8 @@ def identify_samples(
         valid=valid,
         working_point=(*np.mean(first.inputs, axis=0).tolist(), steady),
         certificate=sampled_certificate(
-            order=choice.chosen.order,
-            free_order=choice.free.order,
+            order=choice.chosen.fit.order,
+            free_order=choice.free.fit.order,
             widened=factor,
             valid=valid,
             worse=choice.worse,
@@ -159,21 +159,19 @@ def _sections(candidate: SampledCandidate, period: float) -> ParallelSections:
 
 
 def _inflated_to_free_choice(
-    sections: ParallelSections, choice: SampledChoice, period: float
+    sections: ParallelSections, choice: SampledChoice, lines: FloatArray
 ) -> tuple[ParallelSections, float]:
     if choice.chosen is choice.free:
         return sections, 1.0
-    free, factor = _sections(choice.free, period), 1.0
-    lines = np.geomspace(1e-3, 1.0, _FREQUENCIES) * 0.5 / period
+    free, factor = _sections(choice.free, sections.period), 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.log(free.response(lines) / sections.response(lines))
     for input in range(sections.inputs):
-        own, other = sections.band(lines, input), free.band(lines, input)
-        low, high = _widest(lines, _narrow(own))
+        low, high = _widest(lines, _narrow(sections.band(lines, input)))
         trusted = (lines >= low) & (lines <= high) & np.isfinite(apart[input])
-        cut = [Band(b.frequency[trusted], b.gain[trusted], b.phase[trusted]) for b in (own, other)]
+        own, other = (each.band(lines[trusted], input) for each in (sections, free))
         with np.errstate(divide="ignore"):
-            factor = max(factor, widening(cut[0], cut[1], apart[input][trusted]))
+            factor = max(factor, widening(own, other, apart[input][trusted]))
     return replace(sections, covariance=factor**2 * np.asarray(sections.covariance)), factor
 
 
@@ -230,7 +228,7 @@ def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
         end = min(place + size, len(lines))
         far = np.searchsorted(lines, _BLOCK_RATIO * lines[place] + size / 2)
         end = max(min(end, int(far)), place + 1)
-        if 2 * (end - place) > size:
+        if 2 * (end - place) >= size:
             blocks.append(lines[place:end])
         place = end
     return blocks

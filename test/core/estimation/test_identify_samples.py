@@ -327,14 +327,14 @@ def test_the_simplest_of_equals_is_taken(better, order):
     small = SampledCandidate(fits[1], 1 + 0.05 * rng.normal(size=8))
     large = SampledCandidate(fits[3], small.held_out - better * (1 + rng.normal(size=8) / 3))
     large = replace(large, held_out=large.held_out + (better < 0.01) * 0.05 * rng.normal(size=8))
-    assert simplest_undominated([small, large]).order == order
+    assert simplest_undominated([small, large]).fit.order == order
 
 
 def test_the_order_that_is_asked_for_is_kept():
     u, y = recorded("zero-order", samples=2000)
     choice = choose_sampled([record(u, y)], "zero-order", order=5)
-    assert choice.chosen.order == 5
-    assert choice.free.order == 2
+    assert choice.chosen.fit.order == 5
+    assert choice.free.fit.order == 2
 
 
 def test_polynomials_become_the_same_response():
@@ -376,3 +376,39 @@ def test_a_mode_beyond_the_strong_band_of_the_input_is_found():
     # Sampled for the strong band alone, the mode at 0.3 cycles would be lost.
     assert free_run(model, u[half:], y[half:]).explained > 0.999
     assert np.max(np.abs(model.sections.poles().imag)) == pytest.approx(2 * np.pi * 0.3, rel=1e-3)
+
+
+@pytest.mark.parametrize("at", [0.3, 0.5, 0.6])
+def test_one_step_shows_a_lag_from_the_lowest_line_on(at):
+    samples, period, lag = 2000, 0.01, 1.7
+    rng, decay = np.random.default_rng(5), np.exp(-period / lag)
+    u = np.where(np.arange(samples) < at * samples, 1.0, 1.2)
+    # It starts at rest, so the record begins with the answer to a constant input.
+    y = signal.lfilter([0.0, 1 - decay], [1.0, -decay], u) + rng.normal(0, 2e-3, samples)
+    model = identified(u, y, period)
+    assert model.certificate["verdict"].startswith("accepted")
+    (low, high) = model.valid[0]
+    assert low == pytest.approx(1 / (samples * period), rel=0.05)
+    lines = np.geomspace(low, high, 50)
+    truth = (1 - decay) / (np.exp(2j * np.pi * lines * period) - decay)
+    assert np.max(np.abs(model.sections.response(lines)[0] / truth - 1)) < 0.05
+
+
+def test_a_delay_that_a_few_poles_imitate_is_not_taken():
+    poles = np.array([-0.081 + 0.749j, -0.008 + 0.083j])
+    residues = np.array([0.048 + 0.246j, 0.021 + 0.012j])
+    parts = [
+        ([2 * r.real, -2 * (r * np.conj(p)).real], [1.0, -2 * p.real, abs(p) ** 2])
+        for p, r in zip(poles, residues, strict=True)
+    ]
+    rng = np.random.default_rng(1)
+    # The input ends at half the Nyquist frequency, so its first answers do not show a delay.
+    u = signal.lfilter(*signal.butter(8, 0.5), rng.normal(size=2000))
+    y = np.zeros(len(u))
+    for up, down in [*parts, ([1.151], [1.0, 1.655])]:
+        b, a, _ = signal.cont2discrete((up, down), 1.0, "foh")
+        y += signal.lfilter(np.ravel(b), a, u)
+    y += rng.normal(0, 0.01 * np.std(y), len(y))
+    certificate = identified(u, y, 1.0, hold="first-order").certificate
+    assert certificate["delay_samples"] == [0.0]
+    assert certificate["order"] == 5
