@@ -135,7 +135,7 @@ def fit_and_refute(
             _FURTHER_STEPS,
         )
         steps.append(solution)
-        still = {e.family.name for e in refuted_by(solution, [r.name for r in found])}
+        still = {e.family.name for e in refuted_by(solution, [r.name for r in found], least)}
         # Parsimony chooses the culprit; whatever explains as much may be it.
         enough = best.chi_square - max(_ALIKE, _ALIKE_SHARE * best.chi_square)
         alike = [e for e in beyond if e is not best and e.family.named and e.family.name not in
@@ -191,10 +191,12 @@ def _grouped(
     return tuple(causes), tuple(doubts)
 
 
-def refuted_by(solution: Solution, released: Sequence[str]) -> list[Evidence]:
+def refuted_by(
+    solution: Solution, released: Sequence[str], least: float = _LEAST_GAIN
+) -> list[Evidence]:
     """Return the evidence of the families beyond their declaration, strongest first."""
     evidences = [evidence_of(solution, f) for f in solution.network.families]
-    return _beyond(evidences, released, _LEAST_GAIN)
+    return _beyond(evidences, released, least)
 
 
 def _beyond(evidences: Sequence[Evidence], released: Sequence[str], least: float) -> list[Evidence]:
