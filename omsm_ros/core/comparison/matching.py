@@ -4,6 +4,8 @@ Piston, tip, tilt and power are linear; shift and clocking, on request, are foun
 with the slopes of the local fits. All places have the same area.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -69,6 +71,25 @@ class Matched:
         """a − b at the places [m], (m,)."""
         return self.a - self.b
 
+    def step(self) -> dict[str, float]:
+        """Return the least-squares step of each pose parameter."""
+        scale = np.linalg.norm(self.columns, axis=1)
+        solved = np.linalg.lstsq(self.columns.T / scale, self.difference, rcond=1e-10)[0] / scale
+        return dict(zip(self.dofs, map(float, solved), strict=True))
+
+    def levelled(self, step: Mapping[str, float]) -> Matched:
+        """Return both with ``step`` of linear pose parameters removed from the second."""
+        columns = dict(zip(self.dofs, self.columns, strict=True))
+        level = sum((value * columns[name] for name, value in step.items()), np.zeros(1))
+        flat = np.full(self.grid.height.size, np.nan)
+        flat[self.filled] = self.a - self.b - level
+        return replace(
+            self,
+            grid=replace(self.grid, height=flat.reshape(self.grid.height.shape)),
+            b=self.b + level,
+            moved={**self.moved, **step},
+        )
+
     def without_fit(self, values: FloatArray) -> FloatArray:
         """Return values (…, m) without their fit by the fitted pose parameters."""
         design = self.columns.T / np.linalg.norm(self.columns, axis=1)
@@ -91,110 +112,56 @@ def match(a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid, dofs: Sequence
 
     Raises DataError for too few common places, or a fit that does not converge.
     """
-    places = _Places(a, b, grid)
-    wanted = ordered_dofs(dofs)
-    moved = dict.fromkeys(wanted, 0.0)
-    seen = places.seen(moved, wanted)
-    refused = _not_determined(seen.columns, places.columns_of_first(seen.filled, wanted), grid.dx)
-    left = tuple(name for name in wanted if name not in refused)
+    x, y = (part.ravel() for part in np.meshgrid(grid.x, grid.y))
+    here = a.at(x, y)
+    wanted = dict.fromkeys(ordered_dofs(dofs), 0.0)
+    seen = _resampled(here, b, grid, wanted)
+    of_first = {name: _column(name, seen.x, seen.y, seen.from_a) for name in wanted}
+    of_second = dict(zip(wanted, seen.columns, strict=True))
+    refused = _not_determined(of_second, of_first, grid.dx)
+    moved = {name: value for name, value in wanted.items() if name not in refused}
     for _ in range(_TURNS):
-        seen = places.seen(moved, left)
+        seen = _resampled(here, b, grid, moved)
         step = seen.step()
         lateral_step = {name: step.pop(name) for name in _LATERAL if name in step}
-        if _is_converged(lateral_step, grid.dx, float(np.ptp(places.x))):
-            return places.matched(seen, {**moved, **step}, step, refused)
-        for name, value in lateral_step.items():
-            moved[name] += value
+        if _is_converged(lateral_step, grid.dx, float(np.ptp(x))):
+            return replace(seen.levelled(step), refused=refused)
+        moved |= {name: moved[name] + value for name, value in lateral_step.items()}
     raise DataError("comparison.not_converged")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """Both measurements where they have heights, and the column of each pose parameter (n,)."""
-
-    filled: BoolArray
-    a: FloatArray
-    b: FloatArray
-    columns: dict[str, FloatArray]
-    there: LocalHeights
-    u: FloatArray
-    v: FloatArray
-
-    def step(self) -> dict[str, float]:
-        """Return the least-squares step of each pose parameter."""
-        design = np.stack(list(self.columns.values()), axis=1)
-        scale = np.linalg.norm(design, axis=0)
-        solved = np.linalg.lstsq(design / scale, self.a - self.b, rcond=1e-10)[0] / scale
-        return dict(zip(self.columns, map(float, solved), strict=True))
-
-
-class _Places:
-    """The places of a grid, and both measurements there."""
-
-    def __init__(self, a: LocalQuadratic, b: LocalQuadratic, grid: HeightGrid) -> None:
-        self._b, self._grid = b, grid
-        self.x, self.y = (part.ravel() for part in np.meshgrid(grid.x, grid.y))
-        self._here = a.at(self.x, self.y)
-
-    def seen(self, moved: Mapping[str, float], dofs: Sequence[str]) -> _Seen:
-        """Resample the second measurement after it is ``moved``."""
-        there, u, v = _resampled_after_move(self._b, self.x, self.y, moved)
-        filled = np.isfinite(self._here.value) & np.isfinite(there.value)
-        if np.sum(filled) < _FEWEST_PLACES:
-            raise DataError(
-                "comparison.few_places",
-                count=int(np.sum(filled)),
-                side=self._grid.dx,
-                least=_FEWEST_PLACES,
-            )
-        columns = {n: _column(n, u, v, there)[filled] for n in dofs}
-        heights = (self._here.value[filled], there.value[filled])
-        return _Seen(filled, *heights, columns, there, u[filled], v[filled])
-
-    def columns_of_first(self, filled: BoolArray, dofs: Sequence[str]) -> dict[str, FloatArray]:
-        """Return the columns (n,) of the first measurement where both have heights."""
-        here, x, y = _heights_at(self._here, filled), self.x[filled], self.y[filled]
-        return {name: _column(name, x, y, here) for name in dofs}
-
-    def matched(
-        self,
-        seen: _Seen,
-        moved: dict[str, float],
-        step: dict[str, float],
-        refused: dict[str, Notice],
-    ) -> Matched:
-        """Return both measurements with ``step`` removed from the second."""
-        level = sum((value * seen.columns[name] for name, value in step.items()), np.zeros(1))
-        flat = np.full(self.x.size, np.nan)
-        flat[seen.filled] = seen.a - seen.b - level
-        shape = self._grid.height.shape
-        return Matched(
-            grid=replace(self._grid, height=flat.reshape(shape)),
-            filled=seen.filled,
-            x=self.x[seen.filled],
-            y=self.y[seen.filled],
-            a=seen.a,
-            b=seen.b + level,
-            columns=np.stack(list(seen.columns.values())),
-            dofs=tuple(seen.columns),
-            moved={name: value for name, value in moved.items() if name not in refused},
-            refused=refused,
-            from_a=_heights_at(self._here, seen.filled),
-            from_b=_heights_at(seen.there, seen.filled),
-            b_x=seen.u,
-            b_y=seen.v,
-        )
-
-
-def _resampled_after_move(
-    b: LocalQuadratic, x: FloatArray, y: FloatArray, moved: Mapping[str, float]
-) -> tuple[LocalHeights, FloatArray, FloatArray]:
-    """Return b, after it is ``moved``, at x, y, and these places in the frame of b."""
+def _resampled(
+    here: LocalHeights, b: LocalQuadratic, grid: HeightGrid, moved: Mapping[str, float]
+) -> Matched:
+    """Return the first measurement ``here``, and the second after it is ``moved``, at ``grid``."""
+    x, y = (part.ravel() for part in np.meshgrid(grid.x, grid.y))
     angle = moved.get("clocking", 0.0)
     dx, dy = x - moved.get("x", 0.0), y - moved.get("y", 0.0)
     u = dx * np.cos(angle) + dy * np.sin(angle)
     v = -dx * np.sin(angle) + dy * np.cos(angle)
-    return b.at(u, v), u, v
+    there = b.at(u, v)
+    filled = np.isfinite(here.value) & np.isfinite(there.value)
+    if np.sum(filled) < _FEWEST_PLACES:
+        raise DataError(
+            "comparison.few_places", count=int(np.sum(filled)), side=grid.dx, least=_FEWEST_PLACES
+        )
+    columns = [_column(name, u, v, there)[filled] for name in moved]
+    return Matched(
+        grid=grid,
+        filled=filled,
+        x=x[filled],
+        y=y[filled],
+        a=here.value[filled],
+        b=there.value[filled],
+        columns=np.array(columns),
+        dofs=tuple(moved),
+        moved={**moved},
+        refused={},
+        from_a=_heights_at(here, filled),
+        from_b=_heights_at(there, filled),
+        b_x=u[filled],
+        b_y=v[filled],
+    )
 
 
 def _column(name: str, x: FloatArray, y: FloatArray, there: LocalHeights) -> FloatArray:
