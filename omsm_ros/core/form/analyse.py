@@ -14,11 +14,12 @@ from omsm_ros.core.form.deviation_map import (
     GridCells,
     UncertainValue,
     neighbour_noise,
+    path_noise,
     profile_noise,
     repeated_noise,
     root_mean_square,
 )
-from omsm_ros.core.form.part_extents import extents_of_part, extents_of_parts
+from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import (
     POWER,
     SYMMETRIC,
@@ -49,7 +50,7 @@ from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
 from omsm_ros.core.registration.placement import Placed, PointBatch, PointBatches, placed
 from omsm_ros.core.registration.pose_parameters import Registration
 from omsm_ros.core.registration.register import CHUNK, register
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection, noise_of
 from omsm_ros.core.surface.aperture import Aperture, best_covered, within_aperture
 from omsm_ros.core.surface.area_weights import area_weights
@@ -114,7 +115,7 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
     return {
         "iso10110_A": _sagitta(map_, fit),
-        "iso10110_C": extents_of_part(_symmetric(map_, fit.disc), fit.disc)[0],
+        "iso10110_C": extents_of_parts([_symmetric(map_, fit.disc)], fit.disc)[0][0],
         "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
         "iso10110_RMSi": rms_of_part(irregular),
         "iso10110_RMSa": rms_of_part(uneven),
@@ -277,7 +278,7 @@ def _figures(
         "rms_without_second_order": rms_of_part(rest, extents[2][2]),
         "edge_roll_off": edge_roll_off(map_, outline),
         # These are as measured, with noise and systematic errors.
-        "peak_to_valley_of_points": UncertainValue(gathered.extent, None),
+        "peak_to_valley_of_points": UncertainValue(gathered.most - gathered.least, None),
         "rms_of_points": UncertainValue(root_mean_square(map_), None),
         # A profile measured once does not tell noise from texture.
         "point_noise": UncertainValue(map_.noise if map_.noise_known else None, None),
@@ -312,8 +313,8 @@ class _Gathered:
     def __init__(self, surface: Surface, found: Registration, aperture: Aperture | None) -> None:
         self._surface, self._found, self._aperture = surface, found, aperture
         self._kept = EvenSelection(MOST_WEIGHED)
-        self._least, self._most = np.inf, -np.inf
-        self._noise: list[float] = []
+        self.least, self.most = np.inf, -np.inf
+        self._noise: list[tuple[float, float]] = []
         self._dust: list[FloatArray] = []
         self.counts = dict.fromkeys(
             ("read", "used", "not_finite", "beyond_surface", "outside_aperture", "outliers"), 0
@@ -330,29 +331,18 @@ class _Gathered:
             inside = self._aperture.holds(whole.x, whole.y)
         usable = has_height & inside
         good = usable & found.good(self.counts["read"], len(finite))
-        self._count(finite, has_height, inside, good)
+        shares = (np.ones_like(good), good, ~finite, finite & ~has_height, has_height & ~inside)
+        for name, chosen in zip(self.counts, (*shares, usable & ~good), strict=True):
+            self.counts[name] += int(np.count_nonzero(chosen))
         dust = whole.part(usable & ~good)
         self._dust.append(np.stack([dust.x, dust.y, dust.deviation]))
         if np.any(good):
             self._keep(whole.part(good), portion.systematic[:, good])
 
-    def _count(
-        self, finite: BoolArray, has_height: BoolArray, inside: BoolArray, good: BoolArray
-    ) -> None:
-        for name, chosen in (
-            ("read", np.ones(len(good), bool)),
-            ("used", good),
-            ("not_finite", ~finite),
-            ("beyond_surface", finite & ~has_height),
-            ("outside_aperture", has_height & ~inside),
-            ("outliers", has_height & inside & ~good),
-        ):
-            self.counts[name] += int(np.count_nonzero(chosen))
-
     def _keep(self, points: Placed, systematic: FloatArray) -> None:
-        self._least = min(self._least, float(points.deviation.min()))
-        self._most = max(self._most, float(points.deviation.max()))
-        self._noise.append(noise_of(points.deviation))
+        self.least = min(self.least, float(points.deviation.min()))
+        self.most = max(self.most, float(points.deviation.max()))
+        self._noise.append((noise_of(points.deviation), path_noise(points.deviation)))
         pose, along = self._found.effects(points, systematic)
         rows = [points.x, points.y, points.deviation, *pose, *along]
         self._kept.add(np.stack(rows, axis=1))
@@ -361,11 +351,6 @@ class _Gathered:
     def dust(self) -> FloatArray:
         """Places and deviations (3, d) [m] of the points left out as dust."""
         return np.concatenate(self._dust, axis=1)
-
-    @property
-    def extent(self) -> float:
-        """Largest minus smallest deviation of all points [m]."""
-        return float(self._most - self._least)
 
     @property
     def places(self) -> FloatArray:
@@ -380,7 +365,7 @@ class _Gathered:
         bounds: indices of the sources of which only an upper bound is known
         """
         rows = np.ascontiguousarray(self._kept.rows().T)
-        noise, known = self._point_noise(rows, found.noise)
+        noise, known, error = self._point_noise(rows, found.noise)
         return DeviationMap(
             x=rows[0],
             y=rows[1],
@@ -389,19 +374,25 @@ class _Gathered:
             effects=rows[3:],
             noise=noise,
             noise_known=known,
+            noise_error=error,
             bounds=len(found.pose_effects) + np.array(bounds, np.int64),
             moves=found.moves,
             taken=found.taken,
         )
 
-    def _point_noise(self, rows: FloatArray, fitted: float) -> tuple[float, bool]:
-        """Return the noise of a point [m], and whether it is certainly no texture."""
+    def _point_noise(self, rows: FloatArray, fitted: float) -> tuple[float, bool, float]:
+        """Return the noise of a point [m], whether it is certainly no texture, and its error [m].
+
+        Form adds to each estimate, so the least counts, and the next shows how much it may contain.
+        """
         x, y, deviation = rows[:3]
         if (repeated := repeated_noise(x, y, deviation)) is not None:
-            return repeated, True
+            return repeated, True, 0.0
         spans = sorted((float(np.ptp(x)), float(np.ptp(y))))
         if spans[0] <= _LINE_WIDTH * spans[1]:
-            return profile_noise(x if np.ptp(x) > np.ptp(y) else y, deviation)
+            along = x if np.ptp(x) > np.ptp(y) else y
+            return *profile_noise(along, deviation), 0.0
         # Points may come in any order, where successive points are no neighbours.
-        near = min(float(np.median(self._noise)), neighbour_noise(x, y, deviation), fitted)
-        return near, True
+        estimates = [*np.median(self._noise, axis=0), neighbour_noise(x, y, deviation), fitted]
+        least, next_ = sorted(map(float, estimates))[:2]
+        return least, True, next_ - least

@@ -43,7 +43,7 @@ class DeviationMap:
     moves: indices of effects that are moves of the part, to first order
     taken: the first t effects are form that the fit may have taken for a move, so that it is
         missing from the deviations; mean products of their probable shares (t, t), at most one
-    noise: standard deviation of one point [m]
+    noise: standard deviation of one point [m];  noise_error: standard uncertainty of it [m]
     noise_known: False for an upper bound, as of a profile that was measured once
     """
 
@@ -57,6 +57,7 @@ class DeviationMap:
     moves: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     taken: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     noise_known: bool = True
+    noise_error: float = 0.0
 
     def __len__(self) -> int:
         return len(self.x)
@@ -85,12 +86,50 @@ def root_mean_square(map_: DeviationMap) -> float:
     return float(np.sqrt(np.average(map_.deviation**2, weights=map_.area)))
 
 
+# Neighbours whose plane predicts a point, and points that are predicted.
+_NEIGHBOURS, _MOST_PREDICTED = 6, 6000
+# Least singular value of a plane through neighbours; those of one track determine no slope across.
+_LEAST_ACROSS = 1e-2
+# Points of a stretch of the path whose spectrum is taken, and least number of stretches.
+_STRETCH, _LEAST_STRETCHES = 64, 8
+
+
 def neighbour_noise(x: FloatArray, y: FloatArray, deviation: FloatArray) -> float:
-    """Return the noise of points (n,) in any order, from neighbours in strips of y."""
-    span_x, span_y = float(np.ptp(x)), float(np.ptp(y))
-    spacing = np.sqrt(span_x * span_y / max(len(x), 1))
-    strip = np.floor((y - y.min()) / (2 * spacing)) if spacing > 0 else np.zeros(len(y))
-    return noise_of(deviation[np.lexsort((x, strip))])
+    """Return the noise of points (n,) in any order, from the plane through the nearest of each."""
+    from scipy.spatial import cKDTree  # takes long to load
+
+    if len(x) <= _NEIGHBOURS:
+        return noise_of(deviation)
+    some = slice(None, None, -(-len(x) // _MOST_PREDICTED))
+    places = np.column_stack([x, y])
+    near = cKDTree(places).query(places[some], _NEIGHBOURS + 1)[1][:, 1:]
+    away = places[near] - places[some, np.newaxis]
+    size = np.max(np.abs(away), axis=(1, 2), keepdims=True)
+    away /= np.where(size > 0, size, 1.0)
+    columns = np.concatenate([np.ones_like(away[..., :1]), away], axis=2)
+    weights = np.linalg.pinv(columns, rcond=_LEAST_ACROSS)[:, 0]
+    rest = deviation[some] - np.sum(weights * deviation[near], axis=1)
+    gain = np.sqrt(1 + np.sum(weights**2, axis=1))
+    # At the rim the plane is extrapolated.
+    return spread((rest / gain)[gain <= np.sqrt(2)])
+
+
+def path_noise(deviation: FloatArray) -> float:
+    """Return the noise of points (n,) in the order of measurement, inf for few.
+
+    It is the level of the upper half of the spectrum. Ripple and texture that differences would
+    take for noise are lines in it, and local features are in some of the stretches.
+    """
+    count = len(deviation) // _STRETCH
+    if count < _LEAST_STRETCHES:
+        return np.inf
+    values = deviation[: count * _STRETCH].reshape(count, _STRETCH)
+    form = np.linalg.qr(np.vander(np.linspace(-1, 1, _STRETCH), 3))[0]
+    window = np.hanning(_STRETCH)
+    content = np.abs(np.fft.rfft((values - values @ form @ form.T) * window)) ** 2
+    level = np.median(content, axis=0)[_STRETCH // 4 : -1]
+    # The content of white noise has an exponential distribution.
+    return float(np.sqrt(np.median(level) / np.log(2) / np.sum(window**2)))
 
 
 # Share of repeated places that determines noise, and their size over the spacing of the points.

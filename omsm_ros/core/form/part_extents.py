@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from omsm_ros.core.form.deviation_map import DeviationMap, UncertainValue
 from omsm_ros.core.form.part_figures import (
@@ -57,27 +58,15 @@ _EXTREME = 100
 # Points around a place of the rim that extrapolate the form to it; how far they may be off, in
 # distances of the tracks; and number of places.
 _AROUND, _REACH, _PLACES = 24, 1.5, 360
-# Least singular value of a plane through neighbours; those of one track determine no slope across.
-_LEAST_SPREAD = 1e-2
-# Neighbours on the next tracks, in distances of the tracks. A parabola that falls by one to them
-# from a peak may rise by a quarter between them.
-_NEXT, _QUARTER = (0.7, 1.3), 0.25
-# Distance of the middle of the neighbours beyond which a peak is at the rim; places around a peak
-# (49, 1) from which the next point may be far, half a distance of regular tracks.
-_ONE_SIDED = 0.3
+# Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
+# distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
+_NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
+# Peaks at either end, and share of the height of one that its surroundings hide.
+_PEAKS, _UNSEEN = 6, 0.05
+# Least singular value of a parabola through neighbours, and the weight of its curvature.
+_LEAST_SPREAD, _LEAST_CURVED = 1e-2, 0.3
 # Standard uncertainty of the rim's place, in distances of the tracks.
 _RIM_KNOWN = 1 / 12
-_HALF_WAY = np.linspace(-0.5, 0.5, 7)
-_PLACES_AROUND = np.add.outer(_HALF_WAY, 1j * _HALF_WAY).reshape(-1, 1)
-
-
-def extents_of_part(map_: DeviationMap, disc: Aperture) -> tuple[UncertainValue, UncertainValue]:
-    """Return the peak to valley of the part at its points, and the extent of 99.5 % of its area.
-
-    disc: of the smooth terms
-    """
-    whole, robust, _ = extents_of_parts([map_], disc)[0]
-    return whole, robust
 
 
 def extents_of_parts(
@@ -86,11 +75,12 @@ def extents_of_parts(
     outline: Aperture | None = None,
     spacing: float = 0.0,
 ) -> list[tuple[UncertainValue, UncertainValue, tuple[float, float]]]:
-    """Return the extents, as :func:`extents_of_part`, of a map and of it without smooth forms.
+    """Return peak to valley and extent of 99.5 % of the area of maps that differ by smooth form.
 
     Third is the mean square that form between the last track and the rim adds, and its standard
     uncertainty [m²].
 
+    disc: of the smooth terms
     outline: of the part, None for a map without gaps;  spacing: distance of the tracks [m]
     """
     if not maps[0].noise_known:
@@ -100,7 +90,7 @@ def extents_of_parts(
             (either(a[0], b[0]), either(a[1], b[1]), b[2]) for a, b in zip(one, other, strict=True)
         ]
     form = _PartForm.of(maps[0], disc)
-    gaps = _Gaps.of(maps[0].every(_MOST_FITTED), outline, spacing) if outline else None
+    gaps = _Gaps.of(maps[0], outline, spacing) if outline else None
     return [form.extents(map_, map_.deviation - maps[0].deviation, gaps) for map_ in maps]
 
 
@@ -125,7 +115,10 @@ class _PartForm(NamedTuple):
         fit = _smooth(map_.every(_MOST_FITTED), disc)
         smooth = fit.height(map_.x, map_.y)
         rest = map_.deviation - smooth
-        share, blurred = _share_of_form(rest, map_.noise)
+        # Wiener's factor, and the rms of the form lost by it.
+        variance = float(np.mean(rest**2))
+        share = max(1 - map_.noise**2 / variance, 0.0) if variance > 0 else 0.0
+        blurred = (1 - share) * float(np.sqrt(max(variance - map_.noise**2, 0.0)))
         value, cell = smooth + share * rest, np.arange(len(map_))
         error = np.full(len(map_), share * map_.noise)
         local = np.empty(0, np.int64)
@@ -141,61 +134,51 @@ class _PartForm(NamedTuple):
     ) -> tuple[UncertainValue, UncertainValue, tuple[float, float]]:
         """Return the extents of the ``map_`` whose form differs by a smooth ``shift`` (n,) [m]."""
         form = self.value + shift
-        even = np.arange(0, len(map_), -(-len(map_) // _MOST_DRAWN))
+        even = _equal_areas(map_.area, _MOST_DRAWN)
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
         drawn = _drawn(map_.part(some), self, form[some], some)
-
-        def whole(deviations: FloatArray) -> FloatArray:
-            return np.asarray(np.ptp(deviations, axis=0), np.float64)
-
-        def robust(deviations: FloatArray) -> FloatArray:
-            return _quantile_ranges(deviations[: len(even)], map_.area[even])
-
+        of_gaps = gaps.beyond(form, self.error, map_.area) if gaps else (np.zeros(2), (0.0, 0.0))
         found = []
-        few = slice(None, None, -(-len(map_) // _MOST_FITTED))
-        of_gaps = (np.zeros(2), (0.0, 0.0))
-        if gaps:
-            of_gaps = gaps.beyond(form[few], self.error[few], map_.area[few])
-        of_all = _quantile_ranges(form[few, np.newaxis], map_.area[few])
-        for extent, all_ in ((whole, float(np.ptp(form))), (robust, float(of_all[0]))):
-            of_some = float(extent(form[some, np.newaxis])[0])
-            again, more, likely, full, noise = (extent(way) ** 2 for way in drawn)
-            square = of_some**2 - float(np.mean(again)) + float(np.mean(likely))
+        many = form[_equal_areas(map_.area, _MOST_FITTED)]
+        for ends, all_, count in (((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))):
+            of_some, *ways = (_extents(way[:count], ends) for way in (form[some], *drawn))
+            again, more, likely, full, noise = (way**2 for way in ways)
+            square = float(of_some**2 - np.mean(again) + np.mean(likely))
             of_taken = _rms(full - np.mean(likely))
             # Where many points compete for an extreme, the mean of the draws follows the noise of
             # the figure in part, so that it counts once to twice: the factor is √2.
-            of_errors = length(float(np.std(again)), float(np.std(noise)))
+            of_errors = length(*np.std([again, noise], axis=1))
             # An extent has two ends, each blurred independently.
-            of_blur = 2 * of_some * float(np.sqrt(2)) * self.blurred
+            of_blur = 2 * of_some * np.sqrt(2) * self.blurred
             figure = of_square(square, length(of_errors, _rms(more - again), of_taken, of_blur))
-            between = of_gaps[0] if extent is whole else np.zeros(2)
-            value = (figure.value or 0.0) + all_ - of_some + float(np.sum(between)) / 2
+            between = of_gaps[0] if all_ is form else np.zeros(2)
+            value = (
+                (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between)) / 2
+            )
             spread = length(figure.uncertainty or 0.0, *(between / 2))
-            found.append(UncertainValue(value, spread))
+            found.append(UncertainValue(float(value), spread))
         return found[0], found[1], of_gaps[1]
 
 
-def _quantile_ranges(values: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the extents (k,) of the ``ROBUST`` share of the weight (n,) of ``values`` (n, k)."""
-    beyond, ends = ROBUST[0] * float(np.sum(weights)), []
-    # No more points lie beyond an end than of those with the least weights.
-    count = int(np.searchsorted(np.cumsum(np.sort(weights)), beyond, "right")) + 2
-    for rows in (np.ascontiguousarray(values.T), np.ascontiguousarray(-values.T)):
-        few = np.argpartition(rows, min(count, len(weights)) - 1, axis=1)[:, :count]
-        order = np.take_along_axis(few, np.argsort(np.take_along_axis(rows, few, 1), axis=1), 1)
-        below = np.cumsum(weights[order], axis=1) - weights[order] / 2
-        ordered = np.take_along_axis(rows, order, 1)
-        ends.append([np.interp(beyond, b, v) for b, v in zip(below, ordered, strict=True)])
-    return np.asarray(-np.sum(ends, axis=0), np.float64)
+def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
+    """Return the distances between the quantiles ``ends`` along the first axis."""
+    return np.asarray(np.ptp(np.quantile(values, ends, axis=0, method="hazen"), axis=0))
+
+
+def _equal_areas(area: FloatArray, most: int) -> IntArray:
+    """Return the indices of ``most`` points, or all, that stand for equal shares of ``area``."""
+    ends, count = np.cumsum(area), min(most, len(area))
+    begins = np.arange(count) / count * ends[-1] * (1 + 1e-12)  # rounding of the sums
+    return np.asarray(np.searchsorted(ends, begins, "right"))
 
 
 class _Gaps(NamedTuple):
     """Places that the tracks miss.
 
     x, y: of the points (n,) [m];  spacing: of the tracks [m]
-    near, weights: points (q, k), the nearest first, whose weighted sum extrapolates the form from
-        that to a place of the rim
+    near, weights: points (q, k), the nearest first, whose weighted sum continues the form to a
+        place of the rim
     share: of the area between each place and its nearest point (q,)
     strip: share of the area that a shift of the rim by its uncertainty covers
     """
@@ -213,7 +196,8 @@ class _Gaps(NamedTuple):
         """Return the gaps between the points and to the ``outline``; None for a profile."""
         from scipy.spatial import cKDTree  # takes long to load
 
-        x, y = map_.x, map_.y
+        some = np.arange(0, len(map_), -(-len(map_) // _MOST_FITTED))
+        x, y = map_.x[some], map_.y[some]
         if len(x) < _AROUND or min(np.ptp(x), np.ptp(y)) < _REACH * spacing:
             return None
         corners = outline.rim()
@@ -226,11 +210,8 @@ class _Gaps(NamedTuple):
         near, rim = near[close], rim[:, close, np.newaxis]
         share = away[close, 0] * way[-1] / _PLACES / area
         strip = float(way[-1]) * spacing * _RIM_KNOWN / area
-        first = near[:, :1]
-        weights = _plane(x[near] - rim[0], y[near] - rim[1])
-        weights -= _plane(x[near] - x[first], y[near] - y[first])
-        weights[:, 0] += 1.0
-        return cls(x, y, spacing, near, weights, share, strip)
+        weights = _continued(x[near] - rim[0], y[near] - rim[1])
+        return cls(map_.x, map_.y, spacing, some[near], weights, share, strip)
 
     def beyond(
         self, form: FloatArray, noise: FloatArray, area: FloatArray
@@ -243,32 +224,68 @@ class _Gaps(NamedTuple):
         form, noise, area: of the points, each (n,) [m], the area of any unit
         """
         rim, found = np.sum(self.weights * form[self.near], axis=1), []
-        for values, at_rim in ((-form, -rim), (form, rim)):
-            at_most = float(np.max(at_rim, initial=-np.inf))
-            found.append(max(self._rise(values, noise), at_most - float(values.max()), 0.0))
+        chance = 2 * np.sqrt(np.sum((self.weights * noise[self.near]) ** 2, axis=1))
+        for sign in (-1, 1):
+            values = sign * form
+            at_rim = float(np.max(sign * rim - chance, initial=-np.inf))
+            found.append(max(self._summit(values, noise), at_rim) - float(values.max()))
         # The points stand for the way to the rim; along it the form changes by half on average.
         more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
         higher = float(np.mean(rim**2) - np.average(form**2, weights=area)) if len(rim) else 0.0
-        return np.array(found), (more, length(more, self.strip * higher))
+        return np.maximum(found, 0.0), (more, length(more, self.strip * higher))
 
-    def _rise(self, values: FloatArray, noise: FloatArray) -> float:
-        """Return how far ``values`` (n,) [m] may rise between the tracks around the largest."""
-        peak = int(np.argmax(values))
-        at = ((self.x - self.x[peak]) + 1j * (self.y - self.y[peak])) / self.spacing
-        away = np.abs(at)
-        ring = (away > _NEXT[0]) & (away < _NEXT[1])
-        # At the rim there is none on the other side.
-        if not np.any(ring) or abs(np.mean(at[ring])) > _ONE_SIDED:
-            return 0.0
-        gap = np.max(np.min(np.abs(_PLACES_AROUND - at[away < 1]), axis=1))
-        fall = float(values[peak] - np.mean(values[ring]) - 2 * noise[peak])
-        return fall * _QUARTER * float(min(2 * gap, 1.0)) ** 2
+    def _summit(self, values: FloatArray, noise: FloatArray) -> float:
+        """Return how high ``values`` (n,) [m] may be about the largest, between the tracks."""
+        left, highest = values.copy(), -np.inf
+        for _ in range(_PEAKS):
+            peak = int(np.argmax(left))
+            near = np.flatnonzero(np.abs(self.x - self.x[peak]) < _AWAY[1] * self.spacing)
+            at = (self.x[near] - self.x[peak]) + 1j * (self.y[near] - self.y[peak])
+            at /= self.spacing
+            about = np.abs(at) < _AWAY[1]
+            near, at = near[about], at[about]
+            rise = _rise(at, values[near], values[peak], float(noise[peak]))
+            highest = max(highest, float(values[peak]) + rise)
+            left[near] = -np.inf
+            if np.isneginf(left.max()):
+                break
+        return highest
 
 
-def _plane(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the weights (…, k) of values at x, y (…, k) whose sum is their plane at the origin."""
-    size = np.max(np.hypot(x, y), axis=-1, keepdims=True)
-    columns = np.stack([np.ones_like(x), x / size, y / size], axis=-1)
+def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: float) -> float:
+    """Return how far a Gaussian through ``values`` (n,) [m] may exceed their ``peak``.
+
+    Its summit is half way to the next track at most. Where the neighbouring tracks miss it, it is
+    as wide as along the track.
+
+    at: places about the peak in distances of the tracks (n,);  noise: of the peak [m]
+    """
+    away = np.abs(at)
+    around, ring = away > _AWAY[0], (away > _NEXT[0]) & (away < _NEXT[1])
+    # At the rim there is none on the other side.
+    if not (np.any(around) and np.any(ring)) or abs(np.mean(at[ring])) > _ONE_SIDED:
+        return 0.0
+    height = peak - float(np.median(values[around]))
+    floor = max(2 * noise, _UNSEEN * height)
+    if height <= floor:
+        return 0.0
+    fall = np.log(height / np.clip(height - peak + values, floor, height))
+    seen = (away > 0) & (away < _NEXT[1]) & (fall < np.log(height / floor))
+    square = away[seen if np.any(seen) else ring] ** 2
+    bend = float(fall[seen if np.any(seen) else ring] @ square / (square @ square))
+    return float(height * np.expm1(bend * _HALF_WAY**2))
+
+
+def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return the weights (…, k) whose sum of values at x, y (…, k) continues them to the origin.
+
+    They continue a plane, and the curvature towards the origin where several tracks show it.
+    """
+    away = np.mean(x + 1j * y, axis=-1, keepdims=True)
+    turned = (x + 1j * y) / np.where(away == 0, 1.0, away)
+    # The least coefficients are chosen, so that curvature that one or two tracks leave open is not.
+    bent = _LEAST_CURVED * turned.real**2
+    columns = np.stack([np.ones_like(x), turned.real, turned.imag, bent], axis=-1)
     return np.asarray(np.linalg.pinv(columns, rcond=_LEAST_SPREAD)[..., 0, :])
 
 
@@ -380,13 +397,6 @@ def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
         if chi_square > count + _CHANCE * np.sqrt(2 * count):
             break
     return fit
-
-
-def _share_of_form(values: FloatArray, noise: float) -> tuple[float, float]:
-    """Return the Wiener factor for ``values`` (n,) with ``noise``, and the form lost by it, rms."""
-    variance = float(np.mean(values**2))
-    share = max(1 - noise**2 / variance, 0.0) if variance > 0 else 0.0
-    return share, (1 - share) * float(np.sqrt(max(variance - noise**2, 0.0)))
 
 
 def _drawn(

@@ -51,7 +51,11 @@ def rms_of_part(map_: DeviationMap, beyond: tuple[float, float] = (0.0, 0.0)) ->
     of_bounds = 4 * float(np.sum(shared[map_.bounds] ** 2)) + bounded**2
     of_errors = of_form + of_bounds + 2 * float(np.sum(products**2))
     variance = of_errors + beyond[1] ** 2
-    variance += max(_variance_by_noise(map_, share), _variance_by_tracks(map_, share))
+    # For each point 4 d²σ² from its form, 2 σ⁴ from its noise, and 2 σ⁴ from the scatter of σ; for
+    # all what form may add to σ.
+    by_noise = float(np.sum(share**2 * (4 * map_.deviation**2 * noise + 4 * noise**2)))
+    by_noise += 4 * noise * map_.noise_error**2
+    variance += max(by_noise, _variance_by_tracks(map_, share))
     return of_square(square, float(np.sqrt(variance)))
 
 
@@ -85,15 +89,6 @@ def real_effects(map_: DeviationMap) -> BoolArray:
 def length(*shares: float) -> float:
     """Return the root of the sum of the squares of independent ``shares``."""
     return float(np.sqrt(sum(share**2 for share in shares)))
-
-
-def _variance_by_noise(map_: DeviationMap, share: FloatArray) -> float:
-    """Return the variance of the mean square [m⁴] from the noise of the points.
-
-    For each point 4 d²σ² from its form, 2 σ⁴ from its noise, and 2 σ⁴ from the uncertainty of σ.
-    """
-    noise = map_.noise**2
-    return float(np.sum(share**2 * (4 * map_.deviation**2 * noise + 4 * noise**2)))
 
 
 def _variance_by_tracks(map_: DeviationMap, share: FloatArray) -> float:

@@ -328,7 +328,9 @@ def power_density(cells: GridCells) -> PowerDensity:
         _, *steep = cells.planes(image[np.newaxis], _cutoffs(cells, None)[0])
         steps = np.reshape(cells.steps, (2, 1, 1))
         image = image - np.sum(np.concatenate(steep) * cells.offset[::-1] * steps, axis=0)
-    areal = _areal(cells, image, window) / passed
+    # The mean under the window would leak into the lowest frequencies.
+    content = np.abs(np.fft.fft2(window * (image - np.average(image, weights=window)))) ** 2
+    areal = content * np.prod(cells.steps) / np.sum(window**2) / passed
     white = np.sum((window * cells.noise) ** 2) / np.sum(window**2) * np.prod(cells.steps)
     of_noise = white / passed
     mean_square = float(areal.sum()) * abs(_steps(x, y)[0] * _steps(x, y)[1])
@@ -344,14 +346,6 @@ def _window(cells: GridCells) -> FloatArray:
     across = [np.linspace(-1, 1, size + 2)[1:-1] for size in cells.present.shape]
     radius = np.minimum(np.hypot(across[0][:, np.newaxis], across[1][np.newaxis]), 1.0)
     return np.asarray(np.cos(np.pi * radius / 2) ** 2 * cells.present)
-
-
-def _areal(cells: GridCells, image: FloatArray, window: FloatArray) -> FloatArray:
-    # The mean under the window would leak into the lowest frequencies.
-    level = float(np.sum(window * image) / np.sum(window))
-    tapered = window * (image - level)
-    spectrum = np.abs(np.fft.fft2(tapered)) ** 2
-    return np.asarray(spectrum * np.prod(cells.steps) / np.sum(window**2), np.float64)
 
 
 def _steps(x: FloatArray, y: FloatArray) -> tuple[float, float]:

@@ -35,11 +35,7 @@ _SCALE = np.array([1 / rms_of(term) for term in _TERMS])
 _LEAST_NEW = 1e-4
 # Turning makes rings, so rotationally symmetric terms from the fourth order on have their own σ.
 _RINGS = HIGHEST_ORDER + 1
-_ORDERS = np.array([term.n for term in _TERMS])
 _GROUPS = np.array([_RINGS if t.m == 0 and t.n > 2 else t.n for t in _TERMS])
-# Condition number of the products of all terms: 1 on a disc, 2 on a disc whose rim is missing over
-# a hundredth of the radius.
-_NEARLY_A_DISC = 10.0
 # Relative change of the variances at convergence; parts need 8 to 40 iterations.
 _TURNS, _SETTLED = 300, 1e-3
 # Amplitudes of optical figure errors fall with the second to fourth power of their order.
@@ -94,8 +90,6 @@ class FormBasis:
         """
         values = _zernikes(disc, x, y)
         gram = (values * (area / area.sum())) @ values.T
-        if np.linalg.cond(gram) < _NEARLY_A_DISC:
-            return cls(disc, np.eye(len(_TERMS))[_ORDERS >= 2], _GROUPS[_ORDERS >= 2])
         rows: list[FloatArray] = []
         groups: list[int] = []
         for place in range(len(_TERMS)):

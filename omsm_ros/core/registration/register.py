@@ -156,7 +156,8 @@ def register(
     """
     surface, aperture = within_aperture(surface, aperture)
     chosen = selection(portions, _MOST_SELECTED)
-    start = Placement(shape=_start_of_shape(surface, chosen, shape_asked(asked)))
+    shape = start_of(surface, shape_asked(asked), chosen.x, chosen.y, chosen.height)
+    start = Placement(shape=tuple(shape.items()))
     dofs = _determined(surface, chosen, asked, aperture, start, declared)
     try:
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
@@ -168,7 +169,8 @@ def register(
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture.disc if aperture else disc_of(points.x, points.y)
-    basis = FormBasis.over(points.x, points.y, area_weights(points.x, points.y, even=even), disc)
+    area = area_weights(points.x, points.y, even=even, outline=aperture or disc)
+    basis = FormBasis.over(points.x, points.y, area, disc)
     fit = _PoseFit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
     open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
@@ -178,14 +180,6 @@ def register(
         points = inside_aperture(placed(surface, stand.at, chosen), None)
         disc = disc_of(points.x, points.y)
     return _over_all(fit, stand, portions, sources, open_, dust, disc)
-
-
-def _start_of_shape(
-    surface: Surface, chosen: PointBatch, names: tuple[str, ...]
-) -> tuple[tuple[str, float], ...]:
-    if not names:
-        return ()
-    return tuple(start_of(surface, names, chosen.x, chosen.y, chosen.height).items())
 
 
 def _determined(

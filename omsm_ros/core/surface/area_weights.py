@@ -150,7 +150,9 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
     side = min(_FINER * even, _MOST_CELLS)
     cell, shape = _tiles(x, y, side)
     filled = (np.bincount(cell, minlength=shape[0] * shape[1]) > 0).reshape(shape)
-    reach = side / _filled_side(x, y, even)
+    while even > 2 and _occupied(x, y, even) < _FILLED * _occupied(x, y, even // 2):
+        even //= 2
+    reach = side / even
     # Morphological closing (Serra 1982) with a disc: dilation followed by erosion.
     margin = int(np.ceil(reach)) + 1
     wide = np.pad(filled, margin)
@@ -163,13 +165,6 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
     row, column = (places[scanned] - margin for places in nearest)
     owner = row * shape[1] + column
     return cell, np.bincount(owner, minlength=filled.size).astype(np.float64)
-
-
-def _filled_side(x: FloatArray, y: FloatArray, side: int) -> int:
-    """Return the number of cells, ``side`` at most, along the longer side that tracks fill."""
-    while side > 2 and _occupied(x, y, side) < _FILLED * _occupied(x, y, side // 2):
-        side //= 2
-    return side
 
 
 def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int, int]]:

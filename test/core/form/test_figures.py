@@ -5,7 +5,7 @@ import pytest
 from soaked import soaked
 
 from omsm_ros.core.form.deviation_map import DeviationMap, neighbour_noise, root_mean_square
-from omsm_ros.core.form.part_extents import extents_of_part
+from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import rms_of_part
 from omsm_ros.core.streams.statistics import noise_of
 from omsm_ros.core.surface.aperture import Aperture
@@ -44,7 +44,7 @@ def measured(true, noise, effects, seed):
 
 
 def figures(map_):
-    whole, robust = extents_of_part(map_, DISC)
+    whole, robust = extents_of_parts([map_], DISC)[0][:2]
     return {"pv": whole, "robust": robust, "rms": rms_of_part(map_)}
 
 

@@ -15,7 +15,7 @@ from omsm_ros.core.form.deviation_map import (
     neighbour_noise,
     root_mean_square,
 )
-from omsm_ros.core.form.part_extents import extents_of_part
+from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import (
     asymmetric,
     rms_of_part,
@@ -98,8 +98,8 @@ def test_figures_of_the_part_scale_with_heights_and_all_their_errors(scale):
         map_of(scale * error, scale * 3e-9, [scale * effect]),
     )
     for one, two in zip(
-        (rms_of_part(usual), *extents_of_part(usual, DISC)),
-        (rms_of_part(other), *extents_of_part(other, DISC)),
+        (rms_of_part(usual), *extents_of_parts([usual], DISC)[0][:2]),
+        (rms_of_part(other), *extents_of_parts([other], DISC)[0][:2]),
         strict=True,
     ):
         assert two.value == pytest.approx(scale * one.value, rel=1e-9, abs=0)
