@@ -26,6 +26,7 @@ from omsm_ros.core.form.part_figures import (
     asymmetric,
     best_fit,
     rms_of_part,
+    root_of_products,
     short_waves,
     without_form,
     without_power,
@@ -124,25 +125,18 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
 
 def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the rotationally symmetric part of the irregularity, with noise among its effects."""
-    of_noise = replace(
-        map_, effects=np.concatenate([map_.effects, _noise_effects(map_, disc)]), noise=0.0
-    )
+    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
+    weighted = columns * map_.area
+    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
+    covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
+    effects = np.concatenate([map_.effects, root_of_products(covariance) @ columns])
+    of_noise = replace(map_, effects=effects, noise=0.0)
     irregular, uneven = without_power(of_noise, disc), asymmetric(of_noise, disc)
     return replace(
         irregular,
         deviation=irregular.deviation - uneven.deviation,
         effects=irregular.effects - uneven.effects,
     )
-
-
-def _noise_effects(map_: DeviationMap, disc: Aperture) -> FloatArray:
-    """Return the independent effects (k, n) [m] of noise on the symmetric terms."""
-    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
-    weighted = columns * map_.area
-    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
-    covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T @ columns, np.float64)
 
 
 def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:

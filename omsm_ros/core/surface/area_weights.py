@@ -159,7 +159,12 @@ def _nearest(x: FloatArray, y: FloatArray, outline: Aperture | None) -> tuple[In
     far, nearest = ndimage.distance_transform_edt(~wide, return_indices=True)
     inside = np.ones(wide.shape, bool)
     if outline is not None:
-        inside = outline.holds(*np.meshgrid(*_middles(x, y, shape, margin), indexing="ij"))
+        # The middles of the tiles, with a margin around.
+        middles = [
+            v.min() + (np.arange(-margin, n + margin) + 0.5) * (np.ptp(v) or 1.0) / n
+            for v, n in zip((x, y), shape, strict=True)
+        ]
+        inside = outline.holds(*np.meshgrid(*middles, indexing="ij"))
         far = ndimage.distance_transform_edt(inside & ~wide)
     scanned = (ndimage.distance_transform_edt(far <= reach) > reach) & inside | wide
     row, column = (places[scanned] - margin for places in nearest)
@@ -178,16 +183,6 @@ def _tiles(x: FloatArray, y: FloatArray, side: int) -> tuple[IntArray, tuple[int
         for values, span, count in zip((x, y), spans, counts, strict=True)
     ]
     return np.asarray(places[0] * counts[1] + places[1]), (int(counts[0]), int(counts[1]))
-
-
-def _middles(
-    x: FloatArray, y: FloatArray, shape: tuple[int, int], margin: int
-) -> tuple[FloatArray, ...]:
-    """Return the middles of the tiles along x and y [m], with ``margin`` tiles around."""
-    return tuple(
-        np.asarray(v.min() + (np.arange(-margin, n + margin) + 0.5) * (np.ptp(v) or 1.0) / n)
-        for v, n in zip((x, y), shape, strict=True)
-    )
 
 
 def _occupied(x: FloatArray, y: FloatArray, side: int) -> int:
