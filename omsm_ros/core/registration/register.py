@@ -124,7 +124,7 @@ def _bounded_step(
 
 # Points at a time: 49 columns of them are 6 MB.
 CHUNK = 16_384
-_MOST_SELECTED, _MOST_REFINED = 40_000, 30
+_MOST_SELECTED, _MOST_OF_BASIS, _MOST_REFINED = 40_000, 10_000, 30
 # Points without errors, for seven unknowns.
 _ENOUGH_FOR_A_CURVE = 2000
 # A pose has converged too when its last step is below this share of its uncertainty: where form
@@ -156,8 +156,9 @@ def register(
     """
     surface, aperture = within_aperture(surface, aperture)
     chosen = selection(portions, _MOST_SELECTED)
-    shape = start_of(surface, shape_asked(asked), chosen.x, chosen.y, chosen.height)
-    start = Placement(shape=tuple(shape.items()))
+    shape = shape_asked(asked)
+    begin = start_of(surface, shape, chosen.x, chosen.y, chosen.height) if shape else {}
+    start = Placement(shape=tuple(begin.items()))
     dofs = _determined(surface, chosen, asked, aperture, start, declared)
     try:
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
@@ -169,8 +170,9 @@ def register(
         at = coarse_placement(surface, chosen, dofs.fitted, aperture, start)
     points = inside_aperture(placed(surface, at, chosen), aperture)
     disc = aperture.disc if aperture else disc_of(points.x, points.y)
-    area = area_weights(points.x, points.y, even=even, outline=aperture or disc)
-    basis = FormBasis.over(points.x, points.y, area, disc)
+    x, y = (v[:: -(-len(v) // _MOST_OF_BASIS)] for v in (points.x, points.y))
+    area = area_weights(x, y, even=even, outline=aperture or disc)
+    basis = FormBasis.over(x, y, area, disc)
     fit = _PoseFit(surface, dofs, aperture, basis, at)
     stand = fit.refine(at, chosen)
     open_ = OpenUncertainty.of(fit.unknown(stand.at, chosen))
