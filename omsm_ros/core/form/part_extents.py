@@ -272,8 +272,8 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     fall = np.log(height / np.clip(height - peak + values, floor, height))
     seen = (away > 0) & (away < _NEXT[1]) & (fall < np.log(height / floor))
     square = away[seen if np.any(seen) else ring] ** 2
-    bend = float(fall[seen if np.any(seen) else ring] @ square / (square @ square))
-    return float(height * np.expm1(bend * _HALF_WAY**2))
+    curvature = float(fall[seen if np.any(seen) else ring] @ square / (square @ square))
+    return float(height * np.expm1(curvature * _HALF_WAY**2))
 
 
 def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -284,8 +284,8 @@ def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
     away = np.mean(x + 1j * y, axis=-1, keepdims=True)
     turned = (x + 1j * y) / np.where(away == 0, 1.0, away)
     # The least coefficients are chosen, so that curvature that one or two tracks leave open is not.
-    bent = _LEAST_CURVED * turned.real**2
-    columns = np.stack([np.ones_like(x), turned.real, turned.imag, bent], axis=-1)
+    curved = _LEAST_CURVED * turned.real**2
+    columns = np.stack([np.ones_like(x), turned.real, turned.imag, curved], axis=-1)
     return np.asarray(np.linalg.pinv(columns, rcond=_LEAST_SPREAD)[..., 0, :])
 
 
