@@ -238,7 +238,7 @@ def _early(record: SampledRecord) -> SampledRecord:
 
 
 def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, SectionsFit]:
-    delays = np.zeros(problem.inputs)
+    delays = problem.delays.astype(np.float64)
     best = _late(problem, delays, _DELAY_ORDER)
     for input in range(problem.inputs):
         tried = range(1, most + 1) if problem.hold != BAND_LIMITED else _FREE_DELAYS[1:]
