@@ -83,7 +83,6 @@ SOURCE_NAMES = {
     "c_drift": "angle of C that changes with time",
     "tilt_drift": "tilt of the part that changes with time",
     "lag_curvature": "change of the curvature of G",
-    "removed": "sign or size of the correction",
     "centre_x": "spindle centre in x",
     "centre_y": "spindle centre in y",
     "parallelism": "parallelism of Z to the spindle",

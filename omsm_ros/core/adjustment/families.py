@@ -156,7 +156,6 @@ def _dynamic(r: Ranges) -> list[Family]:
                RECLOCKED),
         _one("lag_curvature", "s²", lambda v: -v.motion_acceleration, 1e-5, OTHER_SPEED),
         _one("creep", "1", lambda v: v.motion_fading, 1e-3, OTHER_SPEED),
-        Family("removed", "1", 1, lambda v: v.removed[np.newaxis], 2.0, OTHER_SPEED, named=False),
     ]  # fmt: skip
     speeds = np.abs(r.speeds)
     # With one speed, or one direction, the column is that of the lag itself.

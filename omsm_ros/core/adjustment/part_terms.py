@@ -130,8 +130,8 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
 _START_POWER = 3.0
 # Sizes that are compared, over the plausible one; each is as probable.
 _SIZES = 10.0 ** np.arange(-1.5, 1.1, 0.5)
-# The data determine ln A and p to about 0.3; a log likelihood matters from 0.5 on.
-_TOLERANCE = {"xatol": 0.1, "fatol": 0.05}
+# Of a log likelihood of some hundreds; it matters from 0.5 on.
+_TOLERANCE = {"ftol": 1e-5}
 # Share of the largest variance: twenty times what a factorisation of fifty rows loses.
 _ROUNDING = 1e-13
 
@@ -178,18 +178,24 @@ class FormTerms:
         known += _ROUNDING * np.max(np.diag(known)) * np.eye(len(known))
         start = np.log(np.mean(self.values**2 * self.degrees**_START_POWER) + 1e-30)
 
-        def spread(law: FloatArray) -> FloatArray:
+        def own(law: FloatArray) -> FloatArray:
             amplitude = np.exp(np.where(self.symmetric, law[1], law[0]))
-            made = known.copy()
-            made.flat[:: len(known) + 1] += amplitude * self.degrees ** -law[2]
-            return made
+            return np.asarray(amplitude * self.degrees ** -law[2])
 
-        def misfit(law: FloatArray) -> float:
-            # Asked for a hundred thousand times: what checks the matrices would take most of it.
-            root, _ = linalg.lapack.dpotrf(spread(law), lower=1)
-            white, _ = linalg.lapack.dtrtrs(root, self.values, lower=1)
-            return float(np.log(root.diagonal()).sum() + white @ white / 2)
+        def misfit(law: FloatArray) -> tuple[float, FloatArray]:
+            # Asked for ten thousand times: what checks the matrices would take most of it.
+            variances = own(law)
+            root, _ = linalg.lapack.dpotrf(known + np.diag(variances), lower=1)
+            pulled, _ = linalg.lapack.dpotrs(root, self.values, lower=1)
+            inverse, _ = linalg.lapack.dpotri(root, lower=1)
+            slopes = variances * (inverse.diagonal() - pulled**2) / 2
+            rises = self.symmetric @ slopes
+            slope = [slopes.sum() - rises, rises, -slopes @ np.log(self.degrees)]
+            value = np.log(root.diagonal()).sum() + self.values @ pulled / 2
+            return float(value), np.array(slope)
 
-        best = optimize.minimize(misfit, [start, start, _START_POWER], method="Nelder-Mead",
-                                 options=_TOLERANCE)  # fmt: skip
-        return -float(best.fun), spread(best.x)
+        # Of terms that are zero the law has no end: 50 is twenty orders of magnitude.
+        bounds = [(start - 50, start + 50)] * 2 + [(0.0, 4 * _START_POWER)]
+        best = optimize.minimize(misfit, [start, start, _START_POWER], method="L-BFGS-B",
+                                 jac=True, bounds=bounds, options=_TOLERANCE)  # fmt: skip
+        return -float(best.fun), known + np.diag(own(best.x))
