@@ -240,7 +240,7 @@ def analyse_form(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=_figures(map_, gathered, found, outline, even)
+        deviation=_figures(map_, gathered, found, outline)
         | optical_terms(map_, zernike)
         | _textures(map_, cells, bands, found, None if even else outline),
         zernike=zernike,
@@ -254,11 +254,11 @@ def analyse_form(
 
 
 def _figures(
-    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture, even: bool
+    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture
 ) -> dict[str, UncertainValue]:
     fitted, rest = best_fit(map_), without_second_order(map_)
     maps = [map_, fitted, rest, without_power(map_, found.disc)]
-    extents = extents_of_parts(maps, found.disc, None if even else outline, found.spacing)
+    extents = extents_of_parts(maps, found.disc, outline, found.spacing)
     whole, robust, _ = extents[0]
     return {
         # Irregularity: the peak to valley without piston, tilts and power.

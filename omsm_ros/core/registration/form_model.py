@@ -217,7 +217,7 @@ def estimate(
         if change < _SETTLED:
             break
     likely = covariance[:dofs, :dofs]
-    sizes = sizes * _variance_upper_factor(np.diag(covariance)[dofs:] / sizes, group)
+    sizes = _upper_variances(sizes, np.diag(covariance)[dofs:] / sizes, group)
     covariance = _inverse(normal, sizes, dofs)
     found = covariance @ right / scale
     return Estimate(
@@ -245,51 +245,49 @@ def _inverse(normal: FloatArray, sizes: FloatArray, dofs: int) -> FloatArray:
     return np.asarray((inverse + inverse.T) / 2, np.float64)
 
 
-def _variance_upper_factor(unknown: FloatArray, group: IntArray) -> FloatArray:
-    """Return the ratio of the upper 85 % bound of each variance (k,) to its estimate.
+def _upper_variances(sizes: FloatArray, unknown: FloatArray, group: IntArray) -> FloatArray:
+    """Return the upper 85 % bounds of the variances ``sizes`` (k,) of the terms.
 
-    unknown: share of each term that the data leave open (k,). The ratio is ν/χ²(ν, 15 %), by
-    Wilson and Hilferty's approximation, for the ν terms that determine the variance of a group.
+    unknown: share of each term that the data leave open (k,). For the ν terms that determine the
+    variance of a group the bound is ν/χ²(ν, 15 %) of it, by Wilson and Hilferty's approximation.
+    An order of which the pose takes all terms may exceed the next by the steepest fall.
     """
-    factor = np.ones_like(unknown)
-    for each in np.unique(group):
+    upper, above, share = sizes.copy(), 0.0, 1.0
+    for each in np.unique(group)[::-1]:
         chosen = group == each
-        known = max(float(np.sum(1 - unknown[chosen])), 1.0)
-        factor[chosen] = (1 - 2 / (9 * known) - _QUANTILE * np.sqrt(2 / (9 * known))) ** -3
-    return factor
+        known = float(np.sum(1 - unknown[chosen]))
+        spread = 2 / (9 * max(known, 1.0))
+        upper[chosen] *= (1 - spread - _QUANTILE * np.sqrt(spread)) ** -3
+        if each != _RINGS:
+            # Noise hides terms of both orders, so those seen count in units of the next.
+            taken = max(1 - known / max(share, 1e-3), 0.0)
+            least = above * ((each + 1) / each) ** (2 * _STEEPEST) * taken
+            upper[chosen] = np.maximum(upper[chosen], least)
+            above, share = float(upper[chosen].max()), known / np.count_nonzero(chosen)
+    return upper
 
 
 def _sizes(form: FloatArray, unknown: FloatArray, least: FloatArray, group: IntArray) -> FloatArray:
     """Return the variance of each term (k,) by group, none below that of a higher order.
 
-    unknown: share of each term that the data leave open (k,)
+    They fall with ``n**-_STEEPEST`` at most, because a shift of an asphere looks like coma: trefoil
+    alone must not bound the coma.  unknown: share of each term that the data leave open (k,)
     """
-    new, above = np.empty_like(form), 0.0
-    for each in (_RINGS, *range(HIGHEST_ORDER, 1, -1)):
+    new, above, below = np.empty_like(form), 0.0, 0.0
+    for each in np.unique(group)[::-1]:
         chosen = group == each
-        if not np.any(chosen):
-            continue
         known = max(float(np.sum(1 - unknown[chosen])), 1e-3)
         value = max(float(np.sum(form[chosen] ** 2)) / known, float(least[chosen].max()))
         if each != _RINGS:
             value = above = max(value, above)
         new[chosen] = value
-    return _monotone_variances(new, group)
-
-
-def _monotone_variances(sizes: FloatArray, group: IntArray) -> FloatArray:
-    """Return the variances (k,) with their fall over order limited to ``n**-_STEEPEST``.
-
-    A shift of an asphere looks like coma, so trefoil alone must not bound the coma.
-    """
-    held, below = sizes.copy(), 0.0
     for each in range(2, HIGHEST_ORDER + 1):
         chosen = group == each
         below *= ((each - 1) / each) ** (2 * _STEEPEST)
         if np.any(chosen):
-            below = max(below, float(held[chosen].max()))
-            held[chosen] = below
-    return held
+            below = max(below, float(new[chosen].max()))
+            new[chosen] = below
+    return new
 
 
 def outlier_limit(residual: FloatArray) -> float:

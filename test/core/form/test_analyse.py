@@ -46,6 +46,19 @@ def test_any_arrangement_of_points_is_judged(arrangement):
         assert min(angle, np.pi - angle) < 0.2
 
 
+def test_a_map_reaches_to_the_rim_between_its_pixels():
+    """An edge −r¹²: its peak to valley and rms over the disc, in closed form."""
+    radius, size = 0.01, 200e-9
+    x, y = (v.ravel() for v in np.meshgrid(*(np.linspace(-radius, radius, 80),) * 2))
+    x, y = x[np.hypot(x, y) <= radius], y[np.hypot(x, y) <= radius]
+    height = -size * (np.hypot(x, y) / radius) ** 12 + RNG.normal(0, 1e-9, len(x))
+    asked = ("piston", "tip", "tilt")
+    figures = form(x, y, height, *asked, aperture=Aperture(radius), even=True).deviation
+    truth = {"peak_to_valley": size, "rms": size * np.sqrt(1 / 13 - 1 / 49)}
+    for name, value in truth.items():
+        assert abs(figures[name].value - value) < 2 * figures[name].uncertainty < 0.1 * value
+
+
 def test_every_point_is_accounted_for():
     x, y = RNG.uniform(-0.02, 0.02, (2, 5000))
     height = np.nan_to_num(Sphere(0.019).height(x, y)) + RNG.normal(0, 1e-8, 5000)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from omsm_ros.core.registration.form_model import Estimate, _variance_upper_factor
+from omsm_ros.core.registration.form_model import Estimate, _upper_variances
 from omsm_ros.core.registration.placement import POSE_PARAMETERS, PointBatch
 from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.registration.register import register
@@ -31,9 +31,16 @@ def test_a_step_is_measured_in_its_own_uncertainty():
 @pytest.mark.parametrize("unknown", [0.0, 0.5])
 def test_a_size_found_from_few_terms_may_be_larger(terms, unknown):
     """A mean of ν squares lies below that of all by ν/χ²(ν) in one of seven; half known, half ν."""
-    factor = _variance_upper_factor(np.full(terms, unknown), np.zeros(terms, np.int64))
+    factor = _upper_variances(np.ones(terms), np.full(terms, unknown), np.full(terms, 8))
     known = terms * (1 - unknown)
     assert factor == pytest.approx(known / stats.chi2.ppf(0.15, known), rel=0.03)
+
+
+def test_form_of_which_no_term_is_seen_may_rise_like_the_steepest():
+    """A toroid with free radii and clocking takes all of order 2; amplitudes fall with n⁻⁴."""
+    order = np.repeat([2, 3, 4], [3, 4, 5])
+    two, three, _ = np.unique(_upper_variances(np.ones(12), 1.0 * (order == 2), order))[::-1]
+    assert two == pytest.approx(max(three * 1.5**8, 41), rel=0.01)
 
 
 @pytest.mark.soak
