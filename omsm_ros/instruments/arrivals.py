@@ -7,7 +7,6 @@ temperature.
 
 import math
 from collections import deque
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -176,24 +175,24 @@ def _line(
     return offset, slope, float(uncertainty)
 
 
-# Arrivals of a span of _DECISION_S decide whether triggers were missed if there are _ARRIVALS, else
-# those of _LONG_DECISION_S; a decision waits no longer than _LONGEST_S.
-_DECISION_S, _ARRIVALS, _LONG_DECISION_S, _LONGEST_S = 0.2, 12, 0.6, 0.8
-_LEAST_ARRIVALS = 3
-# Earliest arrivals of so many spans are the reference; least number of it, and that for a drift.
-_SPANS, _LEAST_SPANS, _DRIFT_SPANS = 15, 4, 8
-# The last sample of a portion may be nearly a period old, so a delay counts from here on [period].
-_LATE_PERIODS, _AGE_PERIODS, _AGES_OF_FEW = 0.75, 0.25, 1.5
-# Limit of lateness over the range of the earliest arrivals, of many and of few spans [1].
-_RANGES, _RANGES_OF_FEW = 2.0, 3.0
+# Earliest arrivals of so many spans of this length [s] are the reference; the least number, and
+# that from which on the limit of what is late only falls.
+_SPAN_S, _SPANS, _LEAST_SPANS, _MANY_SPANS = 0.2, 50, 4, 15
+# The last sample of a portion may be nearly a period old: the lateness that confirms [period].
+_LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
+# It is at least this multiple of the lateness that half of the earliest arrivals have.
+_USUAL = 2.0
+# How many triggers were missed is shown by the arrivals of this time [s], at least so many.
+_LATEST_S, _ARRIVALS = 1.0, 12
 
 
 class MissedTriggerDetector:
-    """Detects triggers that a device without a clock missed, by the arrivals of its samples.
+    """Confirms by their arrivals the samples of a device without a clock, which may miss triggers.
 
-    No sample arrives before it was taken, so the earliest arrivals of each span are even although
+    No sample arrives before it was taken, so a line below the earliest arrivals is even although
     others are late by chance. After a missed trigger all arrivals are late by a period. An arrival
-    that is not late confirms all samples up to it; until then they wait.
+    that is not late confirms all samples up to it; lateness alone proves nothing, so until then
+    they wait. A busy host later does not widen the limit of what is late.
 
     seen_from: least number of missed triggers that exceeds the scatter of the arrivals
     """
@@ -205,96 +204,82 @@ class MissedTriggerDetector:
 
     def restart(self) -> None:
         """Forget all arrivals, as after a pause of the trigger."""
-        # Begin of each span, its earliest lateness [s], arrivals.
-        self._earliest: deque[tuple[float, float, int]] = deque(maxlen=_SPANS)
-        self._off: list[tuple[float, float]] = []  # arrival and excess of those that are off [s]
-        self._dropped = False
-        self._expected: float | None = None  # lateness of the earliest at ``_since`` [s]
-        self._since = self._drift = 0.0
-        self._limit, self.seen_from = _LATE_PERIODS * self._period, 1
+        # Begin of each span, earliest lateness of all arrivals and of those that confirmed [s].
+        self._earliest: deque[tuple[float, float, float]] = deque(maxlen=_SPANS)
+        self._off: deque[tuple[float, float]] = deque()  # arrival and excess since confirmed [s]
+        self._line: tuple[float, float] | None = None  # lateness of the earliest at 0, drift
+        self._limit, self.seen_from = math.inf, 1
+        self._confirmed = 0.0  # last arrival that confirmed [s]
 
-    def missed(self, due: float, arrival: float) -> int | None:
-        """Return the triggers missed before this arrival; 0 confirms it; None: it has to wait.
+    def confirms(self, due: float, arrival: float) -> bool:
+        """Return whether no trigger was missed before this arrival, as far as can be seen.
 
-        due: count, with the triggers missed so far, times period [s];  arrival: monotonic [s]
-        A negative number is of triggers that were counted in excess.
+        due: count times period [s];  arrival: monotonic [s]
         """
-        late = arrival - due
-        if self._expected is None:
-            self._accept(arrival, late)
-            return 0
-        excess = late - self._expected - self._drift * (arrival - self._since)
-        early = bool(self._off) and self._off[0][1] < 0
-        if abs(excess) <= self._limit and not early:
-            self._accept(arrival, late)
-            return 0
-        if excess < -self._limit and not early:
-            self._off.clear()  # earlier than expected: none was missed
-        if excess < -self._limit or (excess > self._limit and not early):
-            self._off.append((arrival, excess))
-        return self._decide(arrival)
-
-    def end(self) -> int:
-        """Return the triggers missed before the samples that wait, when no more will come."""
-        missed = self._decide(self._off[-1][0] + _LONGEST_S) if self._off else 0
-        self._off.clear()
-        return missed or 0
-
-    def _decide(self, now: float) -> int | None:
-        waited, few = now - self._off[0][0], len(self._off) < _LEAST_ARRIVALS
-        if not _is_whole(waited, len(self._off)) or (few and waited < _LONGEST_S):
-            return None
-        if few:
+        late, excess = arrival - due, self.excess(due, arrival)
+        # A line that is not confirmed any more is uncertain by the drift of crystals.
+        confirmed = excess <= self._limit - _DRIFT_SIGMA * (arrival - self._confirmed)
+        if confirmed:
+            self._confirmed = arrival
             self._off.clear()
-            return 0
-        recent = [excess for _, excess in self._off][-max(_ARRIVALS, len(self._off) // 2) :]
-        half = (len(recent) + 1) // 2
-        earlier, later = (self._triggers(part) for part in (recent[:half], recent[half:]))
-        if earlier != later:
-            if waited < _LONGEST_S:
-                return None
-            if len(self._off) > _ARRIVALS // 2 and not self._dropped:
-                self._off, self._dropped = self._off[-half:], True  # the first ones were by chance
-                return None
-            self.restart()  # what grows is another rate
-            return 0
-        self._off.clear()
-        self._dropped = False
-        return later
-
-    def _triggers(self, excess: Sequence[float]) -> int:
-        """Return the triggers that the earliest arrival shows; its age may add most of another."""
-        return math.floor(min(excess) / self._period + 1 - _LATE_PERIODS)
-
-    def _accept(self, arrival: float, late: float) -> None:
-        self._off.clear()
-        self._dropped = False
-        if self._earliest:
-            begin, least, count = self._earliest[-1]
-            if not _is_whole(arrival - begin, count):
-                self._earliest[-1] = (begin, min(least, late), count + 1)
-                return
-        if len(self._earliest) >= _LEAST_SPANS:
+            if self._line is not None and excess < 0:
+                self._line = (self._line[0] + excess, self._line[1])
+        else:
+            self._off.append((arrival, excess))
+            while arrival - self._off[0][0] > _LATEST_S:
+                self._off.popleft()
+        sure = late if confirmed else math.inf
+        if self._earliest and arrival - self._earliest[-1][0] < _SPAN_S:
+            begin, least, surest = self._earliest[-1]
+            self._earliest[-1] = (begin, min(least, late), min(surest, sure))
+        else:
             self._set_reference()
-        self._earliest.append((arrival, late, 1))
+            self._earliest.append((arrival, late, sure))
+        return confirmed
+
+    def excess(self, due: float, arrival: float) -> float:
+        """Return by how much an arrival is later than the earliest ones [s]; -inf if not known."""
+        if self._line is None:
+            return -math.inf
+        return arrival - due - self._line[0] - self._line[1] * arrival
+
+    @property
+    def missed(self) -> int:
+        """Return the missed triggers that the latest arrivals show if none confirms; else 0."""
+        if len(self._off) < _ARRIVALS or self._off[-1][0] - self._off[0][0] < _SPAN_S:
+            return 0
+        least = min(excess for _, excess in self._off)
+        return math.floor(least / self._period + 1 - _LATE_PERIODS)
 
     def _set_reference(self) -> None:
-        """Lay a line below the earliest arrivals; their scatter is the limit of detection."""
-        begin, late, _ = np.array(self._earliest).T
-        since = begin - begin[-1]
-        many = len(begin) >= _DRIFT_SPANS
-        self._drift = float(np.polyfit(since, late, 1)[0]) if many else 0.0
-        rest = late - self._drift * since
-        self._since, self._expected = float(begin[-1]), float(rest.min())
-        scatter = float(np.ptp(rest))
-        if scatter < self._period:  # only the ages of samples scatter, by less than a period
-            scatter = (1 if many else _AGES_OF_FEW) * scatter + _AGE_PERIODS * self._period
-        else:
-            scatter *= _RANGES if many else _RANGES_OF_FEW
-        self._limit = max(_LATE_PERIODS * self._period, scatter)
-        self.seen_from = int(np.ceil(self._limit / self._period))
+        """Lay the highest line below the earliest arrivals; their scatter is the limit."""
+        if len(self._earliest) < _LEAST_SPANS:
+            return
+        begin, every, sure = np.array(self._earliest).T
+        learning = len(begin) < _MANY_SPANS
+        late = every if learning else sure
+        used = np.isfinite(late)
+        if np.sum(used) < _LEAST_SPANS:
+            return
+        since, late = (begin - begin[-1])[used], late[used]
+        i, j = np.triu_indices(len(since), 1)
+        slopes = (late[j] - late[i]) / (since[j] - since[i])
+        least, drift, rest = _below(since, late, slopes)
+        # Steeper than crystals only if the arrivals lie on the line, as of another rate.
+        if abs(drift) > _DRIFT_SIGMA and np.median(rest) > _FIT_PART * abs(drift) * np.ptp(since):
+            least, drift, rest = _below(since, late, np.clip(slopes, -_DRIFT_SIGMA, _DRIFT_SIGMA))
+        self._line = (least - drift * float(begin[-1]), drift)
+        # All arrivals count, or the limit would fall by leaving late ones out; two are on the line.
+        rest = (every - least - drift * (begin - begin[-1]))[-_MANY_SPANS:]
+        usual = _USUAL * float(np.median(np.sort(rest)[2:]))
+        limit = max(_LATE_PERIODS * self._period, usual + _AGE_PERIODS * self._period)
+        self._limit = limit if learning else min(self._limit, limit)
+        self.seen_from = math.ceil(self._limit / self._period)
 
 
-def _is_whole(lasted: float, arrivals: int) -> bool:
-    """Return whether a span that ``lasted`` [s] decides."""
-    return lasted >= (_DECISION_S if arrivals >= _ARRIVALS else _LONG_DECISION_S)
+def _below(x: FloatArray, y: FloatArray, slopes: FloatArray) -> tuple[float, float, FloatArray]:
+    """Return offset, slope and rests (n,) of the highest line below points, of some slopes (m,)."""
+    offsets = np.min(y - slopes[:, np.newaxis] * x, axis=1)
+    best = int(np.argmax(offsets + slopes * x.mean()))
+    offset, slope = float(offsets[best]), float(slopes[best])
+    return offset, slope, y - slope * x - offset

@@ -1,5 +1,6 @@
 """Cuts runs of samples into blocks, stamped by the host's clock."""
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -22,6 +23,8 @@ PERIOD_TOLERANCE = 100 * PPM
 RATE_TOLERANCE = 1000 * PPM
 # The same for a trigger from outside, and for a device without time stamps, by its arrivals.
 TRIGGER_TOLERANCE = ARRIVAL_TOLERANCE = 5000 * PPM
+# Time that a sample waits for an arrival that confirms it, before it is withheld [s].
+_LONGEST_S = 0.8
 # Parts of a block: a wrong period deviates in each of them, a pause or a damaged time in one.
 _PARTS = 4
 
@@ -84,10 +87,11 @@ def _begin_at_zero(before: IntArray, after: IntArray) -> bool:
 class BlockCutter:
     """Cuts runs into blocks of ``block_size`` samples; a gap or restart ends a block early.
 
-    delivered, withheld: samples in blocks handed over, and kept back for their wrong rate
+    delivered, withheld: samples in blocks handed over, and kept back for their wrong rate or
+        because no arrival confirms that no trigger was missed before them
     restarted_at_zero: the encoders lost their positions with a restart, so nothing is handed over
     perhaps_at_zero: they are at zero after a silence, as after a restart or a move to the origin
-    missed: triggers without a sample of the device, by the arrivals of the others
+    unconfirmed: samples are withheld because triggers may have been missed before them
     period_deviation: relative, from nominal: of the last full block's device time, or of the
         arrivals of a device without time stamps [1]
     period_warnings: full blocks beyond PERIOD_TOLERANCE
@@ -100,16 +104,19 @@ class BlockCutter:
         self._pending: Samples = np.empty(0, SAMPLE)
         self._first = self._stamp = 0
         self._turns = [Turns(axis.wrap) for axis in channels.axes or ()]
-        # Without a clock of the device, only arrivals show a trigger that it missed.
-        watched = not (channels.timed or settings.free_running)
+        # Without a clock of the device, only arrivals show a trigger that it missed. What one
+        # device latches together stays together.
+        together = channels.distance and channels.axes is not None
+        watched = not (channels.timed or settings.free_running or together)
         self._detector = MissedTriggerDetector(settings.sample_period) if watched else None
-        self._waiting: list[CountedRun] = []
+        self._waiting: deque[tuple[float, CountedRun]] = deque()  # arrival [s]
         self._counts = np.zeros(len(AXES), np.int64)  # of the last sample
         self.restarted_at_zero = self.perhaps_at_zero = self.lost_settings = False
         # Device time less that of the count, and arrival, of the last samples [ns].
         self._usual: tuple[int, int] | None = None
         self._due = self._doubtful = 0  # time by the count; an offset to be confirmed
-        self.missed = self._ahead = 0
+        self._missed_before = 0  # the last pause or restart
+        self._lost = self.unconfirmed = False  # whether triggers were missed before a pause
         self.delivered = self.withheld = self.blocks = self.period_warnings = 0
         self.period_deviation = 0.0
         self._evenly_wrong = False
@@ -117,7 +124,12 @@ class BlockCutter:
     @property
     def pending(self) -> int:
         """Return the number of samples that wait for their block, or for later arrivals."""
-        return len(self._pending) + sum(len(run.samples) for run in self._waiting)
+        return len(self._pending) + sum(len(run.samples) for _, run in self._waiting)
+
+    @property
+    def missed(self) -> int:
+        """Return the triggers without a sample of the device, by the arrivals of the others."""
+        return self._missed_before + (self._detector.missed if self._detector else 0)
 
     @property
     def least_missed(self) -> int:
@@ -160,28 +172,29 @@ class BlockCutter:
         if self._detector is None or not runs:
             yield from self._cut(runs, arrival_ns, after_silence)
             return
-        if after_silence or any(run.restarted for run in runs):
-            yield from self._release(self._detector.end(), arrival_ns)
+        restarted, last = any(run.restarted for run in runs), runs[-1]
+        due = (last.first_sample + len(last.samples) - 1) * self._settings.sample_period
+        # After a pause of the trigger, but not of the host, the samples are late by it.
+        paused = after_silence and abs(self._detector.excess(due, now)) > self._settings.pause / 2
+        if paused or restarted:
+            self._lost = (self._lost or self._detector.missed > 0) and not restarted
+            self._missed_before = self.missed
+            self._withhold(np.inf)
             self._detector.restart()
-            yield from self._cut(runs, arrival_ns, after_silence)
-            return
-        self._waiting += runs
-        last = self._waiting[-1]
-        count = last.first_sample + len(last.samples) - 1 + self._ahead
-        missed = self._detector.missed(count * self._settings.sample_period, now)
-        if missed is not None:
-            yield from self._release(missed, arrival_ns)
+        self._waiting += [(now, run) for run in runs]
+        if self._detector.confirms(due, now) and not self._lost:
+            confirmed = [run for _, run in self._waiting]
+            self._waiting.clear()
+            self.unconfirmed = False
+            yield from self._cut(confirmed, arrival_ns, after_silence)
+        self.unconfirmed |= self._withhold(now - _LONGEST_S)
 
-    def _release(self, missed: int, arrival_ns: int) -> Iterator[BlockPair]:
-        """Yield the blocks of the samples that waited, after ``missed`` triggers."""
-        waiting, self._waiting = self._waiting, []
-        if missed and waiting:
-            yield from self._flush()
-            self._first = waiting[0].first_sample
-            self._ahead += missed
-            self.missed += abs(missed)
-        if waiting:
-            yield from self._cut(waiting, arrival_ns, False)
+    def _withhold(self, until: float) -> bool:
+        """Withhold the samples that arrived before ``until`` [s]; return whether there are any."""
+        before = self.withheld
+        while self._waiting and self._waiting[0][0] < until:
+            self.withheld += len(self._waiting.popleft()[1].samples)
+        return self.withheld > before
 
     def _cut(
         self, runs: Sequence[CountedRun], arrival_ns: int, after_silence: bool
@@ -189,7 +202,7 @@ class BlockCutter:
         times = [self._times(run, arrival_ns, after_silence) for run in runs]
         for i, run in enumerate(runs):
             if run.restarted or run.first_sample != self._first + len(self._pending):
-                yield from self._flush()
+                yield from self.flush()
                 self._first = run.first_sample
             if run.restarted and self._channels.axes is not None:
                 self._judge_restart(run, after_silence and i == 0)
@@ -232,13 +245,9 @@ class BlockCutter:
         while len(self._pending) >= self._settings.block_size:
             yield from self._take(self._settings.block_size)
 
-    def flush(self, arrival_ns: int) -> Iterator[BlockPair]:
-        """Yield the partial block, if any, with the samples that waited for later arrivals."""
-        if self._detector is not None:
-            yield from self._release(self._detector.end(), arrival_ns)
-        yield from self._flush()
-
-    def _flush(self) -> Iterator[BlockPair]:
+    def flush(self) -> Iterator[BlockPair]:
+        """Yield the partial block, if any; samples that are not confirmed are withheld."""
+        self._withhold(np.inf)
         if len(self._pending):
             yield from self._take(len(self._pending))
 
@@ -248,7 +257,7 @@ class BlockCutter:
         A time that was spoilt on the line is replaced by that of the count.
         """
         times: IntArray = run.samples["time"]
-        counts = run.first_sample + self._ahead + np.arange(len(run.samples))
+        counts = run.first_sample + np.arange(len(run.samples))
         due: IntArray = np.rint(counts * self._settings.sample_period * NANOSECONDS_PER_S).astype(
             np.int64
         )

@@ -33,7 +33,8 @@ class StreamStatistics:
     delivered, pending: in blocks handed over, and waiting for their block to fill
     held: waiting for their successor;  spoilt: with a counter that jumped ahead and back
     duplicates: received twice
-    withheld: kept back because the device runs at another rate than it was set to
+    withheld: kept back because the device runs at another rate than it was set to, its encoders
+        lost their positions, or no arrival confirms that it missed no trigger before them
     missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
     lost, gaps: trigger counts that never arrived, and in how many places
     restarts: how often the device's counter or clock fell back
@@ -160,6 +161,11 @@ class StreamDevice:
                 "device, so positions are lost and samples are withheld: home the axes, then start "
                 "this driver again"
             )
+        if self._cutter.unconfirmed:
+            return (
+                f"{self._transport.name}: all samples arrive late, as after missed triggers, and "
+                "are withheld: if this lasts, restart the counters of both devices together"
+            )
         if self._cutter.wrong_rate:
             return (
                 f"{self._transport.name} measures at {self._rates()}; its samples are withheld: "
@@ -277,4 +283,4 @@ class StreamDevice:
             silent, self._heard = max(self._came_at - self._heard, 0.0), self._came_at
             blocks = self._add(rest, self._came_ns or arrival_ns, silent)
         blocks += self._cutter.add(list(self._tracker.settle()), arrival_ns, self._came_at)
-        return [*blocks, *self._cutter.flush(arrival_ns)]
+        return [*blocks, *self._cutter.flush()]
