@@ -43,8 +43,8 @@ _EXCITED = 1e-3
 _MOST_LINES = 4000
 # Iterations of vector fitting: by then it has converged, or will not.
 _RELOCATIONS = 10
-# Damping ratio of pairs at a start, and of those that are added for a line of the residual.
-_START_DAMPING, _ADDED_DAMPING = 0.05, 0.01
+# Damping ratio of pairs at a start, those that are tried for a line of the residual, and the lines.
+_START_DAMPING, _ADDED_DAMPINGS, _TRIED_LINES = 0.05, (0.002, 0.01, 0.05), 40
 # Least damping ratio that a start may have, and range of |pole| T / RATE in a start.
 _LEAST_DAMPING, _SLOWEST, _FASTEST = 1e-5, 1e-6, 1e4
 # Time constant [samples] of an added pole that is too fast to matter.
@@ -402,38 +402,51 @@ def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
     """Return poles (order,) in w, scaled: those of ``smaller`` and further ones.
 
-    They are pairs at the lines of the largest residual, poles too fast to matter (so that a larger
+    They are pairs that explain most of the residual, poles too fast to matter (so that a larger
     model fits no worse), or poles as slow as the record.
     """
     more, own = order - smaller.order, smaller.roots()
     fast = -1 / (_FAST * RATE) * 1.5 ** np.arange(more)
     slowest = -1 / (0.5 * max(len(r) for r in problem.records) * RATE)
     found = [np.concatenate([own, fast]), np.concatenate([own, slowest * 1.5 ** np.arange(more)])]
-    rates = _residual_lines(problem, smaller, more // 2)
-    if len(rates) == more // 2 > 0:
-        upper = rates * (1j - _ADDED_DAMPING)
-        found.append(np.concatenate([own, upper, np.conj(upper), fast[: more % 2]]))
+    upper = _missing_pairs(problem, smaller, more // 2)
+    if len(upper):
+        found.append(np.concatenate([own, upper, np.conj(upper), fast[: more - 2 * len(upper)]]))
     return [np.asarray(poles, np.complex128) for poles in found]
 
 
-def _residual_lines(problem: SectionsProblem, fitted: SectionsFit, count: int) -> FloatArray:
-    """Return w of the excited lines of the largest residual of the longest record, apart."""
+def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) -> ComplexArray:
+    """Return upper poles (≤ count,), in w, whose responses to the inputs explain most residual.
+
+    They are chosen one by one at the lines of the largest residual of the longest record, because
+    a disturbance or distortion may be stronger there than a mode that is missing.
+    """
     index = int(np.argmax([len(one.places) for one in problem.spectra]))
     start = sum(len(one.places) for one in problem.spectra[:index])
     one, grid = problem.spectra[index], np.zeros(len(problem.records[index]))
     grid[one.places] = fitted.residual[start : start + len(one.places)]
-    power = np.abs(fft.rfft(grid, one.length)) ** 2
-    power = ndimage.uniform_filter1d(power, 15)
-    shown = one.excited[0][[0, -1]]
-    power[(one.angle < shown[0]) | (one.angle > shown[1])], found = 0.0, []
-    for _ in range(count):
+    spectrum = np.asarray(fft.rfft(grid, one.length), np.complex128)
+    power, shown = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, 15), one.excited[0][[0, -1]]
+    power[(one.angle < shown[0]) | (one.angle > shown[1])] = 0.0
+    late = np.exp(-1j * one.angle * problem.late(fitted.nonlinear, fitted.order)[:, np.newaxis])
+    drives = (one.inputs * late)[:, np.newaxis]
+    poles: list[complex] = []
+    responses: list[FloatArray] = []
+    while count and len(poles) < _TRIED_LINES * len(_ADDED_DAMPINGS) and np.any(power > 0):
         line = int(np.argmax(power))
-        if power[line] == 0:
-            break
-        found.append(abs(one.w[line]))
-        apart = max(40, line // 20)
-        power[max(line - apart, 0) : line + apart] = 0.0
-    return np.array(found)
+        power[max(line - 10, 0) : line + 11], rate = 0.0, abs(one.w[line])
+        for damping in _ADDED_DAMPINGS:
+            basis = basis_of(np.array([[2 * damping / rate, 1 / rate**2]]), one.w)[1:]
+            columns = _stacked((drives * basis).reshape(-1, len(one.w)))
+            poles.append(rate * (1j - damping))
+            responses.append(np.linalg.qr(columns.T)[0])
+    left, found = _stacked(spectrum[np.newaxis])[0], []
+    for _ in range(count if poles else 0):
+        along = [response.T @ left for response in responses]
+        best = int(np.argmax([part @ part for part in along]))
+        left = left - responses[best] @ along[best]
+        found.append(poles[best])
+    return np.array(found, np.complex128)
 
 
 def _inverse(gram: FloatArray) -> FloatArray:
