@@ -400,11 +400,7 @@ def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
 
 
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
-    """Return poles (order,) in w, scaled: those of ``smaller`` and further ones.
-
-    They are pairs that explain most of the residual, poles too fast to matter (so that a larger
-    model fits no worse), or poles as slow as the record.
-    """
+    """Return poles (order,) in w, scaled: of ``smaller`` and fast, slow or explaining its rest."""
     more, own = order - smaller.order, smaller.roots()
     fast = -1 / (_FAST * RATE) * 1.5 ** np.arange(more)
     slowest = -1 / (0.5 * max(len(r) for r in problem.records) * RATE)
@@ -428,24 +424,20 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
     spectrum = np.asarray(fft.rfft(grid, one.length), np.complex128)
     power, shown = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, 15), one.excited[0][[0, -1]]
     power[(one.angle < shown[0]) | (one.angle > shown[1])] = 0.0
-    late = np.exp(-1j * one.angle * problem.late(fitted.nonlinear, fitted.order)[:, np.newaxis])
-    drives = (one.inputs * late)[:, np.newaxis]
-    poles: list[complex] = []
-    responses: list[FloatArray] = []
-    while count and len(poles) < _TRIED_LINES * len(_ADDED_DAMPINGS) and np.any(power > 0):
+    drives = problem._inputs(one, fitted.nonlinear, fitted.order)[0][:, np.newaxis]
+    tried: list[tuple[complex, FloatArray]] = []
+    while count and len(tried) < _TRIED_LINES * len(_ADDED_DAMPINGS) and np.any(power > 0):
         line = int(np.argmax(power))
         power[max(line - 10, 0) : line + 11], rate = 0.0, abs(one.w[line])
         for damping in _ADDED_DAMPINGS:
             basis = basis_of(np.array([[2 * damping / rate, 1 / rate**2]]), one.w)[1:]
             columns = _stacked((drives * basis).reshape(-1, len(one.w)))
-            poles.append(rate * (1j - damping))
-            responses.append(np.linalg.qr(columns.T)[0])
+            tried.append((rate * (1j - damping), np.linalg.qr(columns.T)[0]))
     left, found = _stacked(spectrum[np.newaxis])[0], []
-    for _ in range(count if poles else 0):
-        along = [response.T @ left for response in responses]
-        best = int(np.argmax([part @ part for part in along]))
-        left = left - responses[best] @ along[best]
-        found.append(poles[best])
+    for _ in range(count if tried else 0):
+        pole, response = max(tried, key=lambda one: float(np.sum((one[1].T @ left) ** 2)))
+        left = left - response @ (response.T @ left)
+        found.append(pole)
     return np.array(found, np.complex128)
 
 
