@@ -400,7 +400,7 @@ def basis_of(sections: FloatArray, w: ComplexArray) -> ComplexArray:
 
 
 def grown_starts(problem: SectionsProblem, smaller: SectionsFit, order: int) -> list[ComplexArray]:
-    """Return poles (order,) in w, scaled: of ``smaller`` and fast, slow or explaining its rest."""
+    """Return starts, poles (order,) in w: of ``smaller``, and fast, slow or missing ones."""
     more, own = order - smaller.order, smaller.roots()
     fast = -1 / (_FAST * RATE) * 1.5 ** np.arange(more)
     slowest = -1 / (0.5 * max(len(r) for r in problem.records) * RATE)
