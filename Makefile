@@ -19,8 +19,6 @@ unexport PYTHONDONTWRITEBYTECODE
 NUMPY_TYPED := import sys; sys.exit(sys.version_info < (3, 11))
 # Tests and demos stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
-# The types are checked while the messages are built.
-MAKEFLAGS += --jobs=2
 
 .PHONY: setup demo test matrix lint bench soak docs lock clean distclean
 
@@ -31,10 +29,10 @@ demo: setup
 
 # Three processes, a file each, in the order of test/conftest.py; JOBS=0 for one after the other.
 JOBS ?= 3
-test: setup lint
+test: lint
 	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
 
-lint: $(VENV)
+lint: setup
 	$(RUN) ruff check .
 	$(RUN) ruff format --check .
 	$(RUN) if python -c "$(NUMPY_TYPED)"; then mypy; fi

@@ -3,7 +3,6 @@
 set -eu
 cd "$(dirname "$0")/.."
 . ./env.sh
-unset MAKEFLAGS # this is another make
 export COLCON_DEFAULTS_FILE="$PWD/colcon_defaults.yaml"
 # `python -m colcon`, not `colcon`: a distribution's own would write scripts that start the
 # system's Python, which does not see .venv. Its warnings are about wheels in general: that .venv
