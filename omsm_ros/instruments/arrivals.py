@@ -175,14 +175,14 @@ def _line(
     return offset, slope, float(uncertainty)
 
 
-# Earliest arrivals of so many spans of this length [s] are the reference; the least number, and
-# that from which on the limit of what is late only falls.
+# The reference: earliest arrivals of spans of this length [s]; the number of spans, the least
+# number, and that from which on the limit of what is late only falls.
 _SPAN_S, _SPANS, _LEAST_SPANS, _MANY_SPANS = 0.2, 50, 4, 15
 # The last sample of a portion may be nearly a period old: the lateness that confirms [period].
 _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
 # It is at least this multiple of the lateness that half of the earliest arrivals have.
 _USUAL = 2.0
-# How many triggers were missed is shown by the arrivals of this time [s], at least so many.
+# The arrivals of this time [s], and the least number of them, show the number of missed triggers.
 _LATEST_S, _ARRIVALS = 1.0, 12
 
 

@@ -104,8 +104,8 @@ class BlockCutter:
         self._pending: Samples = np.empty(0, SAMPLE)
         self._first = self._stamp = 0
         self._turns = [Turns(axis.wrap) for axis in channels.axes or ()]
-        # Without a clock of the device, only arrivals show a trigger that it missed. What one
-        # device latches together stays together.
+        # Without a clock of the device, only arrivals show a trigger that it missed. Channels that
+        # one device latches stay together.
         together = channels.distance and channels.axes is not None
         watched = not (channels.timed or settings.free_running or together)
         self._detector = MissedTriggerDetector(settings.sample_period) if watched else None

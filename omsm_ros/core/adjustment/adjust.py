@@ -288,7 +288,7 @@ def _or_sense_of_c(
 ) -> tuple[Reason, ...]:  # fmt: skip
     """Return ``reasons``, or the sense of C alone, if the scans agree where C has the other one.
 
-    Only a part that was turned on the chuck tells it from its mirror image.
+    Only a part that was turned on the chuck distinguishes it from its mirror image.
     """
     if all(r.minor for r in refutations) or len({s.clocking for s in scans}) == 1:
         return reasons

@@ -130,7 +130,7 @@ def part_model(blocks: Blocks, turns: float, highest: int = HIGHEST_DEGREE) -> P
 _START_POWER = 3.0
 # Sizes that are compared, over the plausible one; each is as probable.
 _SIZES = 10.0 ** np.arange(-1.5, 1.1, 0.5)
-# Of a log likelihood of some hundreds; it matters from 0.5 on.
+# Relative to a log likelihood of some hundreds, which matters from 0.5 on.
 _TOLERANCE = {"ftol": 1e-5}
 # Share of the largest variance: twenty times what a factorisation of fifty rows loses.
 _ROUNDING = 1e-13
@@ -194,7 +194,7 @@ class FormTerms:
             value = np.log(root.diagonal()).sum() + self.values @ pulled / 2
             return float(value), np.array(slope)
 
-        # Of terms that are zero the law has no end: 50 is twenty orders of magnitude.
+        # The law of terms that are zero has no end: 50 is twenty orders of magnitude.
         bounds = [(start - 50, start + 50)] * 2 + [(0.0, 4 * _START_POWER)]
         best = optimize.minimize(misfit, [start, start, _START_POWER], method="L-BFGS-B",
                                  jac=True, bounds=bounds, options=_TOLERANCE)  # fmt: skip

@@ -385,7 +385,7 @@ def test_one_step_shows_a_lag_from_the_lowest_line_on(at):
     samples, period, lag = 2000, 0.01, 1.7
     rng, decay = np.random.default_rng(5), np.exp(-period / lag)
     u = np.where(np.arange(samples) < at * samples, 1.0, 1.2)
-    # It starts at rest, so the record begins with the answer to a constant input.
+    # The filter starts at rest, so the record begins with its response to a first step.
     y = signal.lfilter([0.0, 1 - decay], [1.0, -decay], u) + rng.normal(0, 2e-3, samples)
     model = identified(u, y, period)
     assert model.certificate["verdict"].startswith("accepted")
