@@ -95,7 +95,7 @@ def registration_of(args: argparse.Namespace) -> RegistrationOptions:
 
 
 _OTHERS = ("aperture", "tolerance", "dust", "placement", "drawing")
-# Smallest standard uncertainty of a placement [m], [rad]; below an atom it is zero.
+# A smaller standard uncertainty of a placement [m], [rad] counts as zero.
 _LEAST_PLACEMENT = 1e-12
 
 

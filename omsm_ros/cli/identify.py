@@ -319,7 +319,7 @@ def _check_for_bags(args: argparse.Namespace) -> None:
 
 
 def _check_axes(names: Sequence[str]) -> None:
-    """Raise ConfigurationError for further axes that a bag does not have, or has once."""
+    """Raise ConfigurationError for an axis that bags do not have, or that is named twice."""
     if len({*names}) < len(names) or not {*names} <= {*FURTHER_AXES}:
         raise ConfigurationError(
             f"--input names the axes {shown(','.join(names))} besides Z, expected each of "

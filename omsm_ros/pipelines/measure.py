@@ -191,16 +191,16 @@ _DOFS = ("piston", "tip", "tilt", "x", "y", "clocking")
 
 
 def _aligned(removed: Mapping[str, Any]) -> list[str]:
-    """Return the degrees of freedom that were fitted, or would have been: form looks like them.
+    """Return the degrees of freedom that form may look like: fitted, held or not determined.
 
-    The figures are those after best-fit alignment, which no held pose makes uncertain.
+    All of them are removed, so that no uncertain pose makes the figures of form uncertain.
     """
     every = {*removed["fitted"], *removed["held"], *removed["not_determined"]}
     return [name for name in _DOFS if name in every]
 
 
 def _posed(nominal: Surface, form: Mapping[str, Any]) -> Surface:
-    """Return the surface as the registration found it, where that is unless it is near enough."""
+    """Return the surface in the shape and pose that were found; a small pose is left out."""
     pose, shape = form["pose"], form.get("shape", {})
     nominal = with_parameters(nominal, {name: v["value"] for name, v in shape.items()})
     found = Pose(**{name: float(pose[name]["value"] or 0.0) for name in _DOFS})

@@ -204,7 +204,7 @@ def _adjusted(
     families = solution.network.families
     effects = effects_on_form(solution, surface, removed)
     form = form_map(solution, surface, removed, doubts, effects)
-    # As high as the heights that came in.
+    # The zero of the heights was taken off before the fit, and belongs to the piston.
     form = replace(form, pose=form.pose + zero.height * (np.array(removed) == "piston"))
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
@@ -238,9 +238,9 @@ def _adjusted(
 
 
 def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float, float | None]:
-    """Return the drift after one second, found, its relative uncertainty, and declared [m].
+    """Return the drift found after one second [m], its relative uncertainty, and the declared one.
 
-    A declared drift that fades may move by its size within any second.
+    A declared drift that fades may move by its whole size within a second.
     """
     stated = {p.name: p.uncertainty for p in priors}
     walk = stated.get("drift_walk")

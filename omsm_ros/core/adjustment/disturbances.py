@@ -83,7 +83,7 @@ def _lasting(series: FloatArray, step: float) -> bool:
 
 
 def _summit(power: FloatArray, peak: int) -> int:
-    """Return the local maximum that ``peak`` lies on the flank of."""
+    """Return the local maximum next to ``peak``, uphill from it."""
     while True:
         low, high = max(peak - 1, 0), min(peak + 2, len(power))
         top = low + int(np.argmax(power[low:high]))

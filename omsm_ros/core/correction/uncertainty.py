@@ -160,7 +160,7 @@ def sensitivity_filters(
     combined, poles = sensitivity_numerators(calibration), np.tile(g.poles(), 2)
     height, slow = combined["z"], static_until(calibration)
     if slow > 0:
-        # G(0) = 1 exactly: an uncertain gain acts on motion only, see at_rest_until.
+        # G(0) = 1 exactly: an uncertain gain acts on motion only, see static_until.
         combined["z"] = slow * np.column_stack([np.zeros(len(height)), height])
         square = np.asarray(polynomial.polymul(square, [1.0, slow]), np.float64)
         poles = np.append(poles, -1 / slow)
