@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.self_calibration import (
@@ -260,7 +260,7 @@ def _findings(found: SelfCalibration) -> Iterator[Finding]:
     if not found.agreement.holds:
         values = {"disagreement": found.agreement.disagreement, "ratio": found.agreement.ratio}
         yield Finding("adjustment.scans_disagree", REJECTS, values)
-    if stats.chi2.sf(found.prior_conflict, GAIN) < _PRIOR_CONFLICT_P:
+    if chdtrc(GAIN, found.prior_conflict) < _PRIOR_CONFLICT_P:
         values = {"shift": float(found.values[LAG]), "chi2": found.prior_conflict}
         yield Finding("adjustment.step_test_conflict", REJECTS, values)
     latency, spread = (

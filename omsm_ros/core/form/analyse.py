@@ -113,30 +113,33 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     tilts; C that of the rotationally symmetric part of the rest. RMSt is the rms without piston
     and tilts, RMSi also without power, and RMSa the rms of the asymmetric rest.
     """
-    irregular, uneven = without_power(map_, fit.disc), asymmetric(map_, fit.disc)
+    of_noise = _with_noise_of_rings(map_, fit.disc)
+    irregular, uneven = without_power(of_noise, fit.disc), asymmetric(of_noise, fit.disc)
+    symmetric = replace(
+        irregular,
+        deviation=irregular.deviation - uneven.deviation,
+        effects=irregular.effects - uneven.effects,
+    )
+    both = (
+        replace(part, effects=part.effects[: len(map_.effects)], noise=map_.noise)
+        for part in (irregular, uneven)
+    )
     return {
         "iso10110_A": _sagitta(map_, fit),
-        "iso10110_C": extents_of_parts([_symmetric(map_, fit.disc)], fit.disc)[0][0],
+        "iso10110_C": extents_of_parts([symmetric], fit.disc)[0][0],
         "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
-        "iso10110_RMSi": rms_of_part(irregular),
-        "iso10110_RMSa": rms_of_part(uneven),
+        **dict(zip(("iso10110_RMSi", "iso10110_RMSa"), map(rms_of_part, both), strict=True)),
     }
 
 
-def _symmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the rotationally symmetric part of the irregularity, with noise among its effects."""
+def _with_noise_of_rings(map_: DeviationMap, disc: Aperture) -> DeviationMap:
+    """Return the map with the noise of its rotationally symmetric terms as its last effects."""
     columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
     weighted = columns * map_.area
     solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
     covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
     effects = np.concatenate([map_.effects, root_of_products(covariance) @ columns])
-    of_noise = replace(map_, effects=effects, noise=0.0)
-    irregular, uneven = without_power(of_noise, disc), asymmetric(of_noise, disc)
-    return replace(
-        irregular,
-        deviation=irregular.deviation - uneven.deviation,
-        effects=irregular.effects - uneven.effects,
-    )
+    return replace(map_, effects=effects, noise=0.0)
 
 
 def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
@@ -234,15 +237,15 @@ def analyse_form(
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
     zernike = _terms(map_, found)
-    cells = GridCells.of(map_, even=even)
+    cells, rest = GridCells.of(map_, even=even), without_second_order(map_)
     bands = bands_of(cells, *filters)
     return FormResult(
         registration=found,
         aperture=outline,
         map=map_,
-        deviation=_figures(map_, gathered, found, outline)
+        deviation=_figures(map_, rest, gathered, found, outline)
         | optical_terms(map_, zernike)
-        | _textures(map_, cells, bands, found, None if even else outline),
+        | _textures((map_, rest), cells, bands, found, None if even else outline),
         zernike=zernike,
         bands=bands,
         profiles=profiles(map_, found.disc),
@@ -254,9 +257,14 @@ def analyse_form(
 
 
 def _figures(
-    map_: DeviationMap, gathered: _Gathered, found: Registration, outline: Aperture
+    map_: DeviationMap,
+    rest: DeviationMap,
+    gathered: _Gathered,
+    found: Registration,
+    outline: Aperture,
 ) -> dict[str, UncertainValue]:
-    fitted, rest = best_fit(map_), without_second_order(map_)
+    """Return figures of the map;  rest: of it without its second order."""
+    fitted = best_fit(map_)
     maps = [map_, fitted, rest, without_power(map_, found.disc)]
     extents = extents_of_parts(maps, found.disc, outline, found.spacing)
     whole, robust, _ = extents[0]
@@ -281,13 +289,14 @@ def _figures(
 
 
 def _textures(
-    map_: DeviationMap,
+    maps: tuple[DeviationMap, DeviationMap],
     cells: GridCells,
     bands: Bands,
     found: Registration,
     outline: Aperture | None,
 ) -> dict[str, UncertainValue]:
-    parts = without_form(map_, found.disc), without_second_order(map_)
+    """Return texture and slopes;  maps: of the part, and without its second order."""
+    parts = without_form(maps[0], found.disc), maps[1]
     formless, rest = (GridCells.of(part, even=outline is None) for part in parts)
     steep = slopes(rest, bands)["slope_rms"]
     points = None

@@ -31,7 +31,7 @@ from omsm_ros.core.form.part_figures import (
     root_of_products,
     with_and_without,
 )
-from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
+from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes, separable
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
@@ -381,22 +381,23 @@ def _beyond_chance(count: int) -> float:
 def _smooth(map_: DeviationMap, disc: Aperture) -> ZernikeFit:
     """Return smooth terms of the deviations, of as high an order as the points show."""
     orders = [n for n in _ORDERS if len(terms_up_to(n)) * _POINTS_PER_TERM <= len(map_)] or [0]
+    every = terms_up_to(orders[0])
+    weighted = (columns := zernike_values(*disc.scaled(map_.x, map_.y), every)) * map_.area
+    gram, squares = weighted @ columns.T, weighted @ weighted.T
+    right = weighted @ map_.deviation
     for order, lower in zip(orders, [*orders[1:], -1], strict=True):
-        points = (map_.x, map_.y, map_.deviation)
-        fit = fit_zernikes(
-            *points, terms_up_to(order), disc, weights=map_.area, condition=_CONDITION
-        )
+        terms = terms_up_to(order)
+        kept = separable(gram[: len(terms), : len(terms)], terms, _CONDITION)
         # Orders that only follow the noise would blur the rim, where the noise of all adds up.
-        high = np.array([term.n > lower for term in fit.terms])
-        weighted = (columns := zernike_values(*disc.scaled(map_.x, map_.y), fit.terms)) * map_.area
-        solve = np.linalg.inv(weighted @ columns.T)[high]
-        covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve.T
+        solve = np.linalg.inv(gram[np.ix_(kept, kept)])[[terms[k].n > lower for k in kept]]
+        covariance = map_.noise**2 * solve @ squares[np.ix_(kept, kept)] @ solve.T
         # Wald's test, because where the points leave parts of the disc out the terms are alike.
-        count, found = len(solve), fit.coefficients[high]
+        count, found = len(solve), solve @ right[kept]
         chi_square = float(found @ np.linalg.solve(covariance + _TINY * np.eye(count), found))
         if chi_square > count + _CHANCE * np.sqrt(2 * count):
             break
-    return fit
+    points = (map_.x, map_.y, map_.deviation)
+    return fit_zernikes(*points, terms, disc, weights=map_.area, condition=_CONDITION)
 
 
 def _drawn(

@@ -12,7 +12,7 @@ from math import comb
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
-from omsm_ros.core.form.zernike_fit import passes
+from omsm_ros.core.form.zernike_fit import CHUNK, passes
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
@@ -133,8 +133,11 @@ def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
     weighted = columns * map_.area
     # For points on a line some columns coincide; the minimum-norm solution is used.
     solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
-    values = np.concatenate([map_.deviation[np.newaxis], map_.effects])
-    rest = values - (solve @ (weighted @ values.T)).T @ columns
+    rest = np.concatenate([map_.deviation[np.newaxis], map_.effects])
+    shares = (solve @ (weighted @ rest.T)).T
+    for begin in range(0, len(map_), CHUNK):
+        chunk = slice(begin, begin + CHUNK)
+        rest[:, chunk] -= shares @ columns[:, chunk]
     return replace(map_, deviation=rest[0], effects=rest[1:])
 
 

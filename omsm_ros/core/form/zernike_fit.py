@@ -122,7 +122,7 @@ def fit_zernikes(
     more = np.empty((0, len(x))) if effects is None else effects
     values = np.concatenate([deviation[np.newaxis], more])
     gram, right = _normal_equations(x, y, values, terms, disc, weights)
-    kept = _separable(gram, terms, condition)
+    kept = separable(gram, terms, condition)
     gram, right = gram[np.ix_(kept, kept)], right[kept]
     used = tuple(terms[k] for k in kept)
     scale = 1 / np.sqrt(np.diag(gram))
@@ -161,7 +161,7 @@ def _normal_equations(
     return gram, right
 
 
-def _separable(gram: FloatArray, terms: Sequence[ZernikeIndex], condition: float) -> list[int]:
+def separable(gram: FloatArray, terms: Sequence[ZernikeIndex], condition: float) -> list[int]:
     """Return the indices of the terms up to the highest order that is well conditioned."""
     for order in range(max(t.n for t in terms), -1, -1):
         kept = [k for k, t in enumerate(terms) if t.n <= order]
