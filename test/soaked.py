@@ -9,3 +9,8 @@ def soaked(*cases):
         pytest.param(*(case if isinstance(case, tuple) else (case,)), marks=pytest.mark.soak)
         for case in cases
     ]
+
+
+def always(*chosen, of):
+    """Return ``chosen``, and the other cases of ``of`` for `make soak` alone."""
+    return [*chosen, *soaked(*(case for case in of if case not in chosen))]

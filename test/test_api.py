@@ -52,6 +52,7 @@ def test_the_lag_is_that_of_the_simulated_machine(identified):
     assert identified.verdict.startswith("accepted")
 
 
+@pytest.mark.soak
 def test_arrays_give_the_same_as_a_recording(identified):
     made = omsm.simulate("step_test")
     again = omsm.identify(made.z, made.distance, made.period)

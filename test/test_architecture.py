@@ -2,6 +2,7 @@
 
 import ast
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -24,6 +25,11 @@ def _name(path):
     return ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
 
 
+def _lines(path):
+    return len(path.read_text(encoding="utf-8").splitlines())
+
+
+@cache
 def _tree(path):
     return ast.parse(path.read_text(encoding="utf-8"))
 
@@ -134,14 +140,19 @@ RULES = {
 }
 
 
-@pytest.mark.parametrize("path", MODULES, ids=_name)
-def test_a_module_keeps_the_rules(path):
-    name, tree = _name(path), _tree(path)
-    broken = [text for rule, applies in RULES.items() if applies(name) for text in rule(name, tree)]
-    lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert not broken
-    assert lines <= LONGEST_FILE, "is it still one thing?"
-    assert path.stem not in {"utils", "util", "misc", "helpers", "common"}, "name its subject"
+def test_modules_keep_the_rules():
+    trees = {_name(path): _tree(path) for path in MODULES}
+    assert len(trees) > 200
+    assert not [
+        text
+        for name, tree in trees.items()
+        for rule, applies in RULES.items()
+        if applies(name)
+        for text in rule(name, tree)
+    ]
+    assert not [_name(p) for p in MODULES if _lines(p) > LONGEST_FILE], "is it still one thing?"
+    vague = {"utils", "util", "misc", "helpers", "common"}
+    assert not [_name(p) for p in MODULES if p.stem in vague], "name its subject"
 
 
 BROKEN = [
@@ -169,7 +180,7 @@ def test_a_broken_rule_is_reported(rule, name, source, reported):
 
 def test_the_product_has_a_bounded_size():
     files = [p for p in MODULES if p.name != "__init__.py"]
-    lines = sum(len(p.read_text(encoding="utf-8").splitlines()) for p in MODULES)
+    lines = sum(map(_lines, MODULES))
     assert len(files) <= MOST_FILES
     assert lines <= MOST_LINES
 
@@ -205,13 +216,13 @@ def test_few_files_are_imported_by_one_other_only():
     assert len(single) <= MOST_SINGLE_IMPORTERS, single
 
 
-@pytest.mark.parametrize("room", sorted({p.parent for p in MODULES}), ids=lambda p: p.name)
-def test_a_room_has_few_files(room):
-    assert len(list(room.glob("[!_]*.py"))) <= LARGEST_ROOM, "divide it by subject"
+def test_a_room_has_few_files():
+    rooms = Counter(p.parent for p in MODULES if not p.name.startswith("_"))
+    assert not {room: n for room, n in rooms.items() if n > LARGEST_ROOM}, "divide it by subject"
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "test").rglob("*.py")), ids=lambda p: p.name)
-def test_a_test_file_has_a_bounded_size(path):
-    lines = len(path.read_text(encoding="utf-8").splitlines())
-    assert lines <= LONGEST_FILE, "split it by subject"
-    assert not list(functions_are_too_long(path.stem, _tree(path)))
+def test_test_files_have_a_bounded_size():
+    paths = sorted((ROOT / "test").rglob("*.py"))
+    assert len(paths) > 200
+    assert not [p.name for p in paths if _lines(p) > LONGEST_FILE], "split it by subject"
+    assert not [text for p in paths for text in functions_are_too_long(p.stem, _tree(p))]

@@ -143,6 +143,7 @@ def test_each_may_be_registered_to_the_nominal_surface_first(results, tmp_path, 
         assert any("registered by" in note for note in facts[side]["notes"])
 
 
+@pytest.mark.soak
 def test_two_scans_of_one_calibration_may_be_registered_first(results, tmp_path, capsys):
     """Errors of the calibration stay common to both after the registration."""
     nominal = tmp_path / "mirror.yaml"
@@ -156,6 +157,7 @@ def test_two_scans_of_one_calibration_may_be_registered_first(results, tmp_path,
     assert facts["common_errors"] == plain["common_errors"] != []
 
 
+@pytest.mark.soak
 def test_it_speaks_to_people(results, tmp_path, capsys):
     pair = (str(results["slow"]), str(results["fast"]))
     assert main(["difference", *pair, "--out", str(tmp_path / "d")]) == DONE

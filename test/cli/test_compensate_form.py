@@ -1,5 +1,7 @@
 """A simulated corrective cut removes the form error and leaves only shorter waves."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -41,15 +43,23 @@ def compensate(folder, out, *more):
     return main([str(word) for word in words])
 
 
-def test_one_cut_leaves_what_is_finer_than_the_low_pass(folder, tmp_path, capsys):
-    assert compensate(folder, tmp_path, "--low-pass", "0.004", "--json") == 0
-    facts = json.loads(capsys.readouterr().out)
-    table = np.loadtxt(tmp_path / "compensation.csv", delimiter=",", skiprows=1)
+@pytest.fixture(scope="module")
+def cut(folder, tmp_path_factory):
+    """Facts and folder of a compensation along a spiral."""
+    out, said = tmp_path_factory.mktemp("compensation"), io.StringIO()
+    with contextlib.redirect_stdout(said):
+        assert compensate(folder, out, "--low-pass", "0.004", "--spiral", "2e-4", "--json") == 0
+    return json.loads(said.getvalue()), out
+
+
+def test_one_cut_leaves_what_is_finer_than_the_low_pass(folder, cut):
+    facts, out = cut
+    table = np.loadtxt(out / "compensation.csv", delimiter=",", skiprows=1)
     assert len(table) == facts["places"]
-    cut = LinearNDInterpolator(table[:, :2], table[:, 2])
+    taken_off = LinearNDInterpolator(table[:, :2], table[:, 2])
     x, y = np.random.default_rng(2).uniform(-0.65 * RADIUS, 0.65 * RADIUS, (2, 20_000))
     before = error(x, y)
-    after = before + cut(x, y)
+    after = before + taken_off(x, y)
     after = after - after.mean()
     ripple = 4e-9 / np.sqrt(2)
     assert np.std(before) > 5 * ripple
@@ -65,6 +75,7 @@ def test_one_cut_leaves_what_is_finer_than_the_low_pass(folder, tmp_path, capsys
     assert 1e-10 < np.median(spread) < 2e-9
 
 
+@pytest.mark.soak
 def test_what_will_be_left_holds_marks_finer_than_the_table(tmp_path, capsys):
     """Tool marks of a quarter of a table cell cannot be compensated."""
     r, angle = RADIUS * (1 - np.arange(20_000) / 20_000), np.arange(20_000) * 0.06
@@ -85,11 +96,10 @@ def test_a_low_pass_finer_than_the_points_is_refused(folder, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
+def test_the_tool_takes_the_form_off_along_its_spiral(cut):
     """Interpret the G-code as a controller does, at the point under the tool."""
-    assert compensate(folder, tmp_path, "--low-pass", "0.004", "--spiral", "2e-4", "--json") == 0
-    facts = json.loads(capsys.readouterr().out)
-    lines = (tmp_path / "compensation.nc").read_text().splitlines()
+    facts, out = cut
+    lines = (out / "compensation.nc").read_text().splitlines()
     assert "millimetres" in lines[2]
     moves = [[float(word[1:]) for word in line.split()] for line in lines if line[0] == "X"]
     assert len(moves) == facts["path_places"]
@@ -109,6 +119,7 @@ def test_the_tool_takes_the_form_off_along_its_spiral(folder, tmp_path, capsys):
     assert facts["significant_share"] > 0.8
 
 
+@pytest.mark.soak
 def test_offsets_below_their_uncertainty_are_warned_of(folder, tmp_path, capsys):
     """A shift that cannot be separated from form is uncertain by tens of nanometres."""
     words = ("--low-pass", "0.004", "--fit", "auto", "--json")
@@ -117,6 +128,7 @@ def test_offsets_below_their_uncertainty_are_warned_of(folder, tmp_path, capsys)
     assert "less than twice its uncertainty" in facts["warnings"][0]
 
 
+@pytest.mark.soak
 def test_a_spiral_too_fine_for_a_controller_is_refused(folder, tmp_path, capsys):
     assert compensate(folder, tmp_path / "o", "--low-pass", "0.004", "--spiral", "1e-8") == 2
     assert "take a wider feed" in capsys.readouterr().err

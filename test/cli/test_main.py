@@ -51,6 +51,7 @@ def test_identify_writes_a_calibration(capsys, folder, tmp_path):
     assert facts["static_gain"] == pytest.approx(0.99213, abs=5e-5)
 
 
+@pytest.mark.soak
 def test_correct_writes_cloud_summary_and_report(capsys, folder, tmp_path):
     status, text, _ = run(
         capsys, "correct", folder / "scan.mcap", "--calibration", folder / "cal.json",

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-from soaked import soaked
 
 from omsm_ros import cli
 from omsm_ros.errors import ConfigurationError
@@ -61,6 +60,7 @@ def test_the_s_filter_takes_shorter_waves_out_of_the_texture(facts):
     assert left[1] / left[0] == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.soak
 def test_the_l_filter_takes_longer_waves_out_of_the_texture(facts):
     cutoffs = (2e-3, 4e-3)
     fine = ("--s-filter", 1e-3)
@@ -69,7 +69,8 @@ def test_the_l_filter_takes_longer_waves_out_of_the_texture(facts):
     assert left[0] / left[1] == pytest.approx(expected, rel=0.03)
 
 
-@pytest.mark.parametrize("per_turn", [90, *soaked(240)])
+@pytest.mark.soak
+@pytest.mark.parametrize("per_turn", [90, 240])
 def test_the_spiral_of_the_next_cut_has_so_many_places_a_turn(facts, per_turn):
     feed = 5e-4
     found, out = facts(
@@ -88,6 +89,7 @@ def test_a_spiral_needs_places_on_each_turn(per_turn, tmp_path, capsys):
     assert "places a turn is" in capsys.readouterr().err
 
 
+@pytest.mark.soak
 def test_a_compensation_is_of_the_aperture_alone(facts):
     whole, _ = facts("compensate", "--low-pass", 4e-3)
     part, out = facts("compensate", "--low-pass", 4e-3, "--aperture", "5e-3")

@@ -19,6 +19,7 @@ from omsm_ros.twin.probe import ProbeErrors
 from .written import facts, write
 
 
+@pytest.mark.soak
 def test_reversal_finds_no_latency_in_a_mechanical_lag(capsys, tmp_path, calibration):
     scans = [
         write(

@@ -23,10 +23,10 @@ OPTIONS = ("--no-report",)
 
 @pytest.fixture(scope="module")
 def shop(tmp_path_factory, small_scan_blocks, true_calibration):
-    """Three good bags, one of them in a folder, one that is damaged, and a calibration."""
+    """Two good bags, one of them in a folder, one that is damaged, and a calibration."""
     folder = tmp_path_factory.mktemp("shop")
     (folder / "bags" / "monday").mkdir(parents=True)
-    for name in ("a", "b", "monday/c"):
+    for name in ("a", "monday/c"):
         with BagWriter(
             folder / "bags" / f"{name}.mcap", (bags.AXES_TOPIC, bags.DISTANCE_TOPIC)
         ) as bag:
@@ -35,8 +35,8 @@ def shop(tmp_path_factory, small_scan_blocks, true_calibration):
                 bag.write_block(distance)
     (folder / "bags" / "torn.mcap").write_bytes(b"\x89MCAP0\r\n and then nothing")
     (folder / "few").mkdir()
-    for name in ("a", "b", "torn"):
-        shutil.copy(folder / "bags" / f"{name}.mcap", folder / "few")
+    for name, copy in (("a", "a"), ("a", "b"), ("torn", "torn")):
+        shutil.copy(folder / "bags" / f"{name}.mcap", folder / "few" / f"{copy}.mcap")
     calibration_file.save_calibration(folder / "cal.json", true_calibration)
     return folder
 
@@ -54,9 +54,7 @@ def states(entries):
 
 def test_every_bag_becomes_a_result_or_a_reason(shop, finished, tmp_path):
     folder, entries = finished
-    assert states(entries) == {
-        "a.mcap": DONE, "b.mcap": DONE, "monday/c.mcap": DONE, "torn.mcap": REFUSED,
-    }  # fmt: skip
+    assert states(entries) == {"a.mcap": DONE, "monday/c.mcap": DONE, "torn.mcap": REFUSED}
     assert "torn.mcap" in entries[-1].said
     assert load_campaign(folder) == entries
     alone = tmp_path / "alone"
@@ -81,12 +79,12 @@ def test_what_is_done_is_not_done_again(shop, finished, tmp_path, monkeypatch):
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
     assert started == ["torn.mcap"]
     started.clear()
-    (tmp_path / "b" / "summary.json").unlink()
+    (tmp_path / "a" / "summary.json").unlink()
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
-    assert sorted(started) == ["b.mcap", "torn.mcap"]
+    assert sorted(started) == ["a.mcap", "torn.mcap"]
     started.clear()
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, (*OPTIONS, "--probe-latency", "1e-4"))
-    assert len(started) == 4
+    assert len(started) == 3
 
 
 def test_a_killed_process_costs_its_bag_and_no_other(shop, tmp_path, monkeypatch):
@@ -110,19 +108,20 @@ def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monke
         pass
 
     def corrected(task):
-        if task.bag == "b.mcap":
-            raise KilledWorker("Attempted to run task 'b' on 4 different workers")
+        if task.bag == "a.mcap":
+            raise KilledWorker("Attempted to run task 'a' on 4 different workers")
         return Entry(task.bag, task.folder, task.fingerprint, DONE, "")
 
     monkeypatch.setattr(campaign, "correct_one", corrected)
     entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=1)
     assert [(e.bag, e.said) for e in entries if e.state == CRASHED] == [
-        ("b.mcap", "no worker finished it (KilledWorker)")
+        ("a.mcap", "no worker finished it (KilledWorker)")
     ]
-    assert len(entries) == 4
+    assert len(entries) == 3
     assert load_campaign(tmp_path) == entries
 
 
+@pytest.mark.soak
 def test_a_campaign_that_is_killed_goes_on(shop, tmp_path):
     command = [
         sys.executable, "-m", "omsm_ros.cli", "batch", str(shop / "few"), "--calibration",
@@ -197,4 +196,4 @@ def test_two_dask_workers_give_the_same_though_one_is_killed(shop, tmp_path):
             scheduler=cluster.scheduler_address, progress=kill_once,
         )  # fmt: skip
     assert killed
-    assert sorted(states(entries).values()) == [DONE, DONE, DONE, REFUSED]
+    assert sorted(states(entries).values()) == [DONE, DONE, REFUSED]

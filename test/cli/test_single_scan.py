@@ -61,12 +61,6 @@ def shop(tmp_path_factory):
     text = "\n".join(["schema: omsm-sources/1", "sources:", *zeros])
     (folder / "zeros.yaml").write_text(text, encoding="utf-8")
     assert cli.main(["identify", f"{folder}/steps.mcap", "--out", f"{folder}/cal.json"]) == 0
-    table = "t,x,y,z,c,d"
-    for name, one, sign in (("steps", steps, 1), ("scan", scan, -1)):
-        a = one.axes
-        columns = [np.arange(len(a)) * 1e-3, a.x, a.y, a.z, a.c, sign * one.distance.distance]
-        np.savetxt(folder / f"{name}.csv", np.column_stack(columns), delimiter=",", header=table,
-                   comments="")  # fmt: skip
     return folder
 
 
@@ -142,8 +136,17 @@ def test_pitch_without_an_arm_evaluates_nothing(capsys, shop):
     assert 2e-9 < row["height"] < 20e-9
 
 
+@pytest.mark.soak
 def test_a_wrong_sign_from_tables_is_contradicted(capsys, shop):
     """The step test imported with the sign -1, the scan without, of logs that agree."""
+    for name, one, sign in (
+        ("steps", planned_test_of(SCENARIO), 1),
+        ("scan", scan_of(SCENARIO), -1),
+    ):
+        a = one.axes
+        columns = [np.arange(len(a)) * 1e-3, a.x, a.y, a.z, a.c, sign * one.distance.distance]
+        np.savetxt(shop / f"{name}.csv", np.column_stack(columns), delimiter=",",
+                   header="t,x,y,z,c,d", comments="")  # fmt: skip
     for name, sign in (("steps", -1), ("scan", -1), ("scan_wrong", 1)):
         (shop / "map.yaml").write_text(MAP.replace("SIGN", str(sign)))
         table = shop / f"{name.split('_')[0]}.csv"
@@ -170,6 +173,7 @@ def test_a_wrapped_c_turns_as_fast_as_it_does(capsys, shop):
         assert limits["spindle speed"]["value"] == pytest.approx(30, rel=1e-3)
 
 
+@pytest.mark.soak
 def test_history_has_the_registered_figure(capsys, shop):
     base = str(shop / "base.sqlite")
     found = correct(capsys, shop, "scan.mcap", "--catalogue", base)["figures"]

@@ -79,7 +79,7 @@ def test_the_twin_without_faults_is_safe_to_scan(capsys, tmp_path):
     assert prediction["residual"] < 0.7e-9
 
 
-@pytest.mark.parametrize("redirected", ["2>/dev/full", ">&- 2>&-", *soaked("2>&-")])
+@pytest.mark.parametrize("redirected", ["2>/dev/full", *soaked(">&- 2>&-", "2>&-")])
 def test_the_exit_status_is_right_without_a_readable_stderr(redirected, tmp_path):
     command = f"{sys.executable} -m omsm_ros.cli compare none.json none.json {redirected}"
     done = subprocess.run(command, shell=True, cwd=tmp_path, capture_output=True, check=False)

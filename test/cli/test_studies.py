@@ -157,6 +157,7 @@ def test_align_warns_programs_too_of_a_form_that_is_no_noise(capsys, tmp_path, c
     assert "not a sphere of that radius, or its form" in warning
 
 
+@pytest.mark.soak
 def test_a_pitch_that_was_measured_elsewhere_is_reported(capsys, tmp_path, scan_bag, calibration):
     (tmp_path / "g.yaml").write_text("abbe_arm: 0.05\n")
     words = ["correct", str(scan_bag), "--calibration", str(calibration), "--no-report", "--json",

@@ -29,6 +29,7 @@ def test_a_page_without_a_way_to_it_is_found_out():
         assert name == "index" or name in re.findall(r"^[\w/-]+$", index, re.MULTILINE)
 
 
+@pytest.mark.soak
 def test_the_manual_is_made_without_a_warning(tmp_path):
     pytest.importorskip("sphinx", reason="sphinx makes the manual")
     pytest.importorskip("furo", reason="furo is its theme")

@@ -67,6 +67,7 @@ def test_the_page_runs_from_top_to_bottom(tmp_path, monkeypatch):
     assert names["figure"].axes
 
 
+@pytest.mark.soak
 def test_twelve_tasks_are_done_in_ten_lines_each(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pandas", reason="one task makes a table")
     monkeypatch.chdir(tmp_path)
@@ -94,7 +95,7 @@ def test_twelve_tasks_are_done_in_ten_lines_each(tmp_path, monkeypatch, capsys):
 
 
 # "make docs" runs them all in kernels.
-QUICK = ("textures-and-vibration", "python-control", "own-csv")
+QUICK = ("python-control", "own-csv")
 NOTEBOOKS = sorted(path.stem for path in (ROOT / "docs/notebooks").glob("*.md"))
 
 

@@ -55,7 +55,7 @@ EMULATOR = "ros2 run omsm_ros cell_emulator --ros-args -p link:={port} -p time_l
 
 # A few seconds of them are in every run, all in `make soak`.
 QUICK = re.compile(
-    r"docs/commands.md.* omsm (plan|surface|completion)"
+    r"docs/commands.md.* omsm (plan steps|surface|completion)"
     r"|README.md.* make |CONTRIBUTING.md|docs/import.md.*import steps|docs/form.md.*surface"
 )
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from soaked import soaked
 
 from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
 from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
@@ -66,7 +67,7 @@ def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
     assert run.delivered > 800
 
 
-@pytest.mark.parametrize("form", ["binary", "ascii"])
+@pytest.mark.parametrize("form", ["binary", *soaked("ascii")])
 def test_a_telegram_that_waits_for_the_next_one_is_not_stamped_late(form: str, bench: Any) -> None:
     run = bench(ChrocodileEmulator, ChrocodileDevice, replace(SIX, format=form), interval=1e-3)
     run.run(1.0)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from loopback import SimulatedClock
+from soaked import soaked
 
 from omsm_ros.instruments.emulator import Instrument
 from omsm_ros.instruments.scaling import AxisScaling
@@ -21,7 +22,7 @@ from omsm_ros.instruments.six_channel.protocol import StreamScaling
 from .scripted_stream import Script
 
 
-@pytest.mark.parametrize("portion", [1 << 20, 17])
+@pytest.mark.parametrize("portion", [1 << 20, *soaked(17)])
 def test_every_sample_arrives_once_with_its_counter(bench: Any, portion: int) -> None:
     run = bench(CsvStreamEmulator, CsvStreamDevice, CsvSettings(), portion=portion)
     run.run(1.0)

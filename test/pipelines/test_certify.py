@@ -40,6 +40,7 @@ def test_identify_writes_the_certificate_it_is_asked_for(capsys, bag, tmp_path):
     assert "steps" in text
 
 
+@pytest.mark.soak
 def test_identify_speaks_of_the_certificate_to_people(capsys, bag, tmp_path):
     folder = tmp_path / "report"
     arguments = ["identify", bag, "--out", tmp_path / "c.json", "--order", 1, "--report", folder]

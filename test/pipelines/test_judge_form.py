@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.cli import main
 from omsm_ros.core.correction.surface_points import SurfacePoints
@@ -66,8 +67,8 @@ def form(folder, out, *arguments, report=False):
 
 @pytest.fixture(scope="module")
 def held(folder, tmp_path_factory):
-    """A result with piston, tip and tilt alone fitted."""
-    words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS)
+    """A result with piston, tip and tilt alone fitted, and a tolerance."""
+    words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS, "--tolerance", 1e-6)
     status, path = form(folder, tmp_path_factory.mktemp("held"), *words)
     assert status == 0
     return path
@@ -93,7 +94,10 @@ def test_known_terms_are_reported_within_their_uncertainty(folder, held):
         "points",
         "left_out",
         "open",
+        "conformity",
     }
+    assert found["conformity"]["verdict"] == "cannot tell"
+    assert "points left out as dust" in found["conformity"]["reasons"][0]
     terms = {(t["n"], t["m"]): t for t in found["zernike"]}
     assert len(terms) == 37
     # As heights along z; the deviation is along the normal.
@@ -161,10 +165,6 @@ def test_what_no_move_explains_is_known_where_form_looks_like_a_move(automatic):
 
 def test_the_page_answers_first_and_has_every_figure(folder, tmp_path, capsys):
     words = ("--fit", "piston,tip,tilt", "--aperture", RADIUS, "--tolerance", 1e-6)
-    status, path = form(folder, tmp_path, *words)
-    open_ = json.loads(path.read_text())["conformity"]
-    assert open_["verdict"] == "cannot tell"
-    assert "points left out as dust" in open_["reasons"][0]
     words += ("--dust", "isolated")
     status, path = form(folder, tmp_path, *words, report=True)
     assert status == 0
@@ -239,6 +239,7 @@ def test_a_systematic_error_of_the_scan_is_in_every_figure(folder, held, tmp_pat
         assert reported["deviation"][name]["uncertainty"] > plain["deviation"][name]["uncertainty"]
 
 
+@pytest.mark.soak
 def test_an_open_latency_leaves_the_figures_those_of_the_points(folder, tmp_path):
     """A possible error does not change the figures, but increases their uncertainty."""
     cloud = CloudFile(folder / CLOUD).read()
@@ -290,6 +291,7 @@ def test_a_scan_without_its_calibration_is_distinguished_from_a_map(folder, tmp_
     assert "is a bag, no map" in capsys.readouterr().err
 
 
+@pytest.mark.soak
 def test_a_fitted_move_that_masks_form_gives_a_warning(folder, tmp_path):
     """On a small disc a shift cannot be separated from astigmatism; held, the form is certain."""
     words = ("--aperture", RADIUS / 6)
@@ -302,16 +304,23 @@ def test_a_fitted_move_that_masks_form_gives_a_warning(folder, tmp_path):
     assert not any("hold it" in note for note in notes["piston,tip,tilt"])
 
 
-def test_a_missing_sector_keeps_the_tolerance_open(tmp_path):
+X, Y = (v.ravel() for v in np.meshgrid(*[np.linspace(-10e-3, 10e-3, 80)] * 2))
+
+
+@pytest.mark.parametrize("given", [Aperture(10e-3), *soaked(None)])
+@pytest.mark.parametrize(("sector", "expected"), [(0.6 * np.pi, 0.4), *soaked((np.pi, 0.0))])
+def test_a_missing_sector_keeps_the_tolerance_open(given, sector, expected):
     rng = np.random.default_rng(1)
-    x, y = (v.ravel() for v in np.meshgrid(*[np.linspace(-10e-3, 10e-3, 80)] * 2))
-    for sector, expected in ((np.pi, 0.0), (0.6 * np.pi, 0.4)):
-        chosen = (np.hypot(x, y) <= 10e-3) & (np.abs(np.arctan2(y, x)) <= sector)
-        batch = PointBatch(x[chosen], y[chosen], rng.normal(0, 1e-9, int(chosen.sum())),
-                           np.empty((0, int(chosen.sum()))))  # fmt: skip
-        for given in (None, Aperture(10e-3)):
-            found = analyse_form(Flat(), [batch].copy, ("piston", "tip", "tilt"), aperture=given)
-            assert found.uncovered == pytest.approx(expected, abs=0.05 if given else 0.3)
-            assert bool(found.doubts()) == (expected > 0)
-    square = PointBatch(x, y, rng.normal(0, 1e-9, len(x)), np.empty((0, len(x))))
+    chosen = (np.hypot(X, Y) <= 10e-3) & (np.abs(np.arctan2(Y, X)) <= sector)
+    count = int(chosen.sum())
+    batch = PointBatch(X[chosen], Y[chosen], rng.normal(0, 1e-9, count), np.empty((0, count)))
+    found = analyse_form(Flat(), [batch].copy, ("piston", "tip", "tilt"), aperture=given)
+    assert found.uncovered == pytest.approx(expected, abs=0.05 if given else 0.3)
+    assert bool(found.doubts()) == (expected > 0)
+
+
+@pytest.mark.soak
+def test_a_whole_square_is_covered():
+    rng = np.random.default_rng(1)
+    square = PointBatch(X, Y, rng.normal(0, 1e-9, len(X)), np.empty((0, len(X))))
     assert analyse_form(Flat(), lambda: [square], ("piston",)).uncovered < 0.02

@@ -29,6 +29,7 @@ def figure(facts, name):
     return float(row["ratio"]), row["ours"]
 
 
+@pytest.mark.soak
 def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path, capsys):
     """Fig. 6: 2.288 µm by integration of a critically damped 200 Hz axis through Eq. 12."""
     facts = run_experiment("steps", tmp_path / "s")
@@ -49,6 +50,7 @@ def test_steps_show_the_error_at_an_edge_and_at_rest(tmp_path, capsys):
     assert held[bags.ACCELERATION_TOPIC] > 0
 
 
+@pytest.mark.soak
 def test_the_circle_of_6_mm_shows_the_printed_figures(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_experiments, "_CIRCLE_SECONDS", 8.0)
     facts = run_experiment("circles", tmp_path / "c")
@@ -138,6 +140,7 @@ def test_the_vibration_is_found_folded(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "v/experiment.json").read_text())["experiment"] == "vibration"
 
 
+@pytest.mark.soak
 def test_the_mirror_loses_its_dynamic_error(tmp_path, monkeypatch):
     monkeypatch.setattr(paper_mirror, "SCAN", Scenario(start_radius=2e-3))
     facts = run_experiment("mirror", tmp_path / "m")
@@ -183,6 +186,7 @@ def test_bands_that_a_motion_does_not_excite_are_not_reported():
     assert excited_bands(two, 1e-3) == ((3.0, 4.0), (40.0, 41.0))
 
 
+@pytest.mark.soak
 def test_plans_and_the_twin_know_the_elliptic_mirror(tmp_path, capsys):
     """A clear aperture of 24.57 mm holds 290 011 readings in the paper."""
     surface, folder = tmp_path / "mirror.yaml", str(tmp_path / "plan")

@@ -180,6 +180,7 @@ def test_the_map_of_the_page_is_that_of_the_deviation(result):
     assert b64decode(layer["png"]).startswith(b"\x89PNG")
 
 
+@pytest.mark.soak
 def test_the_same_bag_gives_the_same_bytes(result, summary, true_calibration, tmp_path):
     """Except for the page, which states the time of its creation."""
     measure(

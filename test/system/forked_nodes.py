@@ -5,13 +5,18 @@ that a test which waits for a report waits less. The process reads a request a l
 answers it with a line: start a node, or tell how one has ended.
 """
 
+import atexit
+import gc
 import importlib
+import inspect
 import json
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+import traceback
 
 from omsm_ros.nodes import start
 from omsm_ros.nodes.cell_demo_node import NodeProcesses
@@ -84,8 +89,14 @@ class ForkedNodes(NodeProcesses):
         self._running[label] = self._server.start(command, self._folder / f"{label}.log")
 
 
+LATER = ("rcl_interfaces.msg._parameter_event", "rosidl_generator_py", "jsonschema",
+         "omsm_ros.pipelines.verify_calibration", "omsm_ros.instruments.six_channel.device",
+         "omsm_ros.instruments.six_channel.emulator")  # fmt: skip
+"""What a node imports when it needs it."""
+
+
 def load():
-    """Import what every node imports; quicken the reports."""
+    """Import what every node imports, have what their first lines of log need; quicken reports."""
     start.one_thread_of_blas()
     for module in (
         *sorted({name.partition(":")[0] for name in start.NODES.values()}),
@@ -93,7 +104,11 @@ def load():
     ):
         loaded = importlib.import_module(f"omsm_ros.nodes.{module}")
     loaded.PERIOD_S = REPORT_PERIOD_S
-    importlib.import_module("omsm_ros.messages")
+    for module in ("omsm_ros.messages", *LATER):
+        importlib.import_module(module)
+    inspect.getmodule(sys._getframe())  # it remembers the file of each module
+    gc.collect()
+    gc.freeze()
 
 
 def become(command, environment, folder, log):
@@ -111,6 +126,25 @@ def become(command, environment, folder, log):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which nohup before the tests would ignore
 
 
+def end_at_once(main):
+    """Run ``main`` and end the process as Python does, but without freeing all its modules."""
+    code = 0
+    try:
+        main()
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if code and not isinstance(end.code, int):
+            print(end.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    threading._shutdown()  # waits for threads that are no daemons
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 def main():
     """Serve until stdin ends; in a fork, run its node."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of Ctrl-C in the tests' terminal
@@ -123,7 +157,7 @@ def main():
             answer = os.waitstatus_to_exitcode(status) if ended else None
         elif not (answer := os.fork()):
             become(**request)
-            return start.main()
+            end_at_once(start.main)
         print(json.dumps(answer), flush=True)
 
 

@@ -88,7 +88,7 @@ CALIBRATIONS = st.fixed_dictionaries(
 FUZZ = {"database": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
 
 
-@pytest.mark.parametrize("count", [25, *soaked(20_000)])
+@pytest.mark.parametrize("count", [10, *soaked(20_000)])
 def test_messages(cell, true_calibration, small_scan_blocks, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
@@ -157,7 +157,7 @@ REQUESTS = st.one_of(
 )
 
 
-@pytest.mark.parametrize("count", [20, *soaked(5_000)])
+@pytest.mark.parametrize("count", [8, *soaked(5_000)])
 def test_requests(cell, true_calibration, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from coverage import CLOCKING_RAD, LAG_S, PRIORS, drawn, normalised, true_form
 from plain_world import MIRROR, RADIUS_M, Machine, rings
+from soaked import soaked
 
 from omsm_ros.core.adjustment import (
     CONTRADICTED,
@@ -92,6 +93,7 @@ def test_corrected_heights_are_the_part(table):
     assert np.std(raw) > 3 * np.std(left)
 
 
+@pytest.mark.soak
 def test_accuracy_beyond_reach_is_too_uncertain(table):
     _, scans, _ = table
     found = adjust(scans[:2], PRIORS, nominal=MIRROR, accuracy=2e-9)
@@ -197,10 +199,11 @@ def test_a_pose_is_projected_out_of_the_form():
     )
 
 
-def test_stated_noise_and_walk_are_replaced_by_what_the_scans_show():
+@pytest.mark.parametrize("seeds", [(0,), *soaked(range(2))])
+def test_stated_noise_and_walk_are_replaced_by_what_the_scans_show(seeds):
     """Declared 1.2 nm/√s and 12 nm; the machine has five and three times as much."""
     errors, stated = [], []
-    for seed in range(2):
+    for seed in seeds:
         machine, scans = drawn(seed, 2, pitch=0.8e-3, noise=36e-9, walk=6e-9)
         found = adjust(scans, PRIORS, nominal=MIRROR, accuracy=25e-9)
         assert found.noise == pytest.approx(36e-9, rel=0.05)
@@ -236,9 +239,8 @@ def test_a_remounted_part_is_placed_by_the_adjustment():
     assert not found.refutations
 
 
-@pytest.mark.parametrize(
-    "seed", [0, *(pytest.param(k, marks=pytest.mark.soak) for k in range(1, 3))]
-)
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(3))
 def test_a_turned_part_with_rings_keeps_its_form(seed):
     """Z follows the nominal surface, so that the distance is the form.
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from coverage import PRIORS, drawn
 from plain_world import MIRROR, RADIUS_M, Machine
+from soaked import soaked
 
 from omsm_ros.core.adjustment import (
     ScanDesign,
@@ -17,7 +18,7 @@ from omsm_ros.core.adjustment.planning import additions, best_addition, design_o
 FIRST = ScanDesign(rpm=30.0, start=RADIUS_M, end=0.0, pitch=0.4e-3)
 
 
-@pytest.mark.parametrize(("scans", "name"), [(1, "single"), (2, "quick")])
+@pytest.mark.parametrize(("scans", "name"), [(2, "quick"), *soaked((1, "single"))])
 def test_a_plan_foretells_the_adjustment(scans, name):
     designs = usual_sets(FIRST)[name]
     planned = posterior_uncertainty(designs, PRIORS, MIRROR)
@@ -84,6 +85,7 @@ def test_the_design_of_a_scan_is_read_from_it():
     assert design.rate == pytest.approx(1000.0, rel=1e-3)
 
 
+@pytest.mark.soak
 def test_the_best_addition_is_the_best_of_all():
     machine = Machine(1)
     scan = machine.scan(30)

@@ -14,33 +14,33 @@ from omsm_ros.core.adjustment import CONTRADICTED, VERIFIED, adjust
 # Kind, family, its true values (or None where a drawn error adds to it).
 ONE_SCAN = [
     ("centre_y", "centre_y", [-10e-6]),
-    *soaked(("centre_x", "centre_x", [-3e-6])),
-    ("asymmetry", "lag_asymmetry", [20e-6]),
-    ("backlash", "motion_error", [30e-9]),
-    *soaked(("spindle_3", "spindle_axial/3", None), ("spindle_6", "spindle_axial/6", [20e-9, 0.0])),
-    ("spindle_2.5", "spindle_axial/2.5", [20e-9, 0.0]),
-    *soaked(("height_step", "height_step@0", [90e-9])),
-    ("c_lost", "c_lost@0", [5e-4]),
+    *soaked(
+        ("centre_x", "centre_x", [-3e-6]),
+        ("asymmetry", "lag_asymmetry", [20e-6]),
+        ("backlash", "motion_error", [30e-9]),
+        ("spindle_3", "spindle_axial/3", None),
+        ("spindle_6", "spindle_axial/6", [20e-9, 0.0]),
+        ("spindle_2.5", "spindle_axial/2.5", [20e-9, 0.0]),
+        ("height_step", "height_step@0", [90e-9]),
+        ("c_lost", "c_lost@0", [5e-4]),
+    ),
 ]
 # A second scan corrects what one refutes: one kind always, the others in `make soak`.
-ALWAYS = ("height_step",)
 TWO_SCANS = [
-    *(
-        pytest.param(*kind, marks=() if kind[0] in ALWAYS else pytest.mark.soak)
-        for kind in (getattr(k, "values", k) for k in ONE_SCAN)
-    ),
-    ("latency", "lag_change", None),
-    ("lag_by_z", "lag_motion", None),
-    pytest.param("lag_by_x", "lag_x", None, marks=pytest.mark.soak),
     ("creep", "creep", [3e-4]),
-    ("warming", "drift_rate", None),
+    *soaked(
+        *(getattr(kind, "values", kind) for kind in ONE_SCAN),
+        ("latency", "lag_change", None),
+        ("lag_by_z", "lag_motion", None),
+        ("lag_by_x", "lag_x", None),
+        ("warming", "drift_rate", None),
+    ),
 ]
 # Uncertainty that is left where an error in part looks like form: a lag that depends on the place
 # like the coma, a slow drift like a creep, which changes the scale of Z.
 IN_PART_FORM_M = {
     "lag_by_z": 12e-9, "lag_by_x": 12e-9, "creep": 15e-9, "c_lost": 19e-9, "warming": 24e-9
 }  # fmt: skip
-MORE_LINES = [("floor", 1), ("hum", 2)]
 
 
 @functools.cache
@@ -96,8 +96,7 @@ def test_candidates_that_look_alike_are_all_named():
 
 
 @pytest.mark.parametrize(
-    ("kind", "scans"),
-    [("hum", 1), ("floor", 2), *(pytest.param(*k, marks=pytest.mark.soak) for k in MORE_LINES)],
+    ("kind", "scans"), [("hum", 1), *soaked(("floor", 1), ("floor", 2), ("hum", 2))]
 )
 def test_lines_in_time_are_named_by_their_frequency(kind, scans):
     machine, found = disturbed(kind, scans)
@@ -130,6 +129,7 @@ def test_what_spirals_to_the_centre_cannot_show_rests_on_its_declaration():
     assert max(resting.values()) < 10e-9
 
 
+@pytest.mark.soak
 def test_an_accepted_value_refutes_no_more():
     machine, made = drawn(0, 2, **KINDS["backlash"])
     found = adjust(made, PRIORS, nominal=MIRROR, accuracy=25e-9, accepted=["motion_error"])

@@ -52,6 +52,7 @@ def drawn(seed, count=COUNT, scale=1.0):
     ]
 
 
+@pytest.mark.soak
 def test_an_unchanged_twin_repeats_as_well_as_it_states():
     found = repeatability([calibrated(seed) for seed in range(COUNT)])
     assert found.repeatable

@@ -148,6 +148,7 @@ def test_two_directions_are_the_same_estimator() -> None:
     assert found.share == pytest.approx(1 / 3, abs=0.005)
 
 
+@pytest.mark.soak
 def test_the_stated_uncertainty_is_that_of_repetition() -> None:
     """Nothing but noise differs, so nothing but noise is allowed for."""
     known = step_test(0.0)

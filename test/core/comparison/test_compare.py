@@ -52,6 +52,7 @@ def test_two_scans_with_drift_agree_and_with_astigmatism_differ(seed):
     assert size == pytest.approx(-20e-9, abs=3 * largest.uncertainty)
 
 
+@pytest.mark.soak
 def test_the_size_of_the_drift_is_found():
     """Within the factor that one realisation of a random walk leaves open."""
     sizes = []
@@ -77,6 +78,7 @@ def test_stated_drift_widens_what_a_spiral_turns_it_into_and_nothing_else():
     assert spread[1][2, 2] == pytest.approx(spread[0][2, 2], rel=0.1)
 
 
+@pytest.mark.soak
 def test_stated_uncertainties_hold_over_repetitions():
     """Noise alone: the terms of the difference scatter as stated, and the probability is even."""
     scores, probabilities = [], []
@@ -120,6 +122,7 @@ def test_without_an_uncertainty_nothing_is_evaluated():
     assert found.sides[1].sources is None
 
 
+@pytest.mark.soak
 def test_an_uncertainty_larger_than_the_part_tells_nothing():
     found = compare_measurements_of_part(scan(0, common=5e-6, drift=0.0), mapped(common=5e-6))
     assert found.verdict.verdict == CANNOT_TELL
@@ -133,6 +136,7 @@ def test_an_uncertainty_in_a_wrong_unit_is_larger_than_the_part():
     assert "exceeds all that is compared" in str(found.verdict.reasons[0])
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("dof", ["x", "clocking"])
 def test_a_shift_alone_is_fitted(dof):
     moved = mapped(**({"shift": (80e-6, 0.0)} if dof == "x" else {"turn": 7e-3}), common=1e-9)
@@ -194,6 +198,7 @@ def test_each_direction_of_a_calibration_is_one_error_in_both():
     )
 
 
+@pytest.mark.soak
 def test_an_error_that_both_share_is_subtracted():
     first, second = scan(1, drift=0.0), scan(2, feed=2e-4, rpm=45, drift=0.0)
     size = 2e-3

@@ -24,7 +24,7 @@ def test_many_shapes_tell_the_size():
     assert np.median(sizes) == pytest.approx(20e-9, rel=0.15)
 
 
-@pytest.mark.parametrize("shapes", [2, *soaked(4), None])
+@pytest.mark.parametrize("shapes", [2, *soaked(4, None)])
 def test_two_of_the_size_hold_what_drifts(shapes):
     """Twice the estimate covers 95 % of drifts of the same size, for any number of shapes."""
     rng = np.random.default_rng(1)

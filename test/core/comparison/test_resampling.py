@@ -66,6 +66,7 @@ def test_the_error_of_the_method_is_stated_from_above_and_not_far_above():
     assert 0.7 * true < stated < 3 * true
 
 
+@pytest.mark.soak
 def test_independent_errors_scatter_as_stated():
     """Against many repetitions of the noise."""
     x, y = _inside(60)

@@ -166,7 +166,7 @@ def spiral() -> np.ndarray:
     return path.positions(turn(25.0)).z
 
 
-@pytest.mark.parametrize("path", [spiral, raster, *soaked(constant_surface_speed)])
+@pytest.mark.parametrize("path", [spiral, *soaked(raster, constant_surface_speed)])
 def test_error_of_a_path_is_that_of_an_independent_simulation(path) -> None:
     """(1 - G) z by scipy's solver of the differential equation, the input piecewise cubic."""
     z = path()

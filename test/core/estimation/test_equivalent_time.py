@@ -85,10 +85,13 @@ def test_no_mode_is_found_where_there_is_none():
     assert found.finding.code == "estimation.no_fast_mode"
 
 
-def test_edges_that_start_with_a_sample_or_that_are_soft_show_nothing():
+def test_edges_that_start_with_a_sample_show_nothing():
     assert fast_mode(step_test(dither=0.0)).finding.code == "estimation.not_dithered"
     assert fast_mode(step_test(edges=6)).finding.code == "estimation.few_edges"
 
+
+@pytest.mark.soak
+def test_soft_edges_show_nothing():
     def slow(t):
         return axis_step(t * 0.1)
 

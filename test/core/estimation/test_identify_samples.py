@@ -73,7 +73,7 @@ def test_the_wrong_hold_finds_another_system():
     assert np.max(np.abs(ratio - 1)) > 0.1
 
 
-@pytest.mark.parametrize("colour", [0.0, 0.8])
+@pytest.mark.parametrize("colour", [*soaked(0.0), 0.8])
 def test_stated_uncertainties_hold_over_many_records(colour):
     """Errors of both responses over stated, of 40 pairs of records: their rms is about 1."""
     pulls = []
@@ -144,6 +144,7 @@ def test_a_smooth_input_is_taken_as_band_limited():
     assert np.max(np.abs(model.sections.response(lines)[0] / TRUTH.response(lines) - 1)) < 0.12
 
 
+@pytest.mark.soak
 def test_the_pace_of_the_record_only_scales_the_model():
     u, y = smooth_record(samples=2000)
     fast, slow = (identified(u, y, period, hold="band-limited") for period in (1e-3, 10.0))
@@ -351,6 +352,7 @@ def test_polynomials_become_the_same_response():
     assert negative.equivalent() is None
 
 
+@pytest.mark.soak
 def test_the_time_of_a_long_record_is_bounded(monkeypatch):
     """The search works on a part: with four times the record it takes less than four times."""
     monkeypatch.setattr(sampled_choice, "EXPLORED_ON", 1000)
@@ -380,7 +382,7 @@ def test_a_mode_beyond_the_strong_band_of_the_input_is_found():
     assert np.max(np.abs(model.sections.poles().imag)) == pytest.approx(2 * np.pi * 0.3, rel=1e-3)
 
 
-@pytest.mark.parametrize("at", [0.3, 0.5, 0.6])
+@pytest.mark.parametrize("at", [0.5, *soaked(0.3, 0.6)])
 def test_one_step_shows_a_lag_from_the_lowest_line_on(at):
     samples, period, lag = 2000, 0.01, 1.7
     rng, decay = np.random.default_rng(5), np.exp(-period / lag)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
@@ -17,7 +18,7 @@ def form(x, y, height, *asked, **options):
     return analyse_form(Flat(), lambda: [portion], asked or ("auto",), **options)
 
 
-@pytest.mark.parametrize("arrangement", ["profile", "strip", "random", "ring", "raster"])
+@pytest.mark.parametrize("arrangement", ["profile", "ring", *soaked("strip", "random", "raster")])
 def test_any_arrangement_of_points_is_judged(arrangement):
     """A ripple of 10 nm on a tilted flat: its rms is found wherever the points lie."""
     n = 5000

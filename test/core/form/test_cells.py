@@ -67,6 +67,7 @@ def test_parameters_of_a_sine_are_those_of_the_textbook():
     assert found["rms_waviness"].value == pytest.approx(passed * size / np.sqrt(2), rel=0.04)
 
 
+@pytest.mark.soak
 def test_noise_is_in_the_uncertainty_and_an_effect_too():
     quiet = square(wave(2e-3, 1e-9))
     noisy = square(wave(2e-3, 1e-9), noise=2e-8, effects=[wave(2e-3, 5e-10)])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from soaked import always, soaked
 
 from omsm_ros.core.form.deviation_map import DeviationMap
 from omsm_ros.core.form.part_extents import extents_of_parts
@@ -22,7 +23,7 @@ FORMS = {
 }
 
 
-@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize("name", always("scratch", of=FORMS))
 def test_the_whole_peak_to_valley_contains_local_defects(name):
     form = 20e-9 * (X**2 - Y**2) / R**2 + FORMS[name]
     held = 0
@@ -37,7 +38,7 @@ def test_the_whole_peak_to_valley_contains_local_defects(name):
     assert held >= 3
 
 
-@pytest.mark.parametrize("turns", [60, 100])
+@pytest.mark.parametrize("turns", [60, *soaked(100)])
 def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
     """A spiral reaches the rim at one place only; the rest of it is up to a turn further in.
 

@@ -93,6 +93,7 @@ def test_terms_of_the_standard_are_those_of_known_zernikes():
     assert found["iso10110_RMSi"].uncertainty < 1e-13
 
 
+@pytest.mark.soak
 def test_the_symmetric_irregularity_is_as_uncertain_as_its_scatter():
     """Noise shakes its few terms: as much as twenty scans scatter, not nothing."""
     still = disc_map({ZernikeIndex(4, 0): 10e-9, ZernikeIndex(2, 2): 5e-9}, points=4_000)

@@ -48,6 +48,7 @@ def identified(threads: str) -> tuple[int, str]:
     return int(outside), digest
 
 
+@pytest.mark.soak
 def test_threads_of_blas_change_no_bit_of_a_calibration():
     one, two = identified("1"), identified("2")
     if two[0] < 2:

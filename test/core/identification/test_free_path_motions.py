@@ -74,6 +74,7 @@ def test_one_frequency_does_not_tell_gain_from_dynamics(frequency, plant, seed):
     assert "does not separate the static gain from the dynamics" in str(certificate.reasons[0])
 
 
+@pytest.mark.soak
 def test_a_second_frequency_tells_them_apart():
     sines = Multisine(frequencies=(2.0, 9.0), amplitude=15e-6)
     calibration = identified(sines, LIGHT_MODE, WHOLE, 1)
@@ -82,17 +83,7 @@ def test_a_second_frequency_tells_them_apart():
     assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        0,
-        4,
-        pytest.param(1, marks=pytest.mark.soak),
-        pytest.param(2, marks=pytest.mark.soak),
-        pytest.param(3, marks=pytest.mark.soak),
-        pytest.param(5, marks=pytest.mark.soak),
-    ],
-)
+@pytest.mark.parametrize("seed", [0, *soaked(*range(1, 6))])
 def test_an_even_ramp_may_be_drift(seed):
     rng = np.random.default_rng(seed)
     z = rng.normal(2e-9 * np.arange(20_000), 4e-10)

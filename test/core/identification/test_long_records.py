@@ -41,6 +41,7 @@ def of_mode():
     return recorded(MODE)
 
 
+@pytest.mark.soak
 def test_fewer_samples_choose_what_all_would(of_mode, monkeypatch):
     prepared = prepare(of_mode, "encoder")
     fewer, every = EvaluationBudget(), EvaluationBudget()

@@ -5,6 +5,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from scipy import stats
+from soaked import soaked
 
 from omsm_ros.core.identification.identify import identify, table_mass, two_mass_model
 from omsm_ros.core.kinematics.trajectories import StepTest
@@ -28,7 +29,7 @@ def calibrated(collocated, mass):
     return identify(assemble([recording.axes], [recording.distance]), settings=settings).calibration
 
 
-@pytest.mark.parametrize("collocated", [False, True])
+@pytest.mark.parametrize("collocated", [False, *soaked(True)])
 def test_an_identified_machine_is_known_within_its_uncertainty(collocated):
     entry = calibrated(collocated, 10.0).certificate.response.two_mass
     assert entry.collocated is collocated
@@ -50,7 +51,7 @@ def test_a_response_says_nothing_of_the_scale():
         assert second.model[name] == pytest.approx(2 * first.model[name], rel=1e-3)
 
 
-@pytest.mark.parametrize("collocated", [False, pytest.param(True, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("collocated", [False, *soaked(True)])
 def test_without_a_mass_all_is_per_mass_of_the_table(collocated):
     """The truth over m1, within the stated uncertainty, and the fit with a mass over it."""
     entry = calibrated(collocated, None).certificate.response.two_mass
@@ -82,6 +83,7 @@ def test_one_mode_is_no_pair_of_masses():
     assert two_mass_model(one, np.zeros((4, 4)), 100.0, 10.0) is None
 
 
+@pytest.mark.soak
 def test_masses_do_not_explain_a_latency():
     chain = MACHINE.non_collocated()
     late = TransferFunction(chain.numerator, chain.denominator, 5e-4)

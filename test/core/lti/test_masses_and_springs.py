@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from soaked import soaked
 
 from omsm_ros.core.lti.frequency_response import relative_response_jacobian
 from omsm_ros.core.lti.modes import FITTED, TwoMass, fit_two_mass, oscillations, response_features
@@ -75,7 +74,8 @@ def test_masses_and_springs_are_recovered(collocated):
     assert np.all(np.isfinite(fitted.uncertainty))
 
 
-@pytest.mark.parametrize("collocated", [False, *soaked(True)])
+@pytest.mark.soak
+@pytest.mark.parametrize("collocated", [False, True])
 def test_masses_and_springs_lie_within_what_is_stated_of_them(collocated):
     """Responses drawn from their covariance, with coefficients that the machine does not need."""
     soft = TwoMass(m1=1.0, m2=0.2, k1=2e5, k2=4e4, c1=45.0, c2=6.0)

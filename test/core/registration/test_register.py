@@ -167,6 +167,7 @@ def test_the_stated_uncertainty_is_the_scatter_on_a_part_without_errors():
     assert 0.1 < np.sqrt(np.mean(off**2)) < 1.2
 
 
+@pytest.mark.soak
 def test_the_stated_uncertainty_holds_what_the_form_of_the_part_does_to_the_pose():
     """50 nm of astigmatism pass for micrometres of shift: least squares states a hundredth.
 
@@ -265,7 +266,7 @@ def test_steps_of_the_part_are_no_dust():
     assert len(found.dust) <= 1
 
 
-@pytest.mark.parametrize("size", [80e-9, *soaked(120e-9), 300e-9])
+@pytest.mark.parametrize("size", [*soaked(80e-9, 120e-9), 300e-9])
 @pytest.mark.parametrize("seed", [3, *soaked(4)])
 def test_a_small_piece_settles_though_its_form_looks_like_a_pose(size, seed):
     """Over 3 mm form and shift are one: steps of 0.2 mm, which bend what lies between them."""
@@ -347,4 +348,4 @@ def test_memory_does_not_grow_with_the_scan():
         tracemalloc.stop()
         return used
 
-    assert peak(16) < 1.1 * peak(4)
+    assert peak(8) < 1.1 * peak(2)

@@ -18,6 +18,7 @@ def lines_of(signal):
     return find_lines(signal, without_form(signal).residual).lines
 
 
+@pytest.mark.soak
 def test_amplitude_and_frequency_within_their_uncertainties(made):
     pulls = []
     for seed in range(8):

@@ -69,6 +69,7 @@ def test_one_scan_alone_is_undecided_and_says_what_it_needs(made):
     assert only["110 µm"].kind == PART  # its pace over the part changed
 
 
+@pytest.mark.soak
 def test_two_scans_of_one_speed_and_feed_tell_nothing(made):
     first, _ = named(made("A", EVERY), made("B", EVERY, seed=2))
     assert {row.kind for at, row in first.items() if at != "110 µm"} == {UNDECIDED}
@@ -145,6 +146,7 @@ def test_rings_and_spindle_at_the_same_feed_per_turn_stay_undecided(made):
         assert "feed per turn" in str(rows[0][2.5].needs)
 
 
+@pytest.mark.soak
 def test_jitter_gaps_and_dropouts(made):
     rough = {"jitter": 2e-3, "lost": 0.1, "gap": (4.0, 6.0)}
     first, second = named(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.core.streams.blocks import AxisBlock, Block, DistanceBlock, Status
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
@@ -93,7 +94,7 @@ def scattered(samples: int, step: float = 1e-9) -> np.ndarray:
 
 
 @pytest.mark.parametrize("step", [1e-15, 1e-9, 20e-9])
-@pytest.mark.parametrize("size", [1, 7, 100, 10_000])
+@pytest.mark.parametrize("size", [7, 100, 10_000, *soaked(1)])
 def test_readings_that_scatter_are_no_fault(step: float, size: int) -> None:
     assert faults(*readings(scattered(4000, step), size)) == []
 
@@ -197,7 +198,7 @@ def moving(size: int = 100, **axis: np.ndarray) -> StreamWatch:
     return watched(*blocks)
 
 
-@pytest.mark.parametrize("size", [1, 100, 6000])
+@pytest.mark.parametrize("size", [100, 6000, *soaked(1)])
 def test_an_axis_that_stands_still_between_steps_is_named(size: int) -> None:
     held = np.arange(6000) // 10 * 10
     assert list(moving(size).step_faults()) == []

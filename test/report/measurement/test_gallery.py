@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
 from omsm_ros.errors import DataError
@@ -46,12 +47,13 @@ def test_without_a_nominal_surface_it_shows_height_and_error(cloud):
     assert {"height_map", "error_map"} <= set(MAPS)
 
 
-@pytest.mark.parametrize("points", [1, 3, 200])
+@pytest.mark.parametrize("points", [1, *soaked(3, 200)])
 def test_a_few_points_are_no_reason_to_fail(cloud, points):
     few = part_of(cloud, slice(0, points))
     assert "raw_map" in surface_figures(few, PAPER_MIRROR)
 
 
+@pytest.mark.soak
 def test_a_coarse_feed_still_has_profiles(cloud):
     share = np.arange(4000) / 4000
     radius, angle = PAPER_MIRROR_RADIUS_M * (1 - share), 2 * np.pi * 8 * share
