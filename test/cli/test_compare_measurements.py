@@ -121,6 +121,7 @@ def test_the_nominal_surface_is_taken_off_both(results, tmp_path, capsys):
     assert facts["difference"]["rms"] == pytest.approx(bare["difference"]["rms"], rel=0.02)
 
 
+@pytest.mark.soak
 def test_each_may_be_registered_to_the_nominal_surface_first(results, tmp_path, capsys):
     """A paraboloid that is clamped with a tilt of 20 mrad has another height over x and y."""
     table = CloudFile(results["fast"] / "cloud.ply").read()

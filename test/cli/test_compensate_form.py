@@ -134,27 +134,33 @@ def test_a_spiral_too_fine_for_a_controller_is_refused(folder, tmp_path, capsys)
     assert "take a wider feed" in capsys.readouterr().err
 
 
-def test_a_complete_program_and_the_effect_of_the_last_cut(folder, tmp_path, capsys):
-    """The part of the fixture again, after a cut with the wrong sign: the next one is refused."""
-    cut = ("--low-pass", "0.004", "--spiral", "1e-3", "--tool-radius", "0.005", "--json")
-    assert compensate(folder, tmp_path / "first", *cut) == 0
+def test_a_complete_program_is_written(folder, tmp_path, capsys):
+    words = ("--low-pass", "0.004", "--spiral", "1e-3", "--tool-radius", "0.005", "--json")
+    assert compensate(folder, tmp_path, *words) == 0
     facts = json.loads(capsys.readouterr().out)
-    program = (tmp_path / "first" / "cut.nc").read_text().splitlines()
+    program = (tmp_path / "cut.nc").read_text().splitlines()
     assert sum(line.startswith("G1 ") for line in program) > 500
     assert program[-1] == "M2"
     assert facts["path_error"] < 1e-7
-    previous = tmp_path / "first" / "compensation.csv"
-    worse = tmp_path / "worse"
-    worse.mkdir()
+
+
+def after_a_cut(folder, cut, out, share, *more):
+    """Compensate the part again after a cut that took off ``share`` of its form."""
     points = np.loadtxt(folder / "part.xyz")
-    points[:, 2] += FORM.height(points[:, 0], points[:, 1])
-    np.savetxt(worse / "part.xyz", points, fmt="%.15g")
-    (worse / "mirror.yaml").write_text((folder / "mirror.yaml").read_text())
-    again = ("--low-pass", "0.004", "--previous", previous)
-    assert compensate(worse, tmp_path / "second", *again) == 2
+    points[:, 2] -= share * FORM.height(points[:, 0], points[:, 1])
+    np.savetxt(out / "part.xyz", points, fmt="%.15g")
+    (out / "mirror.yaml").write_text((folder / "mirror.yaml").read_text())
+    previous = ("--previous", cut[1] / "compensation.csv")
+    return compensate(out, out / "again", "--low-pass", "0.004", *previous, *more)
+
+
+def test_after_a_cut_with_the_wrong_sign_the_next_one_is_refused(folder, cut, tmp_path, capsys):
+    assert after_a_cut(folder, cut, tmp_path, -1.0) == 2
     assert "sign" in capsys.readouterr().err
-    assert not (tmp_path / "second" / "cut.nc").exists()
-    points[:, 2] -= 1.9 * FORM.height(points[:, 0], points[:, 1])
-    np.savetxt(worse / "part.xyz", points, fmt="%.15g")
-    assert compensate(worse, tmp_path / "third", *again, "--json") == 0
+    assert not (tmp_path / "again" / "cut.nc").exists()
+
+
+@pytest.mark.soak
+def test_the_effect_of_the_last_cut_is_stated(folder, cut, tmp_path, capsys):
+    assert after_a_cut(folder, cut, tmp_path, 0.9, "--json") == 0
     assert json.loads(capsys.readouterr().out)["last_cut"] == pytest.approx(0.9, abs=0.05)

@@ -93,7 +93,7 @@ def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
     arguments = ["correct", folder / "scan.mcap", "--calibration", folder / "cal.json",
                  "--out", tmp_path, "--nominal", folder / "mirror.yaml", "--fit", "piston,tip,tilt",
                  "--json"]  # fmt: skip
-    status, text, _ = run(capsys, *arguments)
+    status, text, _ = run(capsys, *arguments, "--no-report")
     assert status == 0
     summary = json.loads(text)
     found = json.loads((tmp_path / "form.json").read_text())
@@ -103,8 +103,6 @@ def test_correct_registers_the_part_in_its_pass(capsys, folder, tmp_path):
     assert found["deviation"]["rms"]["value"] < 15e-9
     assert summary["verdict"]["code"] == "not_verified"
     assert summary["figures"]["removed"] == ["piston", "tip", "tilt"]
-    page = (tmp_path / "report.html").read_text()
-    assert "registered" in page
 
 
 def test_a_fit_needs_a_surface(capsys, folder, tmp_path):

@@ -50,6 +50,7 @@ def test_commands_print_at_one_place():
     assert calls == {"command.py": 1, "command_line.py": 3}
 
 
+@pytest.mark.soak
 def test_what_is_written_is_where_the_line_says(capsys, small_scan, calibration, tmp_path):
     """All commands state written files alike: names and their folder, or paths."""
     scan = write(tmp_path / "scan.mcap", small_scan)

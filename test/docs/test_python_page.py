@@ -95,7 +95,7 @@ def test_twelve_tasks_are_done_in_ten_lines_each(tmp_path, monkeypatch, capsys):
 
 
 # "make docs" runs them all in kernels.
-QUICK = ("python-control", "own-csv")
+QUICK = ("python-control",)
 NOTEBOOKS = sorted(path.stem for path in (ROOT / "docs/notebooks").glob("*.md"))
 
 

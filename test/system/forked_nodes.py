@@ -1,8 +1,8 @@
 """Nodes as forks of one process that has loaded them, which saves each a second of imports.
 
-A fork runs what the command of the node runs. It reports its state ten times a second, not once, so
-that a test which waits for a report waits less. The process reads a request a line from stdin and
-answers it with a line: start a node, or tell how one has ended.
+A fork runs what the command of the node runs. It reports its state five times a second, not once,
+so that a test which waits for a report waits less. The process reads a request a line from stdin
+and answers it with a line: start a node, or tell how one has ended.
 """
 
 import atexit
@@ -22,7 +22,7 @@ from omsm_ros.nodes import start
 from omsm_ros.nodes.cell_demo_node import NodeProcesses
 from omsm_ros.nodes.memory import use_single_malloc_arena
 
-REPORT_PERIOD_S = 0.1
+REPORT_PERIOD_S = 0.2
 
 
 class NodeServer:

@@ -113,6 +113,7 @@ def test_what_a_rejected_calibration_corrected_is_not_valid(table, true_calibrat
     assert found.verdict.reasons[0].code == REJECTED
 
 
+@pytest.mark.soak
 def test_an_uncertainty_too_large_names_the_number_that_has_to_shrink(table):
     """With the size that is named, U is the accuracy; no size reaches 1 nm."""
     _, scans, _ = table
@@ -142,6 +143,11 @@ def test_what_is_only_declared_does_not_turn_green(table):
     names = {r.names[0]: r for r in found.verdict.reasons if r.names}
     assert names["straightness_x"].code == "declared_only"
     assert names["straightness_x"].names[1] == "reference_artefact"
+
+
+@pytest.mark.soak
+def test_what_is_not_even_declared_is_missing_or_seen(table):
+    _, scans, _ = table
     nothing = adjust(scans[:2], (), nominal=MIRROR, accuracy=25e-9)
     missing = {r.names[0]: r.code for r in nothing.verdict.reasons if r.names}
     assert missing["straightness_x"] == missing["encoder_scale"] == "not_evaluated"
@@ -169,6 +175,7 @@ def test_two_scans_of_one_speed_and_direction_are_not_redundant():
     assert found.source("lag_change").uncertainty[0] > 5e-6
 
 
+@pytest.mark.soak
 def test_spindle_reversed_shows_the_lag():
     machine = Machine(4, lag=35e-6)
     scans = [machine.scan(40), machine.scan(-40, outward=True)]
@@ -181,6 +188,7 @@ def test_spindle_reversed_shows_the_lag():
     assert {r.code for r in found.verdict.reasons} == {"not_evaluated", "uncertainty"}
 
 
+@pytest.mark.soak
 def test_a_pose_is_projected_out_of_the_form():
     """A tilted and lifted part has the same map, and the pose comes out."""
     machine = Machine(5, pitch=0.8e-3)
@@ -257,6 +265,7 @@ def test_a_turned_part_with_rings_keeps_its_form(seed):
     assert not alone.refutations
 
 
+@pytest.mark.soak
 def test_a_pose_that_is_only_declared_counts_in_the_form():
     """A part off by 8 µm looks astigmatic; declared so, the uncertainty holds it."""
     machine = Machine(9, lag=10e-6, pitch=0.8e-3)

@@ -41,6 +41,7 @@ def test_more_scans_leave_less_uncertain():
     assert quick.duration == pytest.approx(single.duration * 1.5 + 20.0)
 
 
+@pytest.mark.soak
 def test_the_shortest_set_that_reaches_the_accuracy_is_first():
     sets = usual_sets(FIRST)
     plans = plan_scans(list(sets.values()), PRIORS, MIRROR, 12e-9)

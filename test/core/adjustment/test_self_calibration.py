@@ -100,7 +100,7 @@ def error_left(calibration: Calibration, latency: float) -> float:
     return float(np.ptp(error[inside]))
 
 
-@pytest.mark.parametrize("share", [0.0, *soaked(0.5), 1.0])
+@pytest.mark.parametrize("share", [*soaked(0.0, 0.5), 1.0])
 def test_two_speeds_and_a_step_test_divide_the_lag(share: float) -> None:
     latency = share * LAG_S
     known = step_test(latency, off=0.7e-6)

@@ -71,6 +71,7 @@ def test_sharp_edges_show_the_mode_at_804_hz_also_of_a_late_probe(rounded, late)
     assert found.frequency_uncertainty < 3.0
 
 
+@pytest.mark.soak
 def test_no_mode_is_found_where_there_is_none():
     """The probe follows the axis by 0.34 ms of a real pole."""
     rate = 1 / 0.34e-3

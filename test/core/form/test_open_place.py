@@ -1,6 +1,7 @@
 """Terms of a part with an undetermined pose, against the same form fitted at another place."""
 
 import numpy as np
+import pytest
 
 from omsm_ros.core.form.analyse import analyse_form
 from omsm_ros.core.registration.placement import PointBatch
@@ -25,6 +26,7 @@ def terms_of(shift, *asked):
     )}  # fmt: skip
 
 
+@pytest.mark.soak
 def test_terms_of_a_sphere_hold_what_a_shift_along_itself_makes_of_them():
     straight, shifted = terms_of(0.0, "auto"), terms_of(1e-3, "auto")
     named = terms_of(0.0, "piston", "tip", "tilt")

@@ -123,7 +123,7 @@ def _by_scipy(sections, lines):
     return total * np.exp(-2j * np.pi * lines * sections.delays[0])
 
 
-@pytest.mark.parametrize("seed", [0, *soaked(1)])
+@pytest.mark.parametrize("seed", [1, *soaked(0)])
 def test_what_is_accepted_of_a_random_plant_is_true(seed):
     assert judged(seed)[2] == []
 

@@ -98,6 +98,7 @@ def test_heights_of_all_axes_are_right_within_the_noise_of_the_step_test(seeds):
     assert 0.4 < np.sqrt(np.mean(np.square(ratios))) < 1.7
 
 
+@pytest.mark.soak
 def test_several_recordings_give_one_model_and_name_the_one_that_differs():
     lag = DELAY + 2 * DAMPING / MODE - 1e-4
     two = [alone(recording(seed)) for seed in range(2)]

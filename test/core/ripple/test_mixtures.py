@@ -8,6 +8,7 @@ from benchmarks.mixtures import mixture
 from benchmarks.spectra import judged
 
 
+@pytest.mark.soak
 @pytest.mark.parametrize("seed", [4003])
 def test_lines_are_named_rightly_and_no_alias_is_classified_as_part(seed):
     counted = Counter(judged(mixture(seed)))

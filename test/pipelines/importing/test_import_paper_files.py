@@ -71,6 +71,7 @@ def assert_the_same_cloud(one, other):
     assert counts[0] == counts[1]
 
 
+@pytest.mark.soak
 def test_a_scan_as_csv_gives_the_cloud_of_its_bag(tmp_path, small_scan, true_calibration):
     calibration = tmp_path / "cal.json"
     calibration_file.save_calibration(calibration, true_calibration)
