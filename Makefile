@@ -20,7 +20,7 @@ NUMPY_TYPED := import sys; sys.exit(sys.version_info < (3, 11))
 # Tests and demos stay on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
-.PHONY: setup demo test matrix lint bench soak docs lock clean distclean
+.PHONY: setup demo test compiled matrix lint bench soak docs lock clean distclean
 
 setup: $(PACKAGE)
 
@@ -29,8 +29,12 @@ demo: setup
 
 # Three processes, a file each, in the order of test/conftest.py; JOBS=0 for one after the other.
 JOBS ?= 3
-test: lint
+test: compiled lint
 	$(RUN) python -m pytest --numprocesses $(JOBS) --dist loadfile --no-loadscope-reorder
+
+# While types are checked, one process compiles the tests; else each of those that run them would.
+compiled: setup
+	@$(RUN) (python -m pytest --collect-only --quiet > /dev/null 2>&1 &)
 
 lint: setup
 	$(RUN) ruff check .
