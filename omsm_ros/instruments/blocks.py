@@ -23,8 +23,9 @@ PERIOD_TOLERANCE = 100 * PPM
 RATE_TOLERANCE = 1000 * PPM
 # The same for a trigger from outside, and for a device without time stamps, by its arrivals.
 TRIGGER_TOLERANCE = ARRIVAL_TOLERANCE = 5000 * PPM
-# Time that a sample waits for an arrival that confirms it, before it is withheld [s].
-_LONGEST_S = 0.8
+# Time that a sample waits for an arrival that confirms it, before that is said, and before it is
+# withheld [s].
+_LONG_S, _LONGEST_S = 0.8, 3.0
 # Parts of a block: a wrong period deviates in each of them, a pause or a damaged time in one.
 _PARTS = 4
 
@@ -115,7 +116,8 @@ class BlockCutter:
         # Device time less that of the count, and arrival, of the last samples [ns].
         self._usual: tuple[int, int] | None = None
         self._due = self._doubtful = 0  # time by the count; an offset to be confirmed
-        self._missed_before = 0  # the last pause or restart
+        self._missed_before = 0  # the last pause, restart or renumbering
+        self._skipped = 0  # counts left out for missed triggers
         self._lost = self.unconfirmed = False  # whether triggers were missed before a pause
         self.delivered = self.withheld = self.blocks = self.period_warnings = 0
         self.period_deviation = 0.0
@@ -172,7 +174,10 @@ class BlockCutter:
         if self._detector is None or not runs:
             yield from self._cut(runs, arrival_ns, after_silence)
             return
-        restarted, last = any(run.restarted for run in runs), runs[-1]
+        restarted = any(run.restarted for run in runs)
+        self._skipped *= not restarted
+        runs = [replace(run, first_sample=run.first_sample + self._skipped) for run in runs]
+        last = runs[-1]
         due = (last.first_sample + len(last.samples) - 1) * self._settings.sample_period
         # After a pause of the trigger, but not of the host, the samples are late by it.
         paused = after_silence and abs(self._detector.excess(due, now)) > self._settings.pause / 2
@@ -187,14 +192,17 @@ class BlockCutter:
             self._waiting.clear()
             self.unconfirmed = False
             yield from self._cut(confirmed, arrival_ns, after_silence)
-        self.unconfirmed |= self._withhold(now - _LONGEST_S)
+        elif missed := self._detector.forget_missed():
+            self._withhold(np.inf)
+            self._skipped += missed
+            self._missed_before += missed
+        self._withhold(now - _LONGEST_S)
+        self.unconfirmed |= bool(self._waiting) and self._waiting[0][0] < now - _LONG_S
 
-    def _withhold(self, until: float) -> bool:
-        """Withhold the samples that arrived before ``until`` [s]; return whether there are any."""
-        before = self.withheld
+    def _withhold(self, until: float) -> None:
+        """Withhold the samples that arrived before ``until`` [s]."""
         while self._waiting and self._waiting[0][0] < until:
             self.withheld += len(self._waiting.popleft()[1].samples)
-        return self.withheld > before
 
     def _cut(
         self, runs: Sequence[CountedRun], arrival_ns: int, after_silence: bool

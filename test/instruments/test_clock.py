@@ -28,10 +28,10 @@ def stamps_of(clock: DeviceClock, device: np.ndarray, arrival: np.ndarray) -> np
 def link(
     samples: int, *, drift: float = 0.0, jitter: float = 1.0, seed: int = 0, step_ms: int = 5
 ) -> tuple[np.ndarray, ...]:
-    """Device time, true host time and arrival [ns]: even jitter of ± ``jitter`` ms."""
+    """Device time, true host time and arrival [ns], later by 0 to 2 ``jitter`` ms, evenly."""
     device = np.arange(samples, dtype=np.int64) * step_ms * MS
     host = EPOCH + np.rint(device * (1 + drift)).astype(np.int64)
-    late = np.random.default_rng(seed).uniform(-jitter, jitter, samples) * MS
+    late = np.random.default_rng(seed).uniform(0, 2 * jitter, samples) * MS
     return device, host, np.maximum.accumulate(host + late.astype(np.int64))
 
 
@@ -71,7 +71,7 @@ def test_a_drift_that_changes_is_followed() -> None:
     device = np.arange(60_000, dtype=np.int64) * 5 * MS
     seconds = device * 1e-9
     host = EPOCH + device + np.rint(1e9 * 10e-6 * seconds**2 / 600).astype(np.int64)
-    jitter = np.random.default_rng(2).uniform(-1, 1, len(device)) * MS
+    jitter = np.random.default_rng(2).uniform(0, 2, len(device)) * MS
     stamps = stamps_of(DeviceClock(), device, np.maximum.accumulate(host + jitter.astype(np.int64)))
     assert abs(stamps - host)[4000:].max() < 0.1 * MS
 

@@ -9,8 +9,8 @@ The median skew of about a second is judged every 0.2 s. A slip begins at
 ``|median| < period / 2 + tolerance``. Between the two the last verdict holds. The scatter is that
 within the second, or that over the last half minute if it is larger, because a driver's clock
 wanders while it is estimated from arrivals. The error of that estimate is bounded by its movement:
-a mean of n arrivals moves by 1/n of their scatter with the next one and is wrong by 1/√n of it,
-which is √n times the movement.
+the earliest of n arrivals is late by about 1/n of their scatter, so it was by k/n of that when
+there were n/k.
 
 The delays of two devices may differ by half a period and more, and hide a slip in the skew. So a
 block of one stream that is stamped later than the one before by a whole number of periods is a
@@ -54,19 +54,17 @@ _SURE_STAMPS = 3
 _WANDER_S = 30.0
 # A step of stamps is a slip from the share of a period on; a longer one is a pause of the trigger.
 _STEP_PERIODS, _LONGEST_STEP_S = 0.7, 0.15
-# After so many verdicts it is looked anew whether this multiple of the steps that nearly all stamps
-# have (the share) is below it; otherwise steps show nothing.
-_STEP_VERDICTS, _USUAL_STEPS, _USUAL_SHARE = 5, 3.0, 0.95
+# After so many verdicts it is looked anew whether this multiple of the largest step of a clock, and
+# of what it may still move, is below it; otherwise steps show nothing.
+_STEP_VERDICTS, _USUAL_STEPS = 5, 3.0
 # A skew within this of that before the step shows that it was none [samples].
 _RETURNED = 0.25
 # Stamps kept for a median; single-sample blocks at 1 kHz make 800 in a span.
 _MOST_STAMPS = 1024
 # Standard deviations of single stamps that the median of several does not reach.
 _SEVERAL_TIMES = 3.0
-# A driver's clock is the end of a regression line, which moves more than a mean does. In 20 to 30
-# starts with arrivals uneven by ±20 ms, 0.5 gives 2 false alarms, 0.7 none; 1.0 finds small slips
-# late.
-_END_OF_LINE = 0.7
+# A slip is found within so many verdicts; skews before them show how clocks move.
+_FOUND_IN = 5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,7 +316,8 @@ class TriggerSlipDetector:
             time = begun[:, 4] - stream * begun[:, 1]
             steps = np.diff(time) - np.diff(begun[:, 0]) * self._period_ns
             if len(steps) >= _LEAST_STAMPS:
-                usual = _USUAL_STEPS * float(np.quantile(abs(steps), _USUAL_SHARE))
+                moved = _clock_uncertainty(np.array(self._wander))
+                usual = _USUAL_STEPS * max(float(abs(steps).max()), moved)
                 least = _STEP_PERIODS * self._period_ns
                 self._least_steps[stream] = least if usual < least else math.inf
 
@@ -386,7 +385,10 @@ class TriggerSlipDetector:
 
 
 def _clock_uncertainty(wander: FloatArray) -> float:
-    """Return the error that clocks with the skews ``wander`` (n,) may still have."""
-    if len(wander) <= 2:
-        return 0.0
-    return _END_OF_LINE * spread_about_median(np.diff(wander)) * math.sqrt(len(wander))
+    """Return the error that clocks with the skews ``wander`` (n,) may still have.
+
+    A slip in the newest skews is not a movement of clocks.
+    """
+    known = wander[:-_FOUND_IN]
+    arrivals = np.arange(1, len(known) + 1) / len(wander)
+    return float(np.max(abs(known - known[-1:]) * arrivals, initial=0.0))
