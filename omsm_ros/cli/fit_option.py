@@ -12,7 +12,7 @@ from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER, TOLERANCE, shown
-from omsm_ros.readable import count, measured
+from omsm_ros.readable import NOTHING, count, measured
 
 if TYPE_CHECKING:
     from omsm_ros.pipelines.form import RegistrationOptions
@@ -108,17 +108,17 @@ def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
     from omsm_ros.report.measurement.page import correlated_moves, figure_rows
 
     removed, points = facts["removed"], facts["points"]
-    rows = [(name, _pose(facts, name)) for name in removed["fitted"]]
+    rows = [row for row in figure_rows(facts, adjusted) if row[1] != NOTHING]
+    others = ", ".join(
+        f"{count(v)} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read"
+    )
+    rows += [("points", f"{count(points['read'])} read: {others}")]
+    rows += [(name, _pose(facts, name)) for name in removed["fitted"]]
     rows += [(f"{n} held", why) for n, why in removed["held"].items()]
     rows += [
         (f"{n} not fitted", f"{why}{correlated_moves(facts, n)}")
         for n, why in removed["not_determined"].items()
     ]
-    rows += figure_rows(facts, adjusted)
-    others = ", ".join(
-        f"{count(v)} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read"
-    )
-    rows += [("points", f"{count(points['read'])} read: {others}")]
     rows += [("note", text) for text in removed["notes"]]
     return rows + [("not evaluated", text) for text in removed["not_evaluated"]]
 

@@ -10,12 +10,12 @@ registration.no_freedom: no pose parameter is named, expected a list of {known}
 registration.not_determined: {name} cannot be fitted: {reason}; leave it out of {opt.fit}
 registration.surface_unchanged: this move does not change the surface
 registration.same_effect: on this surface it has the effect of {others:and}
-registration.held_length: form looks like this move: the points determine it to {uncertainty:m/2} (k
-    = 1), which is {form:m/2} rms of form, and do not show that the part was moved ({value:m/2} was
-    fitted); the uncertainty of each figure includes it
-registration.held_angle: form looks like this move: the points determine it to {uncertainty:rad/2}
-    (k = 1), which is {form:m/2} rms of form, and do not show that the part was moved ({value:rad/2}
-    was fitted); the uncertainty of each figure includes it
+registration.held_length: this move looks like form and is not significant: {value:m/2} ±
+    {uncertainty:m/2} (k = 1), an effect of {form:m/2} rms; the uncertainty of each figure includes
+    it
+registration.held_angle: this move looks like form and is not significant: {value:rad/2} ±
+    {uncertainty:rad/2} (k = 1), an effect of {form:m/2} rms; the uncertainty of each figure
+    includes it
 registration.form_like_pose: the pose does not converge: on these points pose and form of the part
     look alike; check the parameters of the surface, the sign of its radii and the units of the
     cloud, or fit fewer pose parameters with {opt.fit} piston,tip,tilt

@@ -36,9 +36,11 @@ from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_ply
 from omsm_ros.io.results import CloudFile, load_fields, read_summary
 from omsm_ros.readable import quantity
+from omsm_ros.report.verdict import headline
 from omsm_ros.units import NOT_USED, LengthUnits
 
 _PORTION = 131_072
+_CORRECTION = "stated with the correction, for the whole scan and all sources of uncertainty"
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,8 @@ def open_measurement(
             lambda: _slices(points), (), False, points.notes, gridded, missing=points.missing
         )
     notes = () if units in (None, LengthUnits(1.0, 1.0)) else (NOT_USED,)
+    if (summary := summary_of_points(path)) and summary.get("figures"):
+        notes += (f"{_CORRECTION}: {headline(summary)}",)
     fields_path = file.with_name(SYSTEMATIC)
     fields = load_fields(fields_path) if fields_path.is_file() else None
     if fields is None:
@@ -130,6 +134,13 @@ def open_measurement(
     return OpenedMeasurement(
         lambda: _portions(cloud, fields), fields.names, True, notes, bounds=fields.bounds
     )
+
+
+def summary_of_points(path: Path) -> dict[str, Any] | None:
+    """Return the summary of a result folder, or of the cloud in it, None if it has none."""
+    file = (path if path.is_dir() else path.parent) / SUMMARY
+    is_result = path.is_dir() or path.name == CLOUD
+    return read_summary(file) if is_result and file.is_file() else None
 
 
 def _slices(
@@ -199,10 +210,10 @@ def draw_form(measured: Path, out: Path, origin: Mapping[str, Any] = MappingProx
     # Imported on demand, because loading the figures takes longer than many evaluations.
     from omsm_ros.pipelines.publish import publish_form
 
-    folder = measured if measured.is_dir() else measured.parent
-    fields_path = folder / SUMMARY if measured.is_dir() or measured.name == CLOUD else None
-    summary = read_summary(fields_path) if fields_path and fields_path.is_file() else None
-    publish_form(out, f"Form of {measured.resolve().name}", summary, origin)
+    summary = summary_of_points(measured) or {}
+    # Figures and conformity of this page are those of the form.
+    kept = {name: v for name, v in summary.items() if name not in ("figures", "conformity")}
+    publish_form(out, f"Form of {measured.resolve().name}", kept, origin)
 
 
 def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:

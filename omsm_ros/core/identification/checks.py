@@ -275,13 +275,13 @@ def requested_order(order: int, factor: float) -> Findings:
 def poles_beyond_valid_range(
     dynamics: TransferFunction, valid_up_to: float, nyquist: float
 ) -> Findings:
-    """Warn of poles beyond ``valid_up_to`` [Hz]: they shape the response, but are not known.
+    """Warn of pairs of poles beyond ``valid_up_to`` [Hz]: they may be no modes of the machine.
 
     One that is ten times faster than half the sampling rate shapes nothing, and is not named;
-    nor is any where nothing is known.
+    nor is any where nothing is known, nor a real pole, which is no resonance.
     """
     for mode in dynamics.modes():
-        if 0 < valid_up_to < mode.frequency < 10 * nyquist:
+        if mode.damping < 1 and 0 < valid_up_to < mode.frequency < 10 * nyquist:
             values = {"frequency_hz": mode.frequency, "up_to_hz": valid_up_to}
             yield Finding("identification.pole_beyond_band", WARNING, values)
 

@@ -25,8 +25,8 @@ _MOST_RINGS, _TURNS_PER_RING, _POINTS_PER_RING = 2048, 2.0, 20
 # Largest gap that its neighbours represent, as an angle [rad] and in usual steps of the path. A
 # larger weight would bring the noise of a single point into every figure.
 _LARGEST_ARC, _MOST_STEPS = np.pi / 6, 10.0
-# Sectors of a turn, as wide as the largest gap.
-_SECTORS = round(2 * np.pi / _LARGEST_ARC)
+# Sectors of a turn: at least as wide as the largest gap, at most as many as a ring has points for.
+_LEAST_SECTORS, _MOST_SECTORS = round(2 * np.pi / _LARGEST_ARC), 360
 # Most cells along the side of a grid. When their size doubles, the number of occupied cells falls
 # to a quarter if they fill the surface, and to a half along single tracks; the limit between both.
 _MOST_CELLS, _FILLED = 768, 3.5
@@ -128,9 +128,11 @@ def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
 
     Points of the neighbouring rings count too, because a fast feed crosses a ring in half a turn.
     """
-    sector = np.floor(angle * (_SECTORS / (2 * np.pi))).astype(np.int64) % _SECTORS
-    points = np.bincount(group * _SECTORS + sector, minlength=count * _SECTORS)
-    seen = points.reshape(count, _SECTORS) > 0
+    some = len(group) // (count * _POINTS_PER_RING)
+    sectors = int(np.clip(some, _LEAST_SECTORS, _MOST_SECTORS))
+    sector = np.floor(angle * (sectors / (2 * np.pi))).astype(np.int64) % sectors
+    points = np.bincount(group * sectors + sector, minlength=count * sectors)
+    seen = points.reshape(count, sectors) > 0
     around = seen.copy()
     around[1:] |= seen[:-1]
     around[:-1] |= seen[1:]

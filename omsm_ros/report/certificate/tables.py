@@ -84,7 +84,7 @@ def residual_table(certificate: Certificate) -> Table:
         ),
         ("edges", count(found.edges), ""),
     ]
-    return Table("Tests of the residual", ("", "in words"), known_rows(rows, 1))
+    return Table("Tests of the residual", ("", "meaning"), known_rows(rows, 1), prose="meaning")
 
 
 def _in_words(p: float | None, good: str, bad: str) -> str:

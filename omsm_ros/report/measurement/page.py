@@ -90,6 +90,8 @@ def figure_rows(form: Mapping[str, Any], adjusted: object = None) -> list[tuple[
 
     adjusted: figures of the adjusted scan, if there are any; PV and rms then are only those
     """
+    entries = part(form, "deviation") or {}
+    first = {name: entries[name] for name in ("peak_to_valley", "rms") if name in entries}
     return [
         (
             figure(name),
@@ -98,7 +100,7 @@ def figure_rows(form: Mapping[str, Any], adjusted: object = None) -> list[tuple[
             )
             + covered(form) * (name in _EXTENTS or "peak_to_valley" in name),
         )
-        for name, entry in (part(form, "deviation") or {}).items()
+        for name, entry in (first | entries).items()
         if not (adjusted and name in _ADJUSTED)
     ]
 
@@ -305,7 +307,7 @@ def render(report: Report) -> str:
         removed=removed_table(report.form),
         script=drawing,
         script_policy=policy_of(drawing),
-        headlines=headlines(report.summary),
+        headlines=headlines(report.summary, report.form),
         sections=_sections(report),
         records=_records(report),
         picture=lambda name: picture(report.figures[name]),
@@ -319,12 +321,12 @@ def _trust_section(report: Report) -> PageVerdict:
     return verdict_on_measurement(report.summary)
 
 
-def headlines(summary: Mapping[str, Any]) -> list[Headline]:
+def headlines(summary: Mapping[str, Any], form: Mapping[str, Any] = {}) -> list[Headline]:
     """Return the main results that are known."""
     found = []
-    if figures := part(summary, "figures"):
+    if figures := part(summary, "figures") or registered_figures(form):
         detail = f"rms {_expanded(figures['rms'])}"
-        pv = _expanded(figures["peak_to_valley"]) + covered(part(summary, "form"))
+        pv = _expanded(figures["peak_to_valley"]) + covered(form or part(summary, "form"))
         found.append(Headline("Form deviation, PV", pv, detail))
     before = part(summary, "dynamic_error_before")
     if before:

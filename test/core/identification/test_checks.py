@@ -109,8 +109,10 @@ def test_an_accuracy_that_is_not_reached_is_reserved():
     assert "uncertainty of 20.2 nm (k = 2)" in only(accuracy(use, 10.1e-9), RESERVATION)
 
 
-def test_a_pole_beyond_the_trusted_band_is_warned_of():
-    assert "1.59 kHz" in only(poles_beyond_valid_range(FAST, 80.0, 500.0), WARNING)
+def test_a_pair_of_poles_beyond_the_valid_range_is_warned_of():
+    pair = TransferFunction.from_ascending([1.0], [1.0, 1e-5, 1e-8])
+    assert "1.59 kHz" in only(poles_beyond_valid_range(pair, 80.0, 500.0), WARNING)
+    assert not list(poles_beyond_valid_range(FAST, 80.0, 500.0))  # a real pole is no resonance
 
 
 def test_a_wrong_order_asked_for_is_the_cause():
