@@ -127,7 +127,7 @@ def test_a_move_that_looks_like_form_is_held_and_terms_carry_what_it_may_do(auto
     found = automatic
     assert found["removed"]["fitted"] == ["piston", "tip", "tilt"]
     assert set(found["removed"]["held"]) == {"x", "y"}
-    assert "nm rms of form" in found["removed"]["held"]["y"]
+    assert "nm rms; the uncertainty of each figure" in found["removed"]["held"]["y"]
     assert "tip and y" in found["removed"]["not_determined"]["clocking"]
     for term in found["zernike"]:
         known = {(2, -2): ASTIGMATISM, (3, -1): COMA}.get((term["n"], term["m"]), 0.0)

@@ -281,39 +281,38 @@ _LINES = {
 
 
 def _profiles(cloud: CloudView, deviations: dict[str, FloatArray]) -> dict[str, bytes]:
+    titles = {name: words for name, (_, *words) in _LINES.items()}
+    titles["profile_radius"] = ["Mean over each ring", "radius"]
+    cuts = profile_cuts(cloud, deviations)
+    return {
+        name: style.png(profile(cut["raw"], cut["corrected"], title=title, position=position))
+        for name, (title, position) in titles.items()
+        if len((cut := cuts[name])["raw"].position)
+    }
+
+
+def profile_cuts(
+    cloud: CloudView, deviations: dict[str, FloatArray]
+) -> dict[str, dict[str, form.Profile]]:
+    """Return the profiles of each kind of deviation (n,) [m], by the names of the figures."""
     x, y = cloud.x, cloud.y
     size = 2 * float(np.hypot(x, y).max())
     feed = _feed(cloud)
     # Segments of full turns average out the errors of other orders.
     spacing = feed * np.ceil(size / _SEGMENTS / feed) if feed else size / _SEGMENTS
-    made = {}
-    for name, (angle, title, position) in _LINES.items():
-        cuts = {
-            kind: form.line_profile(
-                x, y, value, angle=angle,
-                half_width=size * _BAND_SHARE / 2, spacing=spacing,
-            )
-            for kind, value in deviations.items()
-        }  # fmt: skip
-        if len(cuts["raw"].position):
-            made[name] = _profile(cuts, title, position)
-    rings = {
-        kind: form.radial_profile(x, y, value, spacing=spacing)
-        for kind, value in deviations.items()
+    wide = {"half_width": size * _BAND_SHARE / 2, "spacing": spacing}
+    cuts = {
+        name: {k: form.line_profile(x, y, v, angle=angle, **wide) for k, v in deviations.items()}
+        for name, (angle, *_) in _LINES.items()
     }
-    if len(rings["raw"].position):
-        made["profile_radius"] = _profile(rings, "Mean over each ring", "radius")
-    return made
+    rings = {k: form.radial_profile(x, y, v, spacing=spacing) for k, v in deviations.items()}
+    return {**cuts, "profile_radius": rings}
 
 
 def _feed(cloud: CloudView) -> float:
     """Return the feed per turn of a spiral [m]; 0 for less than one turn."""
     turns = abs(np.ptp(np.unwrap(np.arctan2(cloud.y, cloud.x)))) / (2 * np.pi)
     return float(np.ptp(np.hypot(cloud.x, cloud.y)) / turns) if turns >= 1 else 0.0
-
-
-def _profile(cuts: dict[str, form.Profile], title: str, position: str) -> bytes:
-    return style.png(profile(cuts["raw"], cuts["corrected"], title=title, position=position))
 
 
 # Figures of a registered part, from the contents of ``form.json`` and ``curves.json``.
