@@ -29,7 +29,7 @@ from omsm_ros.report.tables import Table
 from omsm_ros.twin.cell import Cell, Probe, Recording, record
 from omsm_ros.twin.disturbances import Disturbances, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple
-from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_STATIC_GAIN
+from omsm_ros.twin.plant import PAPER_DYNAMICS, PAPER_EQ_12
 from omsm_ros.twin.probe import ProbeErrors
 from omsm_ros.twin.scenario import Scenario, on_a_flat
 from omsm_ros.twin.sensors import AccelerationSensor, ReferenceSensor
@@ -120,43 +120,10 @@ def _steps(out: Path, seed: int) -> Done:
     )
     write_recording(out / "sharp_steps.mcap", sharp)
     mode = fast_mode(sharp.motion_record())
-    rows = _step_rows(peak, settled)
-    rows += [
-        compared(
-            "range of the probe",
-            "100 µm",
-            1e-4,
-            2 * cell.probe.half_range,
-            "m",
-            "the ten steps need all of the printed range",
-        ),
-        compared("resolution of the probe", "10 nm", 1e-8, cell.probe.resolution, "m"),
-        compared(
-            "resolution of the Z encoder", "0.4 nm", 0.4e-9, cell.encoder_noise, "m", "as noise"
-        ),
-        compared(
-            "range of the capacitive sensor",
-            "250 µm",
-            250e-6,
-            2 * ReferenceSensor().half_range_m,
-            "m",
-        ),
-        compared(
-            "rate of the accelerometer",
-            "10 kHz",
-            1e4,
-            1 / _ACCELEROMETER_S,
-            "Hz",
-            "printed for the bandwidth of the capacitive sensor",
-        ),
-        compared("rate of all other channels", "1 kHz", 1e3, 1 / cell.sample_period, "Hz"),
-    ]
+    rows = _step_rows(peak, settled, cell)
     rows.append(compared("mode of Eq. 12 from 1 kHz data, in equivalent time", "", None,
                          mode.frequency, "Hz", str(mode.finding)))  # fmt: skip
-    one, response = (
-        slice(size - 5, size + 30),
-        PAPER_STATIC_GAIN * PAPER_DYNAMICS.response(_GRID_HZ),
-    )
+    one, response = slice(size - 5, size + 30), PAPER_EQ_12.response(_GRID_HZ)
     found = [mode.frequency, mode.frequency_uncertainty]
     facts = {"peak": peak, "settled": settled.tolist(), "mode": found}
     shown = panels(
@@ -181,7 +148,7 @@ def _steps(out: Path, seed: int) -> Done:
 _GRID_HZ = np.geomspace(1.0, 500.0, 2000)
 
 
-def _step_rows(peak: float, settled: FloatArray) -> list[Compared]:
+def _step_rows(peak: float, settled: FloatArray, cell: Cell) -> list[Compared]:
     response = PAPER_DYNAMICS.response(_GRID_HZ)
     dip = float(_GRID_HZ[np.argmin(np.abs(response))])
     step = float(np.max(np.abs(np.diff(settled))))
@@ -198,6 +165,15 @@ def _step_rows(peak: float, settled: FloatArray) -> list[Compared]:
                  plain(peak / step / 15, 3), "2.29 µm over 0.15 µm; ours of one step"),
         compared("resonance", "338 Hz", 338.0, dip, "Hz", "minimum of the gain of Eq. 12"),
         compared("resonance", "338 Hz", 338.0, turn, "Hz", "phase of Eq. 12 at -1 rad"),
+        compared("range of the probe", "100 µm", 1e-4, 2 * cell.probe.half_range, "m",
+                 "the ten steps need all of the printed range"),
+        compared("resolution of the probe", "10 nm", 1e-8, cell.probe.resolution, "m"),
+        compared("noise of the Z encoder", "0.4 nm", 0.4e-9, cell.encoder_noise, "m",
+                 "printed as resolution"),
+        compared("range of the capacitive sensor", "250 µm", 250e-6,
+                 2 * ReferenceSensor().half_range_m, "m"),
+        compared("rate of the accelerometer", "10 kHz", 1e4, 1 / _ACCELEROMETER_S, "Hz"),
+        compared("rate of all channels", "1 kHz", 1e3, 1 / cell.sample_period, "Hz"),
     ]  # fmt: skip
 
 

@@ -101,8 +101,7 @@ def mirror(out: Path, seed: int) -> Done:
     left = _against_reference(out, scenario, cloud)
     view = view_of(CloudFile(out / CLOUD).read(MOST_DRAWN), scenario.sample_period)
     assert view is not None
-    ours = levelled(view, PAPER_MIRROR)[0]
-    cuts = profile_cuts(view, {"": ours})
+    cuts = profile_cuts(view, {"": levelled(view, PAPER_MIRROR)[0]})
     extents = [float(np.ptp(cuts[f"profile_{name}"][""].value)) for name in ("x", "y", "radius")]
     rows = [
         compared("deviation before, peak to valley", "6 µm", 6e-6, raw["peak_to_valley"], "m",
@@ -120,7 +119,6 @@ def mirror(out: Path, seed: int) -> Done:
                  "each in its own pose: piston, tip and tilt removed"),
         compared("dynamic error, peak to valley", "", None,
                  found["dynamic_error_before"]["peak_to_valley"], "m"),
-        compared("feed of a turn", "0.1 mm", 1e-4, scenario.feed_per_turn, "m"),
         Compared("duration", "6 minutes", f"{duration:.2f} minutes", plain(duration / 6, 3)),
         compared("points, clear aperture of 24.57 mm", "290 011", 290_011, clear, ""),
         compared("points on the ellipse of 25.4 × 35.9 mm", "", None, len(cloud), ""),
@@ -158,6 +156,7 @@ def _motion_rows(made: Recording, cloud: np.ndarray, scenario: Scenario) -> list
         compared("limit of the motion's frequency", "50 Hz", 50.0,
                  MachineLimits().motion_frequency, "Hz",
                  "a limit of 'omsm predict'"),
+        compared("feed of a turn", "0.1 mm", 1e-4, scenario.feed_per_turn, "m"),
         compared("fundamental of the motion", "0.5 Hz", 0.5, turn, "Hz"),
         Compared("harmonics of Z: second, third, fourth", "up to the third",
                  ", ".join(quantity(float(size), "m") for size in orders[2:5]), "", "amplitudes"),

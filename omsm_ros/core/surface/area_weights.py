@@ -128,8 +128,8 @@ def _covered(group: IntArray, angle: FloatArray, count: int) -> FloatArray:
 
     Points of the neighbouring rings count too, because a fast feed crosses a ring in half a turn.
     """
-    some = len(group) // (count * _POINTS_PER_RING)
-    sectors = int(np.clip(some, _LEAST_SECTORS, _MOST_SECTORS))
+    enough = len(group) // (count * _POINTS_PER_RING)
+    sectors = int(np.clip(enough, _LEAST_SECTORS, _MOST_SECTORS))
     sector = np.floor(angle * (sectors / (2 * np.pi))).astype(np.int64) % sectors
     points = np.bincount(group * sectors + sector, minlength=count * sectors)
     seen = points.reshape(count, sectors) > 0
