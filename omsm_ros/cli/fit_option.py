@@ -12,7 +12,7 @@ from omsm_ros.core.registration.pose_parameters import parse_dofs
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.quantities import COUNTER, TOLERANCE, shown
-from omsm_ros.readable import NOTHING, count, measured
+from omsm_ros.readable import NOTHING, count
 
 if TYPE_CHECKING:
     from omsm_ros.pipelines.form import RegistrationOptions
@@ -105,7 +105,7 @@ def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
     adjusted: figures of the adjusted scan, which stand for PV and rms, if there are any
     """
     # Here, because the page loads what draws, which a correction does without.
-    from omsm_ros.report.measurement.page import correlated_moves, figure_rows
+    from omsm_ros.report.measurement.page import figure_rows, removed_table
 
     removed, points = facts["removed"], facts["points"]
     rows = [row for row in figure_rows(facts, adjusted) if row[1] != NOTHING]
@@ -113,20 +113,9 @@ def form_rows(facts: Facts, adjusted: object = None) -> list[tuple[str, str]]:
         f"{count(v)} {k.replace('_', ' ')}" for k, v in points.items() if v and k != "read"
     )
     rows += [("points", f"{count(points['read'])} read: {others}")]
-    rows += [(name, _pose(facts, name)) for name in removed["fitted"]]
-    rows += [(f"{n} held", why) for n, why in removed["held"].items()]
     rows += [
-        (f"{n} not fitted", f"{why}{correlated_moves(facts, n)}")
-        for n, why in removed["not_determined"].items()
+        (name, f"{value} ± {spread} (k = 1)" if value != NOTHING else reason[0])
+        for name, value, spread, *reason in removed_table(facts).rows
     ]
     rows += [("note", text) for text in removed["notes"]]
     return rows + [("not evaluated", text) for text in removed["not_evaluated"]]
-
-
-def _pose(facts: Facts, name: str) -> str:
-    from omsm_ros.report.measurement.page import settled
-    from omsm_ros.report.tables import unit_of_parameter
-
-    value = {**facts["pose"], **facts["shape"]}[name]["value"]
-    spread = settled(facts, name)
-    return f"{measured(value, spread, unit_of_parameter(name))} (k = 1)"

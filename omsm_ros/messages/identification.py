@@ -137,8 +137,6 @@ identification.accuracy: on the intended scan the response alone makes an uncert
     {reached_m:m} (k = 2), where {accuracy_m:m} are asked for: make more steps, or scan more slowly
 identification.requested_order: order {order} was asked for; the free choice leaves more uncertain
     than it can state: its uncertainties are taken {factor:plain/2} times as large
-identification.pole_beyond_band: pole at {frequency_hz:Hz} lies beyond {up_to_hz:Hz}, up to which
-    the response is known within limits: it need not be a resonance
 # Errors.
 identification.few_plateaus: {found!r} plateaus of rest with readings, at least {least} are needed
     for a gain; make more steps or rest longer

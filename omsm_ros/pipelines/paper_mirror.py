@@ -131,7 +131,7 @@ def mirror(out: Path, seed: int) -> Done:
     caption = "Z path, its density, path and error over 25 s, and 150 points (Fig. 7b to e)."
     figures: dict[str, tuple[str, bytes | Figure]] = {"fig7": (caption, _figure_7(made, cloud))}
     drawn_maps = surface_figures(view, PAPER_MIRROR)
-    figures |= {n: (SCAN_CAPTIONS[n].text, drawn_maps[n]) for n in _OF_MIRROR if n in drawn_maps}
+    figures |= {n: (SCAN_CAPTIONS[n], drawn_maps[n]) for n in _OF_MIRROR if n in drawn_maps}
     columns = ("PV, circle", "rms", "PV, ellipse", "rms", "needs")
     table = Table("What could make 6 µm PV and 2.3 µm rms; none is proved", columns,
                   [(n, *(quantity(v, "m") for v in sizes), needs)

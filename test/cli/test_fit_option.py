@@ -43,13 +43,13 @@ def test_effects_of_an_undetermined_degree_of_freedom_are_reported_separately(fa
     rows = dict(form_rows(facts))
     assert rows["tip"] == "1.0 µrad ± 5.0 µrad (k = 1)"
     assert rows["y"] == "22.0 µm ± 4.0 µm (k = 1)"
-    reported = rows["clocking not fitted"]
+    reported = rows["clocking, not fitted"]
     assert reported.startswith("it does what tip and y do; clocking ± 17 mrad correlates with")
     assert reported.endswith("tip ± 17 mrad, y ± 900 µm, at equal form")
 
 
 def test_a_fixed_degree_of_freedom_is_reported_with_the_reason(facts):
-    assert dict(form_rows(facts))["x held"] == "form looks like it here"
+    assert dict(form_rows(facts))["x, not fitted"] == "held: form looks like it here"
 
 
 def test_an_unresolved_figure_is_reported_as_an_upper_bound(facts):

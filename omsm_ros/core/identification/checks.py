@@ -20,7 +20,6 @@ from omsm_ros.core.lti.frequency_response import (
     ResponseLimits,
     low_frequency_delay_uncertainty,
 )
-from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.model_errors.residual_diagnostics import (
     FALSE_ALARM,
     HALVES,
@@ -272,20 +271,6 @@ def requested_order(order: int, factor: float) -> Findings:
         yield Finding("identification.requested_order", WARNING, {"order": order, "factor": factor})
 
 
-def poles_beyond_valid_range(
-    dynamics: TransferFunction, valid_up_to: float, nyquist: float
-) -> Findings:
-    """Warn of pairs of poles beyond ``valid_up_to`` [Hz]: they may be no modes of the machine.
-
-    One that is ten times faster than half the sampling rate shapes nothing, and is not named;
-    nor is any where nothing is known, nor a real pole, which is no resonance.
-    """
-    for mode in dynamics.modes():
-        if mode.damping < 1 and 0 < valid_up_to < mode.frequency < 10 * nyquist:
-            values = {"frequency_hz": mode.frequency, "up_to_hz": valid_up_to}
-            yield Finding("identification.pole_beyond_band", WARNING, values)
-
-
 CHECKS: tuple[Callable[[IdentificationEvidence], Findings], ...] = (
     # A motion that does not determine the gain makes every other finding meaningless.
     lambda e: separable_gain(gain_uncertainty_alone(e.prepared.problem, e.fit), e.limits.gain),
@@ -330,9 +315,6 @@ CHECKS: tuple[Callable[[IdentificationEvidence], Findings], ...] = (
     lambda e: trusted_range(e.known.valid_up_to, e.limits, e.use.least_valid_up_to_hz),
     lambda e: accuracy(e.use, accuracy_on(e) if e.use.accuracy_m else 0.0),
     lambda e: requested_order(e.fit.structure.poles, e.known.widened),
-    lambda e: poles_beyond_valid_range(
-        e.dynamics, e.known.valid_up_to, 0.5 / e.prepared.problem.period
-    ),
 )
 """Every check, in the order in which findings are stated."""
 

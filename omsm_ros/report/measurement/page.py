@@ -129,8 +129,11 @@ def removed_table(form: Mapping[str, Any]) -> Table:
     for name in part(form, "removed", "fitted") or ():
         pose = part(form, "pose", name) or part(form, "shape", name) or {}
         unit = unit_of_parameter(name)
-        spread = settled(form, name)
-        fitted.append((name, _rounded(pose.get("value"), spread, unit), _size(spread, unit)))
+        # Without a prefix, which 1/m would not take.
+        bare, tail = ("", f" {unit}") if unit == "1/m" else (unit, "")
+        stated = measured(pose.get("value"), settled(form, name), bare).split(" ± ")
+        value, spread = stated if len(stated) == 2 else (stated[0], NOTHING)
+        fitted.append((name, value + tail, spread + tail))
     held: Mapping[str, str] = part(form, "removed", "held") or {}
     refused: Mapping[str, str] = part(form, "removed", "not_determined") or {}
     reasons = {name: f"held: {why}" for name, why in held.items()}
@@ -168,13 +171,6 @@ def correlated_moves(form: Mapping[str, Any], name: str) -> str:
         return ""
     own, *others = stated
     return f"; {own} correlates with {', '.join(others)}, at equal form"
-
-
-def _rounded(value: Any, spread: float | None, unit: str) -> str:
-    """Return a value rounded to the digits of its uncertainty."""
-    if not spread or unit == "1/m":
-        return _size(value, unit)
-    return measured(value, spread, unit).partition(" ±")[0]
 
 
 def _size(value: Any, unit: str) -> str:
@@ -225,40 +221,33 @@ def provenance_table(summary: Mapping[str, Any]) -> Table:
     return Table("Provenance", (), known if part(summary, "bag") else [])
 
 
-@dataclass(frozen=True, slots=True)
-class Caption:
-    """Caption of a figure; ``half_row`` figures fill half a row, others a third."""
-
-    text: str
-    half_row: bool = True
-
-
+# Captions of the figures; maps fill a third of a row, others half.
 MAPS = {
-    "raw_map": Caption("Before the correction: encoder plus probe.", False),
-    "corrected_map_same_scale": Caption("After it, on the scale of the map before.", False),
-    "corrected_map": Caption("After it, enlarged.", False),
-    "height_map": Caption("Corrected height; no nominal surface was given.", False),
-    "error_map": Caption("Dynamic error that was removed.", False),
+    "raw_map": "Before the correction: encoder plus probe.",
+    "corrected_map_same_scale": "After it, on the scale of the map before.",
+    "corrected_map": "After it, enlarged.",
+    "height_map": "Corrected height; no nominal surface was given.",
+    "error_map": "Dynamic error that was removed.",
 }
 PROFILES = {
-    "profile_x": Caption("Through the centre, mean over 1/200 of the aperture."),
-    "profile_y": Caption("Through the centre, mean over 1/200 of the aperture."),
-    "profile_diagonal": Caption("A lag's error is largest here if the part is tilted along x."),
-    "profile_radius": Caption("Mean of each ring: rotationally symmetric error."),
+    "profile_x": "Through the centre, mean over 1/200 of the aperture.",
+    "profile_y": "Through the centre, mean over 1/200 of the aperture.",
+    "profile_diagonal": "A lag's error is largest here if the part is tilted along x.",
+    "profile_radius": "Mean of each ring: rotationally symmetric error.",
 }
-ERRORS = {"dynamic_error": Caption("Before and after: mind the different scales.")}
+ERRORS = {"dynamic_error": "Before and after: mind the different scales."}
 DYNAMICS = {
-    "bode": Caption("Grey: above the frequency up to which the calibration is valid."),
-    "step_response": Caption("One edge of the step test, and the residual of the model."),
+    "bode": "Grey: above the frequency up to which the calibration is valid.",
+    "step_response": "One edge of the step test, and the residual of the model.",
 }
 FORM = {
-    "form_map": Caption("Pose removed. ×: left out as dust. Hatched: aperture without points."),
-    "form_lines": Caption("Along the normal, pose removed, mean over 1/50 of the radius; k = 2."),
-    "form_rings": Caption("Mean of each ring, and around the outer third of the radius; k = 2."),
-    "zernike_terms": Caption("Terms, 1 at the rim, k = 2. Grey: within the uncertainty."),
-    "psd_radial": Caption("Two-sided, with noise; the sum of 2πf S Δf is the mean square; k = 2."),
-    "psd_direction": Caption("Over the direction of the waves; half a turn is the mean square."),
-    "psd_areal": Caption("Its sum times the area of a block is the mean square."),
+    "form_map": "Pose removed. ×: left out as dust. Hatched: aperture without points.",
+    "form_lines": "Along the normal, pose removed, mean over 1/50 of the radius; k = 2.",
+    "form_rings": "Mean of each ring, and around the outer third of the radius; k = 2.",
+    "zernike_terms": "Terms, 1 at the rim, k = 2. Grey: within the uncertainty.",
+    "psd_radial": "Two-sided, with noise; the sum of 2πf S Δf is the mean square; k = 2.",
+    "psd_direction": "Over the direction of the waves; half a turn is the mean square.",
+    "psd_areal": "Its sum times the area of a block is the mean square.",
 }
 CAPTIONS = {**MAPS, **PROFILES, **FORM, **ERRORS, **DYNAMICS}
 
@@ -307,11 +296,12 @@ def render(report: Report) -> str:
         removed=removed_table(report.form),
         script=drawing,
         script_policy=policy_of(drawing),
-        headlines=headlines(report.summary, report.form),
+        headlines=headlines(report.summary),
         sections=_sections(report),
         records=_records(report),
         picture=lambda name: picture(report.figures[name]),
         caption=CAPTIONS.__getitem__,
+        maps=MAPS,
     )
 
 
@@ -321,13 +311,9 @@ def _trust_section(report: Report) -> PageVerdict:
     return verdict_on_measurement(report.summary)
 
 
-def headlines(summary: Mapping[str, Any], form: Mapping[str, Any] = {}) -> list[Headline]:
+def headlines(summary: Mapping[str, Any]) -> list[Headline]:
     """Return the main results that are known."""
     found = []
-    if figures := part(summary, "figures") or registered_figures(form):
-        detail = f"rms {_expanded(figures['rms'])}"
-        pv = _expanded(figures["peak_to_valley"]) + covered(form or part(summary, "form"))
-        found.append(Headline("Form deviation, PV", pv, detail))
     before = part(summary, "dynamic_error_before")
     if before:
         found.append(_dynamic_headline(before, part(summary, "dynamic_error_after")))

@@ -11,7 +11,6 @@ from omsm_ros.core.identification.checks import (
     inter_sample_motion,
     late,
     misfit,
-    poles_beyond_valid_range,
     requested_order,
     scale,
     separable_gain,
@@ -58,7 +57,6 @@ def test_good_evidence_gives_no_finding():
         separable_gain(1e-5, 0.01),
         trusted_range(80.0, LIMITS, LEAST_HZ),
         requested_order(3, 1.0),
-        poles_beyond_valid_range(SLOW, 80.0, 500.0),
         inter_sample_motion(1e-8, 1e-6, HARMLESS_S),
         accuracy(PAPER_USE, 1.0),
     ]
@@ -107,12 +105,6 @@ def test_an_accuracy_that_is_not_reached_is_reserved():
     use = IntendedUse(PAPER_USE.spectrum, accuracy_m=20e-9)
     assert not list(accuracy(use, 9.9e-9))
     assert "uncertainty of 20.2 nm (k = 2)" in only(accuracy(use, 10.1e-9), RESERVATION)
-
-
-def test_a_pair_of_poles_beyond_the_valid_range_is_warned_of():
-    pair = TransferFunction.from_ascending([1.0], [1.0, 1e-5, 1e-8])
-    assert "1.59 kHz" in only(poles_beyond_valid_range(pair, 80.0, 500.0), WARNING)
-    assert not list(poles_beyond_valid_range(FAST, 80.0, 500.0))  # a real pole is no resonance
 
 
 def test_a_wrong_order_asked_for_is_the_cause():
