@@ -131,7 +131,7 @@ def test_what_was_taken_out_has_units_and_reasons():
     table = removed_table(FORM)
     rows = [tuple(c.replace("\u202f", " ") for c in r) for r in table.rows]
     assert rows[0][:3] == ("piston", "1.50 nm", "0.20 nm")
-    assert rows[1][:3] == ("tip", "50.0 µrad", "2.00 µrad")
+    assert rows[1][:3] == ("tip", "50.0 µrad", "2.0 µrad")
     assert rows[2][1] == "0.250 1/m"
     assert rows[3][0] == "clocking, not fitted"
     # The correlated moves are stated here, not in the rows above.
