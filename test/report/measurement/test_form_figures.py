@@ -44,8 +44,7 @@ def test_every_figure_has_a_place_on_the_page():
     }  # fmt: skip
     page = render(Report("Form of a", "today", {}, None, made, {"zernike": ZERNIKE}, CURVES))
     alternatives = (
-        f'alt="{CAPTIONS[name]}"'[:30]
-        for name in ("form_lines", "zernike_terms", "psd_radial")
+        f'alt="{CAPTIONS[name]}"'[:30] for name in ("form_lines", "zernike_terms", "psd_radial")
     )
     order = ["Form of the part", "Validity of the measurement", *alternatives]
     places = [page.index(text) for text in order if text in page]
