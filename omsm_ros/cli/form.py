@@ -37,7 +37,6 @@ from omsm_ros.io.gcode_file import path_gcode as program_of
 from omsm_ros.pipelines.form import (
     OpenedMeasurement,
     RegistrationOptions,
-    draw_form,
     judge_form,
     open_measurement,
 )
@@ -310,7 +309,10 @@ def _form(args: argparse.Namespace) -> Facts:
         points = open_measurement(source, args.unit, args.channel)
         facts = judge_form(points, surface, out, registration_of(args))
         if not args.no_report:
-            draw_form(source, out, args.origin)
+            # Imported on demand, because it takes longer to load than many forms to evaluate.
+            from omsm_ros.pipelines.publish import publish_form
+
+            publish_form(source, out, args.origin)
             facts = {**facts, "report": REPORT}
     return {**facts, "out": str(args.out)}
 

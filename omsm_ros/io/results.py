@@ -15,7 +15,7 @@ from omsm_ros.core.correction.surface_points import CLOUD_FIELDS, SurfacePoints,
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, exception_text, open_regular, save_bytes
+from omsm_ros.io.files import CLOUD, SUMMARY, atomic_file, exception_text, open_regular, save_bytes
 from omsm_ros.io.folders import read_result
 from omsm_ros.io.json_and_yaml import (
     CONFORMITY,
@@ -210,6 +210,13 @@ def read_summary(path: Path) -> dict[str, Any]:
     for source in (summary.get("budget") or {}).get("sources", []):
         source["source"] = FORMER_NAMES.get(source["source"], source["source"])
     return summary
+
+
+def summary_of_points(path: Path) -> dict[str, Any] | None:
+    """Return the summary of a result folder, or of the cloud in it, None if it has none."""
+    file = (path if path.is_dir() else path.parent) / SUMMARY
+    is_result = path.is_dir() or path.name == CLOUD
+    return read_summary(file) if is_result and file.is_file() else None
 
 
 # The parts of ``form.json`` and ``curves.json`` that pages use.

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,10 +30,10 @@ from omsm_ros.core.surface.height_grid import as_grid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, without_duplicates
 from omsm_ros.core.surface.shape_parameters import external
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SUMMARY, SYSTEMATIC, save_json
+from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, SYSTEMATIC, save_json
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_ply
-from omsm_ros.io.results import CloudFile, load_fields, read_summary
+from omsm_ros.io.results import CloudFile, load_fields, summary_of_points
 from omsm_ros.readable import quantity
 from omsm_ros.report.verdict import headline
 from omsm_ros.units import NOT_USED, LengthUnits
@@ -136,13 +135,6 @@ def open_measurement(
     )
 
 
-def summary_of_points(path: Path) -> dict[str, Any] | None:
-    """Return the summary of a result folder, or of the cloud in it, None if it has none."""
-    file = (path if path.is_dir() else path.parent) / SUMMARY
-    is_result = path.is_dir() or path.name == CLOUD
-    return read_summary(file) if is_result and file.is_file() else None
-
-
 def _slices(
     points: MeasuredPoints, fields: ErrorFields | None = None, size: int = _PORTION
 ) -> Iterator[PointBatch]:
@@ -199,21 +191,6 @@ def judge_form(
     columns = [form.map.x, form.map.y, form.map.deviation]
     write_ply(out / DEVIATION, np.rec.fromarrays(columns, formats="<f8,<f8,<f8", names="x,y,z"))
     return facts
-
-
-def draw_form(measured: Path, out: Path, origin: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write the report of a form whose results :func:`judge_form` wrote into ``out``.
-
-    measured: file or folder of the measurement; its summary, if any, is part of the report
-    origin: entries of the title block
-    """
-    # Imported on demand, because loading the figures takes longer than many evaluations.
-    from omsm_ros.pipelines.publish import publish_form
-
-    summary = summary_of_points(measured) or {}
-    # Figures and conformity of this page are those of the form.
-    kept = {name: v for name, v in summary.items() if name not in ("figures", "conformity")}
-    publish_form(out, f"Form of {measured.resolve().name}", kept, origin)
 
 
 def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:

@@ -29,7 +29,14 @@ from omsm_ros.io.files import (
 from omsm_ros.io.folders import result_folder
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
-from omsm_ros.io.results import CloudFile, PlyWriter, read_curves, read_form, read_summary
+from omsm_ros.io.results import (
+    CloudFile,
+    PlyWriter,
+    read_curves,
+    read_form,
+    read_summary,
+    summary_of_points,
+)
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import MOST_DRAWN
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -145,18 +152,20 @@ def publish(
 
 
 def publish_form(
-    out: Path,
-    title: str,
-    summary: Mapping[str, Any] | None = None,
-    origin: Mapping[str, Any] = MappingProxyType({}),
+    measured: Path, out: Path, origin: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
     """Write ``report.html`` of a registered part from its results in ``out``.
 
-    summary: of the measurement of its points, if there is one
+    measured: file or folder of the measurement; its summary, if any, is part of the report
+    origin: entries of the title block
     """
     part = read_points(out / DEVIATION)
     layer = Layer("registered deviation", part.x, part.y, part.height, "nm")
-    publish(out, title, summary or {}, None, {}, embedded([layer]), origin)
+    summary = summary_of_points(measured) or {}
+    # Figures and conformity of this page are those of the form.
+    kept = {name: v for name, v in summary.items() if name not in ("figures", "conformity")}
+    title = f"Form of {measured.resolve().name}"
+    publish(out, title, kept, None, {}, embedded([layer]), origin)
 
 
 def publish_spectra(
