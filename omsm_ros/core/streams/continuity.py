@@ -53,7 +53,8 @@ class TriggerCount:
         self._newest_first = 0
         self._newest_stamp_ns: int | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=_MOST_GAPS)
-        self._jumped: tuple[int, int] | None = None  # count and stamp of a block that is ahead
+        # Count, stamp and length of a block that is ahead.
+        self._jumped: tuple[int, int, int] | None = None
 
     def place(self, block: Block, length: int) -> Arrival:
         """Place ``block`` of ``length`` samples after what came before."""
@@ -64,10 +65,12 @@ class TriggerCount:
             self._gaps.clear()
         elif first > self._next:
             if self._leaps(block):
-                self._jumped = (first, block.stamp_ns)
+                self._jumped = (first, block.stamp_ns, length)
                 return Arrival(self._session, first, length, 0, jumped=length)
-            self._gaps.append((self._next, first))
             missing = first - self._next
+            if self._jumped is not None and self._next <= self._jumped[0] < first:
+                missing -= min(self._jumped[2], first - self._jumped[0])  # it came
+            self._gaps.append((self._next, first))
         self._jumped = None
         end = first + length
         skip = min(max(self._next - first, 0), length)
@@ -84,7 +87,7 @@ class TriggerCount:
             return False
         jumped = self._jumped
         confirmed = jumped is not None and block.first_sample > jumped[0]
-        return jumped is None or not confirmed or is_ahead_of_time(jumped, block)
+        return jumped is None or not confirmed or is_ahead_of_time(jumped[:2], block)
 
     def _filled(self, first: int, end: int) -> int:
         """Remove the counts ``first`` to ``end`` from the gaps; return how many there were."""

@@ -145,6 +145,8 @@ def test_a_counter_that_leaps_is_followed_once_the_next_block_confirms_it() -> N
         )  # fmt: skip
         placed.append(stream.new(block))
     assert [a is not None and a.first for a in placed] == [0, 100, False, 1_000_300, 1_000_400]
+    account = stream.tally.snapshot(0)
+    assert account.received + account.missing == 1_000_500
 
 
 ZEROS = np.zeros(100)
