@@ -67,6 +67,7 @@ def test_two_scans_of_one_part_agree(results, tmp_path, capsys):
     assert np.sqrt(np.mean(table[:, 2] ** 2)) == pytest.approx(facts["difference"]["rms"])
 
 
+@pytest.mark.soak
 def test_twenty_nanometres_of_astigmatism_differ(results, tmp_path, capsys):
     _, facts = difference(capsys, tmp_path / "d", results["slow"], results["other"])
     assert facts["verdict"] == "differ"

@@ -51,6 +51,7 @@ def roughness(found):
     return found["deviation"]["Sq"]["value"]
 
 
+@pytest.mark.soak
 def test_the_s_filter_takes_shorter_waves_out_of_the_texture(facts):
     cutoffs = (1.0e-3, 1.5e-3)
     left = [roughness(facts("form", "--no-report", "--s-filter", c)[0]) for c in cutoffs]

@@ -99,6 +99,7 @@ def test_selfcal_divides_the_lag_and_correct_uses_it(capsys, tmp_path, late_pair
     assert sizes["unresolved"][1]["probe_latency"] > sizes["unresolved"][0] / 2
 
 
+@pytest.mark.soak
 def test_selfcal_without_a_step_test_says_what_it_cannot_tell(capsys, tmp_path, late_pair):
     out = tmp_path / "cal.json"
     arguments = ["selfcal", *map(str, late_pair), "--out", str(out)]

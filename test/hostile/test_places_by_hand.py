@@ -12,6 +12,7 @@ import pytest
 from hostile import maps, trees
 from hostile.bag_inputs import TOPICS
 from hostile.judge import Case, ask, judge, refused
+from soaked import soaked
 
 from omsm_ros.io.bag_writer import BagWriter
 
@@ -128,7 +129,7 @@ def test_numbers_of_half_precision_are_held_against_the_same_bounds(place, table
     ("words", "status"),
     [
         # Turns stand still along the path and leap: of its frequencies thousands are strong.
-        (("spectrum", "steps.mcap", "--out", "out", "--no-report"), 0),
+        *soaked((("spectrum", "steps.mcap", "--out", "out", "--no-report"), 0)),
         # No place has neighbours at its own radius and at others.
         (("selfcal", "scan.mcap", "steps.mcap", "--out", "new.json"), 2),
         # A radius that is nothing but for its last bits is no coordinate.

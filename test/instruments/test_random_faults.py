@@ -146,7 +146,7 @@ def sequences(examples: int) -> Any:
     )
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["dollar, binary", "packet", "text"])
 @sequences(4)
 @given(st.data())
 def test_whatever_happens_in_any_order(name: str, bench: Any, data: st.DataObject) -> None:

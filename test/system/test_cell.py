@@ -110,6 +110,7 @@ def start_scan_of_new_emulator(cell):
     pytest.fail("the new emulator never answered")
 
 
+@pytest.mark.soak
 def test_killed_and_restarted_emulator(cell, true_calibration):
     # Slow enough that the scan outlasts the kill on a busy computer.
     cell.start_correcting(true_calibration, time_lapse=3.0)
@@ -216,6 +217,7 @@ def test_calibrator_answers_bad_requests_and_stays(cell):
     cell.processes.check()
 
 
+@pytest.mark.soak
 def test_calibrator_identifies_from_a_bag(cell, tmp_path, step_test):
     from omsm_ros.io import bags
     from omsm_ros.io.bag_writer import BagWriter

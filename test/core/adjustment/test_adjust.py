@@ -103,6 +103,7 @@ def test_accuracy_beyond_reach_is_too_uncertain(table):
     assert reason.value == pytest.approx(2 * found.form.pv.uncertainty)
 
 
+@pytest.mark.soak
 def test_what_a_rejected_calibration_corrected_is_not_valid(table, true_calibration):
     """Two scans that agree verify nothing where the step test was rejected."""
     _, scans, _ = table
@@ -223,6 +224,7 @@ def test_stated_noise_and_walk_are_replaced_by_what_the_scans_show(seeds):
     assert 0.3 < np.mean(errors) / np.mean(stated) < 2.0
 
 
+@pytest.mark.soak
 def test_a_part_without_nominal_surface_shows_the_lag_too():
     machine = Machine(6, lag=35e-6, pitch=0.6e-3)
     found = adjust([machine.scan(30), machine.scan(60, outward=True)], PRIORS)
@@ -230,6 +232,7 @@ def test_a_part_without_nominal_surface_shows_the_lag_too():
     assert abs(lag.found[0] - 35e-6) < 3 * lag.uncertainty[0] < 3e-6
 
 
+@pytest.mark.soak
 def test_a_remounted_part_is_placed_by_the_adjustment():
     """Shifted by 10 µm and turned by 0.3 mrad in another clamping: found, and form unharmed."""
     machine = Machine(8, lag=10e-6)

@@ -27,6 +27,7 @@ def two_scans():
     return of_two_scans(range(SEEDS))
 
 
+@pytest.mark.soak
 def test_few_clean_machines_are_verified_and_covered():
     """No family of two machines is refuted; PV, rms, lag and 48 terms are off as stated."""
     rows, found = of_two_scans(range(FEW_SEEDS))

@@ -267,6 +267,7 @@ def test_a_turn_that_a_surface_of_revolution_does_not_show_is_refused():
     assert any("clocking was not fitted" in str(text) for text in found.verdict.reservations)
 
 
+@pytest.mark.soak
 def test_slopes_that_are_noise_alone_tell_no_turn():
     """With a nanometre of noise each slope has a little of its own, which no fit settles on."""
     at, random = np.linspace(-RADIUS, RADIUS, 81), np.random.default_rng(2)

@@ -98,6 +98,7 @@ def test_stated_uncertainties_hold_over_many_records(colour):
     assert 0.92 < np.mean(np.abs(pulls) < 2) < 0.985
 
 
+@pytest.mark.soak
 def test_units_do_not_matter():
     u, y = recorded("zero-order")
     plain, scaled = (identified(1e-6 * f * u, 1e9 * f * y) for f in (1.0, 1e5))
@@ -181,7 +182,8 @@ def test_gaps_and_several_records_give_the_model_of_one():
     assert model.certificate["samples"]["compared"] < 1600 - 9 * 16
 
 
-@pytest.mark.parametrize("modes", [6, *soaked(12)])
+@pytest.mark.soak
+@pytest.mark.parametrize("modes", [6, 12])
 def test_a_ladder_of_modes_is_found_and_its_band_is_true(modes):
     rng, tones = np.random.default_rng(8), np.linspace(0.01, 0.2, modes)
     poles = 2 * np.pi * tones * (-0.01 + 1j)
@@ -289,6 +291,7 @@ def test_more_poles_than_the_input_excites_are_refused_with_what_to_do(lines, or
         identified(u, second_order(u), 1e-3, order=order)
 
 
+@pytest.mark.soak
 def test_a_square_wave_that_follows_two_sines_is_known_at_those_at_most():
     """Its harmonics are none of any linear answer."""
     u = sines([16.0, 23.0])

@@ -71,6 +71,7 @@ def test_backlash_behind_an_overshooting_servo_is_found_and_bends_no_pole():
     assert abs(off) < 30e-6
 
 
+@pytest.mark.soak
 def test_an_overshooting_servo_without_a_gap_shows_none():
     certificate = identify(overshooting(4, 0.0)).calibration.certificate
     assert certificate.model_errors.modelled == ()

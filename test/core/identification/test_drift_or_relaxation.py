@@ -108,6 +108,7 @@ def test_the_share_of_slow_poles_is_their_partial_fraction(share):
     assert fitted_relaxation(whole) == pytest.approx(abs(share), rel=1e-9)
 
 
+@pytest.mark.soak
 def test_next_to_a_relaxation_lag_and_roll_off_stay_independent():
     """With a lag alone beside it the band would close at the upper end, where nothing is known.
 

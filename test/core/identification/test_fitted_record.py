@@ -63,10 +63,10 @@ def ringing():
     )
 
 
+@pytest.mark.soak
 class TestRecordThatStartsRinging:
     """A 60 Hz mode rings down from an edge that was before the first sample."""
 
-    @pytest.mark.soak
     def test_it_is_not_still_at_the_start(self, ringing):
         """Without the initial-condition response the same model misses ten times the noise."""
         without = replace(ringing.prepared.problem, fits_initial_condition=False)

@@ -59,6 +59,7 @@ class TestImperfectData:
         assert calibration.certificate.model_errors.backlash_m == pytest.approx(40e-9, rel=0.2)
         assert calibration.static_gain == pytest.approx(PAPER_STATIC_GAIN, abs=1e-4)
 
+    @pytest.mark.soak
     def test_sharp_edges_are_rejected_by_name_and_the_band_holds_the_truth(self):
         calibration = identify(record_of(recorded(motion=StepTest(rise=0.0)))).calibration
         assert calibration.certificate.verdict == "rejected"

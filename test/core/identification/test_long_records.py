@@ -58,6 +58,7 @@ def test_fewer_samples_choose_what_all_would(of_mode, monkeypatch):
     assert found.chosen.bic == pytest.approx(asked.chosen.bic, abs=0.1)
 
 
+@pytest.mark.soak
 def test_what_is_stated_holds_the_truth(of_mode):
     calibration = identify(of_mode).calibration
     assert calibration.certificate.verdict == "accepted"

@@ -145,6 +145,7 @@ def test_a_soft_mode_becomes_a_pole_and_the_response_right():
     assert found.model.chosen.fit.dynamics.response(lines) == pytest.approx(truth, abs=1e-4)
 
 
+@pytest.mark.soak
 def test_a_light_mode_takes_the_place_of_poles_that_imitated_it():
     """Without it the search settles on real poles of 2.9 Hz, which then stand in its way."""
     servo, structure, slow = (2 * np.pi * f for f in (100.0, 400.0, 1.5))

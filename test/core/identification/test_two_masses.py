@@ -51,7 +51,8 @@ def test_a_response_says_nothing_of_the_scale():
         assert second.model[name] == pytest.approx(2 * first.model[name], rel=1e-3)
 
 
-@pytest.mark.parametrize("collocated", [False, *soaked(True)])
+@pytest.mark.soak
+@pytest.mark.parametrize("collocated", [False, True])
 def test_without_a_mass_all_is_per_mass_of_the_table(collocated):
     """The truth over m1, within the stated uncertainty, and the fit with a mass over it."""
     entry = calibrated(collocated, None).certificate.response.two_mass

@@ -44,6 +44,7 @@ def test_a_peak_that_is_seen_late_is_not_clipped():
         prepare(late_sine(19.8e-6), "encoder")
 
 
+@pytest.mark.soak
 def test_exchanged_channels_are_named():
     rng, lag = np.random.default_rng(2), 0.34e-3
     test = StepTest()

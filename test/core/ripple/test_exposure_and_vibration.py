@@ -173,6 +173,7 @@ def test_the_aliased_vibration_is_removed_and_the_marks_stay(wander, ppm, late):
     assert after == pytest.approx(before, rel=0.01)
 
 
+@pytest.mark.soak
 def test_a_modulated_vibration_is_one_line():
     """Sidebands at three resolutions, as of a spindle, are removed with their line."""
     time = np.arange(20_000) / RATE

@@ -265,6 +265,7 @@ def test_what_is_no_table_is_named_with_its_line(tmp_path, text, said):
     assert not (tmp_path / "out.mcap").exists()
 
 
+@pytest.mark.soak
 def test_a_table_longer_than_a_piece(tmp_path):
     rows = 230_000
     text = "d,i\n" + "\n".join(f"{i % 50},{i}" for i in range(rows))
