@@ -29,6 +29,7 @@ from omsm_ros.core.adjustment.network import Network, Scales, Solution, solve, w
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.planning import best_addition
 from omsm_ros.core.adjustment.refutation import (
+    MODEL_SHARE,
     Doubt,
     Refutation,
     completed,
@@ -209,11 +210,12 @@ def _adjusted(
     agreement = agreement_of(solution, surface, removed)
     wrong = _wrong_signs(views)
     walk, enough = _walk(detecting, priors), redundant(scans)
-    reasons = reasons_of(refutations, {p.name for p in priors}, agreement, wrong, walk, accepted)
+    stated, least = {p.name for p in priors}, MODEL_SHARE * form.rms.value
+    reasons = reasons_of(refutations, stated, agreement, wrong, walk, accepted, least)
     verdict = verdict_of(
         _or_sense_of_c(reasons, scans, priors, surface, refutations),
         not_evaluated(families, effects, priors, open_limit(accuracy))
-        + looks_like(form.resembled, families, accepted),
+        + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty),
         enough,
         2 * form.pv.uncertainty,

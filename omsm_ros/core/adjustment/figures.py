@@ -33,9 +33,8 @@ _RIM = 96
 _DRAWS = 300
 # Terms that are reported, and those that are fitted in addition.
 REPORTED_DEGREE, _FITTED_DEGREE = 4, 8
-# Twice the logarithm of odds that is worth more than a bare mention, and that is strong evidence
-# (Kass and Raftery 1995).
-_POSITIVE, _STRONG = 2.0, 6.0
+# Twice the logarithm of odds that is worth more than a bare mention (Kass and Raftery 1995).
+_POSITIVE = 2.0
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,8 @@ class FormMap:
     pv, rms: figures;  terms: of degree 2 to 4 on ``disc``, coefficients one at its rim [m], and
         their covariance [m²]
     removed: names of the pose, with their values ``pose`` [m], [1], [rad]
-    resembled: families that the form looks like, the likeliest first, with the rms of their share
-        of it [m]
+    resembled: families that the form looks like, the likeliest first, with what each may do to it,
+        k = 1, rms over the part [m]
     """
 
     x: FloatArray
@@ -121,7 +120,6 @@ def form_map(
     alike = _resembled(made, covariance, every, by_height, effects or {}, solution.network.families)
     more = np.stack([np.zeros(len(made.height)), *(change for _, _, change in alike)], axis=1)
     covariance += more @ more.T
-    strongest = max((gain for _, gain, _ in alike), default=0.0)
     pv, rms = made.pv_and_rms(solution, seed, np.concatenate([open_changes, more], axis=1))
     kept = [k for k, t in enumerate(every) if 2 <= t.n <= REPORTED_DEGREE]
     by_heights = by_height[kept]
@@ -139,11 +137,7 @@ def form_map(
         term_covariance=by_heights @ covariance @ by_heights.T,
         removed=tuple(removed),
         pose=made.pose,
-        resembled=tuple(
-            (name, _rms(places, change[:, np.newaxis]))
-            for name, gain, change in alike
-            if strongest > _STRONG and gain > strongest - _POSITIVE
-        ),
+        resembled=tuple((name, _rms(places, change[:, np.newaxis])) for name, _, change in alike),
     )
 
 

@@ -24,8 +24,8 @@ _LEAST_GAIN = 10.0
 _LEAST_EFFECT_M = 0.5e-9
 # Two explanations within this of each other in χ², or in their share of it, are not separated.
 _ALIKE, _ALIKE_SHARE = 12.0, 0.05
-# The model of a first cause is wrong by up to this share: what it leaves is no other cause.
-_MODEL_SHARE = 0.01
+# The models of a first cause and of the form are wrong by up to this share; it is no other cause.
+MODEL_SHARE = 0.01
 # Families that explain this share of the cause may stand behind it: no model of one is exact.
 _RIVAL_SHARE, _RARE, _FAR_BEYOND = 0.2, 3.0, 3.0
 # A family whose value changes by less than this share is a cause of its own.
@@ -116,17 +116,15 @@ def fit_and_refute(
 ) -> tuple[Solution, tuple[Refutation, ...], tuple[Doubt, ...]]:
     """Return the solution with all refuted families released, which they are, and what is open."""
     solution = settled(solve(network, y, scales, sizes), _FIRST_STEPS)
-    first = {f.name: evidence_of(solution, f).values for f in network.families}
+    evidences = [evidence_of(solution, f) for f in network.families]
+    first = {e.family.name: e.values for e in evidences}
     found: list[Refutation] = []
+    released: list[str] = []
     steps = [solution]
     least = _LEAST_GAIN
-    while len(found) < _MOST_RELEASED:
-        evidences = [evidence_of(solution, f) for f in network.families]
-        beyond = _beyond(evidences, [r.name for r in found], least)
-        if not beyond:
-            break
+    while len(found) < _MOST_RELEASED and (beyond := _beyond(evidences, released, least)):
         best = _culprit(beyond)
-        least = max(least, _MODEL_SHARE * best.gain)
+        least = max(least, MODEL_SHARE * best.gain)
         family = best.family
         # As large as it was found, if that is more than plausible.
         size = max(family.wide, float(np.sqrt(np.mean(best.values**2))))
@@ -135,21 +133,23 @@ def fit_and_refute(
             _FURTHER_STEPS,
         )
         steps.append(solution)
-        still = {e.family.name for e in refuted_by(solution, [r.name for r in found], least)}
+        others = [e for e in evidences if e is not best and e.deviate > _RARE]
+        evidences = [evidence_of(solution, f) for f in network.families]
+        still = [e.family.name for e in _beyond(evidences, released, least)] + released
         # Parsimony chooses the culprit; whatever explains as much may be it.
-        enough = best.chi_square - max(_ALIKE, _ALIKE_SHARE * best.chi_square)
-        alike = [e for e in beyond if e is not best and e.family.named and e.family.name not in
-                 still and (_as_good(e, best) or e.chi_square >= enough)]  # fmt: skip
+        enough = best.chi_square - max(_ALIKE, _RIVAL_SHARE * best.chi_square)
+        alike = [e for e in others if _plausible(e) and e.family.name not in still
+                 and (_as_good(e, best) or e.chi_square >= enough)]  # fmt: skip
         minor = best.effect < 2 * solution.scales.texture and best.gain < SURE
-        rivals = [e for e in evidences if e is not best and e.deviate > _RARE and not minor
-                  and explained(e, best) > _RIVAL_SHARE]  # fmt: skip
+        rivals = [e for e in others if not minor and explained(e, best) > _RIVAL_SHARE]
         # As a centre that is off along X and along Y: two causes that together explain as much.
         parts = [e for e in rivals if e not in alike and e.family.size < family.size
                  and e.family.name not in still]  # fmt: skip
         if sum(explained(e, best) for e in parts) > 1 - _ALIKE_SHARE:
             alike += parts
         found.append(Refutation(best, tuple(alike), tuple(rivals), minor))
-    left = max((e.gain for e in refuted_by(solution, [r.name for r in found])), default=0.0)
+        released.append(family.name)
+    left = max((e.gain for e in _beyond(evidences, released, _LEAST_GAIN)), default=0.0)
     return solution, *_grouped(found, steps, first, left)
 
 
@@ -160,8 +160,9 @@ def _grouped(
     """Return causes and doubts; a family released because of an earlier one belongs to that one.
 
     A family that was found as large before anything was released is a cause of its own, as is the
-    same cause in another scan. A family whose value an earlier release changed shows what that
-    release left. If that is more than the error of its model, no single family explains the scans.
+    same cause in another scan. A family whose value an earlier release changed, or whose effect is
+    a small share of the first one's, shows what that release left. If that is more than the error
+    of its model, no single family explains the scans.
     first: found value of each family before the first release;  rest: gain that is left at the end
     """
     causes: list[Refutation] = []
@@ -170,7 +171,9 @@ def _grouped(
     for one in found:
         moved = np.linalg.norm(one.evidence.values - first[one.name])
         again = base_name(one.name) in {base_name(c.name) for c in causes}
-        if not causes or again or moved < _UNCHANGED * np.linalg.norm(one.evidence.values):
+        small = causes and one.evidence.effect < _RIVAL_SHARE * causes[0].evidence.effect
+        changed = moved > _UNCHANGED * np.linalg.norm(one.evidence.values)
+        if not causes or again or not (small or changed):
             causes.append(one)
             left.append(0.0)
             of.append(len(causes) - 1)
@@ -181,7 +184,8 @@ def _grouped(
     shares = []
     for k, (cause, more) in enumerate(zip(causes, left, strict=True)):
         chi_square = cause.evidence.chi_square
-        explains = more <= max(_ALIKE, _ALIKE_SHARE * chi_square)
+        named = _plausible(cause.evidence) or not cause.evidence.family.named
+        explains = named and more <= max(_ALIKE, _ALIKE_SHARE * chi_square)
         causes[k] = replace(cause, explains=explains)
         shares.append(min(np.sqrt((more + rest) / chi_square), 1.0) if explains else 1.0)
     doubts = (
@@ -189,14 +193,6 @@ def _grouped(
         for before, after, k in zip(steps, steps[1:], of, strict=False)
     )
     return tuple(causes), tuple(doubts)
-
-
-def refuted_by(
-    solution: Solution, released: Sequence[str], least: float = _LEAST_GAIN
-) -> list[Evidence]:
-    """Return the evidence of the families beyond their declaration, strongest first."""
-    evidences = [evidence_of(solution, f) for f in solution.network.families]
-    return _beyond(evidences, released, least)
 
 
 def _beyond(evidences: Sequence[Evidence], released: Sequence[str], least: float) -> list[Evidence]:
@@ -216,14 +212,17 @@ def _beyond(evidences: Sequence[Evidence], released: Sequence[str], least: float
 def explained(one: Evidence, best: Evidence) -> float:
     """Return the share of what ``best`` explains that family ``one`` alone would explain.
 
-    A declared family counts against the odds that its declaration is wrong. Far beyond its
-    plausible size it explains nothing.
+    A declared family counts against the odds that its declaration is wrong, and explains nothing
+    far beyond its plausible size.
     """
-    beyond = float(np.max(np.abs(one.values))) > _FAR_BEYOND * one.family.wide
-    if not one.family.named or base_name(one.family.name) in FREE or (one.declared and beyond):
-        return 0.0
     size = one.gain if one.declared else one.chi_square - one.dof
-    return float(np.clip(size / best.chi_square, 0.0, 1.0))
+    return float(np.clip(size / best.chi_square, 0.0, 1.0)) if _plausible(one) else 0.0
+
+
+def _plausible(one: Evidence) -> bool:
+    """Return whether it is a cause with a name, which no declaration is far below."""
+    far = one.declared and np.max(np.abs(one.values)) > _FAR_BEYOND * one.family.wide
+    return one.family.named and base_name(one.family.name) not in FREE and not far
 
 
 def _as_good(one: Evidence, best: Evidence) -> bool:
@@ -233,7 +232,7 @@ def _as_good(one: Evidence, best: Evidence) -> bool:
 def _culprit(beyond: list[Evidence]) -> Evidence:
     """Return the simplest of those that explain as much; a named one before one that detects."""
     as_good = [e for e in beyond if _as_good(e, beyond[0])]
-    named = [e for e in as_good if e.family.named] or as_good
+    named = [e for e in as_good if _plausible(e)] or as_good
     return min((e for e in named if e.gain >= named[0].gain - _ALIKE), key=lambda e: e.family.size)
 
 

@@ -85,12 +85,14 @@ def reasons_of(
     wrong_sign: Sequence[tuple[int, float]],
     walk: tuple[float, float, float | None],
     accepted: Collection[str],
+    least: float = 0.0,
 ) -> tuple[Reason, ...]:
     """Return what contradicts the scans or their declarations.
 
     declared: names of the declared sources;  wrong_sign: scan, and share that it follows
     walk: of the drift after one second, found, its relative uncertainty, and declared [m]
     accepted: names of families whose found value somebody has accepted
+    least: effect below which a cause has no name: the model of the form may have made it [m]
     """
     found = [Reason(WRONG_SIGN, (str(scan),), share, 0.0) for scan, share in wrong_sign]
     causes = [r for r in refutations if not r.minor and r.name not in accepted]
@@ -98,7 +100,7 @@ def reasons_of(
         for cause in causes:
             code = REFUTED if base_name(cause.name) in declared else UNDECLARED_EFFECT
             names: tuple[str, ...] = (cause.name, *cause.alike)
-            if not cause.evidence.family.named:
+            if not cause.evidence.family.named or cause.evidence.effect < least:
                 code, names = UNIDENTIFIED, ()
             found.append(Reason(code, names, cause.evidence.deviate, 3.0))
     else:
@@ -155,17 +157,19 @@ def not_evaluated(
 
 
 def looks_like(
-    resembled: Sequence[tuple[str, float]], families: Sequence[Family], accepted: Collection[str]
-) -> tuple[Reason, ...]:
+    resembled: Sequence[tuple[str, float]], families: Sequence[Family], accepted: Collection[str],
+    limit: float,
+) -> tuple[Reason, ...]:  # fmt: skip
     """Return the families that the form looks like, which these scans cannot tell from the part.
 
-    resembled: their names, with the rms of their share of the form [m];  accepted: as the part's
+    resembled: their names, with what each may do to the form [m];  accepted: as the part's
+    limit: effect from which on one matters [m]
     """
     by = {f.name: f.shown_by for f in families}
     return tuple(
         Reason(LOOKS_LIKE, (name, by[name]), size)
         for name, size in resembled
-        if name not in accepted
+        if name not in accepted and size > limit
     )
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 from omsm_ros.core.adjustment.evidence import Evidence
 from omsm_ros.core.adjustment.part_terms import FormTerms
-from omsm_ros.core.adjustment.refutation import Refutation
+from omsm_ros.core.adjustment.refutation import Refutation, explained
 from omsm_ros.core.adjustment.sources import Family
-from omsm_ros.core.adjustment.verdict import reasons_of
+from omsm_ros.core.adjustment.verdict import looks_like, reasons_of
 
 DEGREES = np.repeat(np.arange(2, 9), np.arange(3, 10))
 SYMMETRIC = np.zeros(len(DEGREES), np.bool_)
@@ -77,3 +77,26 @@ def test_nothing_is_named_beside_a_cause_that_no_family_explains():
     (one,) = reasons_of(causes, {"centre_x"}, (), (), (0.0, 0.1, None), ())
     assert (one.code, one.names) == ("unidentified", ())
     assert one.value == max(c.evidence.deviate for c in causes)
+
+
+def test_what_the_model_of_the_form_may_have_made_has_no_name():
+    """A cause of 10 nm beside a form of which 1 % is more than that."""
+    (one,) = reasons_of([cause("lag_motion", 11.0)], (), (), (), (0.0, 0.1, None), (), 11e-9)
+    assert (one.code, one.names, one.value) == ("unidentified", (), 11.0)
+    (one,) = reasons_of([cause("lag_motion", 11.0)], (), (), (), (0.0, 0.1, None), (), 9e-9)
+    assert one.names == ("lag_motion",)
+
+
+def test_a_source_far_beyond_its_plausible_size_explains_nothing():
+    """A probe whose scale would be off by 12 %, where 1 % is a probe in need of repair."""
+    best = cause("c_lost@0", 20.0).evidence
+    scale = cause("static_gain", 19.0).evidence
+    assert explained(replace(scale, values=np.array([2e-6])), best) == 361 / 400
+    assert explained(replace(scale, values=np.array([12e-6])), best) == 0
+
+
+def test_a_form_that_looks_like_a_source_counts_by_what_that_may_do():
+    family = cause("pitch", 1.0).evidence.family
+    found = looks_like([("pitch", 21e-9), ("pitch", 19e-9)], [family], (), 20e-9)
+    assert [(r.names, r.value) for r in found] == [(("pitch", "reclocked"), 21e-9)]
+    assert not looks_like([("pitch", 21e-9)], [family], ["pitch"], 20e-9)
