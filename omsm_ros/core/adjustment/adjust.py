@@ -200,7 +200,6 @@ def _adjusted(
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, priors)
     detecting, refutations, doubts = _fitted(network, views, sizes, priors)
-    evidences = _evidences(detecting, refutations)
     solution = completed(detecting, refutations)
     families = solution.network.families
     effects = effects_on_form(solution, surface, removed)
@@ -226,7 +225,7 @@ def _adjusted(
     )
     return Adjustment(
         form=form,
-        sources=_findings(detecting, evidences, effects, priors, refutations),
+        sources=_findings(detecting, effects, priors, refutations),
         refutations=refutations,
         agreement=agreement,
         wrong_sign=wrong,
@@ -312,7 +311,6 @@ def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[E
 
 def _findings(
     solution: Solution,
-    evidences: Sequence[Evidence],
     effects: Mapping[str, Effect],
     priors: Sequence[Source],
     refutations: Sequence[Refutation],
@@ -321,7 +319,7 @@ def _findings(
     stated = {p.name: p.uncertainty for p in priors}
     alike = {r.name: r.alike for r in refutations}
     found = []
-    for evidence in evidences:
+    for evidence in _evidences(solution, refutations):
         family = evidence.family
         takes_part = family.name in solution.sizes
         here = solution.network.place[family.name]
