@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording, scan_data
-from omsm_ros.readable import number
+from omsm_ros.readable import date_text, number
 from omsm_ros.report.tables import sized
 from omsm_ros.units import RPM_RAD_S
 
@@ -260,7 +261,8 @@ def write_adjustment(
         # Here, because drawing takes longer to load than scans to adjust.
         from omsm_ros.report.adjustment import render
 
-        save_text(out / REPORT, render(title, facts, found))
+        date = date_text(datetime.now(timezone.utc))
+        save_text(out / REPORT, render(title, facts, found, date))
 
 
 def adjustment_facts(

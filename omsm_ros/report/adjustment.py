@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.adjustment.sources import WITH_CALIBRATION
-from omsm_ros.messages import sentence
 from omsm_ros.readable import column, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study, title_block
@@ -25,10 +24,10 @@ CAPTIONS = {
 }
 
 
-def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
+def render(title: str, facts: Mapping[str, Any], found: Adjustment, date: str) -> str:
     """Return the page as HTML.
 
-    facts: the content of ``adjustment.json``;  found: from which it was made
+    facts: the content of ``adjustment.json``;  found: from which it was made;  date: as printed
     """
     origin, verdict = facts.get("origin") or {}, page_verdict(facts["verdict"])
     figures = {
@@ -60,7 +59,7 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment) -> str:
             ),
             captions=CAPTIONS,
             figures={name: style.png(made) for name, made in figures.items()},
-            footer=f"calibration {facts['calibration'][:12]}",
+            footer=f"issued {date} · calibration {facts['calibration']}",
         )
     )
 
@@ -133,10 +132,9 @@ def _status(source: Mapping[str, Any]) -> str:
 
 
 def found_text(source: Mapping[str, Any]) -> str:
-    """Return the found value with its uncertainty, or which scan would show it."""
+    """Return the found value with its uncertainty, or that these scans do not show it."""
     if not source["identifiable"]:
-        wanted = sentence(f"verdict.add_{source['identified_by']}", {})
-        return f"not identifiable; to find it, {wanted}"
+        return "not identifiable from these scans"
     size = float(np.linalg.norm(source["found"]))
     spread = float(np.sqrt(np.mean(np.square(source["uncertainty"]))))
     return measured(size, spread, "" if source["unit"] == "1" else source["unit"])

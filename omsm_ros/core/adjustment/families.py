@@ -50,8 +50,9 @@ class Ranges:
     periods: Mapping[str, float] = field(default_factory=dict)
 
 
-# A probe that is driven through less of its range shows no error of it.
-_LEAST_DISTANCE_M = 1e-6
+# A probe that is driven through less of its range shows no error of it: the plausible size of its
+# linearity errors over this distance is a slope of a few per cent, as that of its scale.
+_LEAST_DISTANCE_M = 10e-6
 
 
 def ranges_of(
