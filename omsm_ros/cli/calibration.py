@@ -112,7 +112,8 @@ def _compare(args: argparse.Namespace) -> Facts:
 def change_text(change: CalibrationChange) -> str:
     """Return in one line what changed between two calibrations."""
     return (
-        f"{'changed' if change.changed else 'no significant change'}: lag by {quantity(change.delay, 's', signed=True)} "
+        f"{'changed' if change.changed else 'no significant change'}: "
+        f"lag by {quantity(change.delay, 's', signed=True)} "
         f"({change.delay_sigmas:.1f} sigma), static gain by "
         f"{quantity(change.static_gain / PPM, 'ppm', signed=True)} "
         f"({change.static_gain_sigmas:.1f} sigma), {p_value_text(change.p_value)}"
