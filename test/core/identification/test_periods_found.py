@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from late_steps import LATE, NOISE, STEPS, TIME, late_record
+from soaked import soaked
 
 from omsm_ros.core.estimation.output_error import fit
 from omsm_ros.core.estimation.preparation import prepare
@@ -52,7 +53,7 @@ def test_an_error_between_two_periods_of_the_travel_is_one_error(period):
     assert found[0] == pytest.approx(period, rel=0.01)
 
 
-@pytest.mark.parametrize(("periods", "family"), [(1.0, DRIFT), (3.1, VIBRATION)])
+@pytest.mark.parametrize(("periods", "family"), [(1.0, DRIFT), *soaked((3.1, VIBRATION))])
 def test_what_wanders_slowly_is_a_drift_and_what_repeats_is_a_line(periods, family):
     """Lines begin at two periods over the record; either leaves nothing of it."""
     wandering = 50e-9 * np.sin(2 * np.pi * periods * TIME / TIME[-1] + 0.3)
