@@ -207,8 +207,8 @@ class MissedTriggerDetector:
 
     def restart(self) -> None:
         """Forget all arrivals, as after a pause of the trigger."""
-        # Begin of each span, earliest lateness of all arrivals and of those that confirmed [s].
-        self._earliest: deque[tuple[float, float, float]] = deque(maxlen=_SPANS)
+        # Begin and earliest lateness of each span [s].
+        self._earliest: deque[tuple[float, float]] = deque(maxlen=_SPANS)
         self._line: tuple[float, float] | None = None  # lateness of the earliest at 0, drift
         self._limit, self.seen_from = math.inf, 1
         self._confirmed = 0.0  # last arrival that confirmed [s]
@@ -225,13 +225,12 @@ class MissedTriggerDetector:
             self._confirmed = arrival
             if self._line is not None and excess < 0:
                 self._line = (self._line[0] + excess, self._line[1])
-        sure = late if confirmed else math.inf
         if self._earliest and arrival - self._earliest[-1][0] < _SPAN_S:
-            begin, least, surest = self._earliest[-1]
-            self._earliest[-1] = (begin, min(least, late), min(surest, sure))
+            begin, least = self._earliest[-1]
+            self._earliest[-1] = (begin, min(least, late))
         else:
             self._set_reference()
-            self._earliest.append((arrival, late, sure))
+            self._earliest.append((arrival, late))
         return confirmed
 
     def excess(self, due: float, arrival: float) -> float:
@@ -271,25 +270,21 @@ class MissedTriggerDetector:
         """Return the lateness of the spans before and after the last confirmation [period]."""
         if self._line is None:
             return np.empty(0), np.empty(0)
-        begin, every, _ = np.array(self._earliest).T
-        rest = (every - self._line[0] - self._line[1] * begin) / self._period
+        begin, late = np.array(self._earliest).T
+        rest = (late - self._line[0] - self._line[1] * begin) / self._period
         return rest[begin + _SPAN_S <= self._confirmed], rest[begin > self._confirmed]
 
     def _set_reference(self) -> None:
         """Lay the highest line below the earliest arrivals; their scatter is the limit."""
-        if len(self._earliest) < _LEAST_SPANS:
-            return
-        begin, every, sure = np.array(self._earliest).T
+        begin, late = np.reshape(self._earliest, (-1, 2)).T
         learning = len(begin) < _MANY_SPANS
-        late = every if learning else sure
-        used = np.isfinite(late)
-        if np.sum(used) < _LEAST_SPANS:
+        sure = begin <= (math.inf if learning else self._confirmed)
+        if np.sum(sure) < _LEAST_SPANS:
             return
-        since, late = (begin - begin[-1])[used], late[used]
-        least, drift, _ = _line_below(since, late)
+        least, drift, _ = _line_below((begin - begin[-1])[sure], late[sure])
         self._line = (least - drift * float(begin[-1]), drift)
         # All arrivals count, or the limit would fall by leaving late ones out.
-        rest = every - least - drift * (begin - begin[-1])
+        rest = late - least - drift * (begin - begin[-1])
         usual = _USUAL * float(np.median(_least_in_windows(rest)))
         limit = max(_LATE_PERIODS * self._period, usual + _AGE_PERIODS * self._period)
         self._limit = limit if learning else min(self._limit, limit)

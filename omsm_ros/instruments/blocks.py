@@ -218,17 +218,17 @@ class BlockCutter:
             if i == 0 or run.restarted:
                 self._set_clock(runs[i:], times[i:], arrival_ns, after_silence and i == 0)
             yield from self._append(run, times[i])
+        self.lost_settings &= not runs
 
     def _judge_restart(self, run: CountedRun, after_silence: bool) -> None:
         """Decide whether the encoders lost their positions with the restart before ``run``.
 
         During a silence the axes may have moved to their origin and the counter may have been
-        reset on purpose, unless the device lost its settings too.
+        reset on purpose, unless the device lost its connection or its settings too.
         """
         at_zero = _begin_at_zero(self._counts, run.samples["counts"][0])
         self.restarted_at_zero |= at_zero and (self.lost_settings or not after_silence)
         self.perhaps_at_zero = at_zero and not self.restarted_at_zero
-        self.lost_settings = False
 
     def _set_clock(
         self,

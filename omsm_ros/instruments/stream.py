@@ -114,7 +114,11 @@ class StreamDevice:
         Raises DeviceError when the connection or the device is lost; ``close`` then still
         hands over the partial block.
         """
-        data = self._transport.read(timeout)
+        try:
+            data = self._transport.read(timeout)
+        except DeviceError:
+            self._cutter.lost_settings = self.decoded > 0  # it may have been switched off
+            raise
         arrival_ns, now = self._now_ns(), self._monotonic()
         if data or not self._came_ns:
             self._came_ns, self._came_at = arrival_ns, now
@@ -163,8 +167,9 @@ class StreamDevice:
             )
         if self._cutter.unconfirmed:
             return (
-                f"{self._transport.name}: all samples arrive late, as after missed triggers, and "
-                "are withheld: if this lasts, restart the counters of both devices together"
+                f"{self._transport.name}: all samples arrive late, as after missed triggers or at "
+                "another rate, and are withheld: if this lasts, check sample_period, then restart "
+                "the counters of both devices together"
             )
         if self._cutter.wrong_rate:
             return (

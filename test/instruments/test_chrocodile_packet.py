@@ -10,7 +10,7 @@ import pytest
 from soaked import always
 
 from omsm_ros.errors import DeviceError, DeviceTimeoutError
-from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
+from omsm_ros.instruments.chrocodile.device import ChrocodileSettings, RefusedError
 from omsm_ros.instruments.chrocodile.emulator import ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
 from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
@@ -101,6 +101,15 @@ def test_a_model_without_some_commands_is_set_up_all_the_same(cell: Any) -> None
     run.end()
     run.check()
     assert run.delivered > 700
+
+
+def test_a_refused_trigger_is_not_taken_as_set(cell: Any) -> None:
+    """Free-running, it would count exposures where the axes count triggers."""
+    run = cell(ChrocodileSettings(trigger="each"))
+    usual = run.instrument._answer
+    run.instrument._answer = lambda r: "not valid" if r.name == "TRE" else usual(r)
+    with pytest.raises(RefusedError, match="refused TRE"):
+        run.device.open()
 
 
 def test_another_service_on_the_port_is_named(cell: Any) -> None:

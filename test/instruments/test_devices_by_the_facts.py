@@ -408,6 +408,32 @@ def test_encoders_that_begin_at_zero_are_not_published(absolute: bool) -> None:
     assert ("home the axes" in device.trouble) != absolute
 
 
+def test_encoders_at_zero_after_a_lost_connection_are_not_published() -> None:
+    """The device was switched off for a second: its counter and its encoders begin at zero."""
+    now = 0.0
+    before, after = frames_of(np.arange(5000, 5300)), frames_of(np.arange(0, 300))
+    portions = [encode_frames(f[i : i + 50]) for f in (before, after) for i in range(0, 300, 50)]
+    device = GenericStreamDevice(
+        Script(*portions[:6], DeviceError("reset by peer"), *portions[6:]), StreamSettings()
+    )
+    device._monotonic = lambda: now
+    device.open()
+    found = []
+    for turn in range(13):
+        now += 0.05
+        if turn != 6:
+            found += device.poll(0.0)
+            continue
+        with pytest.raises(DeviceError):
+            device.poll(0.0)
+        found += device.close()
+        now += 1.0
+        device.open()
+    assert [pair.axes.first_sample for pair in found] == [5000, 5100, 5200]
+    assert device.statistics.withheld == 300
+    assert "home the axes" in device.trouble
+
+
 def test_a_scan_that_begins_at_the_origin_after_a_pause_is_published() -> None:
     """The axes moved to their origin and the counter was reset on purpose meanwhile."""
     now = 0.0

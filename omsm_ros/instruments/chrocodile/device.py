@@ -213,7 +213,8 @@ class Chrocodile(StreamDevice):
         for name in ("SEN", "LAI"):
             self._read(name)
         if not intact:
-            self._try(TRIGGERS[wanted.trigger])  # some of these reset the counter
+            tell = self._try if wanted.trigger == "free_run" else self._ask
+            tell(TRIGGERS[wanted.trigger])  # some of these reset the counter
             self._tracker.restart_count()
             self._cutter.lost_settings = self._ever_set_up
         self._ever_set_up = True
