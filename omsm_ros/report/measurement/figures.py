@@ -406,7 +406,8 @@ def radial_density(curve: Mapping[str, Any]) -> Figure:
     made, axes = style.figure(_WIDE, _HIGH)
     ax = axes[0, 0]
     values = np.array(curve["value"], np.float64)
-    floor = max(_BELOW * float(values.min()), _LEAST_SHARE * float(values.max()))
+    least = float(np.min(values, where=values > 0, initial=np.max(values)))
+    floor = max(_BELOW * least, _LEAST_SHARE * float(values.max()))
     _draw_curve(ax, curve, 1 / MILLIMETRE_M, _AREAL_UNIT, floor=floor)
     style.logarithmic(ax.xaxis, every=(1.0, 2.0, 5.0))
     style.logarithmic(ax.yaxis)
@@ -457,14 +458,14 @@ def _draw_curve(
 ) -> None:
     """Draw a curve in units of ``along`` and ``unit`` with a band of ±2u.
 
-    floor: lower limit of the band; None: it may be negative
+    floor: lower limit of curve and band; None: they may be negative
     """
     position, value, spread = (
         np.array(curve[name], np.float64) for name in ("position", "value", "uncertainty")
     )
     low, high = (value - 2 * spread) / unit, (value + 2 * spread) / unit
     if floor is not None:
-        low = np.maximum(low, floor / unit)
+        low, value = np.maximum(low, floor / unit), np.where(value < floor, np.nan, value)
     # A line over places without points would show what nobody measured.
     gaps = np.diff(position)
     empty = np.flatnonzero(gaps > _GAP * np.median(gaps)) + 1

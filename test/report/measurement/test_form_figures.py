@@ -80,6 +80,9 @@ def test_densities_are_read_in_nanometres_and_waves_per_millimetre():
     # The first value is less than its expanded uncertainty: the band goes to the floor, not below.
     band = axes.collections[0].get_paths()[0].vertices
     assert band[:, 1].min() == pytest.approx(0.02)
+    without = {**CURVES["psd"]["radial"], "value": [4e-24, 0.0, 1e-25]}
+    axes = form_figures.radial_density(without).axes[0]
+    assert axes.lines[0].get_ydata() == pytest.approx([4.0, np.nan, 0.1], nan_ok=True)
     turn = form_figures.direction_density(CURVES["psd"]["azimuthal"]).axes[0]
     assert turn.lines[0].get_ydata() == pytest.approx([1.0, 4.0, 2.0])
     assert turn.lines[0].get_xdata()[0] == pytest.approx(np.degrees(0.1))
