@@ -178,8 +178,7 @@ def _dynamic(r: Ranges) -> list[Family]:
 def _lag_time(r: Ranges) -> Family:
     """Return a lag that changes from the first scan on, and from the beginning of each."""
     return Family("lag_time", "s", 2, lambda v: v.motion_rate * np.stack(
-        [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4,
-        OTHER_SPEED)  # fmt: skip
+        [v.time / r.duration, v.since / r.durations[v.index]]), 1e-4, OTHER_SPEED)  # fmt: skip
 
 
 def _of_each_direction(r: Ranges) -> list[Family]:
@@ -244,14 +243,16 @@ def _curve(
     lengths = [length for n, length in r.lengths.items() if n in same]
     length = min(lengths, default=(nodes[-1] - nodes[0]) / 2)
     parts = components(smooth(length), nodes)
+    place = np.linspace(-1.0, 1.0, len(nodes))
     if ways == 2:
-        # Their mean is the place of the spindle axis, a source of its own.
-        parts = parts - np.mean(parts, axis=1, keepdims=True)
+        # Their mean is the place of the spindle axis; the line of a position is the scale of its
+        # axis, and an angle of the part: sources of their own.
+        known = legendre.legvander(place, int(name == "positioning_x"))
+        parts = parts - (known @ np.linalg.lstsq(known, parts.T, rcond=None)[0]).T
 
     def over(position: FloatArray) -> FloatArray:
         return np.stack([np.interp(position, nodes, part) for part in parts])
 
-    place = np.linspace(-1.0, 1.0, len(nodes))
     bends = legendre.legvander(place, 3)[:, 2:]
     shapes = np.kron(np.linalg.lstsq(parts.T, bends, rcond=1e-6)[0], np.eye(ways))
     return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by,
@@ -368,8 +369,7 @@ def _of_each_scan(r: Ranges) -> list[Family]:
         Family("decentre", "m", 2, lambda v: np.stack(
             [v.lateral_error(1.0, 0.0), v.lateral_error(0.0, 1.0)]), 3e-5, REFERENCE, named=False),
         Family("clocking", "rad", 1, lambda v: v.lateral_error(-v.y, v.x)[np.newaxis], 1e-3,
-               REFERENCE,
-               named=False),
+               REFERENCE, named=False),
     ]  # fmt: skip
     for k in range(len(r.clampings)):
         if k:

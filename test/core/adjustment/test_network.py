@@ -47,6 +47,21 @@ def test_eliminated_cells_equal_generalised_least_squares(small):
     )
 
 
+def test_the_line_of_a_position_is_the_scale_of_its_axis(small):
+    """Errors of position over X have neither mean nor incline: centre and scale have them."""
+    views, network, _ = small
+    families = {f.name: f for f in network.families}
+    view = views[0]
+    by_centre = families["centre_x"].columns(view)[0]
+    moved = families["positioning_x"].columns(view)[::2] / by_centre
+    order = np.argsort(view.slide_x)
+    even = np.linspace(*view.slide_x[order[[0, -1]]], 500)
+    for curve in moved:
+        over = np.interp(even, view.slide_x[order], curve[order])
+        assert np.ptp(over) > 1e-3
+        assert np.max(np.abs(np.polyfit(even / even[-1], over, 1))) < 0.02 * np.ptp(over)
+
+
 def test_blocks_are_means_of_points(small):
     """Count, deviation and a column of each block, by a loop; the column by six of its points."""
     views, network, _ = small
