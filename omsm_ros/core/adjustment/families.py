@@ -241,7 +241,7 @@ def _curve(
     same = next(names for names in _OVER if name in names)
     nodes = np.linspace(*ends, 129) if ends[1] > ends[0] else np.array([ends[0], ends[0] + 1.0])
     lengths = [length for n, length in r.lengths.items() if n in same]
-    length = min(lengths, default=(nodes[-1] - nodes[0]) / 2)
+    length = min(lengths, default=(nodes[-1] - nodes[0]) / 2**0.5)
     parts = components(smooth(length), nodes)
     place = np.linspace(-1.0, 1.0, len(nodes))
     if ways == 2:

@@ -25,7 +25,7 @@ class Source:
 
     name: of the family, such as ``"centre_x"`` or ``"spindle_axial/2"``
     uncertainty: standard uncertainty of each of its components [unit of the family]
-    correlation_length: of an unknown curve over its axis [m]; None: half of the axis' range
+    correlation_length: of an unknown curve over its axis [m]; None: 0.7 of the axis' range
     period: of a periodic error over Z or over the distance [m]
     evaluated: True if a recording on this machine gave the figure; what is only declared, and not
         shown by the scans, cannot turn a verdict green

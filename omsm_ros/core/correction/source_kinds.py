@@ -40,8 +40,8 @@ def fading(length: float) -> Kernel:
 
 
 def smooth(length: float) -> Kernel:
-    """Return the covariance of a smooth curve of unit variance, correlated over ``length``."""
-    return lambda start, end: np.exp(-0.5 * ((start - end) / length) ** 2)
+    """Return the covariance exp(-(distance / ``length``)²) of a smooth curve of unit variance."""
+    return lambda start, end: np.exp(-(((start - end) / length) ** 2))
 
 
 def components(kernel: Kernel, where: FloatArray) -> FloatArray:
@@ -86,7 +86,7 @@ def _across_both(p: ScanPoints, size: FloatArray | float) -> FloatArray:
 
 def _curve_components(position: FloatArray, parameters: Parameters) -> FloatArray:
     """Return components of a smooth curve over ``position`` (n,)."""
-    length = parameters.get("correlation_length", float(np.ptp(position)) / 2)
+    length = parameters.get("correlation_length", float(np.ptp(position)) / 2**0.5)
     return components(smooth(length), position)
 
 

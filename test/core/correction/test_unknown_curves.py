@@ -10,7 +10,7 @@ from omsm_ros.core.correction.source_kinds import Kernel, components, fading, ra
 TIME = np.linspace(0.0, 250.0, 700)
 
 
-@pytest.mark.parametrize("kernel", [random_walk, fading(80.0), smooth(60.0)])
+@pytest.mark.parametrize("kernel", [random_walk, fading(80.0), smooth(85.0)])
 def test_components_add_up_to_the_covariance(kernel: Kernel) -> None:
     parts = components(kernel, TIME)
     expected = kernel(TIME[:, np.newaxis], TIME[np.newaxis])
@@ -38,3 +38,8 @@ def test_smooth_curves_have_few_components() -> None:
 def test_where_nothing_moves_the_curve_is_a_constant() -> None:
     parts = components(smooth(1.0), np.zeros(5))
     assert np.allclose(parts, np.ones((1, 5)))
+
+
+@pytest.mark.parametrize("kernel", [fading(80.0), smooth(80.0)])
+def test_the_correlation_falls_to_1_e_over_the_length(kernel: Kernel) -> None:
+    assert kernel(np.zeros(1), np.array([80.0])) == pytest.approx(np.exp(-1))
