@@ -45,6 +45,7 @@ _LENGTHS = (
     _Unit(NANOMETRE_M, "nm", "nanometer nanometers nanometre nanometres"),
     _Unit(0.0254, "inch", "in inches"),
     _Unit(1e-2, "", "cm centimeters centimetres"),
+    _Unit(MICROMETRE_M, "", "âµm"),  # µm in UTF-8, read as Latin-1 and in lower case
     _Unit(2.54e-5, "", "mil"),
     _Unit(1e-10, "", "Å å angstrom angstroms"),
     _Unit(1e-12, "", "pm picometers picometres"),

@@ -19,7 +19,7 @@ from omsm_ros.core.form.deviation_map import (
     repeated_noise,
     root_mean_square,
 )
-from omsm_ros.core.form.part_extents import extents_of_parts
+from omsm_ros.core.form.part_extents import MOST_UNSEEN, extents_of_parts
 from omsm_ros.core.form.part_figures import (
     POWER,
     SYMMETRIC,
@@ -200,7 +200,8 @@ class FormResult:
         if len(away) and not decided:
             largest = float(np.max(np.abs(away)))
             reason = Notice("form.excluded_points", count=len(away), largest=largest)
-            found.append(Doubt(reason, float(np.ptp(np.append(self.map.deviation, away)))))
+            height = float(np.ptp(np.append(self.map.deviation, MOST_UNSEEN * away)))
+            found.append(Doubt(reason, height))
         return found
 
 

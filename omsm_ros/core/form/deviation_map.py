@@ -68,17 +68,8 @@ class DeviationMap:
 
     def part(self, chosen: slice | IntArray) -> DeviationMap:
         """Return the ``chosen`` points."""
-        columns = {name: getattr(self, name)[chosen] for name in _COLUMNS}
-        return replace(self, **columns, effects=self.effects[:, chosen])
-
-    def joined(self, other: DeviationMap) -> DeviationMap:
-        """Return these points and those of ``other``, a part of the same map."""
-        columns = {n: np.concatenate([getattr(m, n) for m in (self, other)]) for n in _COLUMNS}
-        effects = np.concatenate([self.effects, other.effects], axis=1)
-        return replace(self, **columns, effects=effects)
-
-
-_COLUMNS = ("x", "y", "deviation", "area")
+        names = ("x", "y", "deviation", "area", "effects")
+        return replace(self, **{name: getattr(self, name)[..., chosen] for name in names})
 
 
 def root_mean_square(map_: DeviationMap) -> float:

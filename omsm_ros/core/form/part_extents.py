@@ -55,14 +55,16 @@ _CHANCE = 3.0
 _TINY = 1e-40
 # Points at either extreme that show the form lost there.
 _EXTREME = 100
-# Points around a place of the rim that extrapolate the form to it; how far they may be off, in
-# distances of the tracks; and number of places.
+# Points at an extreme, and those that continue the form to a place of the rim; how far they may be
+# off, in distances of the tracks; and number of places.
 _AROUND, _REACH, _PLACES = 24, 1.5, 360
 # Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
 # distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
 _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
 # Peaks at either end, and share of the height of one that its surroundings hide.
 _PEAKS, _UNSEEN = 6, 0.05
+# Most by which a summit that both neighbouring tracks miss exceeds what one track shows of it.
+MOST_UNSEEN = float(_UNSEEN ** -(_HALF_WAY**2))
 # Least singular value of a parabola through neighbours, and the weight of its curvature.
 _LEAST_SPREAD, _LEAST_CURVED = 1e-2, 0.3
 # Standard uncertainty of the rim's place, in distances of the tracks.
@@ -99,6 +101,8 @@ class _PartForm(NamedTuple):
 
     value: (n,) [m];  smooth: its smooth terms
     cell, error: number of the cell (n,) whose mean a point has, and its noise [m]
+    mean: value without the share of a single point (n,);  rest: deviation less the value (n,) [m]
+    noise: of the deviation [m]
     local: points that differ from the smooth form (m,);  blurred: rms of the form lost [m]
     """
 
@@ -106,6 +110,9 @@ class _PartForm(NamedTuple):
     smooth: ZernikeFit
     cell: IntArray
     error: FloatArray
+    mean: FloatArray
+    rest: FloatArray
+    noise: float
     local: IntArray
     blurred: float
 
@@ -113,21 +120,17 @@ class _PartForm(NamedTuple):
     def of(cls, map_: DeviationMap, disc: Aperture) -> _PartForm:
         """Return the form of a map;  disc: of the smooth terms."""
         fit = _smooth(map_.every(_MOST_FITTED), disc)
-        smooth = fit.height(map_.x, map_.y)
-        rest = map_.deviation - smooth
+        mean, cell = fit.height(map_.x, map_.y), np.arange(len(map_))
+        local, form, own, noise, blurred = _local_features(map_, mean)
+        left = map_.deviation - mean
         # Wiener's factor, and the rms of the form lost by it.
-        variance = float(np.mean(rest**2))
-        share = max(1 - map_.noise**2 / variance, 0.0) if variance > 0 else 0.0
-        blurred = (1 - share) * float(np.sqrt(max(variance - map_.noise**2, 0.0)))
-        value, cell = smooth + share * rest, np.arange(len(map_))
-        error = np.full(len(map_), share * map_.noise)
-        local = np.empty(0, np.int64)
-        if (found := local_features(map_, smooth)) is not None:
-            local = found.points
-            value[local], error[local] = found.form, found.error
-            cell[local] = len(map_) + found.cell
-            blurred = max(blurred, found.blurred)
-        return cls(value, fit, cell, error, local, blurred)
+        more = max(float(np.mean(left**2)) - map_.noise**2, 0.0)
+        share = more / (more + map_.noise**2) if more else 0.0
+        value, error = mean + share * left, np.full(len(map_), share * map_.noise)
+        value[local], error[local], cell[local] = form, noise, len(map_) + own
+        mean[local], blurred = form, max(blurred, (1 - share) * float(np.sqrt(more)))
+        left = map_.deviation - value
+        return cls(value, fit, cell, error, mean, left, map_.noise, local, blurred)
 
     def extents(
         self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None
@@ -153,12 +156,24 @@ class _PartForm(NamedTuple):
             of_blur = 2 * of_some * np.sqrt(2) * self.blurred
             figure = of_square(square, length(of_errors, _rms(more - again), of_taken, of_blur))
             between = of_gaps[0] if all_ is form else np.zeros(2)
-            value = (
-                (figure.value or 0.0) + _extents(all_, ends) - of_some + float(np.sum(between)) / 2
-            )
-            spread = length(figure.uncertainty or 0.0, *(between / 2))
+            lost, unsure = self._lost(self.mean + shift) if all_ is form else (0.0, 0.0)
+            value = (figure.value or 0.0) + lost + _extents(all_, ends) - of_some + sum(between) / 2
+            spread = length(figure.uncertainty or 0.0, *(between / 2), unsure)
             found.append(UncertainValue(float(value), spread))
         return found[0], found[1], of_gaps[1]
+
+    def _lost(self, mean: FloatArray) -> tuple[float, float]:
+        """Return the extent that the ``mean`` (n,) misses, and its standard uncertainty [m].
+
+        That is what it leaves at its extremes on average, shrunk by the noise of this average.
+        """
+        order, found, square = np.argsort(mean), 0.0, 0.0
+        for sign, ends in ((-1, order[:_AROUND]), (1, order[-_AROUND:])):
+            left, variance = float(np.mean(self.rest[ends])), self.noise**2 / len(ends)
+            share = max(1 - variance / left**2, 0.0) if left else 0.0
+            found += sign * share * left
+            square += share * variance + ((1 - share) * left) ** 2
+        return found, float(np.sqrt(square))
 
 
 def _extents(values: FloatArray, ends: tuple[float, float]) -> FloatArray:
@@ -177,8 +192,8 @@ class _Gaps(NamedTuple):
     """Places that the tracks miss.
 
     x, y: of the points (n,) [m];  spacing: of the tracks [m]
-    near, weights: points (q, k), the nearest first, whose weighted sum continues the form to a
-        place of the rim
+    near: points (q, k), the nearest first;  weights: of their sums that continue the form to a
+        place of the rim, and that add to it if the curvature rises (2, q, k)
     share: of the area between each place and its nearest point (q,)
     strip: share of the area that a shift of the rim by its uncertainty covers
     """
@@ -223,11 +238,12 @@ class _Gaps(NamedTuple):
 
         form, noise, area: of the points, each (n,) [m], the area of any unit
         """
-        rim, found = np.sum(self.weights * form[self.near], axis=1), []
-        chance = 2 * np.sqrt(np.sum((self.weights * noise[self.near]) ** 2, axis=1))
+        rim, further = np.sum(self.weights * form[self.near], axis=2)
+        weights, found = np.sum(self.weights, axis=0), []
+        chance = 2 * np.sqrt(np.sum((weights * noise[self.near]) ** 2, axis=1))
         for sign in (-1, 1):
             values = sign * form
-            at_rim = float(np.max(sign * rim - chance, initial=-np.inf))
+            at_rim = float(np.max(sign * (rim + further) - chance, initial=-np.inf))
             found.append(max(self._summit(values, noise), at_rim) - float(values.max()))
         # The points stand for the way to the rim; along it the form changes by half on average.
         more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
@@ -255,8 +271,8 @@ class _Gaps(NamedTuple):
 def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: float) -> float:
     """Return how far a Gaussian through ``values`` (n,) [m] may exceed their ``peak``.
 
-    Its summit is half way to the next track at most. Where the neighbouring tracks miss it, it is
-    as wide as along the track.
+    Its summit is half way to the next track at most, where it is steepest: the peak may be a ridge
+    along a track. Where the neighbouring tracks miss it, it is as wide as that allows.
 
     at: places about the peak in distances of the tracks (n,);  noise: of the peak [m]
     """
@@ -269,51 +285,48 @@ def _rise(at: NDArray[np.complex128], values: FloatArray, peak: float, noise: fl
     floor = max(2 * noise, _UNSEEN * height)
     if height <= floor:
         return 0.0
-    fall = np.log(height / np.clip(height - peak + values, floor, height))
-    seen = (away > 0) & (away < _NEXT[1]) & (fall < np.log(height / floor))
-    square = away[seen if np.any(seen) else ring] ** 2
-    curvature = float(fall[seen if np.any(seen) else ring] @ square / (square @ square))
+    near = (away > 0) & (away < _NEXT[1])
+    fall = np.log(height / np.clip(height - peak + values[near], floor, height))
+    u, v = at[near].real, at[near].imag
+    a, b, c = np.linalg.lstsq(np.stack([u * u, u * v, v * v], axis=1), fall, rcond=_LEAST_SPREAD)[0]
+    # Tracks seldom meet a summit that is narrower than those that both neighbours miss.
+    curvature = np.clip((a + c + np.hypot(a - c, b)) / 2, 0.0, -np.log(_UNSEEN))
     return float(height * np.expm1(curvature * _HALF_WAY**2))
 
 
 def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return the weights (…, k) whose sum of values at x, y (…, k) continues them to the origin.
+    """Return weights (2, …, k) whose sum of values at x, y (…, k) continues them to the origin.
 
-    They continue a plane, and the curvature towards the origin where several tracks show it.
+    They continue a plane, and the curvature towards the origin where several tracks show it, from
+    the first point. The second weights are half the share of the curvature, as the next order of a
+    series is that the points do not show.
     """
     away = np.mean(x + 1j * y, axis=-1, keepdims=True)
     turned = (x + 1j * y) / np.where(away == 0, 1.0, away)
     # The least coefficients are chosen, so that curvature that one or two tracks leave open is not.
     curved = _LEAST_CURVED * turned.real**2
     columns = np.stack([np.ones_like(x), turned.real, turned.imag, curved], axis=-1)
-    return np.asarray(np.linalg.pinv(columns, rcond=_LEAST_SPREAD)[..., 0, :])
+    weights = []
+    for kept in (4, 3):
+        fit = np.linalg.pinv(columns[..., :kept], rcond=_LEAST_SPREAD)
+        weights.append(fit[..., 0, :] - (columns[..., :1, :kept] @ fit)[..., 0, :])
+        weights[-1][..., 0] += 1.0
+    return np.stack([weights[0], (weights[0] - weights[1]) / 2])
 
 
-class LocalFeatures(NamedTuple):
-    """Points (m,) of a map whose form differs from its smooth form and its local means.
+def _local_features(
+    map_: DeviationMap, smooth: FloatArray
+) -> tuple[IntArray, FloatArray, IntArray, FloatArray, float]:
+    """Return where (m,) grooves, pips, scratches and edges change the ``smooth`` form (n,) [m].
 
-    points: indices in the map;  form: estimate [m]
-    cell, error: number of the cell whose mean it is, and the noise of that [m]
-    blurred: rms of the form that the estimate does not resolve [m]
-    """
-
-    points: IntArray
-    form: FloatArray
-    cell: IntArray
-    error: FloatArray
-    blurred: float
-
-
-def local_features(map_: DeviationMap, smooth: FloatArray) -> LocalFeatures | None:
-    """Return what grooves, pips, scratches and edges add to the ``smooth`` form (n,) [m], or None.
+    With the form there [m], the number of the cell whose mean it is and the noise of that [m], each
+    (m,), and the rms of the form that these means do not resolve [m].
 
     Cells of five sizes whose mean exceeds what noise makes anywhere on the map show them, as do
     single points (D. Donoho, I. Johnstone, Biometrika 81, 425). Each of the largest cells with one
     has the means of the size with the least expected error (Stein); all cells have, if the means of
     one size are closer than none all over the map, as for ripple.
     """
-    if map_.noise == 0:
-        return None
     rest = map_.deviation - smooth
     spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
     side = float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
@@ -328,10 +341,11 @@ def local_features(map_: DeviationMap, smooth: FloatArray) -> LocalFeatures | No
         # Σ (mean / error)² of noise alone is χ² with as many degrees of freedom as cells.
         chi_square = float(np.sum((mean[error > 0] / error[error > 0]) ** 2))
         ripple |= chi_square - 2 * count > _CHANCE * np.sqrt(2 * count)
-    chosen = (np.bincount(levels[0], differs) > 0) | ripple
+    # Without noise there is nothing to average.
+    chosen = ((np.bincount(levels[0], differs) > 0) | ripple) & (map_.noise > 0)
     some = np.flatnonzero(chosen[levels[0]])
     if not len(some):
-        return None
+        return some, np.empty(0), some, np.empty(0), 0.0
     cells = [np.unique(level[some], return_inverse=True)[1] for level in levels]
     cells.append(np.arange(len(some)))
     best = _least_risk(cells, rest[some], map_.noise)
@@ -343,7 +357,7 @@ def local_features(map_: DeviationMap, smooth: FloatArray) -> LocalFeatures | No
     ends = np.concatenate([order[:_EXTREME], order[-_EXTREME:]])
     missed = (map_.deviation[some] - form)[ends][best[ends] < len(levels)]
     variance = float(np.mean(missed**2)) - map_.noise**2 if len(missed) else 0.0
-    return LocalFeatures(some, form, own, error[own], float(np.sqrt(max(variance, 0.0))))
+    return some, form, own, error[own], float(np.sqrt(max(variance, 0.0)))
 
 
 def _least_risk(cells: Sequence[IntArray], values: FloatArray, noise: float) -> IntArray:

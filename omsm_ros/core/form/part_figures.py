@@ -12,13 +12,11 @@ from math import comb
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap, GridCells, UncertainValue
-from omsm_ros.core.form.zernike_fit import CHUNK, passes
+from omsm_ros.core.form.zernike_fit import DIFFERENCES, passes
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
-# Order of differences over passes: of a wave of sixteen passes 1/400 remains.
-_DIFFERENCES = 4
 # Piston, both tilts and power; the terms that ISO 25178-2 removes as form; the rotationally
 # symmetric terms up to order 12.
 POWER = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1), ZernikeIndex(2, 0))
@@ -111,8 +109,8 @@ def _variance_by_tracks(map_: DeviationMap, share: FloatArray) -> float:
 
 def _rough_squares(values: FloatArray) -> FloatArray:
     """Return the squares of what is not smooth in ``values`` (n,), from their differences."""
-    rough = np.diff(values, _DIFFERENCES) ** 2 / comb(2 * _DIFFERENCES, _DIFFERENCES)
-    before = _DIFFERENCES // 2
+    rough = np.diff(values, DIFFERENCES) ** 2 / comb(2 * DIFFERENCES, DIFFERENCES)
+    before = DIFFERENCES // 2
     return np.asarray(np.pad(rough, (before, len(values) - len(rough) - before), "edge"))
 
 
@@ -134,10 +132,7 @@ def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
     # For points on a line some columns coincide; the minimum-norm solution is used.
     solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
     rest = np.concatenate([map_.deviation[np.newaxis], map_.effects])
-    shares = (solve @ (weighted @ rest.T)).T
-    for begin in range(0, len(map_), CHUNK):
-        chunk = slice(begin, begin + CHUNK)
-        rest[:, chunk] -= shares @ columns[:, chunk]
+    rest -= (solve @ (weighted @ rest.T)).T @ columns
     return replace(map_, deviation=rest[0], effects=rest[1:])
 
 

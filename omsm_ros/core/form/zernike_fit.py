@@ -27,7 +27,7 @@ _WORST_CONDITION = 1e6
 # Successive points whose errors may be correlated, on paths without passes.
 _GROUP, _LEAST_GROUPS = 128, 4
 # Order of differences over passes: of a wave of sixteen passes 1/400 remains, of noise all.
-_DIFFERENCES = 4
+DIFFERENCES = 4
 # Sums over groups with a smaller share of the variance of single points are rounding.
 _ROUNDING = 1e-12
 # Terms of the series 1 / (1 − h) in the share h, about a tenth, of a group in the fit.
@@ -235,7 +235,7 @@ def _groups(x: FloatArray, y: FloatArray, terms: int) -> tuple[IntArray, int]:
     """
     begins = passes(x, y)
     if begins is not None:
-        return begins, _DIFFERENCES
+        return begins, DIFFERENCES
     size = _GROUP if len(x) >= _GROUP * _LEAST_GROUPS * terms else 1
     return np.arange(0, len(x), size), 0
 

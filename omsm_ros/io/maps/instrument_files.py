@@ -227,7 +227,9 @@ def read_foreign(
             warnings.simplefilter("ignore")  # of missing values, which are checked below
             with topography.open_topography(str(path)) as reader:
                 names = [str(one.name) for one in reader.channels]
-                chosen = chosen_channel(names, channel, _first_of_heights(reader.channels), what)
+                holds = [*map(_holds_heights, reader.channels)]
+                first = holds.index(True) if True in holds else 0
+                chosen = chosen_channel(names, channel, first, what)
                 found = reader.topography(channel_index=chosen)
             height = np.ma.filled(np.asanyarray(found.heights(), np.float64), np.nan)
             along = np.asarray(found.positions(), np.float64) if height.ndim == 1 else None
@@ -256,10 +258,6 @@ def read_foreign(
     return HeightGrid(
         height=rows * scale.height, x0=0.0, y0=0.0, dx=dx * scale.lateral, dy=dy * scale.lateral
     ).points(notes)
-
-
-def _first_of_heights(channels: Sequence[Any]) -> int:
-    return next((k for k, one in enumerate(channels) if _holds_heights(one)), 0)
 
 
 def _holds_heights(channel: Any) -> bool:

@@ -64,3 +64,23 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
         assert whole.uncertainty < 30e-9
         assert abs(rms.value - true) <= 2 * rms.uncertainty
         assert rms.uncertainty < 0.05 * true
+
+
+@pytest.mark.parametrize("along", [1.0, 3.0])
+@pytest.mark.parametrize("off", [0.0, 0.25, 0.5])
+def test_a_summit_between_two_tracks_belongs_to_the_figure(along, off):
+    """The neighbours across the tracks show how steep it is, also that of a ridge along them.
+
+    off: of the summit from a track, along: its length over its width, in distances of the tracks
+    """
+    lines, points = np.linspace(-R, R, 81), np.linspace(-R, R, 240)
+    x, y = (v.ravel() for v in np.meshgrid(points, lines))
+    pitch, height = lines[1] - lines[0], 300e-9
+    away = ((y - (3 + off) * pitch) / (0.9 * pitch)) ** 2 + (x / (0.9 * along * pitch)) ** 2
+    noise = np.random.default_rng(0).normal(0, 1e-9, len(x))
+    map_ = DeviationMap(x=x, y=y, deviation=height * np.exp(-away) + noise, area=np.ones(len(x)),
+                        effects=np.empty((0, len(x))), noise=1e-9)  # fmt: skip
+    square = Aperture(1.5 * R, outline="rectangle", sizes=(R, R))
+    whole = extents_of_parts([map_], Aperture(1.5 * R), square, pitch)[0][0]
+    assert abs(whole.value - height) <= 2 * whole.uncertainty
+    assert whole.uncertainty < 0.25 * height

@@ -88,3 +88,10 @@ def test_the_channel_is_chosen_and_always_named(map_of):
     for wrong, text in (("3", "no channel '3'"), ("Phase", "holds no heights")):
         with pytest.raises(FileError, match=text):
             read_points(path, channel=wrong)
+
+
+def test_a_unit_in_utf_8_that_was_read_as_latin_1_is_known(map_of):
+    """Surfalize writes µm into a .sur in UTF-8; the library reads the format's Latin-1."""
+    np.testing.assert_allclose(
+        read_points(map_of(unit="Âµm")).height, read_points(map_of()).height, rtol=1e-12
+    )
