@@ -99,7 +99,7 @@ def test_without_a_stated_uncertainty_nothing_is_known_of_the_gain() -> None:
     assert found.static_gain == pytest.approx(0.5)
     assert found.static_gain_sigmas == 0.0
     assert not found.changed
-    assert change_text(found).startswith("the same")
+    assert change_text(found).startswith("no significant change")
 
 
 def test_one_stated_uncertainty_is_enough_to_judge_the_gain() -> None:
