@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -66,15 +67,14 @@ def overview(folder: Path) -> None:
 
 
 def pages(folder: Path) -> None:
-    """Show the first screens of certificate and report, as the tutorial makes them."""
-    shot(f"file://{folder}/certificate/certificate.html", "certificate.png", 1100, 790)
-    shop = folder / "shop"
-    omsm(f"twin --out {shop} --radius 0.008 --feed 2e-4")
-    omsm(
-        f"correct {shop}/scan.mcap --calibration {folder}/cal.json --nominal {shop}/mirror.yaml"
-        f" --fit piston,tip,tilt --tolerance 250e-9 --out {folder}/result"
-    )
-    shot(f"file://{folder}/result/report.html", "report.png", 1200, 800)
+    """Run the tutorial, and show the first screens of its certificate and reports."""
+    tutorial = (IMAGES.parent / "tutorial.md").read_text("utf-8")
+    script = "set -e\n" + "".join(re.findall(r"```sh\n(.*?)```", tutorial, re.DOTALL))
+    subprocess.run(["bash", "-c", script], check=True, cwd=folder)
+    shop = f"file://{folder}/shop"
+    shot(f"{shop}/certificate/certificate.html", "certificate.png", 1100, 790)
+    shot(f"{shop}/result/report.html", "report.png", 1200, 800)
+    shot(f"{shop}/adjusted/report.html", "verified.png", 1200, 800)
 
 
 def live(folder: Path) -> None:
