@@ -262,8 +262,9 @@ class MissedTriggerDetector:
         uneven = max(_least_in_windows(before).max(), (excess - missed).max() - _AGE_PERIODS)
         if np.ptp(missed) > 0 or uneven > _EVEN_PERIODS:
             return 0
-        while self._earliest[-1][0] + _SPAN_S > self._confirmed:
-            self._earliest.pop()
+        kept = [span for span in self._earliest if span[0] + _SPAN_S <= self._confirmed]
+        self._confirmed = self._earliest[-1][0]
+        self._earliest = deque(kept, maxlen=_SPANS)
         return int(missed[0])
 
     def _rests(self) -> tuple[FloatArray, FloatArray]:

@@ -177,8 +177,7 @@ class BlockCutter:
         restarted = any(run.restarted for run in runs)
         self._skipped *= not restarted
         runs = [replace(run, first_sample=run.first_sample + self._skipped) for run in runs]
-        last = runs[-1]
-        due = (last.first_sample + len(last.samples) - 1) * self._settings.sample_period
+        due = (runs[-1].first_sample + len(runs[-1].samples) - 1) * self._settings.sample_period
         # After a pause of the trigger, but not of the host, the samples are late by it.
         paused = after_silence and abs(self._detector.excess(due, now)) > self._settings.pause / 2
         if paused or restarted:

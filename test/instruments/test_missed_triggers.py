@@ -217,18 +217,22 @@ def test_late_arrivals_alone_are_no_missed_triggers() -> None:
     assert detector.seen_from == 1
 
 
-def test_missed_triggers_are_certain_after_three_windows() -> None:
-    random, detector = np.random.default_rng(3), MissedTriggerDetector(PERIOD)
-    missed, certain, counted = 2, 0.0, 0
+@pytest.mark.parametrize("period", [1e-3, 2e-4])
+def test_missed_triggers_are_certain_after_three_windows(period: float) -> None:
+    random, detector = np.random.default_rng(3), MissedTriggerDetector(period)
+    missed, certain, counted, resumed = 2, 0.0, 0, 0.0
     for due in np.arange(1, 1000) * 0.01:
-        taken = due + missed * PERIOD * (due > 5.0)
-        arrival = UPTIME_S + taken + random.uniform(0, 0.9 * PERIOD)
-        confirmed = detector.confirms(due + counted * PERIOD, arrival)
+        taken = due + missed * period * (due > 5.0)
+        arrival = UPTIME_S + taken + random.uniform(0, 0.9 * period)
+        confirmed = detector.confirms(due + counted * period, arrival)
         assert not (confirmed and taken > 5.0 and not counted)
+        if confirmed and counted and not resumed:
+            resumed = taken
         if not confirmed and (found := detector.forget_missed()):
             counted, certain = counted + found, taken
     assert counted == missed
     assert 7.4 < certain < 8.0
+    assert certain < resumed < certain + 0.1
 
 
 def test_what_the_arrivals_cannot_show_is_stated() -> None:
