@@ -178,10 +178,8 @@ def effects_on_form(
     for family in solution.network.families:
         if family.name not in solution.sizes:
             continue
-        covariance, here = (
-            solution.covariance_of(solution.network.place[family.name]),
-            _part(solution, family),
-        )
+        covariance = solution.covariance_of(solution.network.place[family.name])
+        here = _part(solution, family)
         change = through[:, here] @ np.linalg.pinv(covariance, rcond=1e-10)
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
@@ -426,7 +424,7 @@ def _resembled(
     """Return families that the scans leave open and that the form speaks for, likeliest first.
 
     Each has its name, twice the logarithm of its odds, and its change of the map as one standard
-    uncertainty (n,) [m]. One of ten declarations that no scan shows is taken to be wrong.
+    uncertainty (n,) [m]. One machine of ten has one declaration wrong that no scan shows.
     """
     if not np.any(made.height):
         return []
@@ -443,6 +441,8 @@ def _resembled(
         shape = effect.shape if family.smooth is None else effect.shape @ family.smooth
         gain, values = form.looks_like(fit @ shape, family.wide)
         if gain > _POSITIVE:
-            share = 1 / (1 + ODDS_ABSENT * np.exp(-min(gain, SURE) / 2))
-            found.append((family.name, gain, np.sqrt(share) * (shape @ values)))
-    return sorted(found, key=lambda one: -one[1])
+            found.append((family.name, gain, shape @ values))
+    odds = np.exp([min(gain, SURE) / 2 for _, gain, _ in found])
+    roots = np.sqrt(odds / (ODDS_ABSENT + np.sum(odds)))
+    alike = [(name, gain, r * change) for (name, gain, change), r in zip(found, roots, strict=True)]
+    return sorted(alike, key=lambda one: -one[1])
