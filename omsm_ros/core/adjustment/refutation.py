@@ -220,7 +220,7 @@ def explained(one: Evidence, best: Evidence) -> float:
 
 
 def _plausible(one: Evidence) -> bool:
-    """Return whether it is a cause with a name, which no declaration is far below."""
+    """Return whether it is a named cause, and not far beyond its plausible size if declared."""
     far = one.declared and np.max(np.abs(one.values)) > _FAR_BEYOND * one.family.wide
     return one.family.named and base_name(one.family.name) not in FREE and not far
 

@@ -150,7 +150,7 @@ def test_the_odds_of_a_move_are_those_of_its_densities():
     assert weak((0, 1.01 * edge, 1.0), (1e-9, spread, 1e-9), effect) is None
     name, why = weak((0, 0.99 * edge, 1.0), (1e-9, spread, 1e-9), effect)
     assert name == "x"
-    assert "determine it to 10 µm (k = 1), which is 10 nm rms of form" in str(why)
+    assert "39 µm ± 10 µm (k = 1), an effect of 10 nm rms" in str(why)
 
 
 def test_the_least_likely_move_is_held_first():
