@@ -94,8 +94,9 @@ def single_samples(cell, count):
             publisher.publish(message)
 
 
-@pytest.mark.parametrize("count", [3000, pytest.param(300_000, marks=pytest.mark.soak)])
 @pytest.mark.soak
+@pytest.mark.timeout(0)  # five minutes
+@pytest.mark.parametrize("count", [3000, 300_000])
 def test_blocks_of_one_sample_are_all_in_the_account(cell, true_calibration, count):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
