@@ -53,8 +53,8 @@ class TriggerCount:
         self._newest_first = 0
         self._newest_stamp_ns: int | None = None
         self._gaps: deque[tuple[int, int]] = deque(maxlen=_MOST_GAPS)
-        # Count, stamp and length of a block that is ahead.
-        self._jumped: tuple[int, int, int] | None = None
+        # Count, stamp and end of the blocks that are ahead.
+        self._jumped: deque[tuple[int, int, int]] = deque(maxlen=_MOST_GAPS)
 
     def place(self, block: Block, length: int) -> Arrival:
         """Place ``block`` of ``length`` samples after what came before."""
@@ -65,29 +65,27 @@ class TriggerCount:
             self._gaps.clear()
         elif first > self._next:
             if self._leaps(block):
-                self._jumped = (first, block.stamp_ns, length)
+                self._jumped.append((first, block.stamp_ns, first + length))
                 return Arrival(self._session, first, length, 0, jumped=length)
-            missing = first - self._next
-            if self._jumped is not None and self._next <= self._jumped[0] < first:
-                missing -= min(self._jumped[2], first - self._jumped[0])  # it came
             self._gaps.append((self._next, first))
-        self._jumped = None
-        end = first + length
+            came = sum(self._filled(begin, end) for begin, _, end in self._jumped)
+            missing = first - self._next - came
         skip = min(max(self._next - first, 0), length)
         late = self._filled(first, first + skip) if skip else 0
         if skip < length:
-            self._next = end
+            self._jumped.clear()
+            self._next = first + length
             self._newest_first, self._newest_stamp_ns = block.newest
         return Arrival(self._session, first, skip, late, missing)
 
     def _leaps(self, block: Block) -> bool:
-        """Return whether the count is ahead of the time, and of a block that was ahead before."""
+        """Return whether the count is ahead of the time, and of the last block that was ahead."""
         assert self._newest_stamp_ns is not None  # of a session that has begun
         if not is_ahead_of_time((self._newest_first, self._newest_stamp_ns), block):
             return False
-        jumped = self._jumped
-        confirmed = jumped is not None and block.first_sample > jumped[0]
-        return jumped is None or not confirmed or is_ahead_of_time(jumped[:2], block)
+        if not self._jumped or block.first_sample <= self._jumped[-1][0]:
+            return True
+        return is_ahead_of_time(self._jumped[-1][:2], block)
 
     def _filled(self, first: int, end: int) -> int:
         """Remove the counts ``first`` to ``end`` from the gaps; return how many there were."""

@@ -11,6 +11,8 @@ from omsm_ros.core.streams.blocks import AccelerationBlock, Block
 from omsm_ros.core.streams.continuity import Arrival, TriggerCount
 from omsm_ros.core.streams.pairing import StreamInput
 
+LEAP = 1_000_000
+
 
 def block(first: int, stamp_s: float) -> Block:
     return Block(stamp_ns=round(stamp_s * 1e9), first_sample=first, sample_period=1e-3)
@@ -147,6 +149,24 @@ def test_a_counter_that_leaps_is_followed_once_the_next_block_confirms_it() -> N
     assert [a is not None and a.first for a in placed] == [0, 100, False, 1_000_300, 1_000_400]
     account = stream.tally.snapshot(0)
     assert account.received + account.missing == 1_000_500
+
+
+@pytest.mark.parametrize("firsts", [
+    (0, 100, LEAP, 2 * LEAP, 3 * LEAP, 3 * LEAP + 100),  # only the last one is confirmed
+    (0, 100, LEAP, 100, LEAP + 100, LEAP + 200),  # a repeated block comes between
+    (0, 100, LEAP, LEAP + 100, LEAP),  # the one that leaps is repeated
+    (0, 200, LEAP, 100, LEAP + 100, LEAP + 200),  # a late block comes between
+])  # fmt: skip
+def test_of_blocks_that_leap_each_sample_counts_once(firsts: tuple[int, ...]) -> None:
+    stream, sent = StreamInput(), sorted(set(firsts))
+    for first in firsts:
+        stream.new(AccelerationBlock(
+            stamp_ns=sent.index(first) * 100_000_000, first_sample=first, sample_period=1e-3,
+            **dict.fromkeys("xyz", ZEROS),
+        ))  # fmt: skip
+    account = stream.tally.snapshot(0)
+    assert account.missing == sent[-1] + 100 - 100 * len(sent)
+    assert account.counted.get("duplicate", 0) == 100 * (len(firsts) - len(sent))
 
 
 ZEROS = np.zeros(100)
