@@ -1,20 +1,16 @@
-"""Linear algebra of small problems: scaled least squares, and the threads of BLAS.
+"""Linear algebra of small problems: scaled least squares, filters, and the threads of BLAS.
 
 Columns may have any units: each is scaled to unit length first.
 """
 
-import importlib.util
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import lru_cache
-from importlib.machinery import PathFinder
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal._sosfilt import _sosfilt
 
 FloatArray = NDArray[np.float64]
 # Rows and values of a matrix held in memory at a time, where a long record is processed in blocks:
@@ -102,14 +98,6 @@ def one_blas_thread() -> Iterator[None]:
         _one_thread.leave()
 
 
-# Loading ``scipy.signal`` and ``scipy.linalg`` takes longer than correcting a scan, and one
-# compiled function of each is needed. The module that holds it is loaded from its file, under its
-# own name, so that a later import of the package finds it there. Where scipy has moved it, the
-# public function is used: it gives the same numbers, half a second later.
-
-ComplexArray = NDArray[np.complex128]
-
-
 def sosfilt(
     sections: FloatArray, samples: FloatArray, state: FloatArray, out: FloatArray | None = None
 ) -> FloatArray:
@@ -117,69 +105,10 @@ def sosfilt(
 
     sections: second-order sections (k, 6) as in scipy, direct form II transposed
     out: where the response is written, (n,) without gaps; None makes room for it
+
+    The compiled loop of :func:`scipy.signal.sosfilt`, whose checks take longer than a short block.
     """
     response = np.empty(len(samples)) if out is None else out
     response[:] = samples
-    _filter_loop()(sections, response[np.newaxis], state[np.newaxis])
+    _sosfilt(sections, response[np.newaxis], state[np.newaxis])
     return response
-
-
-def generalised_eigenvalues(a: FloatArray, b: FloatArray) -> ComplexArray:
-    """Return λ (n,) with det(a - λ b) = 0, infinite ones as infinity or not a number."""
-    return np.asarray(_pencil_solver()(a, b), np.complex128)
-
-
-@lru_cache(maxsize=1)
-def _filter_loop() -> Any:
-    """Return ``f(sections, samples (m, n), state (m, k, 2))``, which works in place."""
-    module = _loaded("scipy.signal._sosfilt")
-    return getattr(module, "_sosfilt", _public_loop)
-
-
-@lru_cache(maxsize=1)
-def _pencil_solver() -> Any:
-    module = _loaded("scipy.linalg._flapack")
-    return _by_lapack if hasattr(module, "dggev") else _public_solver
-
-
-def _loaded(name: str) -> ModuleType | None:
-    """Return the compiled module, or None if it is not where it was in scipy 1.17."""
-    if name in sys.modules:
-        return sys.modules[name]
-    scipy = importlib.util.find_spec("scipy")
-    place = name.split(".")[1]
-    folders = [f"{f}/{place}" for f in (scipy and scipy.submodule_search_locations) or ()]
-    spec = PathFinder.find_spec(name, folders)
-    if spec is None or spec.loader is None:
-        return None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except ImportError:
-        del sys.modules[name]
-        return None
-    return module
-
-
-def _by_lapack(a: FloatArray, b: FloatArray) -> ComplexArray:
-    lapack = sys.modules["scipy.linalg._flapack"]
-    real, imaginary, scale, _, _, _, failed = lapack.dggev(a, b, compute_vl=0, compute_vr=0)
-    if failed:
-        return _public_solver(a, b)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray((real + 1j * imaginary) / scale, np.complex128)
-
-
-def _public_loop(sections: FloatArray, samples: FloatArray, state: FloatArray) -> None:
-    from scipy import signal
-
-    # Its state counts the sections first, the signals second.
-    response, after = signal.sosfilt(sections, samples, zi=np.moveaxis(state, 0, 1))
-    samples[:], state[:] = response, np.moveaxis(after, 0, 1)
-
-
-def _public_solver(a: FloatArray, b: FloatArray) -> ComplexArray:
-    from scipy import linalg
-
-    return np.asarray(linalg.eigvals(a, b), np.complex128)

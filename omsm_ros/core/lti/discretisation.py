@@ -13,7 +13,6 @@ delay is a Lagrange interpolator of the same order. At 0 Hz
 the gain is G(0).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
@@ -21,15 +20,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import polynomial
+from scipy import fft, linalg, signal
 
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, DataError
-from omsm_ros.linear_algebra import generalised_eigenvalues, sosfilt
 from omsm_ros.quantities import SAMPLE_PERIOD
 
-# Terms of the exponential series: for a norm below one half the next term is less than rounding.
-_SERIES_TERMS = 16
 # A zero beyond this is a constant factor to 1e-9 of the gain, or infinite but for rounding.
 _FAR_ZERO = 1e9
 # Default order: the error is below 1 pm on the motion in test_discretisation.py, with a noise gain
@@ -44,8 +41,7 @@ _TOLERANCE = 1e-2
 MIN_SAMPLES = 64
 # Share of the record over which the window fades at each end.
 _FADE = 0.1
-BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
-"""Terms of a window with side lobes below -92 dB (Harris, Proc. IEEE 66, 1978)."""
+_FADED = ("tukey", 2 * _FADE)
 
 # Share of the Nyquist band above which a motion is not resolved by its samples.
 _RESOLVED_SHARE = 0.2
@@ -80,7 +76,7 @@ def polynomial_hold_zeros(
     direct = np.array([float(system.c @ weights[:, 0] + system.d)])
     pencil = np.block([[transition, entry[:, np.newaxis]], [leaving, direct]])
     finite = np.diag(np.append(np.ones(n + order), 0.0))
-    found = generalised_eigenvalues(pencil, finite)
+    found = linalg.eigvals(pencil, finite)
     found = found[np.isfinite(found) & (abs(found) < _FAR_ZERO)]
     found = _with_exact_ones(found, dc_zeros)
     upper = found[found.imag > 0]
@@ -170,66 +166,11 @@ def _hold_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArra
     chain[:n, :n] = a
     chain[:n, n] = b
     chain[n:, n:] = np.eye(order + 1, k=1)
-    exponential = matrix_exponential(chain)
+    exponential = linalg.expm(chain)
     monomials = exponential[:n, n:] * [factorial(j) for j in range(order + 1)]
     nodes = 1.0 - np.arange(order + 1)
     coefficients = np.linalg.inv(np.vander(nodes, increasing=True))
     return exponential[:n, :n], np.asarray(monomials @ coefficients)
-
-
-def matrix_exponential(matrix: FloatArray) -> FloatArray:
-    """Return exp(``matrix``) (n, n) by scaling, Taylor series and squaring.
-
-    It replaces scipy.linalg.expm, which takes 0.1 s to load.
-    """
-    norm = float(np.linalg.norm(matrix, 1))
-    squarings = max(int(np.ceil(np.log2(norm))) + 1, 0) if norm > 0 else 0
-    scaled = matrix / 2**squarings
-    result = np.eye(len(matrix))
-    for k in range(_SERIES_TERMS, 0, -1):
-        result = np.eye(len(matrix)) + scaled @ result / k
-    for _ in range(squarings):
-        result = result @ result
-    return result
-
-
-def second_order_sections(zeros: ComplexArray, poles: ComplexArray, gain: float) -> FloatArray:
-    """Return sections (k, 6) as in scipy of ``gain · Π(1 - z_i/z) / Π(1 - p_i/z)``.
-
-    zeros, poles: in the z plane, complex ones with their conjugates
-
-    Like :func:`scipy.signal.zpk2sos`, without loading ``scipy.signal``: the poles nearest to the
-    unit circle are combined with the zeros nearest to them and come last.
-    """
-    # Padded with roots at the origin, which are factors of 1.
-    longest = max(len(zeros), len(poles), 1)
-    count = longest + longest % 2
-    padded = [np.append(r, np.zeros(count - len(r))) for r in (zeros, poles)]
-    remaining = list(padded[0])
-    sections = []
-    # The larger of two real poles is the last one, as they are ordered.
-    for pair in sorted(_by_two(padded[1]), key=lambda pair: abs(pair[-1]), reverse=True):
-        sections.append([*_monic(_nearest(pair[-1], remaining)), *_monic(pair)])
-    ordered = np.array(sections[::-1], np.float64)
-    ordered[0, :3] *= gain
-    return ordered
-
-
-def _nearest(pole: complex, zeros: list[complex]) -> tuple[complex, complex]:
-    """Remove from ``zeros`` and return the pair nearest to ``pole``, conjugate or both real."""
-    first = min(zeros, key=lambda zero: abs(zero - pole))
-    zeros.remove(first)
-    if first.imag:
-        second = np.conj(first)
-    else:
-        second = min((z for z in zeros if z.imag == 0), key=lambda zero: abs(zero - pole))
-    zeros.remove(second)
-    return first, second
-
-
-def _monic(pair: Sequence[complex] | ComplexArray) -> list[float]:
-    """Return the coefficients of (1 - r/z)(1 - s/z), ascending in 1/z."""
-    return [1.0, float(np.real(-pair[0] - pair[1])), float(np.real(pair[0] * pair[1]))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,10 +203,8 @@ class DigitalFilter:
     @cached_property
     def noise_gain(self) -> float:
         """Ratio of the standard deviations of output and input for white noise."""
-        pulse = np.zeros(self.settling_samples(1e-9) + 1)
-        pulse[0] = 1.0
-        dc_zeros = np.zeros((len(self.sections), 2))
-        return float(np.linalg.norm(sosfilt(self.sections, pulse, dc_zeros)))
+        pulse = signal.unit_impulse(self.settling_samples(1e-9) + 1)
+        return float(np.linalg.norm(signal.sosfilt(self.sections, pulse)))
 
 
 def discretise(
@@ -327,7 +266,7 @@ def _gain(
 def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) -> FloatArray:
     pairs, single = divmod(late, 2)
     delays = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]] * pairs + [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * single
-    rational = second_order_sections(zeros, poles, gain)
+    rational = signal.zpk2sos(zeros, poles, gain)
     return np.vstack([rational, *np.reshape(delays, (-1, 1, 6))])
 
 
@@ -335,14 +274,10 @@ def bilinear(
     dynamics: TransferFunction, sample_period: float, poles: ComplexArray | None = None
 ) -> DigitalFilter:
     """Return the bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
-    rate = 2 / sample_period
-    zeros, roots = dynamics.zeros(), dynamics.poles() if poles is None else poles
+    roots = dynamics.poles() if poles is None else poles
     leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
-    gain = float(np.real(leading * np.prod(rate - zeros) / np.prod(rate - roots)))
-    at_nyquist = -np.ones(len(roots) - len(zeros))
-    mapped = np.append((rate + zeros) / (rate - zeros), at_nyquist)
-    sections = second_order_sections(mapped, (rate + roots) / (rate - roots), gain)
-    return DigitalFilter(sections, sample_period)
+    mapped = signal.bilinear_zpk(dynamics.zeros(), roots, leading, 1 / sample_period)
+    return DigitalFilter(signal.zpk2sos(*mapped), sample_period)
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:
@@ -382,8 +317,9 @@ def velocity_spectrum(
     fast transform. Velocity is used because it leaks less than millimetres of travel.
     """
     velocity = np.diff(checked_motion(z)) / sample_period
-    weights = _tukey(len(velocity)) if faded else _blackman_harris(len(velocity))
-    samples = fast_length(len(velocity))
+    window = _FADED if faded else "blackmanharris"
+    weights = signal.get_window(window, len(velocity))
+    samples = fft.next_fast_len(len(velocity), real=True)
     frequency = np.fft.rfftfreq(samples, sample_period)
     spectrum = np.fft.rfft(velocity * weights, samples) / np.sinc(frequency * sample_period)
     scale = np.full(len(frequency), 2.0)
@@ -393,30 +329,6 @@ def velocity_spectrum(
     norm = np.sqrt(samples * np.sum(weights**2))
     velocities = np.asarray(scale * spectrum / norm, np.complex128)
     return np.asarray(frequency, np.float64), velocities
-
-
-def fast_length(samples: int) -> int:
-    """Return the least 2^k, 3·2^k, 5·2^k or 9·2^k that is not below ``samples``."""
-    return min(
-        factor << max((-(-samples // factor) - 1).bit_length(), 0) for factor in (1, 3, 5, 9)
-    )
-
-
-def _blackman_harris(samples: int) -> FloatArray:
-    # cos kx as polynomials of cos x, which needs one cosine instead of three.
-    a0, a1, a2, a3 = BLACKMAN_HARRIS
-    cosine = np.cos(2 * np.pi / samples * np.arange(samples))
-    return np.asarray(a0 - a2 + cosine * (a1 - 3 * a3 + cosine * (2 * a2 + cosine * 4 * a3)))
-
-
-def _tukey(samples: int) -> FloatArray:
-    """Return a Tukey window that rises and falls over ``_FADE`` of the samples each."""
-    weights = np.ones(samples)
-    length = _FADE * samples
-    rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(int(length) + 1) / length)
-    weights[: len(rising)] = rising
-    weights[samples - len(rising) + 1 :] = rising[:0:-1]
-    return weights
 
 
 def discretisation_error(
@@ -434,8 +346,8 @@ def discretisation_error(
     error = difference * velocity
     rms = float(np.sqrt(np.sum(abs(error) ** 2) / 2))
     samples = len(z) - 1
-    padded = fast_length(samples)
-    amplitude = np.sqrt(padded * np.sum(_tukey(samples) ** 2)) / 2
+    padded = fft.next_fast_len(samples, real=True)
+    amplitude = np.sqrt(padded * np.sum(signal.get_window(_FADED, samples) ** 2)) / 2
     over_time = np.fft.irfft(error * amplitude, padded)[:samples]
     fade = int(_FADE * samples) + 1
     return rms, float(np.ptp(over_time[fade:-fade]))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
-from math import factorial
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import linalg, signal
+from scipy import signal
 
-from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise, matrix_exponential
+from omsm_ros.core.lti.discretisation import DigitalFilter, bilinear, discretise
 from omsm_ros.core.lti.recursion import Recursion, past_motion, past_stationary, through
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
@@ -215,48 +212,3 @@ def test_sections_in_series_multiply() -> None:
         both.response(lines), one.response(lines) * two.response(lines), rtol=1e-12
     )
     assert len(both.poles) == len(one.poles) + len(two.poles)
-
-
-# -- exponentials of matrices
-
-matrices = st.integers(0, 500).map(
-    lambda seed: np.random.default_rng(seed).normal(size=(3, 3)) * 10.0 ** (seed % 4 - 2)
-)
-
-
-@settings(max_examples=30)
-@given(matrix=matrices)
-def test_laws_of_the_exponential(matrix: FloatArray) -> None:
-    grown, shrunk = matrix_exponential(matrix), matrix_exponential(-matrix)
-    size = np.linalg.norm(grown) * np.linalg.norm(shrunk)
-    np.testing.assert_allclose(grown @ shrunk, np.eye(3), atol=1e-12 * size)
-    half = matrix_exponential(matrix / 2)
-    np.testing.assert_allclose(half @ half, grown, atol=1e-12 * np.linalg.norm(half) ** 2)
-    np.testing.assert_allclose(matrix_exponential(matrix.T), grown.T, rtol=1e-9, atol=1e-12 * size)
-    np.testing.assert_allclose(grown, linalg.expm(matrix), atol=1e-11 * np.linalg.norm(half) ** 2)
-
-
-def test_the_exponential_of_a_shift_is_a_row_of_factorials() -> None:
-    shift = np.diag(np.ones(4), 1)
-    expected = [[1 / factorial(j - i) if j >= i else 0.0 for j in range(5)] for i in range(5)]
-    np.testing.assert_allclose(matrix_exponential(shift), expected, rtol=1e-15)
-
-
-def test_the_exponential_of_a_turn_is_cosine_and_sine() -> None:
-    for angle in (1e-9, 0.3, 20.0):
-        turn = matrix_exponential(np.array([[0.0, -angle], [angle, 0.0]]))
-        expected = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        np.testing.assert_allclose(turn, expected, atol=1e-13)
-
-
-def test_the_exponential_against_its_series_in_exact_numbers() -> None:
-    rows = [[Fraction(-3, 2), Fraction(7, 5)], [Fraction(-1, 3), Fraction(-9, 4)]]
-    total = term = [[Fraction(int(i == j)) for j in range(2)] for i in range(2)]
-    for n in range(1, 60):
-        term = [
-            [sum((term[i][k] * rows[k][j] for k in range(2)), Fraction(0)) / n for j in range(2)]
-            for i in range(2)
-        ]
-        total = [[total[i][j] + term[i][j] for j in range(2)] for i in range(2)]
-    found = matrix_exponential(np.array([[float(v) for v in row] for row in rows]))
-    np.testing.assert_allclose(found, [[float(v) for v in row] for row in total], rtol=1e-14)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import linalg
 
-from omsm_ros.core.lti.discretisation import matrix_exponential, polynomial_hold_zeros
+from omsm_ros.core.lti.discretisation import polynomial_hold_zeros
 
 NONE = np.empty(0, np.complex128)
 
@@ -78,22 +77,6 @@ def test_a_differentiator_of_a_resonance_is_blind_to_rest() -> None:
     poles = np.array([-0.1 + 2j, -0.1 - 2j, -0.1 + 2j, -0.1 - 2j])
     found = polynomial_hold_zeros(np.zeros(3, np.complex128), poles, 5, dc_zeros=3)
     assert np.count_nonzero(found == 1.0) == 3
-
-
-@pytest.mark.parametrize("size", [1e-9, 0.1, 1.0, 30.0, 300.0])
-def test_the_exponential_is_that_of_scipy(size: float) -> None:
-    # Stable and not normal, with a chain of integrators, as the hold makes it.
-    matrix = np.zeros((6, 6))
-    matrix[:3, :3] = size * np.array([[-1.0, 4, 0], [-0.5, -0.2, 0], [0, 1, -0.01]])
-    matrix[:3, 3] = size * np.array([1.0, 0.3, -2.0])
-    matrix[3:, 3:] = np.eye(3, k=1)
-    expected = linalg.expm(matrix)
-    found = matrix_exponential(matrix)
-    assert np.allclose(found, expected, rtol=0, atol=1e-13 * max(abs(expected).max(), 1.0))
-
-
-def test_the_exponential_of_nothing_is_one() -> None:
-    assert np.array_equal(matrix_exponential(np.zeros((2, 2))), np.eye(2))
 
 
 @pytest.mark.parametrize("slow", [-6e-3, -3e-3, 1e-3])
