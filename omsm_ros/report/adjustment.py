@@ -16,6 +16,7 @@ from omsm_ros.report.tables import Table, sized
 from omsm_ros.report.verdict import headline, page_verdict
 from omsm_ros.units import MILLIMETRE_M, NANOMETRE_M
 
+_PV = "peak_to_valley"
 CAPTIONS = {
     "map": "Form deviation from the nominal surface, pose removed; mean of each cell.",
     "uncertainty": "Standard uncertainty (k = 1) of the map, all sources together.",
@@ -42,7 +43,7 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment, date: str) -
         StudyPage(
             title=f"{origin.get('title') or title}: {headline(facts)}",
             block=title_block(origin),
-            subtitle="; ".join(_scan_text(scan) for scan in facts["scans"]),
+            subtitle="; ".join([*map(_scan_text, facts["scans"]), *_true_figure(facts)]),
             verdict=replace(verdict, reasons=verdict.reasons[:1]),
             sections=(
                 Section("Form", ("map",)),
@@ -69,14 +70,15 @@ def _scan_text(scan: Mapping[str, Any]) -> str:
     return f"{plain(scan['speed_rpm'])} rpm {way}, {count(scan['points'])} points"
 
 
+def _true_figure(facts: Mapping[str, Any]) -> list[str]:
+    truth = facts.get("truth")
+    return [] if truth is None else [f"truth of the twin: PV {quantity(truth[_PV], 'm')}"]
+
+
 def _truth(facts: Mapping[str, Any]) -> Table:
     """Return what only the twin knows; a table without rows for a real part."""
     truth = facts.get("truth")
-    names = (
-        ("true PV", "peak_to_valley"),
-        ("true rms", "rms"),
-        ("map off by, rms", "map_error_rms"),
-    )
+    names = (("true PV", _PV), ("true rms", "rms"), ("map off by, rms", "map_error_rms"))
     rows = [] if truth is None else [(name, quantity(truth[key], "m")) for name, key in names]
     return Table("Truth of the twin", ("value",), rows)
 
@@ -85,7 +87,7 @@ def _figures(facts: Mapping[str, Any]) -> Table:
     figures = facts["figures"]
     rows = [
         (name, expanded(figures[key]["value"], figures[key]["standard_uncertainty"], "m"))
-        for name, key in (("PV", "peak_to_valley"), ("rms", "rms"))
+        for name, key in (("PV", _PV), ("rms", "rms"))
     ]
     rows += [
         (

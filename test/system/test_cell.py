@@ -15,6 +15,7 @@ from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration, save_calibration
 from omsm_ros.nodes.cell_demo_node import DemoStage, perform
 from omsm_ros.pipelines import demonstrate as demonstration
+from omsm_ros.readable import quantity
 
 
 def account(cell, stream):
@@ -90,6 +91,8 @@ def test_calibrate_scan_correct_and_replay(whole_cell, device):
     adjusted = summary["adjustment"]
     figure, truth = adjusted["figures"]["peak_to_valley"], adjusted["truth"]["peak_to_valley"]
     assert abs(figure["value"] - truth) < 3 * figure["standard_uncertainty"] + 5e-9
+    head = f"truth of the twin: PV {quantity(truth, 'm').split()[0]}"  # its space does not break
+    assert head in (plan.out / "report.html").read_text().replace("\N{NO-BREAK SPACE}", " ")
 
 
 def reconnected(cell):
