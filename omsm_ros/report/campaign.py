@@ -50,7 +50,7 @@ SERIES = (
     Series("Form deviation, rms", ("figures", "rms", "value")),
     Series("Form deviation, PV", ("figures", "peak_to_valley", "value")),
     Series(
-        "U of the PV (k = 1)", ("figures", "peak_to_valley", "standard_uncertainty"), judged=False
+        "u of the PV (k = 1)", ("figures", "peak_to_valley", "standard_uncertainty"), judged=False
     ),
     Series("Dynamic error removed, rms", ("dynamic_error_before", "rms")),
     Series("Standard uncertainty, median", ("uncertainty", "median")),

@@ -99,7 +99,7 @@ def terms(numbers: Sequence[ComparedTerm]) -> Figure:
     ax.set_xticks(np.arange(len(values)), names, rotation=90)
     reach = max(1.3, 1.1 * float(np.max(np.abs(values))))
     ax.set_ylim(-reach, reach)
-    style.label(ax, x="n, m", y="E_n", title="Zernike terms of the difference")
+    style.label(ax, y="E_n", title="Zernike terms (n, m) of the difference")
     return made
 
 
