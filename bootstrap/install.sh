@@ -22,7 +22,6 @@ if [ -z "$distribution" ]; then
     # Nothing of another ROS or Python may be taken for already installed.
     unset PYTHONPATH LD_LIBRARY_PATH
     export PIP_CONSTRAINT=bootstrap/lock.txt
-    packages="--no-deps -r bootstrap/lock.txt" # it is complete: there is nothing to resolve
 else
     echo "Installing Python packages from PyPI into .venv, over $distribution"
     "$python" -m venv --clear --system-site-packages .venv
@@ -37,5 +36,15 @@ fi
 install=".venv/bin/python -m pip install --quiet --disable-pip-version-check"
 $install --upgrade pip
 # Bytecode is written by what is used: that of all takes as long as the rest.
-$install --use-pep517 --no-compile $packages
-[ -n "$distribution" ] || .venv/bin/python bootstrap/repair_wheels.py
+install="$install --use-pep517 --no-compile"
+if [ -z "$distribution" ]; then
+    # The list is complete: nothing is to be resolved, and two processes can share it.
+    awk 'NR % 2' bootstrap/lock.txt >.venv/half.txt
+    $install --no-deps -r .venv/half.txt &
+    awk 'NR % 2 == 0' bootstrap/lock.txt >.venv/other_half.txt
+    $install --no-deps -r .venv/other_half.txt
+    wait $!
+    .venv/bin/python bootstrap/repair_wheels.py
+else
+    $install $packages
+fi
