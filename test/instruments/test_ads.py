@@ -134,7 +134,16 @@ def test_a_ring_of_another_size_is_reported(plc):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # its server's
-def test_a_symbol_that_is_not_there_is_reported(plc):
+def test_a_symbol_that_is_not_there_is_reported(plc, monkeypatch):
+    import pyads
+
+    plain = pyads.Connection.open
+
+    def impatient(connection):
+        plain(connection)
+        connection.set_timeout(300)  # its server does not answer such a request
+
+    monkeypatch.setattr(pyads.Connection, "open", impatient)
     ring = AdsRing(f"{ADDRESS}&symbol=GVL.other")
     with pytest.raises(DeviceError, match=r"GVL\.other"):
         ring.open()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from soaked import soaked
 
 from omsm_ros.instruments.blocks import BlockPair
 from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator
@@ -68,8 +69,15 @@ def checked(got: list[BlockPair]) -> None:
     assert np.all(np.diff(k) > 0)
 
 
-@pytest.mark.parametrize("where", ["pty", "tcp"])
-@pytest.mark.parametrize("fault", ["unplug", "power_cycle", "stall"])
+@pytest.mark.parametrize(
+    ("fault", "where"),
+    [
+        ("unplug", "pty"),
+        ("power_cycle", "tcp"),
+        ("stall", "pty"),
+        *soaked(("unplug", "tcp"), ("power_cycle", "pty"), ("stall", "tcp")),
+    ],
+)
 def test_the_driver_is_back_by_itself(where: str, fault: str, tmp_path: Path) -> None:
     link = str(tmp_path / "probe") if where == "pty" else "tcp://127.0.0.1:0"
     with line_for(link) as line:

@@ -6,12 +6,13 @@ import time
 import pytest
 import rclpy
 from omsm_msgs.msg import Calibration as CalibrationMessage
+from soaked import soaked
 
 from omsm_ros.io.calibration_file import save_calibration
 from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS
 
 
-@pytest.mark.parametrize("simulated", [False, True])
+@pytest.mark.parametrize("simulated", [True, *soaked(False)])
 def test_calibration_of_tomorrow_is_published_once(cell, true_calibration, simulated):
     path = cell.folder / "cal.json"
     save_calibration(path, true_calibration)
