@@ -154,6 +154,7 @@ def test_whatever_happens_in_any_order(name: str, bench: Any, data: st.DataObjec
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(0)  # minutes on a busy host
 @pytest.mark.parametrize("name", KINDS)
 @sequences(150)
 @given(st.data())

@@ -152,6 +152,7 @@ def test_the_stream_lives_through_any_faults(bench: Any, data: st.DataObject) ->
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(0)  # minutes on a busy host
 @sequences(150)
 @given(st.data())
 def test_the_stream_lives_through_many_faults(bench: Any, data: st.DataObject) -> None:
@@ -167,6 +168,7 @@ def test_a_ring_is_read_through_any_faults(
 
 
 @pytest.mark.soak
+@pytest.mark.timeout(0)  # minutes on a busy host
 @sequences(150)
 @given(st.data())
 def test_a_ring_is_read_through_many_faults(
