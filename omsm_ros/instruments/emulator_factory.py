@@ -35,18 +35,16 @@ _LOOK_S = 0.05
 class TcpServer:
     """Serves one client at a time on a loopback port, which stays the same over ``unplug``.
 
-    A second client is refused at once, as by a device with one connection; with ``newest_wins``
-    it replaces the first one. Bytes written without a client are lost; a client that does not
-    read delays the writer. ``sessions`` counts the clients that were accepted, ``turned_away`` the
-    others.
+    A second client is refused at once, as by a device with one connection. Bytes written without a
+    client are lost; a client that does not read delays the writer. ``sessions`` counts the clients
+    that were accepted, ``turned_away`` the others.
 
     Not imitated: delay, loss and reordering of a network, keep-alive, several clients.
     """
 
-    def __init__(self, port: int = 0, *, newest_wins: bool = False) -> None:
+    def __init__(self, port: int = 0) -> None:
         """port: 0 = any free one."""
         self._port = port
-        self._newest_wins = newest_wins
         self._listening: socket.socket | None = None
         self._client: socket.socket | None = None
         self.turned_away = self.sessions = 0
@@ -120,7 +118,7 @@ class TcpServer:
                 client, _ = self._listening.accept()
             except OSError:
                 return
-            if not (self._gone() or self._newest_wins):
+            if not self._gone():
                 self.turned_away += 1
                 client.close()
                 continue

@@ -59,20 +59,6 @@ def test_a_second_client_is_turned_away_and_the_first_stays() -> None:
         second.close()
 
 
-def test_or_it_takes_the_place() -> None:
-    with TcpServer(newest_wins=True) as server:
-        first, second = transport_for(server.path), transport_for(server.path)
-        first.open()
-        assert server.has_reader
-        second.open()
-        server.write(b"new")
-        assert read(second, 3) == b"new"
-        with pytest.raises(DeviceError):
-            first.read(SOON)
-        first.close()
-        second.close()
-
-
 def test_unplugged_and_plugged_again_on_the_same_port() -> None:
     with TcpServer() as server:
         driver = transport_for(server.path)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import signal
 
 from omsm_ros.core.kinematics.kinematics import (
     PolynomialSurface,
@@ -227,8 +228,6 @@ def delayed(scan: ScanData, latency: float) -> ScanData:
 
 def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
     """Return the derivative of ``order`` by time, run by run between gaps."""
-    from scipy import signal  # takes half a second to load
-
     period = float(np.median(np.diff(time)))
     edges = np.flatnonzero(np.diff(time) > 1.5 * period) + 1
     made = np.empty(len(values))
@@ -268,8 +267,6 @@ _CREEP_S = 2.0
 
 def _fading(time: FloatArray, motion: FloatArray) -> FloatArray:
     """Return the mean of ``motion`` over the last two seconds, fading, less ``motion``."""
-    from scipy import signal
-
     step = float(np.median(np.diff(time))) / _CREEP_S
     start = [motion[0] * (1 - step)]
     return np.asarray(signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import signal
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.motion_filter import SETTLED
@@ -114,8 +115,6 @@ class Residual:
 
 def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
     """Return the mean square of (1 - G) z above ``up_to`` [Hz], running over the record, (n,)."""
-    from scipy import signal  # takes half a second to load
-
     kernel = _band_kernel(up_to, digital.sample_period, len(z))
     half = len(kernel) // 2
     if not half:
@@ -137,8 +136,6 @@ def _band_kernel(up_to: float, sample_period: float, samples: int) -> FloatArray
     """
     if up_to >= 0.5 / sample_period:
         return np.ones(1)
-    from scipy import signal  # takes half a second to load
-
     taps, beta = signal.kaiserord(_ATTENUATION_DB, 2 * (1 - _PASSED_SHARE) * up_to * sample_period)
     half = min(taps // 2, samples // 4)
     cutoff = (1 + _PASSED_SHARE) / 2 * up_to
@@ -266,9 +263,9 @@ def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
     if len(z) <= 2 * _STRETCH_SAMPLES:
         return [z]
     starts = set()
-    for signal in (residual, np.abs(np.diff(z)), np.abs(np.diff(z, 2))):
-        level = running_mean(signal, _STRETCH_SAMPLES // 8)
-        middle = int(np.argmax(level)) + len(z) - len(signal)
+    for series in (residual, np.abs(np.diff(z)), np.abs(np.diff(z, 2))):
+        level = running_mean(series, _STRETCH_SAMPLES // 8)
+        middle = int(np.argmax(level)) + len(z) - len(series)
         starts.add(int(np.clip(middle - _STRETCH_SAMPLES // 2, 0, len(z) - _STRETCH_SAMPLES)))
     return [z[start : start + _STRETCH_SAMPLES] for start in sorted(starts)]
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy import optimize, signal
 
 from omsm_ros.core.estimation.noise import reading_step
 from omsm_ros.core.estimation.steps import Edge, find_steps
@@ -125,7 +126,6 @@ def _normalised(record: MotionRecord, edges: list[Edge]) -> _Edges:
 
 def _axis(edges: _Edges, grid: FloatArray, period: float) -> tuple[FloatArray, FloatArray, float]:
     """Return the edge on ``grid`` [samples], the starts (e,), and the residual over its noise."""
-    from scipy import optimize, signal
     from scipy.interpolate import CubicSpline
 
     step = period / _FINE
@@ -174,7 +174,6 @@ class _ProbeFit:
 
     def _through(self, pole: complex, at: FloatArray) -> list[FloatArray]:
         """Return the edge through 1/(s - p) at places ``at``, linear between values of the grid."""
-        from scipy import signal
         from scipy.interpolate import CubicSpline
 
         grown = np.exp(pole * self.step)
@@ -205,8 +204,6 @@ class _ProbeFit:
 def _mode(
     edges: _Edges, grid: FloatArray, command: FloatArray, place: FloatArray, period: float
 ) -> FastMode:
-    from scipy import optimize
-
     known = np.isfinite(edges.probe)
     seen = edges.probe[known] / edges.probe_noise
     residual = _ProbeFit(place[known], seen, grid, command, period / _FINE).residual

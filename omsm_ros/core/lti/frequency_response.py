@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import polynomial
+from scipy import signal
 
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction, slow_motion_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
@@ -31,8 +32,6 @@ def frequency_response(
     Increments make steps and offsets stationary and cancel in the ratio. The uncertainty is
     that of Bendat and Piersol, √((1 - γ²) / (2 γ² n)), with n independent segments.
     """
-    from scipy import signal  # imported here, because it takes half a second to load
-
     du, dy = np.diff(motion), np.diff(output)
     rate = 1 / sample_period
     options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}

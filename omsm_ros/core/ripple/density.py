@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage, special
+from scipy import ndimage, signal, special
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, DataError
@@ -56,8 +56,6 @@ def density(values: FloatArray, step: float) -> Density:
     count = len(values)
     if count < 16:
         raise DataError("ripple.short_spectrum", count=count, least=16)
-    from scipy import signal  # takes half a second to load
-
     frequency, power = signal.periodogram(values, 1 / step, "blackmanharris", detrend=False)
     return Density(frequency, power, 1 / (count * step))
 
@@ -112,8 +110,6 @@ def band_stop(
     A Butterworth filter of fourth order runs forward and backward, so that its phase is zero. It
     interpolates missing samples. Raises ConfigurationError for a band beyond half the rate.
     """
-    from scipy import signal
-
     count = int(sample[-1] - sample[0]) + 1
     even = np.interp(np.arange(count), sample - sample[0], values)
     kept, response = even, np.ones(2048)
@@ -137,8 +133,6 @@ def band_stop(
 
 
 def _sections(low: float, high: float, period: float) -> FloatArray:
-    from scipy import signal
-
     nyquist = 0.5 / period
     if not 0 < low < high < nyquist:
         raise ConfigurationError("ripple.stop_band", low=low, high=high, nyquist=nyquist)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from omsm_ros.core.ripple.coordinates import (
     LEAST_WAVES,
@@ -140,8 +141,6 @@ def _strongest(
     known: Sequence[SpectralLine],
     taken: Mapping[str, Sequence[tuple[float, float]]],
 ) -> list[SpectralLine]:
-    from scipy.signal import find_peaks  # takes half a second to load
-
     best: tuple[float, list[SpectralLine]] = (0.0, [])
     for coordinate in searched:
         power, spacing = power_over(signal, residual, coordinate)

@@ -19,7 +19,7 @@ from numpy.polynomial.polynomial import polyval
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import Gradient
-from omsm_ros.core.surface.zernike_terms import jacobi_step
+from omsm_ros.core.surface.zernike_terms import jacobi
 from omsm_ros.errors import SurfaceError
 from omsm_ros.quantities import COEFFICIENT, CONIC_CONSTANT, RADIUS, CheckedRecord, Quantity
 
@@ -231,16 +231,9 @@ def _orthonormal(count: int, m: int, orders: tuple[float, float]) -> FloatArray:
 def _jacobi_series(
     coefficients: Sequence[float], alpha: float, beta: float, x: FloatArray
 ) -> Series:
-    """Return Σ a_k P_k^(α,β)(2x − 1) and its derivative by x, by the three-term recurrence."""
-    t, zero = 2 * x - 1, np.zeros_like(x)
-    before: Series = (zero, zero)
-    now: Series = (zero + 1, zero)
-    total, slope = zero, zero
-    for k, coefficient in enumerate(coefficients):
-        total, slope = total + coefficient * now[0], slope + coefficient * now[1]
-        a, b, c = jacobi_step(k, alpha, beta)
-        factor = a * t + b
-        value = factor * now[0] - c * before[0]
-        rate = factor * now[1] + 2 * a * now[0] - c * before[1]
-        before, now = now, (value, rate)
+    """Return Σ a_k P_k^(α,β)(2x − 1) and its derivative by x."""
+    total = slope = np.zeros_like(x)
+    terms = jacobi(2 * x - 1, alpha, beta, len(coefficients) - 1, slopes=True)
+    for coefficient, (value, rate) in zip(coefficients, terms, strict=False):
+        total, slope = total + coefficient * value, slope + 2 * coefficient * rate
     return total, slope

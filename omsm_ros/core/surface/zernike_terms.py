@@ -82,7 +82,7 @@ def rms_of(term: ZernikeIndex) -> float:
     return float(1 / np.sqrt((1 if term.m == 0 else 2) * (term.n + 1)))
 
 
-def jacobi_step(k: int, alpha: float, beta: float) -> tuple[float, float, float]:
+def _jacobi_step(k: int, alpha: float, beta: float) -> tuple[float, float, float]:
     """Return a, b, c of ``P_(k+1)(t) = (a t + b) P_k(t) − c P_(k−1)(t)``, P = P^(alpha, beta)."""
     both = alpha + beta
     if k == 0:
@@ -94,15 +94,15 @@ def jacobi_step(k: int, alpha: float, beta: float) -> tuple[float, float, float]
     return a, b, c
 
 
-def _jacobi(
-    t: FloatArray, m: int, highest: int, slopes: bool
+def jacobi(
+    t: FloatArray, alpha: float, beta: float, highest: int, slopes: bool
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield P_k^(0,m)(t) and its derivative, 0 unless ``slopes``, for k = 0 to ``highest``."""
+    """Yield P_k^(α,β)(t) and its derivative, 0 unless ``slopes``, for k = 0 to ``highest``."""
     before, value = np.zeros_like(t), np.ones_like(t)
     before_slope, slope = (np.zeros_like(t) if slopes else np.zeros(()) for _ in range(2))
     yield value, slope
     for k in range(highest):
-        a, b, c = jacobi_step(k, 0, m)
+        a, b, c = _jacobi_step(k, alpha, beta)
         factor = a * t + b
         if slopes:
             slope, before_slope = factor * slope + a * value - c * before_slope, slope
@@ -127,7 +127,7 @@ def zernike_values(x: FloatArray, y: FloatArray, terms: Sequence[ZernikeIndex]) 
     groups = _by_angle(terms)
     for m in range(max(groups, default=0) + 1):
         wanted = groups.get(m, ())
-        radial = [value for value, _ in _jacobi(t, m, max((k for _, k, _ in wanted), default=0),
+        radial = [value for value, _ in jacobi(t, 0, m, max((k for _, k, _ in wanted), default=0),
                                                 False)] if wanted else []  # fmt: skip
         for place, k, sine in wanted:
             np.multiply(radial[k], imaginary if sine else real, out=made[place])
@@ -145,7 +145,7 @@ def zernike_slopes(
         power = base**m
         # Derivative of (x + iy)^m: m (x + iy)^(m-1) along x, i times that along y.
         turned = m * base ** max(m - 1, 0)
-        radial = list(_jacobi(t, m, max(k for _, k, _ in wanted), True))
+        radial = list(jacobi(t, 0, m, max(k for _, k, _ in wanted), True))
         for place, k, sine in wanted:
             value, slope = radial[k]
             along_x[place] = _part(turned, sine) * value + 4 * x * _part(power, sine) * slope
