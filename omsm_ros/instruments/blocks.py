@@ -119,7 +119,7 @@ class BlockCutter:
         self._missed_before = 0  # the last pause, restart or renumbering
         self._skipped = 0  # counts left out for missed triggers
         self._lost = self.unconfirmed = False  # whether triggers were missed before a pause
-        self.delivered = self.withheld = self.blocks = self.period_warnings = 0
+        self.delivered = self.withheld = self.blocks = self.period_warnings = self.resets = 0
         self.period_deviation = 0.0
         self._evenly_wrong = False
 
@@ -211,8 +211,10 @@ class BlockCutter:
             if run.restarted or run.first_sample != self._first + len(self._pending):
                 yield from self.flush()
                 self._first = run.first_sample
-            if run.restarted and self._channels.axes is not None:
-                self._judge_restart(run, after_silence and i == 0)
+            if run.restarted:
+                self.resets += after_silence and i == 0 and not self.lost_settings
+                if self._channels.axes is not None:
+                    self._judge_restart(run, after_silence and i == 0)
             self._counts = run.samples["counts"][-1]
             if i == 0 or run.restarted:
                 self._set_clock(runs[i:], times[i:], arrival_ns, after_silence and i == 0)

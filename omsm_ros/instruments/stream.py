@@ -38,6 +38,7 @@ class StreamStatistics:
     missed: triggers without a sample of this device, by the arrivals (``MissedTriggerDetector``)
     lost, gaps: trigger counts that never arrived, and in how many places
     restarts: how often the device's counter or clock fell back
+    resets: how many of these came after a silence, with the connection kept: the counter was reset
     period_deviation: of the last full block's device time from nominal, relative [1]
     period_warnings: full blocks beyond PERIOD_TOLERANCE
     renewals: connections made again because nothing came
@@ -55,6 +56,7 @@ class StreamStatistics:
     lost: int = 0
     gaps: int = 0
     restarts: int = 0
+    resets: int = 0
     blocks: int = 0
     period_deviation: float = 0.0
     period_warnings: int = 0

@@ -111,8 +111,6 @@ class DriverNode(ManagedNode):
             connected=self._publish_settings,
         )
         self._recent, self._flow = RecentIncrease(), SampleFlow()
-        self._silent_since: int | None = None  # connections when it fell silent
-        self._restarts = self._reset = 0.0
         self._reported: dict[str, object] = {}
         if self._settings_topic:
             self._settings = publish_on(self, undo, String, self._settings_topic, LATCHED_QOS)
@@ -171,14 +169,8 @@ class DriverNode(ManagedNode):
 
     def _add_faults(self, report: StateReport, counts: dict[str, float], now: float) -> None:
         faults = {name: n for name, n in counts.items() if name.startswith(_FAULTS)}
-        # A counter that begins again after a silence was reset for another measurement, unless the
-        # device was connected anew, as after it lost power or its settings.
-        risen = counts.get("restarts", 0.0) - self._restarts
-        kept = self._silent_since == self._reader.connections
-        self._reset += risen if kept and risen == 1 else 0.0
-        self._restarts += risen
-        if "restarts" in faults:
-            faults["restarts"] -= self._reset
+        if "restarts" in faults:  # a counter is reset for another measurement
+            faults["restarts"] -= counts.get("resets", 0.0)
         if seen := self._recent.update(faults, now):
             text = ", ".join(f"{name} {rise:.0f}" for name, rise in seen.items())
             report.add(WARN, f"just now: {text}")
@@ -188,10 +180,6 @@ class DriverNode(ManagedNode):
             return
         patience = max(_SILENCE_S, _SILENCE_SAMPLES * self.values["sample_period"])
         silent = self._flow.silent(now)
-        if silent is None or silent <= patience:
-            self._silent_since = None
-        elif self._silent_since is None:
-            self._silent_since = self._reader.connections
         if silent is None:
             report.add(STALE, "connected, but no sample has come yet")
         elif silent > patience:

@@ -403,7 +403,7 @@ def test_encoders_that_begin_at_zero_are_not_published(absolute: bool) -> None:
     device = GenericStreamDevice(Script(*portions), StreamSettings())
     device.open()
     found = [pair for _ in portions for pair in device.poll(0.0)]
-    assert device.statistics.restarts == 1
+    assert (device.statistics.restarts, device.statistics.resets) == (1, 0)
     assert len(found) == (6 if absolute else 3)
     assert ("home the axes" in device.trouble) != absolute
 
@@ -430,7 +430,7 @@ def test_encoders_at_zero_after_a_lost_connection_are_not_published() -> None:
         now += 1.0
         device.open()
     assert [pair.axes.first_sample for pair in found] == [5000, 5100, 5200]
-    assert device.statistics.withheld == 300
+    assert (device.statistics.withheld, device.statistics.resets) == (300, 0)
     assert "home the axes" in device.trouble
 
 
@@ -448,6 +448,7 @@ def test_a_scan_that_begins_at_the_origin_after_a_pause_is_published() -> None:
         now += 5.0 if number == 6 else 0.05
         found += device.poll(0.0)
     assert sum(len(pair.axes) for pair in found) == 600
+    assert (device.statistics.restarts, device.statistics.resets) == (1, 1)
     assert device.trouble == ""
     assert "home the axes" in device.caution
 

@@ -44,7 +44,7 @@ def driver(monkeypatch):
     now = [50.0]
     monkeypatch.setattr(driving.time, "monotonic", lambda: now[0])
     counts = dict.fromkeys(
-        ("received", "decoded", "malformed", "lost", "losses_of_sync", "restarts"), 0
+        ("received", "decoded", "malformed", "lost", "losses_of_sync", "restarts", "resets"), 0
     )
     made = Driver(
         now=now, counts=counts,
@@ -54,7 +54,6 @@ def driver(monkeypatch):
                                 caution="", settings={"rate_hz": 1000.0}),
         _reader=SimpleNamespace(state=State.READING, trouble="", connections=2),
         _recent=RecentIncrease(), _flow=SampleFlow(), _reported={},
-        _silent_since=None, _restarts=0.0, _reset=0.0,
         _messages=message_mapping.ros_messages(),
         _topics={AxisBlock: "axes", DistanceBlock: "confocal"},
         _publisher_of={AxisBlock: Published(), DistanceBlock: Published()},
@@ -167,24 +166,5 @@ def test_settings_are_reported_once_before_the_first_block_and_again_when_they_c
 
 def test_a_counter_that_is_reset_between_two_measurements_is_no_fault(driver):
     """The same restart while samples arrive is one."""
-    driver.passes(1.0, 1000)
-    assert "no sample" in driver.passes(5.0, 0).text
-    assert driver.passes(1.0, 1000, restarts=1).text.startswith("reading at")
-    assert "just now: restarts 1" in driver.passes(1.0, 1000, restarts=1).text
-
-
-def test_two_restarts_after_a_silence_are_a_fault(driver):
-    driver.passes(1.0, 1000)
-    driver.passes(5.0, 0)
-    assert "just now: restarts 2" in driver.passes(1.0, 1000, restarts=2).text
-
-
-@pytest.mark.parametrize("comes_back_while_silent", [True, False])
-def test_a_restart_of_a_device_that_was_set_up_again_is_a_fault(driver, comes_back_while_silent):
-    """As one that lost power, and with it its settings."""
-    driver.passes(1.0, 1000)
-    driver.passes(5.0, 0)
-    driver._reader.connections += 1
-    if comes_back_while_silent:
-        driver.passes(1.0, 0)
-    assert "just now: restarts 1" in driver.passes(1.0, 1000, restarts=1).text
+    assert driver.passes(1.0, 1000, restarts=1, resets=1).text.startswith("reading at")
+    assert "just now: restarts 1" in driver.passes(1.0, 1000, restarts=2, resets=1).text
