@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from coverage import PRIORS, drawn, normalised
+from coverage import AS_DRAWN, drawn, normalised
 from plain_world import MIRROR
 
 from omsm_ros.core.adjustment import VERIFIED, adjust
@@ -17,7 +17,7 @@ def of_two_scans(seeds):
     rows, found = [], []
     for seed in seeds:
         machine, scans = drawn(seed, 2, PITCH_M)
-        found.append(adjust(scans, PRIORS, nominal=MIRROR, accuracy=25e-9))
+        found.append(adjust(scans, AS_DRAWN, nominal=MIRROR, accuracy=25e-9))
         rows.append(normalised(machine, found[-1]))
     return rows, found
 
@@ -44,7 +44,7 @@ def test_a_scan_without_the_rim_agrees_where_both_have_points():
     _, (first, second) = drawn(1, 2, PITCH_M)
     inside = np.hypot(second.x, second.y) < 8e-3
     columns = {n: v[inside] for n, v in vars(second).items() if isinstance(v, np.ndarray)}
-    found = adjust([first, replace(second, **columns)], PRIORS, nominal=MIRROR, accuracy=25e-9)
+    found = adjust([first, replace(second, **columns)], AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
     assert not any(reason.code == DISAGREE for reason in found.verdict.reasons)
 
 
@@ -93,7 +93,7 @@ def test_single_clean_scans_refute_nothing():
     rows = []
     for seed in range(100, 120):
         machine, scans = drawn(seed, 1, PITCH_M)
-        found = adjust(scans, PRIORS, nominal=MIRROR, accuracy=25e-9)
+        found = adjust(scans, AS_DRAWN, nominal=MIRROR, accuracy=25e-9)
         assert not found.refutations
         assert not found.wrong_sign
         rows.append(normalised(machine, found))
