@@ -10,7 +10,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal._sosfilt import _sosfilt
+
+try:
+    from scipy.signal._sosfilt import _sosfilt
+except ImportError:  # a private name; the public function is slower with short blocks
+    from scipy.signal import sosfilt as _public
+
+    def _sosfilt(sections: Any, samples: Any, state: Any) -> None:
+        samples[0], state[0] = _public(sections, samples[0], zi=state[0])
+
 
 FloatArray = NDArray[np.float64]
 # Rows and values of a matrix held in memory at a time, where a long record is processed in blocks:
