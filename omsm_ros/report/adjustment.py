@@ -85,16 +85,11 @@ def _truth(facts: Mapping[str, Any]) -> Table:
 
 def _figures(facts: Mapping[str, Any]) -> Table:
     figures = facts["figures"]
+    shown = [("PV", figures[_PV], False), ("rms", figures["rms"], False)]
+    shown += [(f"Z({t['n']}, {t['m']})", t, True) for t in figures["terms"]]
     rows = [
-        (name, expanded(figures[key]["value"], figures[key]["standard_uncertainty"], "m"))
-        for name, key in (("PV", _PV), ("rms", "rms"))
-    ]
-    rows += [
-        (
-            f"Z({term['n']}, {term['m']})",
-            expanded(term["value"], term["standard_uncertainty"], "m", signed=True),
-        )
-        for term in figures["terms"]
+        (name, expanded(found["value"], found["standard_uncertainty"], "m", signed=signed))
+        for name, found, signed in shown
     ]
     return Table("Figures, pose removed", ("value and U (k = 2)",), rows)
 

@@ -424,7 +424,8 @@ def _resembled(
     """Return families that the scans leave open and that the form speaks for, likeliest first.
 
     Each has its name, twice the logarithm of its odds, and its change of the map as one standard
-    uncertainty (n,) [m]. One machine of ten has one declaration wrong that no scan shows.
+    uncertainty (n,) [m]: as far as the form shows it, for no part cancels an error of the machine.
+    Of ten declarations that no scan shows one is wrong; of several such families one holds.
     """
     if not np.any(made.height):
         return []
@@ -441,7 +442,11 @@ def _resembled(
         shape = effect.shape if family.smooth is None else effect.shape @ family.smooth
         gain, values = form.looks_like(fit @ shape, family.wide)
         if gain > _POSITIVE:
-            found.append((family.name, gain, shape @ values))
+            change = shape @ values
+            weight = made.places.area * change
+            shown = weight @ made.height / np.maximum(weight @ change, 1e-30)
+            if shown > 0:
+                found.append((family.name, gain, min(shown, 1.0) * change))
     odds = np.exp([min(gain, SURE) / 2 for _, gain, _ in found])
     roots = np.sqrt(odds / (ODDS_ABSENT + np.sum(odds)))
     alike = [(name, gain, r * change) for (name, gain, change), r in zip(found, roots, strict=True)]
