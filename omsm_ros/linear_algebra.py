@@ -4,21 +4,13 @@ Columns may have any units: each is scaled to unit length first.
 """
 
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import ContextDecorator
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-try:
-    from scipy.signal._sosfilt import _sosfilt
-except ImportError:  # a private name; the public function is slower with short blocks
-    from scipy.signal import sosfilt as _public
-
-    def _sosfilt(sections: Any, samples: Any, state: Any) -> None:
-        samples[0], state[0] = _public(sections, samples[0], zi=state[0])
-
 
 FloatArray = NDArray[np.float64]
 # Rows and values of a matrix held in memory at a time, where a long record is processed in blocks:
@@ -65,14 +57,14 @@ def triangle(*parts: FloatArray) -> FloatArray:
     return found
 
 
-class _OneThread:
+class _OneThread(ContextDecorator):
     """The limit of BLAS to one thread, shared by all that ask for it at the same time."""
 
     def __init__(self) -> None:
         self._lock, self._users = threading.Lock(), 0
         self._limit: Any = None
 
-    def enter(self) -> None:
+    def __enter__(self) -> None:
         try:
             from threadpoolctl import threadpool_limits
         except ImportError:  # nodes and commands ask BLAS for one thread as they start
@@ -82,7 +74,7 @@ class _OneThread:
                 self._limit = threadpool_limits(1, user_api="blas")
             self._users += 1
 
-    def leave(self) -> None:
+    def __exit__(self, *_: object) -> None:
         with self._lock:
             self._users -= 1
             if self._users == 0 and self._limit is not None:
@@ -92,18 +84,26 @@ class _OneThread:
 _one_thread = _OneThread()
 
 
-@contextmanager
-def one_blas_thread() -> Iterator[None]:
+def one_blas_thread() -> ContextDecorator:
     """Let BLAS compute in one thread; also a decorator.
 
     The order of additions in a sum depends on the number of threads, so that a search would end at
     other bits, or at another model. Threads cost more than they gain in matrices of this size.
     """
-    _one_thread.enter()
+    return _one_thread
+
+
+@cache  # made when it is needed: every command loads this module, and scipy.signal takes longer
+def _sosfilt() -> Callable[[Any, Any, Any], None]:
     try:
-        yield
-    finally:
-        _one_thread.leave()
+        from scipy.signal._sosfilt import _sosfilt as loop
+    except ImportError:  # a private name; the public function is slower with short blocks
+        from scipy.signal import sosfilt as public
+
+        def loop(sections: Any, samples: Any, state: Any) -> None:
+            samples[0], state[0] = public(sections, samples[0], zi=state[0])
+
+    return loop  # type: ignore[no-any-return]
 
 
 def sosfilt(
@@ -118,5 +118,5 @@ def sosfilt(
     """
     response = np.empty(len(samples)) if out is None else out
     response[:] = samples
-    _sosfilt(sections, response[np.newaxis], state[np.newaxis])
+    _sosfilt()(sections, response[np.newaxis], state[np.newaxis])
     return response

@@ -21,8 +21,8 @@ REAL_ROS2 = shutil.which("ros2") or ""
 # Commands that no test can run, and why; a new command on a page is run.
 NOT_RUN = {
     r"git clone|cd ~/ws && git clone": "needs the network, and a repository that is public",
-    r"rosdep |colcon |\. install/setup\.bash": "need a ROS distribution from apt; 'make setup' "
-    "builds with colcon, test_package.py holds package.xml and setup.py together",
+    r"(\S+=\S+ )?rosdep |colcon |\. install/setup\.bash": "need a ROS distribution from apt; "
+    "'make setup' builds with colcon, test_package.py holds package.xml and setup.py together",
     r"pip install": "needs the network; test_wheel.py installs the wheel in a fresh environment",
     r"\. \./env\.sh": "the tests run in the shell that it makes",
     r"python -m benchmarks": "minutes to an hour; test_benchmarks.py runs their parts",
@@ -30,6 +30,8 @@ NOT_RUN = {
     r"ros2 security ": "the wheels' Fast DDS is built without security",
     r"ros2 run omsm_ros replay$": "the name of a node; it is run with its bag in recordings.md",
     r"omsm (demo|history)$": "the name of a command; both are run with their options elsewhere",
+    r"omsm (COMMAND|sources KIND)": "a word in capitals stands for others",
+    r".*device:=lamp": "needs the package of that page installed; test_adding_a_probe.py has it",
 }
 NEEDS_LAUNCH = {
     r"ros2 launch omsm_ros replay\.launch\.py": "the stand-in for launch has no events; the node "
