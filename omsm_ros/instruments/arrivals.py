@@ -16,7 +16,7 @@ from omsm_ros.units import NANOSECOND_S, NANOSECONDS_PER_S, PPM
 
 # Long enough to average jitter out, short enough to follow a crystal that warms up [s].
 WINDOW_S = 30.0
-# Of the arrivals of this time only the earliest counts: it bounds the fit to 150 points [s].
+# Only the earliest arrival in this time counts, which bounds the fit to 150 points [s].
 _SPAN_S = 0.2
 # Crystals differ by some tens of ppm: the standard uncertainty of the drift before any arrival.
 _DRIFT_SIGMA = 100 * PPM
@@ -183,9 +183,9 @@ _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
 # Spans in whose earliest arrival the delays by a busy host are short, as a rule. The limit is at
 # least this multiple of that delay.
 _WINDOW, _USUAL = 4, 2.0
-# So many spans without an arrival that confirms show the number of missed triggers.
+# This number of spans without a confirming arrival shows how many triggers were missed.
 _SHOWING = 3
-# It is certain if so many windows agree, and if the delay was below this before [period].
+# That is certain if this number of windows agree, and if the delay was below this [period].
 _AGREEING, _EVEN_PERIODS = 3, 0.4
 
 

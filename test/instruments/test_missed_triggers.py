@@ -70,7 +70,7 @@ class Wire:
 
 @dataclass
 class Outcome:
-    """What was published: before the missed trigger, after it, and of two triggers.
+    """Points published before the missed trigger, after it, and of two triggers.
 
     last: count of the last point;  withheld: until the end of the run;  waited: at its end
     """

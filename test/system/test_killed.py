@@ -41,7 +41,7 @@ def seeds(many):
 @pytest.mark.parametrize("seed", seeds(10))
 def test_a_killed_driver_leaves_a_gap_that_is_counted(cell, true_calibration, seed):
     """corrected + counted reasons + missing are what the emulator sent."""
-    # What a driver misses that starts after the end has no number; a process may start in 10 s.
+    # A driver that starts after the end misses samples without a number; a start may take 10 s.
     scans = 2 if seed else 1
     start_scanning(cell, true_calibration, scans)
     when = random.Random(seed).randrange(1000, SCAN // 3)

@@ -319,8 +319,8 @@ def _local_features(
 ) -> tuple[IntArray, FloatArray, IntArray, FloatArray, float]:
     """Return where (m,) grooves, pips, scratches and edges change the ``smooth`` form (n,) [m].
 
-    With the form there [m], the number of the cell whose mean it is and the noise of that [m], each
-    (m,), and the rms of the form that these means do not resolve [m].
+    Also the form there [m], the number of the cell whose mean it is, and the noise of that mean
+    [m], each (m,). Last is the rms of the form that these means do not resolve [m].
 
     Cells of five sizes whose mean exceeds what noise makes anywhere on the map show them, as do
     single points (D. Donoho, I. Johnstone, Biometrika 81, 425). Each of the largest cells with one

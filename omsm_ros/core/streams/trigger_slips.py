@@ -54,8 +54,8 @@ _SURE_STAMPS = 3
 _WANDER_S = 30.0
 # A step of stamps is a slip from the share of a period on; a longer one is a pause of the trigger.
 _STEP_PERIODS, _LONGEST_STEP_S = 0.7, 0.15
-# After so many verdicts it is looked anew whether this multiple of the largest step of a clock, and
-# of what it may still move, is below it; otherwise steps show nothing.
+# After this number of verdicts it is tested again whether this multiple of the largest step of a
+# clock, and of what it may still move, is below it; otherwise steps show nothing.
 _STEP_VERDICTS, _USUAL_STEPS = 5, 3.0
 # A skew within this of that before the step shows that it was none [samples].
 _RETURNED = 0.25
@@ -63,7 +63,7 @@ _RETURNED = 0.25
 _MOST_STAMPS = 1024
 # Standard deviations of single stamps that the median of several does not reach.
 _SEVERAL_TIMES = 3.0
-# A slip is found within so many verdicts; skews before them show how clocks move.
+# A slip is found within this number of verdicts; skews before them show how clocks move.
 _FOUND_IN = 5
 
 

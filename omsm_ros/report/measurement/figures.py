@@ -300,9 +300,9 @@ def profile_cuts(
     feed = _feed(cloud)
     # Segments of full turns average out the errors of other orders.
     spacing = feed * np.ceil(size / _SEGMENTS / feed) if feed else size / _SEGMENTS
-    wide = {"half_width": size * _BAND_SHARE / 2, "spacing": spacing}
+    band = {"half_width": size * _BAND_SHARE / 2, "spacing": spacing}
     cuts = {
-        name: {k: form.line_profile(x, y, v, angle=angle, **wide) for k, v in deviations.items()}
+        name: {k: form.line_profile(x, y, v, angle=angle, **band) for k, v in deviations.items()}
         for name, (angle, *_) in _LINES.items()
     }
     rings = {k: form.radial_profile(x, y, v, spacing=spacing) for k, v in deviations.items()}

@@ -37,7 +37,7 @@ PRIORS = (
     Source("probe_slope_square", 1e-8, evaluated=True),
     *(Source(f"spindle_axial/{n}", size) for n, size in SPINDLE.items()),
 )
-# And what the drawn machines do not have: undeclared, each would count with its plausible size.
+# The drawn machines do not have these; undeclared, each would count with its plausible size.
 AS_DRAWN = (
     *PRIORS,
     Source("expansion", 2e-7, evaluated=True),
