@@ -60,11 +60,13 @@ class Channels(NamedTuple):
 
     distance: it has a probe;  axes: scaling of its encoders in the order of AXES, or None
     timed: its samples carry the time of its own clock
+    homed: it sends positions only while they are known, so that a restart does not lose them
     """
 
     distance: bool = True
     axes: tuple[AxisScaling, ...] | None = None
     timed: bool = True
+    homed: bool = False
 
 
 def wrapping(axes: tuple[AxisScaling, ...] | None, counts: int) -> tuple[AxisScaling, ...] | None:
@@ -213,7 +215,7 @@ class BlockCutter:
                 self._first = run.first_sample
             if run.restarted:
                 self.resets += after_silence and i == 0 and not self.lost_settings
-                if self._channels.axes is not None:
+                if self._channels.axes is not None and not self._channels.homed:
                     self._judge_restart(run, after_silence and i == 0)
             self._counts = run.samples["counts"][-1]
             if i == 0 or run.restarted:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from omsm_ros.errors import ConfigurationError
+from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.linuxcnc.device import make
 from omsm_ros.instruments.parameters import defaults
 from omsm_ros.instruments.scaling import AXES
@@ -45,6 +45,23 @@ def test_every_cycle_is_counted_and_a_restart_is_no_gap():
     assert counts["restarts"] == counts["malformed"] == 1
     assert counts["decoded"] == counts["delivered"] == 11
     assert [b.axes.first_sample for b in blocks][:2] == [1, 8]
+
+
+def test_after_a_restart_the_homed_axes_may_be_at_zero():
+    before = b"".join(line(n, x=12.0, z=1.5, c=1e4) for n in range(5001, 5004))
+    wire = [before, DeviceError("killed"), b"".join(map(line, range(700, 704)))]
+    values = defaults() | {"device": "linuxcnc", "port": "tcp://h:1"}
+    device = make(values, Script(*wire), lambda: 0)
+    device.open()
+    blocks = device.poll(0.0)
+    with pytest.raises(DeviceError):
+        device.poll(0.0)
+    blocks += device.close()
+    device.open()
+    blocks += [*device.poll(0.0), *device.close()]
+    assert [(b.axes.first_sample, len(b.axes)) for b in blocks] == [(5001, 3), (700, 4)]
+    assert not device.trouble
+    assert (device.counts()["restarts"], device.counts()["gaps"]) == (1, 0)
 
 
 def test_the_probe_has_no_target_where_the_program_does_not_measure():

@@ -1,7 +1,8 @@
 """Reads LinuxCNC: lines of HAL's sampler over TCP, one a servo cycle.
 
 The first column is the number of the servo cycle, counted in HAL itself, so that a lost cycle is a
-gap and a restart of LinuxCNC is a fall to one. The time is that number times the period which
+gap and a restart of LinuxCNC is a fall. HAL samples while all joints are homed: before that the
+positions are not known. The time is that number times the period which
 LinuxCNC states itself. ``overrun`` on a line of its own is counted; the samples that it reports are
 missing numbers, too.
 """
@@ -40,4 +41,4 @@ def make(values: Values, transport: Transport, now_ns: NowNs) -> CsvStreamDevice
                 "take device six_channel_text"
             )
         given[f"{axis}.counts_per_unit"] = stated or usual
-    return make_text(given, transport, now_ns, _PARTS)
+    return make_text(given, transport, now_ns, parts=_PARTS, homed=True)

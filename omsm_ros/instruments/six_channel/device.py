@@ -95,7 +95,7 @@ class CsvSettings(BlockSettings):
     """Settings of the text stream.
 
     columns: of a line, in order;  scaling: counts ↔ SI;  modulus: of the sequence
-    parts: of a count that are resolved
+    parts: of a count that are resolved;  homed: as of Channels
     An axis without a column stays at its offset.
     """
 
@@ -103,6 +103,7 @@ class CsvSettings(BlockSettings):
     scaling: StreamScaling = field(default_factory=StreamScaling)
     modulus: int = 2**32
     parts: int = PARTS
+    homed: bool = False
 
 
 class CsvStreamDevice(StreamDevice):
@@ -120,7 +121,7 @@ class CsvStreamDevice(StreamDevice):
         has_axes = bool(set(AXES) & set(settings.columns))
         in_parts = (_in_parts(axis, settings.parts) for axis in settings.scaling.axes)
         axes = tuple(in_parts) if has_axes else None
-        channels = Channels("distance" in settings.columns, axes, timed)
+        channels = Channels("distance" in settings.columns, axes, timed, settings.homed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
         super().__init__(transport, settings, channels, counting, *clocks)
         self._decoder = CsvDecoder(settings.columns, _MOST_PARTS // settings.parts)
@@ -174,16 +175,12 @@ def make_binary(values: Values, transport: Transport, now_ns: NowNs) -> GenericS
     return GenericStreamDevice(transport, settings, now_ns)
 
 
-def make_text(
-    values: Values, transport: Transport, now_ns: NowNs, parts: int = PARTS
-) -> CsvStreamDevice:
-    """Return the device that ``values`` describe, which resolves ``parts`` of a count."""
+def make_text(values: Values, transport: Transport, now_ns: NowNs, **more: Any) -> CsvStreamDevice:
+    """Return the device that ``values`` describe, with ``more`` of CsvSettings."""
     columns = tuple(values["columns"].replace(",", " ").split())
     read = [axis for axis in AXES if axis in columns]
     scaling = StreamScaling(**axes_of(values, read), probe=_probe_scaling(values))
-    settings = CsvSettings(
-        **_stream_settings(values), columns=columns, scaling=scaling, parts=parts
-    )
+    settings = CsvSettings(**_stream_settings(values), columns=columns, scaling=scaling, **more)
     return CsvStreamDevice(transport, settings, now_ns)
 
 
