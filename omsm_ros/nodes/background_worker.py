@@ -1,15 +1,11 @@
 """Does work that takes seconds in a thread, while the node continues to take samples."""
 
-import multiprocessing
 import queue
-import resource
-import signal
 import threading
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
-from multiprocessing.connection import Connection
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import Any, TypeVar
 
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.clock import Clock, ClockType
@@ -21,18 +17,13 @@ from omsm_ros.nodes.memory import return_free_memory
 from omsm_ros.nodes.running import offer, refusing
 
 T = TypeVar("T")
-Attend: TypeAlias = Callable[..., None]
 
 # Requests that may wait; a further one is refused at once.
 _MOST_WAITING = 8
-# Reading a bag from outside takes at most this time [s] and memory [bytes].
-_BAG_S, _BAG_BYTES = 300.0, 8 << 30
 # Idle time after which free memory is returned to the system [s].
 _IDLE_S = 1.0
-# Between two looks at a process, and two messages of feedback that say nothing new [s].
-UNLIMITED = resource.RLIM_INFINITY
-_LOOK_S, _FEEDBACK_S = 0.05, 0.5
-_PROGRESS, _DONE, _FAILED = "progress", "done", "failed"
+# Between two messages of feedback that say nothing new [s].
+_FEEDBACK_S = 0.5
 
 
 def silent(stage: str, **numbers: object) -> None:
@@ -41,72 +32,6 @@ def silent(stage: str, **numbers: object) -> None:
 
 class Cancelled(OmsmError):
     """The client of an action, or the end of the node, has ended the work."""
-
-
-def in_child(
-    work: Callable[..., T],
-    seconds: float = _BAG_S,
-    most_bytes: int = _BAG_BYTES,
-    attend: Attend | None = None,
-) -> T:
-    """Return what ``work`` returns in a process of its own, or raise what it raises.
-
-    A bag from outside may be made to take memory or time without end. ``work`` and its result are
-    pickled. Raises OmsmError if it takes longer, or more memory.
-
-    attend: called with the fields of the progress that ``work(progress)`` states, and without
-        fields meanwhile; what it raises ends the process
-    """
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    arguments = (sender, work, most_bytes, attend is not None)
-    child = context.Process(target=_child, args=arguments, daemon=True)
-    child.start()
-    sender.close()
-    until = time.monotonic() + seconds
-    kind, content = _PROGRESS, cast("Any", {})
-    try:
-        while kind == _PROGRESS:
-            if attend is not None:
-                attend(**content)
-            if time.monotonic() > until:
-                raise OmsmError(
-                    f"the bag was not read in {seconds:g} s; check it with omsm inspect"
-                )
-            kind, content = receiver.recv() if receiver.poll(_LOOK_S) else (_PROGRESS, {})
-    except EOFError as err:
-        raise OmsmError(
-            f"the process that read the bag ended; it may have needed more than "
-            f"{most_bytes / 2**30:.3g} GB: check the bag with omsm inspect"
-        ) from err
-    finally:
-        child.kill()
-        child.join()
-        receiver.close()
-    if kind == _FAILED:
-        raise content
-    return content  # type: ignore[no-any-return]
-
-
-def _child(sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the node ends this process
-    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
-    stated: tuple[object, float] = (None, 0.0)
-
-    def progress(stage: str, **numbers: object) -> None:
-        nonlocal stated
-        about, now = (stage, numbers.get("order")), time.monotonic()
-        if about != stated[0] or now - stated[1] > _FEEDBACK_S:
-            stated = about, now
-            sender.send((_PROGRESS, {"stage": stage, **numbers}))
-
-    try:
-        answer = (_DONE, work(progress) if tells else work())
-    except MemoryError:
-        return  # the parent sees that this process ended
-    except OmsmError as err:
-        answer = (_FAILED, OmsmError(str(err)))
-    sender.send(answer)
 
 
 class Goal:

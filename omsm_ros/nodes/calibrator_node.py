@@ -25,17 +25,11 @@ from omsm_ros.core.streams.trigger_slips import CommonTrigger
 from omsm_ros.errors import BagError, ConfigurationError, FileError, OmsmError, one_line
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import CalibrationFolder
+from omsm_ros.io.child_process import UNLIMITED, in_child
 from omsm_ros.io.figure_messages import certificate_message
 from omsm_ros.io.files import resolved_within
 from omsm_ros.io.folders import exclusive_lock
-from omsm_ros.nodes.background_worker import (
-    UNLIMITED,
-    BackgroundWorker,
-    Goal,
-    in_child,
-    serve_action,
-    silent,
-)
+from omsm_ros.nodes.background_worker import BackgroundWorker, Goal, serve_action, silent
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import BAG_FOLDERS, TRIGGER, trigger_of
 from omsm_ros.nodes.diagnostics import WARN, StateReport

@@ -27,11 +27,12 @@ from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.errors import BagError, CalibrationError, Notice, OmsmError
 from omsm_ros.io import message_mapping
 from omsm_ros.io.calibration_file import load_calibration, load_for_others, since
+from omsm_ros.io.child_process import in_child
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.figure_messages import account_message, verdict_message
 from omsm_ros.io.files import resolved_within
 from omsm_ros.nodes import topics
-from omsm_ros.nodes.background_worker import BackgroundWorker, Goal, in_child, serve_action
+from omsm_ros.nodes.background_worker import BackgroundWorker, Goal, serve_action
 from omsm_ros.nodes.calibration_topic import CalibrationTopic
 from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, options_of, sources_of
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport

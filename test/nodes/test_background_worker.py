@@ -15,7 +15,8 @@ import pytest
 pytest.importorskip("rclpy", reason="ROS 2 is not installed")
 
 from omsm_ros.errors import OmsmError
-from omsm_ros.nodes.background_worker import BackgroundWorker, in_child
+from omsm_ros.io.child_process import in_child
+from omsm_ros.nodes.background_worker import BackgroundWorker
 from omsm_ros.nodes.running import settings_of
 
 

@@ -15,8 +15,9 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.core.surface.measured_points import MeasuredPoints, measured
 from omsm_ros.errors import FileError
-from omsm_ros.io.files import atomic_file, exception_text, library_errors, open_regular
-from omsm_ros.io.optional_libraries import import_optional, walk_in_subprocess
+from omsm_ros.io.child_process import read_in_child
+from omsm_ros.io.files import atomic_file, library_errors, open_regular
+from omsm_ros.io.optional_libraries import import_optional, walk_in_child
 from omsm_ros.quantities import MAP_POINTS, shown
 from omsm_ros.units import LengthUnits, metres_in, needed, refuse_other
 
@@ -59,7 +60,7 @@ def read_hdf5(path: Path, channel: str | None = None) -> MeasuredPoints:
     what = f"HDF5 file {str(path)!r}"
     h5py = import_optional("h5py", what)
     with open_regular(path, FileError, "HDF5 file") as stream:
-        walk_in_subprocess(path, what)
+        walk_in_child(path, what)
         with library_errors(what, "write it again"), h5py.File(stream, "r") as content:
             if content.attrs.get("schema") == SCHEMA and channel is None:
                 return _table(content, what)
@@ -222,23 +223,25 @@ def read_foreign(
     if path.stat().st_size > MAX_FOREIGN_BYTES:
         raise FileError(f"{what} has more than {MAX_FOREIGN_BYTES} bytes; convert it to xyz")
     topography = import_optional("SurfaceTopography", what)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of missing values, which are checked below
-            with topography.open_topography(str(path)) as reader:
-                names = [str(one.name) for one in reader.channels]
-                holds = [*map(_holds_heights, reader.channels)]
-                first = holds.index(True) if True in holds else 0
-                chosen = chosen_channel(names, channel, first, what)
-                found = reader.topography(channel_index=chosen)
-            height = np.ma.filled(np.asanyarray(found.heights(), np.float64), np.nan)
-            along = np.asarray(found.positions(), np.float64) if height.ndim == 1 else None
-    except FileError:
-        raise
-    except Exception as err:  # its readers raise many kinds
-        raise FileError(
-            f"{what} is of no known format, convert it to xyz: {exception_text(err)}"
-        ) from err
+    remedy = "if its format is not known, convert it to xyz"
+    return read_in_child(
+        path, what, remedy, lambda: _by_topography(topography, path, units, channel, what)
+    )
+
+
+def _by_topography(
+    topography: Any, path: Path, units: LengthUnits | None, channel: str | None, what: str
+) -> MeasuredPoints:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of missing values, which are checked below
+        with topography.open_topography(str(path)) as reader:
+            names = [str(one.name) for one in reader.channels]
+            holds = [*map(_holds_heights, reader.channels)]
+            chosen = chosen_channel(names, channel, holds.index(True) if True in holds else 0, what)
+            found = reader.topography(channel_index=chosen)
+        height = np.ma.filled(np.asanyarray(found.heights(), np.float64), np.nan)
+        MAP_POINTS.checked(height.size, FileError, f"{what}: number of points")
+        along = np.asarray(found.positions(), np.float64) if height.ndim == 1 else None
     notes = (f"read by SurfaceTopography as {type(reader).__name__}", channel_note(names, chosen))
     if not _holds_heights(reader.channels[chosen]):
         raise FileError(f"{what}: {notes[1]} holds no heights; choose another")

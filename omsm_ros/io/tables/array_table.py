@@ -5,18 +5,14 @@ A column of a table is named ``dataset[3]``, counted from 0; columns of a single
 channels of TDMS ``group/channel``.
 """
 
-import contextlib
-import faulthandler
 import io
 import logging
-import os
 import re
-import resource
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
@@ -25,29 +21,11 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
+from omsm_ros.io.child_process import read_in_child
 from omsm_ros.io.files import library_errors, open_regular
-from omsm_ros.io.optional_libraries import walk_in_subprocess
+from omsm_ros.io.optional_libraries import walk_in_child
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable, micro_sign
 from omsm_ros.units import NANOSECONDS_PER_S
-
-
-def probe_in_subprocess(read: Callable[[], object]) -> bool:
-    """Return whether ``read`` does not crash its process; exceptions are ignored.
-
-    A damaged file may crash a library. The process is a fork, so no module is loaded again.
-    """
-    with warnings.catch_warnings():
-        # Python 3.12 warns of threads; the fork does not wait for any of them.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()
-    if child == 0:
-        faulthandler.disable()  # the caller reports a crash in one line
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        with contextlib.suppress(BaseException):
-            read()
-        os._exit(0)
-    return not os.WIFSIGNALED(os.waitpid(child, 0)[1])
-
 
 # Archives of NumPy and MATLAB files are loaded completely.
 _MAX_WHOLE_BYTES = 4_000_000_000
@@ -118,10 +96,8 @@ class ArrayTable(ForeignTable):
                 loaded: Mapping[str, Any] = loadmat(self.path, mat_dtype=True, simplify_cells=True)
             return loaded
 
-        if not probe_in_subprocess(load):
-            raise FileError(
-                f"{self} cannot be read: its content is inconsistent; write it again, or as CSV"
-            )
+        # A damaged file may crash the library.
+        read_in_child(self.path, str(self), _AGAIN, lambda: load() and None)
         return load()
 
     def _check_unpacked(self, size: int) -> None:
@@ -138,7 +114,7 @@ class ArrayTable(ForeignTable):
             import h5py
         except ImportError as err:
             raise FileError(f"{self} needs h5py; pip install h5py, or give CSV") from err
-        walk_in_subprocess(self.path, str(self))
+        walk_in_child(self.path, str(self))
         found: dict[str, Any] = {}
         file = self._opened.enter_context(h5py.File(self.path, "r"))
 

@@ -1,6 +1,9 @@
 """Maps read by SurfaceTopography, with a stand-in for the library."""
 
+import os
+import signal
 import sys
+import time
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -8,6 +11,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import FileError
+from omsm_ros.io import child_process
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.units import LengthUnits
 
@@ -95,3 +99,21 @@ def test_a_unit_in_utf_8_that_was_read_as_latin_1_is_known(map_of):
     np.testing.assert_allclose(
         read_points(map_of(unit="Âµm")).height, read_points(map_of()).height, rtol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    ("deed", "reported"),
+    [
+        (lambda _: bytearray(20 << 30), "more memory"),
+        (lambda _: time.sleep(1000), "not read in 1 s"),
+        (lambda _: os.kill(os.getpid(), signal.SIGSEGV), "the program that reads it ended"),
+        (lambda _: 1 / 0, "division by zero; .*convert it to xyz"),
+    ],
+)
+def test_a_library_that_takes_too_much_or_crashes_is_ended(map_of, monkeypatch, deed, reported):
+    path = map_of()
+    monkeypatch.setattr(sys.modules["SurfaceTopography"], "open_topography", deed)
+    if "1 s" in reported:
+        monkeypatch.setattr(child_process, "_FILE_S", 0.2)
+    with pytest.raises(FileError, match=reported):
+        read_points(path)

@@ -1,0 +1,121 @@
+"""Reads what comes from outside in a process of its own, with limits of time and memory.
+
+A file may be made, or damaged, so that a library crashes, does not end or takes all memory.
+"""
+
+import faulthandler
+import math
+import multiprocessing
+import resource
+import signal
+import time
+import warnings
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar, cast
+
+from omsm_ros.errors import FileError, OmsmError
+from omsm_ros.io.files import library_errors
+
+T = TypeVar("T")
+Attend: TypeAlias = Callable[..., None]
+
+UNLIMITED = resource.RLIM_INFINITY
+# Reading a bag from outside takes at most this time [s] and memory [bytes].
+_BAG_S, _BAG_BYTES = 300.0, 8 << 30
+# Elapsed time to load a library and to read a small file [s], and slow unpacking [bytes/s].
+_FILE_S, _SLOWEST_BYTES_S = 20.0, 5e6
+# Between two looks at a process, and two messages of progress that say nothing new [s].
+_LOOK_S, _PROGRESS_S = 0.05, 0.5
+_PROGRESS, _DONE, _FAILED = "progress", "done", "failed"
+
+
+def read_in_child(path: Path, what: str, remedy: str, read: Callable[[], T]) -> T:
+    """Return what ``read`` makes of the file at ``path``, pickled by a copy of this process.
+
+    Raises FileError, which calls the file ``what``, for all that goes wrong; ``remedy`` ends it.
+    """
+
+    def work() -> T:
+        with library_errors(what, remedy):
+            return read()
+
+    seconds = math.ceil(_FILE_S + path.stat().st_size / _SLOWEST_BYTES_S)
+    return in_child(work, seconds, what=what, remedy=remedy, method="fork")
+
+
+def in_child(
+    work: Callable[..., T],
+    seconds: float = _BAG_S,
+    most_bytes: int = _BAG_BYTES,
+    attend: Attend | None = None,
+    *,
+    what: str = "the bag",
+    remedy: str = "check it with omsm inspect",
+    method: str = "spawn",
+) -> T:
+    """Return what ``work`` returns in a process of its own, or raise what it raises.
+
+    Raises FileError if it takes longer, or more memory, or crashes; its text has ``what`` was read,
+    and the ``remedy``.
+
+    attend: called with the fields of the progress that ``work(progress)`` states, and without
+        fields meanwhile; what it raises ends the process
+    method: "spawn" for a new process, to which ``work`` is pickled, else "fork" for a copy of this
+        one, where no module is loaded again
+    """
+    context: Any = multiprocessing.get_context(method)
+    receiver, sender = context.Pipe(duplex=False)
+    arguments = (sender, work, most_bytes, attend is not None)
+    child = context.Process(target=_child, args=arguments, daemon=True)
+    with warnings.catch_warnings():
+        # Python 3.12 warns of threads; a fork does not wait for any of them.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child.start()
+    sender.close()
+    until = time.monotonic() + seconds
+    kind, content = _PROGRESS, cast("Any", {})
+    try:
+        while kind == _PROGRESS:
+            if attend is not None:
+                attend(**content)
+            if time.monotonic() > until:
+                raise FileError(f"{what} was not read in {seconds:g} s; {remedy}")
+            kind, content = receiver.recv() if receiver.poll(_LOOK_S) else (_PROGRESS, {})
+    except EOFError as err:
+        raise FileError(
+            f"{what} cannot be read: the program that reads it ended, perhaps as it needed more "
+            f"than {most_bytes / 2**30:.3g} GB; {remedy}"
+        ) from err
+    finally:
+        child.kill()
+        child.join()
+        receiver.close()
+    if kind == _FAILED:
+        raise content
+    return content  # type: ignore[no-any-return]
+
+
+def _child(sender: Connection, work: Callable[..., Any], most_bytes: int, tells: bool) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends this process
+    faulthandler.disable()  # and reports a crash in one line
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
+    stated: tuple[object, float] = (None, 0.0)
+
+    def progress(stage: str, **numbers: object) -> None:
+        nonlocal stated
+        about, now = (stage, numbers.get("order")), time.monotonic()
+        if about != stated[0] or now - stated[1] > _PROGRESS_S:
+            stated = about, now
+            sender.send((_PROGRESS, {"stage": stage, **numbers}))
+
+    try:
+        answer = (_DONE, work(progress) if tells else work())
+    except MemoryError:
+        return  # the parent sees that this process ended
+    except OmsmError as err:
+        kind = FileError if isinstance(err, FileError) else OmsmError
+        answer = (_FAILED, kind(str(err)))
+    sender.send(answer)
