@@ -1,10 +1,12 @@
 """The twin behind LinuxCNC in the demonstration, and a comparison of a recording with its plan.
 
-    python behind.py COMMAND.mcap OUT.mcap [flat|mirror]    encoders and probe of a commanded motion
-    python behind.py --judge scan_N.csv COMMAND.mcap        distance of the motion from the plan
+    python behind.py COMMAND.mcap OUT.mcap [flat|mirror|nominal]    what encoders and probe read
+    python behind.py --judge scan_N.csv COMMAND.mcap|OUT.mcap       distance from the plan
 
 LinuxCNC commands each servo cycle; servo of Z, encoder, structure, probe and part are simulated.
-Not imitated: real time (the servo thread is a process of the system), lag of X and C, touch.
+The part is a flat, a mirror with a deviation of form, or one without: there the probe reads how far
+it is off the plan. Not imitated: real time (the servo thread is a process of the system), lag of X
+and C, touch.
 """
 
 import sys
@@ -15,7 +17,7 @@ import numpy as np
 
 from omsm_ros.core.kinematics.trajectories import AxisPositions
 from omsm_ros.core.streams.blocks import AxisBlock
-from omsm_ros.core.surface.nominal import Flat
+from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import DataError
 from omsm_ros.io import bags
 from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
@@ -48,14 +50,19 @@ class CommandedMotion:
         )
 
 
+def blocks_of(bag):
+    """Return the blocks of axes and of readings of a bag."""
+    with bags.BagReader(bag) as reader:
+        axes = [block for _, block in reader.records(AXES_TOPIC)]
+        return axes, [block for _, block in reader.records(DISTANCE_TOPIC)]
+
+
 def commanded(bag):
     """Return the commanded axes of a bag as one block, and whether the probe measures, each (n,).
 
     Raises DataError where servo cycles are missing.
     """
-    with bags.BagReader(bag) as reader:
-        axes = [block for _, block in reader.records(AXES_TOPIC)]
-        readings = [block for _, block in reader.records(DISTANCE_TOPIC)]
+    axes, readings = blocks_of(bag)
     ends = [block.first_sample + len(block) for block in axes]
     if any(b.first_sample != end for b, end in zip(axes[1:], ends, strict=False)):
         raise DataError(f"{str(bag)!r} lacks servo cycles; the truth behind them is unknown")
@@ -94,12 +101,15 @@ def behind(bag, out, cell, part, stand_off=None):
     return recording
 
 
-def judge_path(plan, x, z, c, period):
+def judge_path(plan, x, z, c, period, distance=None):
     """Compare a recording (n,) every ``period`` [s] with its plan (t, x, z, c), at equal C.
 
+    distance: of the probe, NaN without a target
+
     Returns the number of ``samples``; ``error``, ``rms`` and ``mean`` of Z, and ``x_error`` [m];
-    ``rate`` of C and ``rate_rms``, its deviation [rad/s]. The mean of Z depends on the mounting and
-    is removed. Raises DataError if less than a tenth of the plan was recorded.
+    ``rate`` of C and ``rate_rms``, its deviation [rad/s]; ``probe_rms``, of what the probe read
+    [m], None if it read nothing. The mean of Z depends on the mounting and is removed. Raises
+    DataError if less than a tenth of the plan was recorded.
     """
     t, plan_x, plan_z, plan_c = plan
     rate = (plan_c[-1] - plan_c[0]) / (t[-1] - t[0])
@@ -118,15 +128,17 @@ def judge_path(plan, x, z, c, period):
         "x_error": float(np.max(np.abs(x[there] - at_x))),
         "rate": float(np.mean(speed)),
         "rate_rms": float(np.std(speed)),
+        "probe_rms": None if distance is None else float(np.nanstd(distance[there])),
     }
 
 
 def judge(program, recording, bound):
     """Compare the axes of a bag with the scan_N.csv that was run."""
-    axes, _ = commanded(recording)
-    found = judge_path(
-        np.loadtxt(program, delimiter=",", skiprows=1).T, axes.x, axes.z, axes.c, axes.sample_period
-    )
+    axes, measures = commanded(recording)
+    plan = np.loadtxt(program, delimiter=",", skiprows=1).T
+    read = np.concatenate([block.distance for block in blocks_of(recording)[1]])
+    distance = np.where(measures, read, np.nan) if np.any(read[measures]) else None
+    found = judge_path(plan, axes.x, axes.z, axes.c, axes.sample_period, distance)
     return {**found, "bound": bound, "within": found["error"] <= bound}
 
 
@@ -134,6 +146,6 @@ if __name__ == "__main__":
     if sys.argv[1] == "--judge":
         print(judge(sys.argv[2], Path(sys.argv[3]), np.inf))
     else:
-        on_flat = sys.argv[3:] != ["mirror"]
-        part = Flat() if on_flat else Scenario().part
-        behind(Path(sys.argv[1]), Path(sys.argv[2]), Cell(), part, None if on_flat else 0.0)
+        name = sys.argv[3] if len(sys.argv) > 3 else "flat"
+        part = {"flat": Flat(), "mirror": Scenario().part, "nominal": PAPER_MIRROR}[name]
+        behind(*map(Path, sys.argv[1:3]), Cell(), part, None if name == "flat" else 0.0)

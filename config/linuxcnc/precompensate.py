@@ -12,20 +12,29 @@ With CAL.json a rehearsal is written, too: the same motion with X at the axis, w
 still, and Z within the range of the probe. Its recording REHEARSAL.mcap shows the lag at the speed
 of the scan, which is then corrected, and how the probe follows the segments, whose frequency is
 beyond the band of the calibration.
+
+What is predicted is what will be measured: the motion off the path and the noise of the encoder, or
+of the probe. The responses are known with uncertainty, so the motion is predicted for many of those
+that they may be: the middle, and the limits of 95 %.
+
+OUT.csv has the path without its ends, for ``behind.py --judge``.
 """
 
 import sys
+from configparser import ConfigParser
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from behind import commanded
+from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import hilbert
 
 from omsm_ros.core.adjustment import ScanDesign
 from omsm_ros.core.kinematics.planner import plan_path, planned_at
-from omsm_ros.core.lti.frequency_response import low_frequency_delay_uncertainty
+from omsm_ros.core.lti.frequency_response import relative_response_jacobian
 from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
@@ -34,35 +43,87 @@ from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
 from omsm_ros.pipelines.plan_scans import scan_path
 
 CYCLE_S = 1e-3
-TAPS = 100
+# Cycles of the response of the encoder after a command; and before it, for the command between two
+# cycles depends on the next ones.
+TAPS, AHEAD = 100, 2
+# What the response may be before it is measured: how much a tap is of the one before it, and the
+# variance of the first.
+DECAYS, SIZES = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95), (0.01, 0.1, 1.0, 10.0)
 # The inverse is whole up to the first and ends at the second frequency [Hz].
 BAND_HZ = (60.0, 120.0)
 # The path is continued by this time at both ends, where the filter settles [s].
 SETTLE_S = 1.0
 BOUND_M = 2e-8
-# Largest acceleration of Z in the configuration, with a margin [m/s²].
-LARGEST_ACCELERATION = 10.0
 # Z of the rehearsal: half of its largest travel [m], and its duration [s].
 REACH_M, REHEARSED_S = 4e-5, 20.0
+# Responses for which the motion is predicted; how far the gain of one may be from the calibrated.
+DRAWS, MOST_RELATIVE = 60, 1.0
+# Time at both ends that is not counted [s].
+EDGE_S = 0.5
 
-# Half of all normal errors are below the first, 95 % below the second [σ].
-MEDIAN, COVERED = 0.674, 1.96
+
+class Response(NamedTuple):
+    """Impulse response from command to encoder (AHEAD + TAPS,), and what is not known of it.
+
+    factor: F, the taps are ``taps + F n`` with standard normal n;  noise: of the encoder [m]
+    """
+
+    taps: np.ndarray
+    factor: np.ndarray
+    noise: float
+
+
+class Prediction(NamedTuple):
+    """rms off the path [m]: middle and limits of 95 % of the motion; noise of what measures it."""
+
+    middle: float
+    least: float
+    most: float
+    noise: float
+
+    def measured(self):
+        """Return middle, least and most of what will be measured [m]."""
+        return tuple(float(np.hypot(v, self.noise)) for v in self[:3])
+
+    def __str__(self):
+        motion = "{:.3g} nm ({:.3g} to {:.3g} nm)".format(*(v * 1e9 for v in self[:3]))
+        seen = "{:.3g} nm ({:.3g} to {:.3g} nm)".format(*(v * 1e9 for v in self.measured()))
+        return f"{seen} as measured; motion {motion}, noise {self.noise * 1e9:.3g} nm"
 
 
 def servo(command, encoder):
-    """Return the impulse response (TAPS,) from command to encoder by least squares."""
+    """Return the response from command to encoder (n,) each.
+
+    The taps decay, how fast is what makes the encoder most likely (Chen, Ohlsson and Ljung,
+    Automatica 48 (2012) 1525): where the step test moves little, as at the frequency of the
+    segments, least squares alone would take noise for a response.
+    """
     command, encoder = command - command[0], encoder - encoder[:100].mean()
-    padded = np.concatenate([np.zeros(TAPS - 1), command])
-    lagged = np.lib.stride_tricks.sliding_window_view(padded, TAPS)[:, ::-1]
-    square = lagged.T @ lagged
-    square += 1e-12 * np.trace(square) / TAPS * np.eye(TAPS)
-    return np.linalg.solve(square, lagged.T @ encoder)
+    count = AHEAD + TAPS
+    padded = np.concatenate([np.zeros(TAPS - 1), command, np.full(AHEAD, command[-1])])
+    lagged = np.lib.stride_tricks.sliding_window_view(padded, count)[:, ::-1]
+    square, seen = lagged.T @ lagged, lagged.T @ encoder
+    noise = float(np.std(encoder - lagged @ np.linalg.lstsq(square, seen, rcond=1e-12)[0]))
+    later = np.maximum.outer(np.arange(count), np.arange(count))
+
+    def likely(decay, size):
+        root = cholesky(size * decay**later + 1e-15 * np.eye(count), lower=True)
+        inner = root.T @ square @ root / noise**2 + np.eye(count)
+        found = np.linalg.solve(inner, root.T @ seen / noise**2)
+        evidence = seen @ root @ found / noise**2 - np.linalg.slogdet(inner)[1]
+        return evidence, root, inner, found
+
+    _, root, inner, found = max(
+        (likely(d, s) for d in DECAYS for s in SIZES), key=lambda one: one[0]
+    )
+    factor = root @ solve_triangular(cholesky(inner, lower=True), np.eye(count), lower=True).T
+    return Response(root @ found, factor, noise)
 
 
 def response(taps, frequency, probe=None):
     """Return the response from command to encoder, or with that of the probe to the probe."""
-    turning = np.exp(-2j * np.pi * CYCLE_S * np.outer(frequency, np.arange(TAPS)))
-    found = turning @ taps
+    cycles = np.arange(len(taps)) - AHEAD
+    found = np.exp(-2j * np.pi * CYCLE_S * np.outer(frequency, cycles)) @ taps
     return found * probe(frequency) if probe else found
 
 
@@ -98,16 +159,27 @@ def inverse(taps, probe=None):
     return of
 
 
+def limits():
+    """Return the largest speed [m/s] and acceleration [m/s²] of Z in the configuration."""
+    ini = ConfigParser(strict=False)
+    ini.read(Path(__file__).with_name("cell.ini"))
+    return tuple(float(ini["AXIS_Z"][f"MAX_{n}"]) * 1e-3 for n in ("VELOCITY", "ACCELERATION"))
+
+
 def precompensated(path, duration, taps, probe=None):
     """Return the path with Z filtered, and the largest acceleration of Z [m/s²].
 
-    Raises ValueError where Z would exceed LARGEST_ACCELERATION.
+    Raises ValueError where Z would exceed half of its speed or acceleration.
     """
     time, z = filtered(path, duration, inverse(taps, probe))
     within = (time > -SETTLE_S / 3) & (time < duration + SETTLE_S / 3)
-    worst = float(np.max(np.abs(np.diff(z[within], 2)))) / CYCLE_S**2
-    if worst > LARGEST_ACCELERATION:
-        raise ValueError(f"Z would be accelerated by {worst:.3g} m/s²; give a slower spindle")
+    needed = [float(np.max(np.abs(np.diff(z[within], k)))) / CYCLE_S**k for k in (1, 2)]
+    for name, found, most in zip(("m/s", "m/s²"), needed, limits(), strict=True):
+        if found > most / 2:
+            raise ValueError(
+                f"Z would need {found:.3g} {name}, allowed is half of {most:.3g}; give a slower "
+                "spindle"
+            )
 
     def moved(at):
         x, _, c = path(at)
@@ -123,22 +195,74 @@ def precompensated(path, duration, taps, probe=None):
             c,
         )
 
-    return moved, worst
+    return moved, needed[1]
 
 
-def predicted(plan, path, taps, probe=None):
-    """Return the rms [m] by which the encoder, or the probe, will be off the path."""
+def through(z, taps, probe=None):
+    """Return where the encoder, or the probe, is while ``z`` (n,) is commanded."""
+    held = np.concatenate([z[:1].repeat(TAPS - 1), z, z[-1:].repeat(AHEAD)])
+    moved = np.convolve(held, taps, "valid")
+    if probe is None:
+        return moved
+    # The dynamics act on what is smooth; a line is taken out so that both ends meet.
+    line = np.linspace(moved[0], moved[-1], len(z))
+    spectrum = np.fft.rfft(moved - line) * probe(np.fft.rfftfreq(len(z), CYCLE_S))
+    return np.fft.irfft(spectrum, len(z)) + line - (line[1] - line[0]) / CYCLE_S * lag_of(probe)
+
+
+class Probes:
+    """Responses from encoder to probe that may be true: by the covariance of a calibration."""
+
+    def __init__(self, known):
+        """known: a calibration, None for the encoder itself."""
+        self.known = known
+        if known:
+            size, turned = np.linalg.eigh(known.covariance)
+            self.factor = turned * np.sqrt(np.maximum(size, 0.0))
+
+    def drawn(self, random, lag=None):
+        """Return a function of frequency; ``lag`` [s] takes the place of that of the draw."""
+        if not self.known:
+            return None
+        dynamics, off = self.known.dynamics, self.factor @ random.normal(size=len(self.factor))
+
+        def relative(frequency):
+            real, imag = relative_response_jacobian(dynamics, np.asarray(frequency)) @ off
+            return real + 1j * imag
+
+        turn = 0.0
+        if lag is not None:
+            turn = -relative(np.array([0.01]))[0].imag / (2 * np.pi * 0.01) - lag
+
+        def of(frequency):
+            found = relative(frequency) + 2j * np.pi * frequency * turn
+            gain = np.clip(found.real, -MOST_RELATIVE, MOST_RELATIVE)
+            return dynamics.response(frequency) * np.exp(gain + 1j * found.imag)
+
+        return of
+
+
+def predicted(plan, path, follows, probes, noise, seed=1):
+    """Return the Prediction for a planned path: of the encoder, or of the probe."""
     time = np.arange(int(plan.time[-1] / CYCLE_S)) * CYCLE_S
-    z = plan.motion(time)[1]
-    moved = np.convolve(z - z[0], taps)[: len(z)] + taps.sum() * z[0]
-    if probe:
-        frequency = np.fft.rfftfreq(len(z), CYCLE_S)
-        # The dynamics act on what is smooth; a line is taken out so that both ends meet.
-        line = np.linspace(moved[0], moved[-1], len(z))
-        moved = np.fft.irfft(np.fft.rfft(moved - line) * probe(frequency), len(z))
-        moved = moved + line - (line[1] - line[0]) / CYCLE_S * lag_of(probe)
-    off = (moved - path(time)[1])[500:-500]
-    return float(np.std(off))
+    z, wanted, random = plan.motion(time)[1], path(time)[1], np.random.default_rng(seed)
+    off = []
+    for _ in range(DRAWS):
+        taps = follows.taps + follows.factor @ random.normal(size=len(follows.taps))
+        off.append(rms(through(z, taps, probes.drawn(random)) - wanted))
+    return limited(off, noise)
+
+
+def rms(off):
+    """Return the rms of ``off`` (n,) each cycle, without the ends."""
+    edge = round(EDGE_S / CYCLE_S)
+    return float(np.std(off[edge:-edge]))
+
+
+def limited(off, noise):
+    """Return the Prediction of which ``off`` (k,) [m] are drawn."""
+    least, middle, most = np.percentile(off, [2.5, 50, 97.5])
+    return Prediction(float(middle), float(least), float(most), noise)
 
 
 def reduced(path, duration):
@@ -160,8 +284,20 @@ def ripple(plan, moved, time):
     return off, np.imag(hilbert(off))
 
 
+class Rehearsal(NamedTuple):
+    """What a rehearsal shows.
+
+    found: lag that the filter left [s], and gains of the ripple of the segments, in phase and a
+        quarter late [1], (3,);  factor: as of Response;  noise: of the probe [m]
+    """
+
+    found: np.ndarray
+    factor: np.ndarray
+    noise: float
+
+
 def rehearsed(bag, plan, path, moved):
-    """Return the lag [s] that the filter left, and the gains (2,) of the ripple of the segments.
+    """Return the Rehearsal of a recording.
 
     plan, path, moved: of the rehearsal;  bag: as recorded; time is that of its spindle
     """
@@ -170,66 +306,79 @@ def rehearsed(bag, plan, path, moved):
         blocks = [block for _, block in reader.records(DISTANCE_TOPIC)]
     distance = np.concatenate([block.distance for block in blocks])
     time = (c - plan.c[0]) / (plan.c[-1] - plan.c[0]) * plan.time[-1]
-    there = np.flatnonzero((time > 0.5) & (time < plan.time[-1] - 0.5))
-    read = np.concatenate([block.ok for block in blocks])[there]
+    there = np.flatnonzero((time > EDGE_S) & (time < plan.time[-1] - EDGE_S))
+    there = there[np.concatenate([block.ok for block in blocks])[there]]
     time, distance = time[there], distance[there]
     z = path(time)[1]
     parts = (z, np.gradient(z, time), *ripple(plan, moved, time), np.ones_like(z), time)
     columns = np.stack(parts, axis=1) / (sizes := np.max(np.abs(parts), axis=1))
-    found = np.linalg.lstsq(columns[read], distance[read], rcond=None)[0] / sizes
-    return -found[1] / found[0], found[2:4] / found[0]
+    found = np.linalg.lstsq(columns, distance, rcond=None)[0]
+    noise = float(np.std(distance - columns @ found))
+    scale = found[0] / sizes[0]
+    to = np.array([-1.0, 1.0, 1.0]) / sizes[1:4] / scale
+    factor = np.linalg.inv(cholesky(columns.T @ columns, lower=True)).T[1:4] * noise
+    return Rehearsal(to * found[1:4], to[:, np.newaxis] * factor, noise / abs(scale))
+
+
+def predicted_after(rehearsal, plan, path, moved, follows, probes, seed=1):
+    """Return the Prediction for the probe, with the lag and the ripple of the rehearsal."""
+    time = np.arange(int(plan.time[-1] / CYCLE_S)) * CYCLE_S
+    smooth, wanted = moved(time)[1], path(time)[1]
+    added, random = np.array(ripple(plan, moved, time)), np.random.default_rng(seed)
+    off = []
+    for _ in range(DRAWS):
+        taps = follows.taps + follows.factor @ random.normal(size=len(follows.taps))
+        late, *gains = rehearsal.factor @ random.normal(size=rehearsal.factor.shape[1])
+        probe = probes.drawn(random, rehearsal.found[0] + late)
+        gains = rehearsal.found[1:] + gains
+        off.append(rms(through(smooth, taps, probe) + gains @ added - wanted))
+    return limited(off, rehearsal.noise)
 
 
 def main(command, steps, surface, rpm, radius, turns, out, calibration=None, rehearsal=None):
-    """Write the program, print and return what is predicted without and with the filter.
-
-    With a calibration but no rehearsal the latter is least, median and most: all but 5 % of the
-    lag's errors.
-    """
+    """Write the program; print and return the Predictions without and with the filter."""
     axes, measures = commanded(Path(command))
     with bags.BagReader(Path(steps)) as reader:
         encoder = np.concatenate([block.z for _, block in reader.records(AXES_TOPIC)])
     there = np.flatnonzero(measures)
-    taps = servo(axes.z[there[0] : there[-1] + 1], encoder)
+    follows = servo(axes.z[there[0] : there[-1] + 1], encoder)
     known = load_calibration(calibration) if calibration else None
-    probe = known.dynamics.response if known else None
+    probes, probe = Probes(known), known.dynamics.response if known else None
+    noise = follows.noise
+    if known:
+        noise = known.certificate.residual.noise_m / abs(known.static_gain)
     rpm, radius, turns = float(rpm), float(radius), float(turns)
     design = ScanDesign(rpm=rpm, start=radius, end=radius - turns * 2e-4, pitch=2e-4)
     path = partial(scan_path, design, load_surface(surface))
     plain = plan_path(path, design.duration, CYCLE_S, BOUND_M)
-    before = predicted(plain, path, taps, probe)
-    moved, worst = precompensated(path, design.duration, taps, probe)
+    before = predicted(plain, path, follows, probes, noise)
+    moved, worst = precompensated(path, design.duration, follows.taps, probe)
     plan = plan_path(moved, design.duration, CYCLE_S, BOUND_M)
-    after = predicted(plan, path, taps, probe)
+    after = predicted(plan, path, follows, probes, noise)
     if known:
         # As many turns as its duration takes, over the same radii.
         longer = replace(design, pitch=design.pitch * design.duration / REHEARSED_S)
         small = reduced(partial(scan_path, longer, load_surface(surface)), longer.duration)
-        small_moved, _ = precompensated(small, longer.duration, taps, probe)
+        small_moved, _ = precompensated(small, longer.duration, follows.taps, probe)
         trial = planned_at(small_moved, longer.duration, plan.segment, CYCLE_S)
         name = Path(out).with_stem(f"{Path(out).stem}_rehearsal")
         name.write_text(path_gcode(trial, [f"rehearsal of {Path(out).name}: X at the axis"]))
     if rehearsal:
-        lag, gains = rehearsed(rehearsal, trial, small, small_moved)
+        seen = rehearsed(rehearsal, trial, small, small_moved)
+        lag = seen.found[0]
         print(f"lag corrected by {lag * 1e6:.3g} us")
 
         def probe(frequency):
             return known.dynamics.response(frequency) * np.exp(-2j * np.pi * frequency * lag)
 
-        moved, worst = precompensated(path, design.duration, taps, probe)
+        moved, worst = precompensated(path, design.duration, follows.taps, probe)
         plan = planned_at(moved, design.duration, plan.segment, CYCLE_S)
-        time = np.arange(0.5, plan.time[-1] - 0.5, CYCLE_S)
-        after = float(np.std(gains @ ripple(plan, moved, time)))
+        after = predicted_after(seen, plan, path, moved, follows, probes)
     Path(out).write_text(path_gcode(plan, [f"precompensated scan at {rpm:g} rpm"]))
-    print(f"off the path: {before * 1e9:.4g} nm rms before, {after * 1e9:.4g} nm after, predicted")
-    if known and not rehearsal:
-        speed = float(np.std(np.diff(plan.height) / plan.segment))
-        off = speed * low_frequency_delay_uncertainty(known.dynamics, known.covariance)
-        # The error of the lag, normal with this standard deviation, adds its square.
-        middle, most = (float(np.hypot(after, k * off)) for k in (MEDIAN, COVERED))
-        print(f"with the error of the lag {middle * 1e9:.3g} nm, "
-              f"{after * 1e9:.3g} to {most * 1e9:.3g} nm (95 %)")  # fmt: skip
-        after = (after, middle, most)
+    time = np.arange(EDGE_S, plan.time[-1] - EDGE_S, CYCLE_S)
+    wanted = np.stack([time, *path(time)], axis=1)
+    np.savetxt(Path(out).with_suffix(".csv"), wanted, delimiter=",", header="time_s,x_m,z_m,c_rad")
+    print(f"off the path, rms, before: {before}\nafter: {after}")
     print(f"acceleration of Z at most {worst:.3g} m/s²")
     return plain, plan, before, after
 

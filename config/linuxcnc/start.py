@@ -155,6 +155,8 @@ def running(program, port, cycle=1e-3, servo=200.0):
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+            with contextlib.suppress(OSError):  # written if it ended with an error
+                print((folder / "linuxcnc_debug.txt").read_text()[-2000:], file=sys.stderr)
 
 
 if __name__ == "__main__":
