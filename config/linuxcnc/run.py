@@ -11,33 +11,41 @@ command, status = linuxcnc.command(), linuxcnc.stat()
 errors = linuxcnc.error_channel()
 
 
-def until(reached, patience):
+def until(what, reached, patience=60.0):
     end = time.monotonic() + patience
-    status.poll()
-    while not reached():
-        if found := errors.poll():
-            sys.exit(f"LinuxCNC: {found[1]}")
+    while True:
+        try:
+            status.poll()
+        except linuxcnc.error as err:  # its task has not begun
+            found = err
+        else:
+            if reached():
+                return
+            found = errors.poll()
+            if found:
+                sys.exit(f"LinuxCNC, {what}: {found[1]}")
         if time.monotonic() > end:
-            sys.exit("LinuxCNC did not answer in time")
+            sys.exit(f"LinuxCNC, {what}: no answer in time {found or ''}")
         time.sleep(0.05)
-        status.poll()
 
 
+until("start", lambda: status.task_state >= linuxcnc.STATE_ESTOP)
 command.state(linuxcnc.STATE_ESTOP_RESET)
 command.wait_complete()
 command.state(linuxcnc.STATE_ON)
-until(lambda: status.task_state == linuxcnc.STATE_ON, 5)
+until("on", lambda: status.task_state == linuxcnc.STATE_ON)
 command.mode(linuxcnc.MODE_MANUAL)
 command.wait_complete()
 for joint in range(status.joints):
     command.home(joint)
-    until(lambda joint=joint: status.homed[joint], 10)
+    until("homing", lambda joint=joint: status.homed[joint])
 command.mode(linuxcnc.MODE_AUTO)
 command.wait_complete()
 command.program_open(os.environ["OMSM_PROGRAM"])
 command.auto(linuxcnc.AUTO_RUN, 0)
-time.sleep(0.5)
+until("begin of the program", lambda: status.interp_state != linuxcnc.INTERP_IDLE)
 until(
+    "program",
     lambda: (
         status.interp_state == linuxcnc.INTERP_IDLE
         and status.exec_state == linuxcnc.EXEC_DONE
