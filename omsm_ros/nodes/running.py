@@ -42,8 +42,8 @@ from omsm_ros.nodes.topics import REQUESTS_QOS
 _BAD_INPUT, _DEFECT = 2, 70  # exit codes, as of the commands
 # After this time since the first signal, the next one ends the process at once [s].
 _PATIENCE_S = 5.0
-# For the last log message of a node that cannot start to reach subscribers of /rosout [s].
-_SHUTDOWN_LOG_S = 1.0
+# For what a node sent last, a log message or the answer to its shutdown, to be received [s].
+_LAST_SENT_S = 1.0
 # Between two requests of one service, so that the queue of a slow client does not overflow [s].
 _PACE_S = 0.01
 
@@ -111,10 +111,9 @@ def _give_up(node: ManagedNode | None, err: Exception) -> None:
         raise err
     if node is None:
         text = f"{type(err).__name__}: {one_line(err)}" if known else defect(err)
-        text = short or text
-        print(text, file=sys.stderr)
+        print(short or text, file=sys.stderr)
     else:  # the line is in the log already
-        time.sleep(_SHUTDOWN_LOG_S if node.count_subscribers("/rosout") else 0.0)
+        time.sleep(_LAST_SENT_S if node.count_subscribers("/rosout") else 0.0)
     rclpy.try_shutdown()
     _ignore_signals()
     sys.exit(_BAD_INPUT if known else _DEFECT)
@@ -180,6 +179,7 @@ def _spin(nodes: Sequence[ManagedNode], ending: _SignalEnd) -> None:
             executor.spin_once()
         except Exception as err:
             log_internal_error(nodes[0], err)
+    ending.asked.wait(_LAST_SENT_S)
 
 
 def settings_of(text: str) -> dict[str, object]:
