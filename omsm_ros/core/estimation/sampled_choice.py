@@ -300,8 +300,10 @@ def _explore(
     for order in sorted({*_ORDERS, asked}):
         if order > most:
             break
-        fits.append(_next_fit(early, fits, order, late))
-        explained.append(1 - float(np.mean(_relative(validation_residual(fits[-1], whole)))))
+        found = [_next_fit(early, fits[:n], order, late) for n in {len(fits), best + 1}]
+        missed = [np.mean(_relative(validation_residual(one, whole))) for one in found]
+        fits.append(found[int(np.argmin(missed))])
+        explained.append(1 - float(np.min(missed)))
         if explained[-1] > 1 - _NO_GAIN * (1 - explained[best]):
             best = len(explained) - 1
         if len(explained) - 1 - best >= _FRUITLESS and order >= asked:
