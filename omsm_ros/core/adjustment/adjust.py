@@ -14,7 +14,7 @@ from omsm_ros.core.adjustment.disturbances import (
     step_family,
     steps_of,
 )
-from omsm_ros.core.adjustment.evidence import Evidence, evidence_of
+from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.figures import (
     NO_EFFECT,
@@ -187,14 +187,9 @@ def adjust(
 
 
 def _adjusted(
-    scans: Sequence[ScanData],
-    priors: Sequence[Source],
-    calibration: Calibration | None,
-    surface: Surface,
-    accuracy: float | None,
-    removed: Sequence[str],
-    accepted: Collection[str],
-) -> Adjustment:
+    scans: Sequence[ScanData], priors: Sequence[Source], calibration: Calibration | None,
+    surface: Surface, accuracy: float | None, removed: Sequence[str], accepted: Collection[str],
+) -> Adjustment:  # fmt: skip
     """Return the adjustment of ``scans`` to the nominal ``surface``."""
     zero = zero_of(scans, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
@@ -301,26 +296,18 @@ def _or_sense_of_c(
     return (Reason(WRONG_SENSE),) if agrees else reasons
 
 
-def _evidences(solution: Solution, refutations: Sequence[Refutation]) -> tuple[Evidence, ...]:
-    """Return the evidence of each family; of a released one, what released it."""
-    released = {r.name: r.evidence for r in refutations}
-    return tuple(
-        released.get(f.name) or evidence_of(solution, f) for f in solution.network.families
-    )
-
-
 def _findings(
-    solution: Solution,
-    effects: Mapping[str, Effect],
-    priors: Sequence[Source],
+    solution: Solution, effects: Mapping[str, Effect], priors: Sequence[Source],
     refutations: Sequence[Refutation],
-) -> tuple[SourceFinding, ...]:
+) -> tuple[SourceFinding, ...]:  # fmt: skip
     """Return every family, declared against found."""
     stated = {p.name: p.uncertainty for p in priors}
     alike = {r.name: r.alike for r in refutations}
     found = []
-    for evidence in _evidences(solution, refutations):
-        family = evidence.family
+    # Of a released family, what released it.
+    released = {r.name: r.evidence for r in refutations}
+    for family in solution.network.families:
+        evidence = released.get(family.name) or evidence_of(solution, family)
         takes_part = family.name in solution.sizes
         here = solution.network.place[family.name]
         found.append(

@@ -156,15 +156,17 @@ class Effect(NamedTuple):
 
     left: by what scans and prior leave open;  free: by what the scans alone leave open if the prior
         is worth nothing, and the family may have its size ``wide``
-    shape: change of the map by each of its parameters (n, size) [m]
+    shape: change of the map by the size ``wide`` of each parameter (n, size) [m]
+    known: information that the scans have of the parameters over ``wide`` (size, size)
     """
 
     left: float
     free: float
     shape: FloatArray
+    known: FloatArray
 
 
-NO_EFFECT = Effect(0.0, 0.0, np.zeros((0, 0)))
+NO_EFFECT = Effect(0.0, 0.0, np.zeros((0, 0)), np.zeros((0, 0)))
 
 
 def effects_on_form(
@@ -183,8 +185,11 @@ def effects_on_form(
         change = through[:, here] @ np.linalg.pinv(covariance, rcond=1e-10)
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
-        free = _rms(made.places, change @ evidence_of(solution, family).free)
-        found[family.name] = Effect(left, max(left, free), change)
+        root = evidence_of(solution, family).free
+        free = _rms(made.places, change @ root)
+        # Without the plausible size itself: (root rootᵀ)⁻¹ = information + wide⁻².
+        known = family.wide**2 * np.linalg.pinv(root @ root.T, rcond=1e-10) - np.eye(family.size)
+        found[family.name] = Effect(left, max(left, free), family.wide * change, known)
     return found
 
 
@@ -439,8 +444,9 @@ def _resembled(
         effect = effects.get(family.name, NO_EFFECT)
         if effect.free < least or not family.named or base_name(family.name) in FREE:
             continue
-        shape = effect.shape if family.smooth is None else effect.shape @ family.smooth
-        gain, values = form.looks_like(fit @ shape, family.wide)
+        ways = np.eye(family.size) if family.smooth is None else family.smooth
+        shape = effect.shape @ ways
+        gain, values = form.looks_like(fit @ shape, ways.T @ effect.known @ ways)
         if gain > _POSITIVE:
             change = shape @ values
             weight = made.places.area * change

@@ -144,9 +144,9 @@ class FormTerms:
     its shape speaks against it. Errors of form become smaller with their degree, in all directions
     alike, or all rotationally symmetric ones; a form that follows one column of the machine is
     improbable. Two models of the coefficients c are compared by their likelihood, each with its
-    best A and p: ``c ~ N(0, A n^-p + C)``, and with the columns S of a family of size w
-    ``c ~ N(0, A n^-p + C + w² S Sᵀ)``. n is the degree, C the covariance by the adjustment, and A
-    one of symmetric terms and another of all others.
+    best A and p: ``c ~ N(0, A n^-p + C)``, and with the columns S of a family of size w, of which
+    the scans have the information I, ``c ~ N(0, A n^-p + C + S (I + w⁻²)⁻¹ Sᵀ)``. n is the degree,
+    C the covariance by the adjustment, and A one of symmetric terms and another of all others.
 
     values: (k,) [m];  covariance: (k, k) [m²];  degrees, symmetric: of the terms (k,)
     """
@@ -156,17 +156,21 @@ class FormTerms:
     degrees: IntArray
     symmetric: BoolArray
 
-    def looks_like(self, columns: FloatArray, wide: float) -> tuple[float, FloatArray]:
+    def looks_like(self, columns: FloatArray, known: FloatArray) -> tuple[float, FloatArray]:
         """Return twice the logarithm by which a family raises the likelihood, and its values.
 
-        columns: change of the terms per unit of the family (k, size);  wide: its plausible size
+        columns: change of the terms by its plausible size (k, size);  known: information that the
+            scans have of its values (size, size), which are in units of that size, too
         """
         alone = self._best(np.zeros((len(self.values), 1)))[0]
+        share, axes = np.linalg.eigh(known)
         gains, found = [], []
-        for size in wide * _SIZES:
-            likelihood, spread = self._best(columns * size)
+        for size in _SIZES:
+            root = axes / np.sqrt(np.maximum(share, 0.0) + size**-2)
+            likelihood, spread = self._best(columns @ root)
             gains.append(2 * (likelihood - alone))
-            found.append(size**2 * columns.T @ linalg.solve(spread, self.values, assume_a="pos"))
+            pulled = linalg.solve(spread, self.values, assume_a="pos")
+            found.append(root @ (root.T @ (columns.T @ pulled)))
         weights = np.exp((np.array(gains) - max(gains)) / 2)
         gain = max(gains) + 2 * np.log(np.mean(weights))
         return float(gain), np.asarray(weights @ np.array(found) / np.sum(weights))

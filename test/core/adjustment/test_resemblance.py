@@ -12,6 +12,7 @@ from omsm_ros.core.adjustment.verdict import looks_like, reasons_of
 
 DEGREES = np.repeat(np.arange(2, 9), np.arange(3, 10))
 SYMMETRIC = np.zeros(len(DEGREES), np.bool_)
+UNKNOWN = np.zeros((1, 1))
 
 
 def drawn(seed, added=0.0):
@@ -26,7 +27,7 @@ def drawn(seed, added=0.0):
 
 
 def test_a_form_of_chance_looks_like_no_column():
-    gains = [form.looks_like(column, 1e-7)[0] for form, column in map(drawn, range(12))]
+    gains = [form.looks_like(1e-7 * column, UNKNOWN)[0] for form, column in map(drawn, range(12))]
     assert np.median(gains) < 0
     assert max(gains) < 10
 
@@ -34,10 +35,18 @@ def test_a_form_of_chance_looks_like_no_column():
 def test_a_form_that_follows_a_column_is_found_with_its_size():
     for seed in range(4):
         form, column = drawn(seed, 600e-9)
-        gain, (value,) = form.looks_like(column, 1e-7)
+        gain, (value,) = form.looks_like(1e-7 * column, UNKNOWN)
         assert gain > 10
         # The part itself has some 15 nm of the column.
-        assert abs(value - 600e-9) < 60e-9
+        assert abs(1e-7 * value - 600e-9) < 60e-9
+
+
+def test_a_size_that_the_scans_exclude_is_not_found():
+    """The same form, where the scans know the column to 20 nm."""
+    form, column = drawn(0, 600e-9)
+    gain, (value,) = form.looks_like(1e-7 * column, np.full((1, 1), 25.0))
+    assert gain < 5
+    assert abs(1e-7 * value) < 60e-9
 
 
 def test_what_the_adjustment_leaves_open_is_no_evidence():
@@ -45,7 +54,7 @@ def test_what_the_adjustment_leaves_open_is_no_evidence():
     form, column = drawn(0, 600e-9)
     unsure = form.covariance + (1e-6) ** 2 * column @ column.T
     known = FormTerms(form.values, unsure, DEGREES, SYMMETRIC)
-    assert known.looks_like(column, 1e-7)[0] < 1
+    assert known.looks_like(1e-7 * column, UNKNOWN)[0] < 1
 
 
 def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
@@ -53,7 +62,7 @@ def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
     rng = np.random.default_rng(3)
     known = rng.normal(size=(len(DEGREES), 3)) * 1e-7
     terms = FormTerms(known @ [0.3, -0.2, 0.1], known @ known.T, DEGREES, SYMMETRIC)
-    gain, values = terms.looks_like(rng.normal(size=(len(DEGREES), 1)), 1e-7)
+    gain, values = terms.looks_like(1e-7 * rng.normal(size=(len(DEGREES), 1)), UNKNOWN)
     assert gain < 2
     assert np.all(np.isfinite(values))
 
