@@ -1,5 +1,6 @@
 """Configuration of Sphinx: ``make docs`` writes the manual to ``out/docs``."""
 
+import inspect
 import re
 import sys
 from pathlib import Path
@@ -17,6 +18,9 @@ version = release = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+autodoc_type_aliases = dict.fromkeys(("ArrayLike", "FloatArray"), "array")
+# Of options such as --fit, typographic dashes would make another text.
+smartquotes = False
 # Notebooks run when the manual is made; one that fails is a warning, which fails the make.
 nb_execution_mode = "cache"
 nb_execution_timeout = 300
@@ -24,6 +28,7 @@ nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 html_theme = "furo"
 html_title = f"omsm_ros {release}"
+html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
 exclude_patterns = ["_*"]
@@ -40,7 +45,32 @@ def outside_as_text(app, name, source):
     )
 
 
+def parameters_as_fields(app, what, name, obj, options, lines):
+    """Make fields of the lines of a docstring that say ``name: meaning;  other: meaning``."""
+    try:
+        known = set(inspect.signature(obj).parameters)
+    except (TypeError, ValueError):
+        return
+    made, field = [], None
+    for line in lines:
+        parts = [re.fullmatch(r"(\w+(?:, \w+)*): (.+)", part) for part in line.split(";  ")]
+        if all(part and known >= set(part[1].split(", ")) for part in parts):
+            fields = [(name, part[2]) for part in parts for name in part[1].split(", ")]
+            made += ["" if field is None else None, *(f":param {n}: {text}" for n, text in fields)]
+            field = made[-1]
+        elif raised := re.fullmatch(r"Raises? (\w+(?:(?:, | or )\w+)*) (for .+)", line):
+            made += ["", f":raises {raised[1]}: {raised[2]}"]
+            field = made[-1]
+        elif field is not None and line.strip():
+            made.append(f"    {line}")
+        else:
+            made.append(line)
+            field = None
+    lines[:] = [line for line in made if line is not None]
+
+
 def setup(app):
     """Write the generated pages before Sphinx reads any page."""
     generated.write(ROOT / "docs" / "reference")
     app.connect("source-read", outside_as_text)
+    app.connect("autodoc-process-docstring", parameters_as_fields)

@@ -34,9 +34,11 @@ def commands() -> str:
     """Return a section for each word after ``omsm``, with its arguments."""
     parser = parser_of(WORDS)
     (words,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    lines = ["# Commands", "", "Exit status: 0 done, 2 bad input, 70 internal error.", ""]
+    lines = ["# Options of the commands", ""]
+    lines += ["Exit status: 0 done, 2 bad input, 70 internal error.", ""]
     for name, sub in words.choices.items():
-        lines += [f"## omsm {name}", "", (sub.description or "").strip().capitalize() + ".", ""]
+        said = (sub.description or "").strip()
+        lines += [f"## omsm {name}", "", f"{said[:1].upper()}{said[1:]}.", ""]
         lines += ["```text", sub.format_usage().strip(), "```", ""]
         lines += _examples(name)
         rows = [
@@ -55,20 +57,34 @@ def _examples(name: str) -> list[str]:
     return ["```text", *(call.replace("\\|", "|") for call in calls), "```", ""]
 
 
+# Arguments whose names say enough on the command line.
+_NAMED = {
+    "CAL.json": "calibration", "OLD.json": "calibration", "NEW.json": "calibration",
+    "SURFACE.yaml": "nominal surface", "MODEL.json": "model", "bag": "recording", "FILE": "table",
+    "clockwise": "recording", "counterclockwise": "recording", "shell": "bash, zsh or tcsh",
+}  # fmt: skip
+
+
 def _argument(action: argparse.Action) -> str:
     names = ", ".join(f"`{option}`" for option in action.option_strings)
-    name = names or f"`{action.metavar or action.dest}`"
-    if names and action.metavar:
-        name += f" `{action.metavar}`"
-    text = " ".join((action.help or "file or folder to write").split())
+    shown = action.metavar if isinstance(action.metavar, tuple) else [action.metavar]
+    placeholder = " ".join(filter(None, shown))
+    name = names or f"`{placeholder or action.dest}`"
+    if names and placeholder:
+        name += f" `{placeholder}`"
+    written = "--out" in action.option_strings
+    text = action.help or (
+        "file or folder to write" if written else _NAMED[placeholder or action.dest]
+    )
+    text = " ".join(text.split())
     notes = []
     if action.choices is not None and action.option_strings:
         notes.append(f"one of {', '.join(f'`{c}`' for c in action.choices)}")
     usual = action.default
     if action.option_strings and usual not in (None, "", False, argparse.SUPPRESS) and usual:
         parts = usual if isinstance(usual, list | tuple) else [usual]
-        shown = (f"{part:.6g}" if isinstance(part, float) else str(part) for part in parts)
-        notes.append(f"default `{','.join(shown)}`")
+        values = (f"{part:.6g}" if isinstance(part, float) else str(part) for part in parts)
+        notes.append(f"default `{','.join(values)}`")
     return f"| {_cell(name)} | {_cell('; '.join([text, *notes]))} |"
 
 

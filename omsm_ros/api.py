@@ -352,7 +352,7 @@ def predict(
         residual=found.residual,
         speed_factor=found.speed_factor,
         binding=found.binding,
-        message=found.message,
+        advice=found.advice,
     )
 
 

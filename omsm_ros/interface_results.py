@@ -196,7 +196,7 @@ def _over_time(time: FloatArray, curves: Mapping[str, FloatArray]) -> Figure:
     made, axes = style.figure(9.2, 4.5, len(curves), 1, sharex=True)
     for ax, (name, values) in zip(axes[:, 0], curves.items(), strict=True):
         ax.plot(time, values / 1e-6, linewidth=0.8)
-        style.label(ax, y="µm", title=name)
+        style.label(ax, y=f"{name} [µm]")
     style.label(axes[-1, 0], x="time [s]")
     return made
 
@@ -381,7 +381,7 @@ class Spectrum(Result):
         axes[0, 0].plot(self.frequency[1:], self.density[1:], linewidth=0.8)
         style.logarithmic(axes[0, 0].xaxis)
         style.logarithmic(axes[0, 0].yaxis)
-        style.label(axes[0, 0], x="frequency", y="density")
+        style.label(axes[0, 0], x="frequency [Hz or 1/m]", y="density [unit²/Hz or unit²·m]")
         return made
 
 
@@ -423,7 +423,8 @@ class Prediction(Result):
 
     error: without correction, after the filter has settled [m], (n,);  period: [s]
     residual: largest standard uncertainty after the correction [m]
-    speed_factor: of this motion within all limits;  binding: the first limit;  message: reason
+    speed_factor: of this motion within all limits;  binding: the first limit
+    advice: what to do if a limit is exceeded, else empty
     """
 
     error: FloatArray
@@ -431,14 +432,15 @@ class Prediction(Result):
     residual: float
     speed_factor: float
     binding: str
-    message: str
+    advice: str
 
     def rows(self) -> Iterator[tuple[str, str]]:
         rms = quantity(float(np.std(self.error)), "m")
         yield "dynamic error", f"{quantity(float(np.ptp(self.error)), 'm')} PV, {rms} rms"
         yield "after correction", f"{quantity(self.residual, 'm')} (k = 1)"
         yield "maximum speed", f"{plain(self.speed_factor)} × this motion, by {self.binding}"
-        yield "reason", self.message
+        if self.advice:
+            yield "advice", self.advice
 
     def _figure(self) -> Figure:
         return _over_time(

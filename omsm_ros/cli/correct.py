@@ -229,13 +229,15 @@ def _show_predict(facts: Facts) -> None:
             ("dynamic error", f"{quantity(facts['peak_to_valley'], 'm', 4)} PV, "
                               f"{quantity(facts['rms'], 'm', 4)} rms"),
             ("after correction", f"{quantity(facts['residual'], 'm')} (k = 1)"),
+            ("  undetected model error", quantity(facts["residual_undetected"], "m")),
             ("Z above the valid band", f"{quantity(facts['outside_band_rms'], 'm', 2)} rms, noise "
                                        "of the encoder included"),
             ("maximum speed", f"{_times(facts['speed_factor'])} this motion, limited by "
                               f"{facts['binding']}"),
             *((f"  limit: {limit['name']}", _limit_text(limit)) for limit in facts["limits"]),
             ("not evaluated", ", ".join(facts["not_evaluated"]) or "nothing"),
-            ("reason", facts["message"]),
+            *((name, facts[key]) for name, key in (("not judged", "left_out"), ("advice", "advice"))
+              if facts[key]),
         ]
     )  # fmt: skip
 

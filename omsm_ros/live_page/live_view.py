@@ -271,7 +271,6 @@ class LiveView:
                 "verdict": verdict_text(calibration),
                 "reasons": [str(reason) for reason in calibration.certificate.reasons[:10]],
                 "delay": calibration.dynamics.low_frequency_delay,
-                "valid_up_to": calibration.valid_up_to,
             }
 
     def add_acceleration(self, block: AccelerationBlock) -> None:

@@ -197,7 +197,7 @@ def profiles(found: Adjustment) -> Figure:
         ax.fill_between(position, height - band, height + band, color=style.AFTER, alpha=0.2,
                         linewidth=0)  # fmt: skip
         ax.plot(position, height, ".-", color=style.AFTER, linewidth=0.9, markersize=3)
-        style.label(ax, y="nm", title=f"along {name}")
+        style.label(ax, y="deviation [nm]", title=f"along {name}")
     style.label(axes[-1, 0], x="position [mm]")
     return made
 

@@ -81,7 +81,7 @@ STANDS_FOR = {
     "SOURCES.yaml": "machine.yaml", "R": "0.001", "W": "0.0003", "NAME": "twin",
     "FILE.png": "made.png", "FROM": "310", "TO": "330", "R,X,Y": "0.0009,0,0",
     "OPTION": "--no-report", "mirror|steps|chirp|circles|vibration": "steps",
-    "S.yaml": "mirror.yaml", "M.yaml": "machine.yaml", "U": "20e-9",
+    "APERTURE": "0.0009", "S.yaml": "mirror.yaml", "M.yaml": "machine.yaml", "U": "20e-9",
 }  # fmt: skip
 IN_COMMAND = {
     "identify": {"BAG": "steps.mcap"},

@@ -29,6 +29,9 @@ NOT_RUN = {
     r"dask |.*--scheduler ": "Dask is optional; benchmarks of campaigns run two workers of it",
     r"ros2 security ": "the wheels' Fast DDS is built without security",
     r"ros2 run omsm_ros replay$": "the name of a node; it is run with its bag in recordings.md",
+    r"omsm record --(port|device six)|omsm inspect check": "need a sender, which "
+    "test_stream_page.py has",
+    r"omsm identify STEPS --multisine ": "needs a recording of that plan; see test_several_bags.py",
     r"omsm (demo|history)$": "the name of a command; both are run with their options elsewhere",
     r"omsm (COMMAND|sources KIND)": "a word in capitals stands for others",
     r".*device:=lamp": "needs the package of that page installed; test_adding_a_probe.py has it",

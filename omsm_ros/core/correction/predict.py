@@ -164,7 +164,8 @@ class Prediction:
     speed_factor: of the path within all limits, at most 100; 0 if it may not be run at any speed
     safe: True if no limit is exceeded;  binding: name of the limit that is reached first
     limits: evaluated ones, that of the dynamics first;  not_evaluated: names of the others
-    left_out, message: sentences about samples that were not judged (or empty), and all the above
+    left_out, advice: samples that were not judged, and what to do if not safe; each may be empty
+    message: a sentence with all the above
     """
 
     peak_to_valley: float
@@ -179,6 +180,7 @@ class Prediction:
     limits: tuple[SpeedLimit, ...]
     not_evaluated: tuple[str, ...]
     left_out: str
+    advice: str
     message: str
 
 
@@ -204,8 +206,9 @@ def predict_error(
     )
     every = (dynamics, *others)
     binding = min(every, key=lambda limit: limit.speed_factor)
-    message = _message(calibration, spread, (dynamics.value, undetected), budget, binding)
-    left_out = path.left_out
+    residuals, left_out = (dynamics.value, undetected), path.left_out
+    advice = _advice(calibration, residuals, budget, binding)
+    message = _message(calibration, spread, residuals, budget, advice)
     outside, outside_rms = _outside_band(calibration, path)
     return Prediction(
         peak_to_valley=spread,
@@ -220,6 +223,7 @@ def predict_error(
         limits=every,
         not_evaluated=tuple(missing),
         left_out="" if left_out is None else str(left_out),
+        advice="" if binding.speed_factor >= 1 else str(advice),
         message="; ".join(str(part) for part in (message, left_out) if part is not None),
     )
 
@@ -294,26 +298,29 @@ def _longer_dwell(
     return rounded_up(plateau * (2 * residual / budget) ** 2, 2)
 
 
+def _advice(
+    calibration: Calibration, residuals: tuple[float, float], budget: float, binding: SpeedLimit
+) -> Notice:
+    factor = binding.speed_factor
+    values: dict[str, object] = {"factor": rounded_down(factor), "limit": binding.name}
+    if factor >= 1:
+        return Notice(f"correction.{'fastest' if factor >= FASTEST else 'faster'}", **values)
+    code = f"correction.{'slower' if factor else 'no_speed'}"
+    if binding.name != DYNAMICS:
+        return Notice(code, **values)
+    dwell = _longer_dwell(calibration, *residuals, budget)
+    better = Notice("correction.better" if dwell is None else "correction.dwell", dwell=dwell)
+    return Notice(f"{code}_dynamics", better=better, **values)
+
+
 def _message(
     calibration: Calibration,
     peak_to_valley: float,
     residuals: tuple[float, float],
     budget: float,
-    binding: SpeedLimit,
+    advice: Notice,
 ) -> Notice:
     residual, undetected = residuals
-    factor = rounded_down(binding.speed_factor)
-    values: dict[str, object] = {"factor": factor, "limit": binding.name}
-    code = "faster" if binding.speed_factor >= 1 else "slower"
-    if binding.speed_factor >= FASTEST:
-        code = "fastest"
-    elif binding.speed_factor == 0:
-        code = "no_speed"
-    advice = Notice(f"correction.{code}", **values)
-    if binding.speed_factor < 1 and binding.name == DYNAMICS:
-        dwell = _longer_dwell(calibration, residual, undetected, budget)
-        better = Notice("correction.better" if dwell is None else "correction.dwell", dwell=dwell)
-        advice = Notice(f"correction.{code}_dynamics", better=better, **values)
     largest = calibration.certificate.undetected.largest
     part: Notice | str = ""
     if undetected and largest is not None:

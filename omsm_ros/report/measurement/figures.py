@@ -378,17 +378,17 @@ def zernike_terms(terms: Sequence[Mapping[str, Any]]) -> Figure:
 
 def line_profiles(lines: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw deviations [nm] over the position [mm] on each line, with ±2u; one panel per line."""
-    made, axes = style.figure(_WIDE, 1.9 * len(lines) + 0.4, rows=len(lines), sharex=True)
+    made, axes = style.figure(_WIDE, 1.4 * len(lines) + 0.4, rows=len(lines), sharex=True)
     for ax, (name, curve) in zip(axes[:, 0], lines.items(), strict=True):
         _draw_curve(ax, curve, MILLIMETRE_M, NANOMETRE_M)
-        style.label(ax, y="[nm]", title=f"Registered deviation {_FORM_LINES[name]}")
+        style.label(ax, y="deviation [nm]", title=f"Registered deviation {_FORM_LINES[name]}")
     style.label(axes[-1, 0], x="position on the line [mm]")
     return made
 
 
 def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Draw deviations [nm] over the radius [mm], mean of each ring, and the angle [°], with ±2u."""
-    made, axes = style.figure(_WIDE, 2.7 * len(rings) + 0.4, rows=len(rings))
+    made, axes = style.figure(_WIDE, 1.7 * len(rings) + 0.4, rows=len(rings))
     kinds = {
         "radius": (MILLIMETRE_M, "radius [mm]", "Registered deviation over the radius"),
         "edge": (MILLIMETRE_M, "radius [mm]", "At the edge, outer tenth of the radius"),
@@ -397,7 +397,7 @@ def ring_profiles(rings: Mapping[str, Mapping[str, Any]]) -> Figure:
     for ax, (name, curve) in zip(axes[:, 0], rings.items(), strict=True):
         unit, x, title = kinds[name]
         _draw_curve(ax, curve, unit, NANOMETRE_M)
-        style.label(ax, x=x, y="[nm]", title=title)
+        style.label(ax, x=x, y="deviation [nm]", title=title)
     return made
 
 

@@ -104,10 +104,12 @@ class LivePage {
     this.numbers(view);
     const calibration = view.calibration;
     document.getElementById("calibration").textContent = calibration.id
-      ? `${calibration.id.slice(0, 12)}: ${calibration.verdict}, lag ${(1e6 * calibration.delay).toFixed(1)} µs, `
-        + `up to ${calibration.valid_up_to.toFixed(1)} Hz`
+      ? `${calibration.id.slice(0, 12)}: ${calibration.verdict}, lag ${(1e6 * calibration.delay).toFixed(1)} µs`
       : "none yet";
     this.tables(view.nodes, view.ended);
+    // Before the first points there is nothing to draw.
+    document.getElementById("map").hidden = !view.grid;
+    document.getElementById("history").hidden = view.series.length < 2;
     series(document.getElementById("series"), view.series);
     document.getElementById("vibration").hidden = !view.spectrum;
     if (view.spectrum) spectrum(document.getElementById("spectrum"), view.spectrum);
@@ -130,7 +132,7 @@ class LivePage {
     document.getElementById("reduction").textContent = view.grid
       ? `A reduction: each cell of ${(1e6 * view.grid.pitch).toFixed(0)} µm shows the mean of its points; `
         + "cells without a point show their neighbours'. Drag, pinch or turn the wheel to enlarge."
-      : "No points yet.";
+      : "No points yet: the map grows while a part is scanned with a calibration in force.";
   }
 
   tables(nodes, ended) {
@@ -217,7 +219,7 @@ function chart(canvas, x, lines, unit, label, logarithmic) {
   const pen = canvas.getContext("2d");
   pen.setTransform(dense, 0, 0, dense, 0, 0);
   pen.font = "11px system-ui, 'DejaVu Sans', sans-serif";
-  const left = 48, right = box.width - 8, top = 10, bottom = box.height - 28;
+  const left = 48, right = box.width - 8, top = 22, bottom = box.height - 28;
   const f = logarithmic ? (v) => Math.log10(Math.max(v, 1e-12)) : (v) => v;
   const all = lines.flatMap((line) => line.values.map(f)).filter(Number.isFinite);
   let low = Math.min(...all, logarithmic ? Infinity : 0), high = Math.max(...all);
