@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, optimize, sparse
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.evidence import evidence_of
 from omsm_ros.core.adjustment.network import Solution
@@ -113,7 +113,7 @@ def form_map(
     open_changes = made.open_changes(doubts, nominal, removed)
     spread = solution.factor.forward(rows.T)
     raw = spread.T @ spread
-    of_cells = made.member @ sparse.diags_array(made.share) @ made.member.T
+    of_cells = made.member @ scipy.sparse.diags_array(made.share) @ made.member.T
     raw += of_cells.toarray()
     covariance = made.free(made.free(raw).T) + open_changes @ open_changes.T
     every, by_height = _term_fit(solution, places)
@@ -243,7 +243,7 @@ def largest_contribution(
     if excess(1.0) <= 0:
         return None
     if over < 0:
-        factor = optimize.brentq(excess, 0.0, 1.0, rtol=1e-3)
+        factor = scipy.optimize.brentq(excess, 0.0, 1.0, rtol=1e-3)
         # The scans determine the rest: 1 / left² = 1 / size² + information.
         left = float(np.mean(np.diag(covariance))) / size**2
         allowed = size / float(np.sqrt(1 + (factor**-2 - 1) / left))
@@ -269,7 +269,7 @@ class _Made:
     pose: FloatArray
     rows: FloatArray
     share: FloatArray
-    member: sparse.csr_array
+    member: scipy.sparse.csr_array
     columns: FloatArray
     fit: FloatArray
 
@@ -293,7 +293,7 @@ class _Made:
         rows[:, net.terms] += values
         columns, fit = _pose(places, nominal, removed)
         number = len(height)
-        member = sparse.csr_array(
+        member = scipy.sparse.csr_array(
             (np.ones(number), (np.arange(number), places.cell)), shape=(number, len(share))
         )
         return cls(
@@ -338,7 +338,7 @@ class _Made:
         random = np.random.default_rng(seed)
         factor = solution.factor
         normal = random.standard_normal((len(solution.active), _DRAWS))
-        moved = linalg.solve_triangular(factor.root, normal, lower=True, trans="T")
+        moved = scipy.linalg.solve_triangular(factor.root, normal, lower=True, trans="T")
         moved *= factor.scale[:, np.newaxis]
         of_cells = np.sqrt(self.share)[:, np.newaxis] * random.standard_normal(
             (len(self.share), _DRAWS)

@@ -11,7 +11,7 @@ eliminated cell by cell.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, optimize
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.blocks import Blocks
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
@@ -169,7 +169,7 @@ class FormTerms:
             root = axes / np.sqrt(np.maximum(share, 0.0) + size**-2)
             likelihood, spread = self._best(columns @ root)
             gains.append(2 * (likelihood - alone))
-            pulled = linalg.solve(spread, self.values, assume_a="pos")
+            pulled = scipy.linalg.solve(spread, self.values, assume_a="pos")
             found.append(root @ (root.T @ (columns.T @ pulled)))
         weights = np.exp((np.array(gains) - max(gains)) / 2)
         gain = max(gains) + 2 * np.log(np.mean(weights))
@@ -189,9 +189,9 @@ class FormTerms:
         def misfit(law: FloatArray) -> tuple[float, FloatArray]:
             # Asked for ten thousand times: what checks the matrices would take most of it.
             variances = own(law)
-            root, _ = linalg.lapack.dpotrf(known + np.diag(variances), lower=1)
-            pulled, _ = linalg.lapack.dpotrs(root, self.values, lower=1)
-            inverse, _ = linalg.lapack.dpotri(root, lower=1)
+            root, _ = scipy.linalg.lapack.dpotrf(known + np.diag(variances), lower=1)
+            pulled, _ = scipy.linalg.lapack.dpotrs(root, self.values, lower=1)
+            inverse, _ = scipy.linalg.lapack.dpotri(root, lower=1)
             slopes = variances * (inverse.diagonal() - pulled**2) / 2
             rises = self.symmetric @ slopes
             slope = [slopes.sum() - rises, rises, -slopes @ np.log(self.degrees)]
@@ -200,6 +200,6 @@ class FormTerms:
 
         # The law of terms that are zero has no end: 50 is twenty orders of magnitude.
         bounds = [(start - 50, start + 50)] * 2 + [(0.0, 4 * _START_POWER)]
-        best = optimize.minimize(misfit, [start, start, _START_POWER], method="L-BFGS-B",
+        best = scipy.optimize.minimize(misfit, [start, start, _START_POWER], method="L-BFGS-B",
                                  jac=True, bounds=bounds, options=_TOLERANCE)  # fmt: skip
         return -float(best.fun), known + np.diag(own(best.x))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import signal
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.kinematics.kinematics import (
     PolynomialSurface,
@@ -234,7 +234,7 @@ def _rate(time: FloatArray, values: FloatArray, order: int = 1) -> FloatArray:
     for run in np.split(np.arange(len(time)), edges):
         half = min(max(round(_HALF_WINDOW_S / period), 3), (len(run) - 1) // 2)
         if 2 * half + 1 > _POLYNOMIAL:
-            made[run] = signal.savgol_filter(
+            made[run] = scipy.signal.savgol_filter(
                 values[run], 2 * half + 1, _POLYNOMIAL, deriv=order, delta=period
             )
         else:
@@ -269,7 +269,7 @@ def _fading(time: FloatArray, motion: FloatArray) -> FloatArray:
     """Return the mean of ``motion`` over the last two seconds, fading, less ``motion``."""
     step = float(np.median(np.diff(time))) / _CREEP_S
     start = [motion[0] * (1 - step)]
-    return np.asarray(signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)
+    return np.asarray(scipy.signal.lfilter([step], [1, step - 1], motion, zi=start)[0] - motion)
 
 
 def _slope(time: FloatArray, values: FloatArray) -> float:

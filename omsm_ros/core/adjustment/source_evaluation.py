@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, optimize
+import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.families import families_of, ranges_of
 from omsm_ros.core.adjustment.scan_data import ScanData, ScanView, view_of, zero_of
@@ -231,7 +231,7 @@ class _Model:
     def _whitened(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
         scale = np.sqrt(np.sum(self.columns**2, axis=1))
         both = np.column_stack([(self.columns / scale[:, np.newaxis]).T, self.heights])
-        made = linalg.solve_triangular(root, both, lower=True)
+        made = scipy.linalg.solve_triangular(root, both, lower=True)
         return made[:, :-1], made[:, -1]
 
     def walk(self) -> tuple[float, tuple[float, float]]:
@@ -241,7 +241,7 @@ class _Model:
         start = grid[int(np.argmin([self._likelihood(p)[0] for p in grid]))]
         step = float(grid[1] - grid[0])
         bounds = (max(start - step, ends[0]), min(start + step, ends[1]))
-        best = optimize.minimize_scalar(
+        best = scipy.optimize.minimize_scalar(
             lambda p: self._likelihood(p)[0], bounds=bounds, method="bounded",
             options={"xatol": 0.02},
         ).x  # fmt: skip

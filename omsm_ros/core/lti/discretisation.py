@@ -19,8 +19,8 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.polynomial import polynomial
-from scipy import fft, linalg, signal
 
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
@@ -76,7 +76,7 @@ def polynomial_hold_zeros(
     direct = np.array([float(system.c @ weights[:, 0] + system.d)])
     pencil = np.block([[transition, entry[:, np.newaxis]], [leaving, direct]])
     finite = np.diag(np.append(np.ones(n + order), 0.0))
-    found = linalg.eigvals(pencil, finite)
+    found = scipy.linalg.eigvals(pencil, finite)
     found = found[np.isfinite(found) & (abs(found) < _FAR_ZERO)]
     found = _with_exact_ones(found, dc_zeros)
     upper = found[found.imag > 0]
@@ -166,7 +166,7 @@ def _hold_integrals(a: FloatArray, b: FloatArray, order: int) -> tuple[FloatArra
     chain[:n, :n] = a
     chain[:n, n] = b
     chain[n:, n:] = np.eye(order + 1, k=1)
-    exponential = linalg.expm(chain)
+    exponential = scipy.linalg.expm(chain)
     monomials = exponential[:n, n:] * [factorial(j) for j in range(order + 1)]
     nodes = 1.0 - np.arange(order + 1)
     coefficients = np.linalg.inv(np.vander(nodes, increasing=True))
@@ -203,8 +203,8 @@ class DigitalFilter:
     @cached_property
     def noise_gain(self) -> float:
         """Ratio of the standard deviations of output and input for white noise."""
-        pulse = signal.unit_impulse(self.settling_samples(1e-9) + 1)
-        return float(np.linalg.norm(signal.sosfilt(self.sections, pulse)))
+        pulse = scipy.signal.unit_impulse(self.settling_samples(1e-9) + 1)
+        return float(np.linalg.norm(scipy.signal.sosfilt(self.sections, pulse)))
 
 
 def discretise(
@@ -266,7 +266,7 @@ def _gain(
 def _sections(zeros: ComplexArray, poles: ComplexArray, gain: float, late: int) -> FloatArray:
     pairs, single = divmod(late, 2)
     delays = [[0.0, 0.0, 1.0, 1.0, 0.0, 0.0]] * pairs + [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * single
-    rational = signal.zpk2sos(zeros, poles, gain)
+    rational = scipy.signal.zpk2sos(zeros, poles, gain)
     return np.vstack([rational, *np.reshape(delays, (-1, 1, 6))])
 
 
@@ -276,8 +276,8 @@ def bilinear(
     """Return the bilinear transform of G without its delay; ``poles`` as in :func:`discretise`."""
     roots = dynamics.poles() if poles is None else poles
     leading = np.trim_zeros(dynamics.numerator, "b")[-1] / dynamics.denominator[-1]
-    mapped = signal.bilinear_zpk(dynamics.zeros(), roots, leading, 1 / sample_period)
-    return DigitalFilter(signal.zpk2sos(*mapped), sample_period)
+    mapped = scipy.signal.bilinear_zpk(dynamics.zeros(), roots, leading, 1 / sample_period)
+    return DigitalFilter(scipy.signal.zpk2sos(*mapped), sample_period)
 
 
 def _lagrange_delay(delay: float, order: int) -> tuple[int, ComplexArray]:
@@ -318,8 +318,8 @@ def velocity_spectrum(
     """
     velocity = np.diff(checked_motion(z)) / sample_period
     window = _FADED if faded else "blackmanharris"
-    weights = signal.get_window(window, len(velocity))
-    samples = fft.next_fast_len(len(velocity), real=True)
+    weights = scipy.signal.get_window(window, len(velocity))
+    samples = scipy.fft.next_fast_len(len(velocity), real=True)
     frequency = np.fft.rfftfreq(samples, sample_period)
     spectrum = np.fft.rfft(velocity * weights, samples) / np.sinc(frequency * sample_period)
     scale = np.full(len(frequency), 2.0)
@@ -346,8 +346,8 @@ def discretisation_error(
     error = difference * velocity
     rms = float(np.sqrt(np.sum(abs(error) ** 2) / 2))
     samples = len(z) - 1
-    padded = fft.next_fast_len(samples, real=True)
-    amplitude = np.sqrt(padded * np.sum(signal.get_window(_FADED, samples) ** 2)) / 2
+    padded = scipy.fft.next_fast_len(samples, real=True)
+    amplitude = np.sqrt(padded * np.sum(scipy.signal.get_window(_FADED, samples) ** 2)) / 2
     over_time = np.fft.irfft(error * amplitude, padded)[:samples]
     fade = int(_FADE * samples) + 1
     return rms, float(np.ptp(over_time[fade:-fade]))

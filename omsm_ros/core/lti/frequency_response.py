@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.polynomial import polynomial
-from scipy import signal
 
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction, slow_motion_jacobian
 from omsm_ros.core.streams.blocks import FloatArray
@@ -35,9 +35,9 @@ def frequency_response(
     du, dy = np.diff(motion), np.diff(output)
     rate = 1 / sample_period
     options = {"fs": rate, "nperseg": min(segment, len(du)), "detrend": False}
-    frequency, cross = signal.csd(du, dy, **options)
-    _, inward = signal.welch(du, **options)
-    _, coherence = signal.coherence(du, dy, **options)
+    frequency, cross = scipy.signal.csd(du, dy, **options)
+    _, inward = scipy.signal.welch(du, **options)
+    _, coherence = scipy.signal.coherence(du, dy, **options)
     count = max(2 * len(du) / options["nperseg"] - 1, 1.0)
     inside = np.clip(coherence, 1e-12, 1.0)
     uncertainty = np.sqrt((1 - inside) / (2 * inside * count))

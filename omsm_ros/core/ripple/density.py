@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # whose parts are loaded when they are used
 from numpy.typing import ArrayLike
-from scipy import ndimage, signal, special
 
 from omsm_ros.core.streams.blocks import FloatArray, IntArray
 from omsm_ros.errors import ConfigurationError, DataError
@@ -56,7 +56,7 @@ def density(values: FloatArray, step: float) -> Density:
     count = len(values)
     if count < 16:
         raise DataError("ripple.short_spectrum", count=count, least=16)
-    frequency, power = signal.periodogram(values, 1 / step, "blackmanharris", detrend=False)
+    frequency, power = scipy.signal.periodogram(values, 1 / step, "blackmanharris", detrend=False)
     return Density(frequency, power, 1 / (count * step))
 
 
@@ -117,8 +117,8 @@ def band_stop(
     settling = 0.0
     for low, high in bands:
         sections = _sections(low, high, period)
-        kept = signal.sosfiltfilt(sections, kept, padlen=min(count - 1, _padding(sections)))
-        one = signal.freqz_sos(sections, 2 * np.pi * frequency * period)[1]
+        kept = scipy.signal.sosfiltfilt(sections, kept, padlen=min(count - 1, _padding(sections)))
+        one = scipy.signal.freqz_sos(sections, 2 * np.pi * frequency * period)[1]
         response = response * abs(one) ** 2
         settling = max(settling, _padding(sections) * period)
     removed = (even - kept)[sample - sample[0]]
@@ -136,7 +136,9 @@ def _sections(low: float, high: float, period: float) -> FloatArray:
     nyquist = 0.5 / period
     if not 0 < low < high < nyquist:
         raise ConfigurationError("ripple.stop_band", low=low, high=high, nyquist=nyquist)
-    return np.asarray(signal.butter(_ORDER, (low, high), "bandstop", fs=1 / period, output="sos"))
+    return np.asarray(
+        scipy.signal.butter(_ORDER, (low, high), "bandstop", fs=1 / period, output="sos")
+    )
 
 
 def _padding(sections: FloatArray) -> int:
@@ -162,7 +164,7 @@ def noise_floor(power: FloatArray, oversampling: int = 1) -> FloatArray:
         low, high = max(centre - half, 0), min(centre + half + 1, count)
         level[place] = np.median(power[low:high])
     # A band with many lines must not raise the floor of its neighbours.
-    level = np.minimum(level, ndimage.median_filter(level, 5, mode="nearest") * 4)
+    level = np.minimum(level, scipy.ndimage.median_filter(level, 5, mode="nearest") * 4)
     tiny = np.finfo(float).tiny
     logs = np.interp(np.arange(count), centres, np.log(np.maximum(level, tiny)))
     return np.asarray(np.exp(logs) / _MEDIAN_OVER_MEAN)
@@ -182,15 +184,15 @@ def significance(ratio: FloatArray, tried: float) -> FloatArray:
     small = np.log(tried) - power
     none = tried * np.log1p(-np.exp(-np.clip(power, _LEAST_RATIO, np.log(tried) - _RARE)))
     log_any = np.where(small < _RARE, small, np.log(-np.expm1(none)))
-    return np.asarray(-special.ndtri_exp(log_any))
+    return np.asarray(-scipy.special.ndtri_exp(log_any))
 
 
 def ratio_at(sigma: float, tried: float) -> float:
     """Return the ratio of powers with a significance of ``sigma``, the inverse of the above."""
-    tried, log_any = max(tried, 1.0), float(special.log_ndtr(-sigma))
+    tried, log_any = max(tried, 1.0), float(scipy.special.log_ndtr(-sigma))
     if log_any < _RARE:
         return float(np.log(tried)) - log_any
-    return -float(np.log(-np.expm1(special.log_ndtr(sigma) / tried)))
+    return -float(np.log(-np.expm1(scipy.special.log_ndtr(sigma) / tried)))
 
 
 def aliased_frequency(frequency: ArrayLike, sample_rate: float) -> FloatArray:

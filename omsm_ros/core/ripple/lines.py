@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
-from scipy.signal import find_peaks
+import scipy
 
 from omsm_ros.core.ripple.coordinates import (
     LEAST_WAVES,
@@ -153,7 +153,7 @@ def _strongest(
             place, half = frequency / spacing, bins * OVERSAMPLING
             ratio[max(int(np.ceil(place - half)), 0) : max(int(place + half) + 1, 0)] = 0.0
         # The last frequency may be a peak, too.
-        peaks, found = find_peaks(
+        peaks, found = scipy.signal.find_peaks(
             np.append(ratio, 0.0),
             height=ratio_at(LEAST_SIGMA, tried),
             distance=_APART_BINS * OVERSAMPLING,
