@@ -57,7 +57,7 @@ BOUND_M = 2e-8
 # Z of the rehearsal: half of its largest travel [m], and its duration [s].
 REACH_M, REHEARSED_S = 4e-5, 20.0
 # Responses for which the motion is predicted; how far the gain of one may be from the calibrated.
-DRAWS, MOST_RELATIVE = 60, 1.0
+DRAWS, MOST_RELATIVE = 100, 1.0
 # Time at both ends that is not counted [s].
 EDGE_S = 0.5
 
@@ -74,21 +74,30 @@ class Response(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """rms off the path [m]: middle and limits of 95 % of the motion; noise of what measures it."""
+    """rms off the path [m]: middle, least and most of 95 %.
 
-    middle: float
-    least: float
-    most: float
+    seen: as measured, (3,);  motion: without the noise, (3,);  noise: of what measures it
+    """
+
+    seen: np.ndarray
+    motion: np.ndarray
     noise: float
 
-    def measured(self):
-        """Return middle, least and most of what will be measured [m]."""
-        return tuple(float(np.hypot(v, self.noise)) for v in self[:3])
+    @classmethod
+    def of(cls, noise, drawn, random):
+        """Return the prediction by motions off the path, drawn (n,) each cycle."""
+        rms = [(rms_of(d + noise * random.normal(size=len(d))), rms_of(d)) for d in drawn]
+        return cls(*np.percentile(rms, [50, 2.5, 97.5], axis=0).T, noise)
 
     def __str__(self):
-        motion = "{:.3g} nm ({:.3g} to {:.3g} nm)".format(*(v * 1e9 for v in self[:3]))
-        seen = "{:.3g} nm ({:.3g} to {:.3g} nm)".format(*(v * 1e9 for v in self.measured()))
-        return f"{seen} as measured; motion {motion}, noise {self.noise * 1e9:.3g} nm"
+        words = ["{:.4g} nm ({:.4g} to {:.4g} nm)".format(*v * 1e9) for v in self[:2]]
+        return f"{words[0]} as measured; motion {words[1]}, noise {self.noise * 1e9:.3g} nm"
+
+
+def rms_of(off):
+    """Return the rms of ``off`` (n,) each cycle, without the ends."""
+    edge = round(EDGE_S / CYCLE_S)
+    return float(np.std(off[edge:-edge]))
 
 
 def servo(command, encoder):
@@ -211,31 +220,42 @@ def through(z, taps, probe=None):
 
 
 class Probes:
-    """Responses from encoder to probe that may be true: by the covariance of a calibration."""
+    """Responses from encoder to probe that may be true: by the covariances of a calibration.
+
+    That of errors which the calibration does not detect is a bound, and they are often smaller.
+    """
 
     def __init__(self, known):
         """known: a calibration, None for the encoder itself."""
         self.known = known
         if known:
-            size, turned = np.linalg.eigh(known.covariance)
-            self.factor = turned * np.sqrt(np.maximum(size, 0.0))
+            parts = known.noise_covariance, known.undetected_error_covariance
+            found = [np.linalg.eigh(part) for part in parts]
+            self.noise, self.undetected = (t * np.sqrt(np.maximum(s, 0.0)) for s, t in found)
 
-    def drawn(self, random, lag=None):
-        """Return a function of frequency; ``lag`` [s] takes the place of that of the draw."""
+    def drawn(self, random, seen=None):
+        """Return a function of frequency.
+
+        seen: frequency [Hz] and, taking the place of those of the draw there, the lag [s] and the
+            share by which the gain is larger than calibrated [1]
+        """
         if not self.known:
             return None
-        dynamics, off = self.known.dynamics, self.factor @ random.normal(size=len(self.factor))
+        dynamics, (noise, error) = self.known.dynamics, random.normal(size=(2, len(self.noise)))
+        off = self.noise @ noise + random.uniform() * self.undetected @ error
 
         def relative(frequency):
             real, imag = relative_response_jacobian(dynamics, np.asarray(frequency)) @ off
             return real + 1j * imag
 
-        turn = 0.0
-        if lag is not None:
-            turn = -relative(np.array([0.01]))[0].imag / (2 * np.pi * 0.01) - lag
+        late = larger = 0.0
+        if seen is not None:
+            slow = relative(np.array(seen[:1]))[0]
+            late = seen[1] + slow.imag / (2 * np.pi * seen[0])
+            larger = seen[2] - slow.real
 
         def of(frequency):
-            found = relative(frequency) + 2j * np.pi * frequency * turn
+            found = relative(frequency) - 2j * np.pi * frequency * late + larger
             gain = np.clip(found.real, -MOST_RELATIVE, MOST_RELATIVE)
             return dynamics.response(frequency) * np.exp(gain + 1j * found.imag)
 
@@ -246,23 +266,12 @@ def predicted(plan, path, follows, probes, noise, seed=1):
     """Return the Prediction for a planned path: of the encoder, or of the probe."""
     time = np.arange(int(plan.time[-1] / CYCLE_S)) * CYCLE_S
     z, wanted, random = plan.motion(time)[1], path(time)[1], np.random.default_rng(seed)
-    off = []
-    for _ in range(DRAWS):
+
+    def off():
         taps = follows.taps + follows.factor @ random.normal(size=len(follows.taps))
-        off.append(rms(through(z, taps, probes.drawn(random)) - wanted))
-    return limited(off, noise)
+        return through(z, taps, probes.drawn(random)) - wanted
 
-
-def rms(off):
-    """Return the rms of ``off`` (n,) each cycle, without the ends."""
-    edge = round(EDGE_S / CYCLE_S)
-    return float(np.std(off[edge:-edge]))
-
-
-def limited(off, noise):
-    """Return the Prediction of which ``off`` (k,) [m] are drawn."""
-    least, middle, most = np.percentile(off, [2.5, 50, 97.5])
-    return Prediction(float(middle), float(least), float(most), noise)
+    return Prediction.of(noise, (off() for _ in range(DRAWS)), random)
 
 
 def reduced(path, duration):
@@ -287,19 +296,23 @@ def ripple(plan, moved, time):
 class Rehearsal(NamedTuple):
     """What a rehearsal shows.
 
-    found: lag that the filter left [s], and gains of the ripple of the segments, in phase and a
-        quarter late [1], (3,);  factor: as of Response;  noise: of the probe [m]
+    frequency: of the waves of the path [Hz]
+    found: lag that the filter left [s], share by which the gain is larger than calibrated [1], and
+        gains of the ripple of the segments, in phase and a quarter late [1], (4,)
+    factor: as of Response;  noise: of the probe [m]
     """
 
+    frequency: float
     found: np.ndarray
     factor: np.ndarray
     noise: float
 
 
-def rehearsed(bag, plan, path, moved):
+def rehearsed(bag, plan, path, moved, static):
     """Return the Rehearsal of a recording.
 
     plan, path, moved: of the rehearsal;  bag: as recorded; time is that of its spindle
+    static: gain of the probe at rest and its uncertainty [1]
     """
     with bags.BagReader(Path(bag)) as reader:
         c = np.concatenate([block.c for _, block in reader.records(AXES_TOPIC)])
@@ -314,10 +327,15 @@ def rehearsed(bag, plan, path, moved):
     columns = np.stack(parts, axis=1) / (sizes := np.max(np.abs(parts), axis=1))
     found = np.linalg.lstsq(columns, distance, rcond=None)[0]
     noise = float(np.std(distance - columns @ found))
-    scale = found[0] / sizes[0]
-    to = np.array([-1.0, 1.0, 1.0]) / sizes[1:4] / scale
-    factor = np.linalg.inv(cholesky(columns.T @ columns, lower=True)).T[1:4] * noise
-    return Rehearsal(to * found[1:4], to[:, np.newaxis] * factor, noise / abs(scale))
+    gain, late, *added = found[:4] / sizes[:4]
+    waves = z - np.polynomial.Polynomial.fit(time, z, 1)(time)
+    frequency = float(np.std(np.gradient(waves, time)) / np.std(waves) / (2 * np.pi))
+    seen = np.array([-late / gain, abs(gain) / static[0] - 1, *np.divide(added, gain)])
+    to = np.array([-1 / gain, np.sign(gain) / static[0], 1 / gain, 1 / gain])
+    factor = np.linalg.inv(cholesky(columns.T @ columns, lower=True)).T[[1, 0, 2, 3]] * noise
+    factor = factor * (to / sizes[[1, 0, 2, 3]])[:, np.newaxis]
+    rest = np.array([0.0, static[1] / static[0], 0.0, 0.0])
+    return Rehearsal(frequency, seen, np.column_stack([factor, rest]), noise / abs(gain))
 
 
 def predicted_after(rehearsal, plan, path, moved, follows, probes, seed=1):
@@ -325,14 +343,14 @@ def predicted_after(rehearsal, plan, path, moved, follows, probes, seed=1):
     time = np.arange(int(plan.time[-1] / CYCLE_S)) * CYCLE_S
     smooth, wanted = moved(time)[1], path(time)[1]
     added, random = np.array(ripple(plan, moved, time)), np.random.default_rng(seed)
-    off = []
-    for _ in range(DRAWS):
+
+    def off():
         taps = follows.taps + follows.factor @ random.normal(size=len(follows.taps))
-        late, *gains = rehearsal.factor @ random.normal(size=rehearsal.factor.shape[1])
-        probe = probes.drawn(random, rehearsal.found[0] + late)
-        gains = rehearsal.found[1:] + gains
-        off.append(rms(through(smooth, taps, probe) + gains @ added - wanted))
-    return limited(off, rehearsal.noise)
+        seen = rehearsal.factor @ random.normal(size=rehearsal.factor.shape[1]) + rehearsal.found
+        probe = probes.drawn(random, (rehearsal.frequency, *seen[:2]))
+        return through(smooth, taps, probe) + seen[2:] @ added - wanted
+
+    return Prediction.of(rehearsal.noise, (off() for _ in range(DRAWS)), random)
 
 
 def main(command, steps, surface, rpm, radius, turns, out, calibration=None, rehearsal=None):
@@ -364,7 +382,8 @@ def main(command, steps, surface, rpm, radius, turns, out, calibration=None, reh
         name = Path(out).with_stem(f"{Path(out).stem}_rehearsal")
         name.write_text(path_gcode(trial, [f"rehearsal of {Path(out).name}: X at the axis"]))
     if rehearsal:
-        seen = rehearsed(rehearsal, trial, small, small_moved)
+        static = abs(known.static_gain), known.static_gain_uncertainty
+        seen = rehearsed(rehearsal, trial, small, small_moved, static)
         lag = seen.found[0]
         print(f"lag corrected by {lag * 1e6:.3g} us")
 

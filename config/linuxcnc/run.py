@@ -2,6 +2,7 @@
 """Run a program on LinuxCNC without a display: home, run, end. Started by LinuxCNC ([DISPLAY])."""
 
 import os
+import subprocess
 import sys
 import time
 
@@ -29,6 +30,12 @@ def until(what, reached, patience=60.0):
         time.sleep(0.05)
 
 
+def waiting():
+    """Return the number of samples that are not sent."""
+    depth = ["halcmd", "getp", "sampler.0.curr-depth"]
+    return int(subprocess.run(depth, capture_output=True, check=True).stdout)
+
+
 until("start", lambda: status.task_state >= linuxcnc.STATE_ESTOP)
 command.state(linuxcnc.STATE_ESTOP_RESET)
 command.wait_complete()
@@ -54,6 +61,6 @@ until(
     ),
     1e6,
 )
-print("program done", flush=True)
-# The last lines of the sampler are still on their way.
+# A reader that came late takes what waits in the sampler; the last lines are still on their way.
+until("samples that nobody reads", lambda: waiting() < 200, 30.0)
 time.sleep(0.5)

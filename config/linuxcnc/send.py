@@ -10,9 +10,10 @@ import time
 
 import hal
 
+# Before HAL is told that this component is ready: LinuxCNC does not start without the port.
+server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
 component = hal.component(f"send-{sys.argv[1]}")
 component.ready()
-server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
 stream = None
 while True:
     client, _ = server.accept()

@@ -148,7 +148,7 @@ def path_gcode(
     x, z, c = path.x, path.z, np.diff(turned) if words.c_relative else turned[1:]
     body = [words.metric, "G90", *words.before_scan]
     body += [f"G0 {at('X', x[0])}", f"G0 {at('Z', z[0])} C{turned[0]:.5f}"]
-    body += [*(words.measuring if measures else ()), words.rest(_SETTLE_S), "G93"]
+    body += [words.rest(_SETTLE_S), *(words.measuring if measures else ()), "G93"]
     body += [
         f"G1 {at('X', a)} {at('Z', b)} {words.c_word.format(f'{d:.6f}')} F{per_minute:.4f}"
         for a, b, d in zip(x[1:], z[1:], c, strict=True)

@@ -16,7 +16,13 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.adjustment import ScanDesign
-from omsm_ros.core.kinematics.trajectories import AxisPositions, plan_steps
+from omsm_ros.core.kinematics.trajectories import (
+    PLANNED_COUNT,
+    SECOND_SHARE,
+    AxisPositions,
+    StepTest,
+    plan_steps,
+)
 from omsm_ros.core.streams.blocks import AxisBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
 from omsm_ros.errors import DataError
@@ -144,24 +150,67 @@ def test_a_killed_linuxcnc_is_a_restart_of_the_count(tmp_path):
     assert 1 < numbers(bag)[at + 1] < 5000 < 10_000 * numbers(bag)[at]
 
 
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/howto/linuxcnc.md").read_text()
+
+
+def by_the_page(folder, begin):
+    """Run the block of the page that begins so in ``folder``; return what it says."""
+    (commands,) = (b for b in re.findall(r"```\n(.*?)```", PAGE, re.DOTALL) if b.startswith(begin))
+    if not (folder / "config").exists():
+        (folder / "config").symlink_to(ROOT / "config")
+    said = folder / "log.txt"
+    with said.open("w") as log:
+        done = subprocess.run(
+            ["bash", "-ec", commands], cwd=folder, check=False, stdout=log, stderr=log
+        )
+    assert done.returncode == 0, said.read_text()
+    return said.read_text()
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    """A folder with step test, scans and report."""
+    folder = tmp_path_factory.mktemp("page")
+    by_the_page(folder, "omsm plan steps")
+    return folder
+
+
 @pytest.mark.soak
 @REAL
 @pytest.mark.timeout(900)
-def test_the_commands_of_the_page_lead_from_step_test_to_report(tmp_path):
-    root = Path(__file__).parents[2]
-    page = (root / "docs/howto/linuxcnc.md").read_text()
-    (commands,) = (b for b in re.findall(r"```\n(.*?)```", page, re.DOTALL) if "plan steps" in b)
-    (tmp_path / "config").symlink_to(root / "config")
-    with (tmp_path / "log.txt").open("w") as log:
-        done = subprocess.run(
-            ["bash", "-ec", commands], cwd=tmp_path, check=False, stdout=log, stderr=log
-        )
-    assert done.returncode == 0, (tmp_path / "log.txt").read_text()
-    assert (tmp_path / "part" / "report.html").exists()
-    found = json.loads((tmp_path / "part" / "adjustment.json").read_text())
+def test_the_commands_of_the_page_lead_from_step_test_to_report(measured):
+    assert (measured / "part" / "report.html").exists()
+    found = json.loads((measured / "part" / "adjustment.json").read_text())
     # The twin's mirror has 113 nm.
     pv = found["figures"]["peak_to_valley"]
     assert abs(pv["value"] - 113e-9) < 2 * pv["standard_uncertainty"] + 10e-9
+
+
+@pytest.mark.soak
+@REAL
+@pytest.mark.timeout(900)
+def test_the_commands_of_the_page_filter_a_scan_as_predicted(measured):
+    said = by_the_page(measured, "filter=")
+    stated = re.findall(r"after: (\S+) nm \((\S+) to (\S+) nm\) as measured", said)
+    middle, least, most = (float(v) * 1e-9 for v in stated[-1])
+    off = float(re.search(r"'probe_rms': ([^,}]+)", said)[1])
+    assert off == pytest.approx(middle, rel=0.2)
+    assert 0.95 * least < off < 1.05 * most
+
+
+@pytest.mark.soak
+@REAL
+@pytest.mark.timeout(900)
+def test_the_commands_of_the_page_close_the_loop(tmp_path):
+    by_the_page(tmp_path, "python config/linuxcnc/loop.py")
+    pv = [found[0] for found in json.loads((tmp_path / "cuts" / "loop.json").read_text())]
+    assert pv[0] > 600e-9
+    assert pv[2] < 60e-9
+    assert pv[0] > pv[1] > pv[2]
+    # The single commands are those of the loop.
+    made = [tmp_path / "cuts" / folder / "cut.nc" for folder in ("compensation_1", "after")]
+    assert made[0].read_bytes() == made[1].read_bytes()
 
 
 class Wave:
@@ -184,7 +233,8 @@ def in_cycles(axes):
 def test_filtered_commands_leave_what_is_predicted(tmp_path, rpm, servo):
     """The planner is its model here; servo, structure and encoder are the twin's."""
     cell = Cell(disturbances=Disturbances(servo_bandwidth_hz=servo))
-    steps = plan_steps(sample_period=1e-3, second_step=3e-6, count=8, dwell=1.0)
+    second = SECOND_SHARE * StepTest().step
+    steps = plan_steps(sample_period=1e-3, second_step=second, count=PLANNED_COUNT, dwell=1.0)
     asked = steps.positions(np.arange(round(steps.duration / 1e-3)) * 1e-3)
     axes = in_cycles((asked.x, asked.y, asked.z, asked.b, asked.c))
     found = record(cell, behind.CommandedMotion(axes), Flat())
@@ -205,12 +255,12 @@ def test_filtered_commands_leave_what_is_predicted(tmp_path, rpm, servo):
         plan = np.loadtxt(tmp_path / "out.csv", delimiter=",", skiprows=1).T
         return behind.judge_path(plan, axes.x, axes.z, axes.c, 1e-3)["rms"]
 
-    assert off_the_path(plain) == pytest.approx(before.measured()[0], rel=0.02)
+    assert off_the_path(plain) == pytest.approx(before.seen[0], rel=0.02)
     off = off_the_path(plan)
-    middle, least, most = after.measured()
+    middle, least, most = after.seen
     assert off == pytest.approx(middle, rel=0.2)
     assert 0.95 * least < off < 1.05 * most
-    assert most < before.middle / 100
+    assert most < before.seen[0] / 100
     assert np.max(np.abs(np.diff(plan.motion(np.arange(0.5, 2.0, 1e-3))[1], 2))) < 1e-6 * 10
 
 
@@ -255,12 +305,16 @@ def test_a_rehearsal_shows_the_lag_and_how_the_probe_follows_the_segments(tmp_pa
         ),
     )
     write_recording(tmp_path / "rehearsal.mcap", seen)
-    seen = precompensate.rehearsed(tmp_path / "rehearsal.mcap", plan, small, small)
+    static = 0.99 / 1.0001, 1e-5
+    seen = precompensate.rehearsed(tmp_path / "rehearsal.mcap", plan, small, small, static)
+    assert seen.frequency == pytest.approx(4.0, rel=0.1)  # two waves a turn
     uncertain = np.linalg.norm(seen.factor, axis=1)
-    error = seen.found - [lag, gain.real, gain.imag]
-    sizes = [np.linalg.norm(v) for v in (np.gradient(small(time_)[1], time_), off, off)]
-    assert uncertain == pytest.approx(1e-8 / 0.99 / np.array(sizes), rel=0.2)
-    assert np.all(np.abs(error) < 3 * uncertain)
+    z = small(time_)[1]
+    sizes = [np.linalg.norm(v) for v in (np.gradient(z, time_), z, off, off)]
+    expected = 1e-8 / 0.99 / np.array(sizes)
+    expected[1] = np.hypot(expected[1], 1e-5)
+    assert uncertain == pytest.approx(expected, rel=0.2)
+    assert np.all(np.abs(seen.found - [lag, 1e-4, gain.real, gain.imag]) < 3 * uncertain)
     assert seen.noise == pytest.approx(1e-8 / 0.99, rel=0.02)
 
 

@@ -1,5 +1,8 @@
 """Real nodes behind the real LinuxCNC: its planner moves and the twin answers."""
 
+import os
+import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +13,7 @@ import pytest
 from omsm_ros.core.adjustment import ScanDesign
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io.calibration_file import save_calibration
-from omsm_ros.pipelines.plan_scans import scan_program
+from omsm_ros.pipelines.plan_scans import scan_program, write_scans
 from omsm_ros.twin.scenario import Scenario
 
 LINUXCNC = Path(__file__).parents[2] / "config" / "linuxcnc"
@@ -26,29 +29,72 @@ PROBE = {
 }
 
 
-@pytest.mark.skipif(bool(start.missing()), reason=start.missing())
-def test_axes_from_linuxcnc_and_a_second_driver_make_true_points(cell, true_calibration):
+REAL = pytest.mark.skipif(bool(start.missing()), reason=start.missing())
+
+
+@REAL
+@pytest.mark.parametrize("killed", [None, "axis_driver", "confocal_driver"])
+def test_axes_from_linuxcnc_and_a_second_driver_make_true_points(cell, true_calibration, killed):
     save_calibration(cell.folder / "cal.json", true_calibration)
     _, program = scan_program(ScanDesign(rpm=60.0, start=2e-3, end=1e-3, pitch=2e-4), PAPER_MIRROR)
     clouds = cell.clouds()
     cell.processes.start("corrector", calibration=str(cell.folder / "cal.json"))
-    cell.processes.start("axis_driver", device="linuxcnc", port=f"tcp://127.0.0.1:{TO}")
-    cell.processes.start("confocal_driver", **PROBE)
+    given = {"axis_driver": {"device": "linuxcnc", "port": PROBE["port"]}, "confocal_driver": PROBE}
+    for name in given:
+        cell.processes.start(name, **given[name])
     value = cell.operator.value
     cell.wait("a listener", lambda: value("axis_driver", "axes_subscribers") >= 1)
     twin = [sys.executable, LINUXCNC / "live.py", str(FROM), str(TO), "mirror", "2"]
     with start.running(program, FROM), subprocess.Popen(twin) as live:
+        if killed:
+            cell.wait("points", lambda: sum(cloud.width for cloud in clouds) > 1000)
+            cell.processes.end(killed, how=signal.SIGKILL)
+            cell.processes.start(killed, **given[killed])
         cell.wait("the end of the scan", lambda: live.poll() is not None)
         cell.settle("corrector", "axes_corrected")
     axes, distance = cell.closed_account("axes"), cell.closed_account("distance")
-    assert axes == distance > 5000
+    lost = {"axis_driver": axes, "confocal_driver": distance}
     assert value("axis_driver", "lost") == value("confocal_driver", "lost") == 0
+    if killed:
+        # What the dead driver had taken is missing, nothing else; the points between are left out.
+        missing = value("corrector", "missing_axes" if "axis" in killed else "missing_distance")
+        assert 0 < missing < 4000
+        assert lost[killed] + missing == max(axes, distance) > 5000
+    else:
+        assert axes == distance > 5000
+    assert true_points(clouds) > (1500 if killed else 4000)
+
+
+def true_points(clouds):
+    """The number of the points, which are on the mirror."""
     points = np.concatenate([np.frombuffer(c.data, fields_of(c)) for c in clouds])
-    assert len(points) > 4000
     part = Scenario().part
     off = points["height"] - part.height(points["x"].astype(float), points["y"].astype(float))
     # Noise of the probe and its resolution, and what a bias of the static gain makes of the height.
     assert np.std(off) < 15e-9
+    assert np.max(np.abs(off - np.mean(off))) < 75e-9
+    return len(points)
+
+
+@REAL
+def test_the_commands_of_the_page_make_true_points(cell, true_calibration):
+    page = (LINUXCNC.parents[1] / "docs/howto/linuxcnc.md").read_text()
+    (commands,) = (b for b in re.findall(r"```\n(.*?)```", page, re.DOTALL) if "live.py" in b)
+    (cell.folder / "config").symlink_to(LINUXCNC.parent)
+    save_calibration(cell.folder / "cal.json", true_calibration)
+    design = ScanDesign(rpm=60.0, start=2e-3, end=1e-3, pitch=2e-4)
+    write_scans([design], PAPER_MIRROR, cell.folder / "plan", 1e-7, 1e-3)
+    clouds = cell.clouds()
+    # The nodes of a workspace of wheels are found by name.
+    shell = ["bash", "-c", 'ros2() { shift 2; "$@"; }\n' + commands]
+    with subprocess.Popen(shell, cwd=cell.folder, start_new_session=True) as page:
+        try:
+            cell.wait("the end of the scan", lambda: page.poll() is not None)
+            cell.settle("corrector", "axes_corrected")
+        finally:
+            os.killpg(page.pid, signal.SIGTERM)
+    assert page.returncode == 0
+    assert true_points(clouds) > 2500  # from where the nodes have found each other
 
 
 def fields_of(cloud):
