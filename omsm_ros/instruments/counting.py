@@ -278,9 +278,11 @@ class SequenceTracker:
         spoilt_time = advance < 0 and not (self._counting.checked or pause.broken or raw == 0)
         advance = 0 if step == 1 and spoilt_time else advance
         in_order = step == 1 and advance >= 0
+        # After a restart, samples without time may equal earlier ones by chance.
+        may_repeat = self._counting.timed or not pause.broken
         if self._is_corrupted_counter(samples):
             self.spoilt += 1
-        elif not (in_order or self._anew) and self._is_repeated(sample):
+        elif may_repeat and not (in_order or self._anew) and self._is_repeated(sample):
             self.duplicates += 1
         elif self._anew or self._counter_fell_back(raw, step, advance, pause):
             self.restarts += 1

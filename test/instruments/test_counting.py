@@ -107,6 +107,17 @@ def test_a_triggered_counter_at_zero_after_a_silence_is_a_restart() -> None:
     assert (tracker.restarts, tracker.lost) == (1, 0)
 
 
+@pytest.mark.parametrize("counting", [FREE, TRIGGERED])
+def test_samples_that_equal_those_before_a_restart_are_no_copies(counting: Counting) -> None:
+    """Nothing is seen, so all samples are alike: only the counter is another after a silence."""
+    tracker = SequenceTracker(counting)
+    blank = samples(list(range(1000)))
+    blank["distance"] = np.nan
+    numbers(tracker, blank)
+    assert numbers(tracker, blank, elapsed=4.0, broken=True) == list(range(1000))
+    assert (tracker.restarts, tracker.duplicates, tracker.lost) == (1, 0, 0)
+
+
 def test_a_device_known_to_have_been_restarted_counts_from_its_number() -> None:
     tracker = SequenceTracker(FREE)
     numbers(tracker, samples([100, 101]))

@@ -92,6 +92,7 @@ class BlockStreamDevice(StreamDevice):
         self._undescribed = False
         self._next: int | None = None  # counter of the next block
         self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
+        self._latest: MeasurementBlock | None = None
         self._commands, self._answers_within, self._period = commands, patience, period
         self._identity: dict[str, str] = {}
 
@@ -102,7 +103,7 @@ class BlockStreamDevice(StreamDevice):
 
     def _prepare(self) -> None:
         super()._prepare()
-        self._doubtful, self._next = [], None
+        self._doubtful, self._next, self._latest = [], None, None
         self._undescribed = False
         if self._commands is None:
             return
@@ -129,11 +130,15 @@ class BlockStreamDevice(StreamDevice):
     def _numbered(self, blocks: list[MeasurementBlock]) -> list[MeasurementBlock]:
         """Return the blocks, with the counter of a spoilt header as the next block shows it.
 
-        The last block waits for the next one if its counter is not the one expected.
+        The last block waits for the next one if its counter is not the one expected. A repeated
+        block keeps its counter, or its values would take the place of a block that was lost.
         """
         waiting, found = self._doubtful + blocks, []
         self._doubtful = []
         for block, after in itertools.zip_longest(waiting, waiting[1:]):
+            if _alike(block, self._latest):
+                found.append(block)
+                continue
             if self._next is not None and block.counter != self._next:
                 if after is None:
                     self._doubtful = [block]
@@ -141,6 +146,7 @@ class BlockStreamDevice(StreamDevice):
                 if after.counter == (self._next + len(block.frames)) % COUNTER_RANGE:
                     block = block._replace(counter=self._next)
             self._next = (block.counter + len(block.frames)) % COUNTER_RANGE
+            self._latest = block
             found.append(block)
         return found
 
@@ -388,6 +394,14 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             )
         counts: IntArray = frames[f"encoder {number}"].astype(np.int64)
         return counts
+
+
+def _alike(block: MeasurementBlock, other: MeasurementBlock | None) -> bool:
+    return (
+        other is not None
+        and block.counter == other.counter
+        and np.array_equal(block.frames, other.frames)
+    )
 
 
 def _check_not_silent(name: str, period: float, patience: float, silent: float) -> None:
