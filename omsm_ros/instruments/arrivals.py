@@ -185,8 +185,11 @@ _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
 _WINDOW, _USUAL = 4, 2.0
 # This number of spans without a confirming arrival shows how many triggers were missed.
 _SHOWING = 3
-# That is certain if this number of windows agree, and if the delay was below this [period].
-_AGREEING, _EVEN_PERIODS = 3, 0.4
+# That is certain if the latest spans, of one of these numbers, agree with those before: in each
+# window, a third of them but at most so long, the earliest arrival is this near a line [period].
+_LATEST, _LONGEST, _EVEN_PERIODS = (12, 24, 48, 96), 16, 0.3
+# So far from the number that the old line shows [periods] the true one is searched.
+_NEAR = 4
 
 
 class MissedTriggerDetector:
@@ -208,10 +211,11 @@ class MissedTriggerDetector:
     def restart(self) -> None:
         """Forget all arrivals, as after a pause of the trigger."""
         # Begin and earliest lateness of each span [s].
-        self._earliest: deque[tuple[float, float]] = deque(maxlen=_SPANS)
+        self._earliest: list[tuple[float, float]] = []
         self._line: tuple[float, float] | None = None  # lateness of the earliest at 0, drift
         self._limit, self.seen_from = math.inf, 1
-        self._confirmed = 0.0  # last arrival that confirmed [s]
+        # Last arrival that confirmed, and begin of the last span that was judged [s].
+        self._confirmed = self._judged = 0.0
 
     def confirms(self, due: float, arrival: float) -> bool:
         """Return whether no trigger was missed before this arrival, as far as can be seen.
@@ -231,6 +235,9 @@ class MissedTriggerDetector:
         else:
             self._set_reference()
             self._earliest.append((arrival, late))
+            known = sum(begin <= self._confirmed for begin, _ in self._earliest)
+            del self._earliest[known : max(len(self._earliest) - _LATEST[-1] - 1, known)]
+            del self._earliest[: max(known - _SPANS, 0)]
         return confirmed
 
     def excess(self, due: float, arrival: float) -> float:
@@ -242,10 +249,12 @@ class MissedTriggerDetector:
     @property
     def missed(self) -> int:
         """Return the missed triggers that the latest arrivals show if none confirms; else 0."""
-        _, since = self._rests()
-        if len(since) < _SHOWING:
+        _, since = self._spans()
+        if self._line is None or len(since) < _SHOWING:
             return 0
-        return max(math.floor(float(since[-_WINDOW:].min()) + _AGE_PERIODS), 0)
+        begin, late = since[-_WINDOW:].T
+        excess = float((late - self._line[0] - self._line[1] * begin).min())
+        return max(math.floor(excess / self._period + _AGE_PERIODS), 0)
 
     def forget_missed(self) -> int:
         """Return the number of missed triggers if it is certain, else 0.
@@ -253,27 +262,43 @@ class MissedTriggerDetector:
         Arrivals are then expected at the times of the triggers again, so their samples must be
         renumbered.
         """
-        before, since = self._rests()
-        since = since[:-1]  # the last span has not ended
-        if len(before) < _MANY_SPANS or len(since) < _AGREEING * _WINDOW:
+        if self._judged == self._earliest[-1][0]:
             return 0
-        excess = since[-_AGREEING * _WINDOW :].reshape(_AGREEING, _WINDOW).min(axis=1)
-        missed = np.floor(excess + _AGE_PERIODS)
-        uneven = max(_least_in_windows(before).max(), (excess - missed).max() - _AGE_PERIODS)
-        if np.ptp(missed) > 0 or uneven > _EVEN_PERIODS:
-            return 0
-        kept = [span for span in self._earliest if span[0] + _SPAN_S <= self._confirmed]
-        self._confirmed = self._earliest[-1][0]
-        self._earliest = deque(kept, maxlen=_SPANS)
-        return int(missed[0])
+        self._judged = self._earliest[-1][0]
+        before, since = self._spans()
+        for number in _LATEST:
+            latest = since[-number - 1 : -1]  # the last one has not ended
+            if len(before) < _MANY_SPANS or len(latest) < number:
+                break
+            if (missed := self._missed_between(before, latest)) is not None:
+                latest[:, 1] -= missed * self._period
+                self._confirmed = self._earliest[-1][0]
+                self._earliest = [*map(tuple, before), *map(tuple, latest)]
+                self._set_reference()
+                return missed
+        return 0
 
-    def _rests(self) -> tuple[FloatArray, FloatArray]:
-        """Return the lateness of the spans before and after the last confirmation [period]."""
-        if self._line is None:
-            return np.empty(0), np.empty(0)
-        begin, late = np.array(self._earliest).T
-        rest = (late - self._line[0] - self._line[1] * begin) / self._period
-        return rest[begin + _SPAN_S <= self._confirmed], rest[begin > self._confirmed]
+    def _missed_between(self, before: FloatArray, since: FloatArray) -> int | None:
+        """Return by how many periods spans ``since`` (n, 2) are later; None if not certain.
+
+        With the true number, one line is below all arrivals and close to them in every window;
+        with all others it is not.
+        """
+        uneven, length = {}, min(len(since) // 3, _LONGEST)
+        for missed in range(max(self.missed - _NEAR, 0), self.missed + _NEAR):
+            begin, late = np.concatenate([before, since - [0.0, missed * self._period]]).T
+            rest = _line_below(begin - begin[-1], late)[2] / self._period
+            windows = rest[len(before) :].reshape(-1, length).min(axis=1)
+            uneven[missed] = max(_least_in_windows(rest[: len(before)], length).max(), *windows)
+        best, other = sorted(uneven, key=uneven.__getitem__)[:2]
+        certain = uneven[best] < _EVEN_PERIODS and uneven[other] > 2 * _EVEN_PERIODS
+        return best if certain else None
+
+    def _spans(self) -> tuple[FloatArray, FloatArray]:
+        """Return the spans (n, 2) before and after the last confirmation."""
+        spans = np.reshape(self._earliest, (-1, 2))
+        begin = spans[:, 0]
+        return spans[begin + _SPAN_S <= self._confirmed], spans[begin > self._confirmed]
 
     def _set_reference(self) -> None:
         """Lay the highest line below the earliest arrivals; their scatter is the limit."""
@@ -292,6 +317,7 @@ class MissedTriggerDetector:
         self.seen_from = math.ceil(self._limit / self._period)
 
 
-def _least_in_windows(values: FloatArray) -> FloatArray:
-    """Return the least of each ``_WINDOW`` consecutive values."""
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(values, _WINDOW).min(axis=1))
+def _least_in_windows(values: FloatArray, length: int = _WINDOW) -> FloatArray:
+    """Return the least of each ``length`` consecutive values, at most all of them."""
+    windows = np.lib.stride_tricks.sliding_window_view(values, min(length, len(values)))
+    return np.asarray(windows.min(axis=1))

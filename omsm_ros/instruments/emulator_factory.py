@@ -182,28 +182,24 @@ class Pty:
         try:
             self._make_link()
         except OSError as err:
-            self.close()
+            self.unplug()
             raise DeviceError(
                 f"cannot create link {str(self._link)!r}: {err}; choose another"
             ) from err
         except ConfigurationError:
-            self.close()
+            self.unplug()
             raise
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self.unplug()
 
-    def close(self) -> None:
-        """Remove the port; an open driver sees its connection lost."""
+    def unplug(self) -> None:
+        """Remove the port; an open driver sees its connection lost, as if a cable is pulled."""
         if self._link is not None and self._points_here(self._link):
             self._link.unlink()
         if self._master is not None:
             os.close(self._master)
             self._master = None
-
-    def unplug(self) -> None:
-        """Remove the port, as a cable is pulled."""
-        self.close()
 
     @property
     def path(self) -> str:
@@ -225,14 +221,9 @@ class Pty:
             if events & select.POLLHUP:
                 break
             if events & select.POLLOUT:
-                remaining = remaining[self._write_some(remaining) :]
+                with contextlib.suppress(BlockingIOError):
+                    remaining = remaining[os.write(self._descriptor(), remaining) :]
         return len(data) - len(remaining)
-
-    def _write_some(self, data: memoryview) -> int:
-        try:
-            return os.write(self._descriptor(), data)
-        except BlockingIOError:
-            return 0
 
     @property
     def has_reader(self) -> bool:

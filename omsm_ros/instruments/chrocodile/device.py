@@ -234,8 +234,7 @@ class Chrocodile(StreamDevice):
         A new client has ordered no signals, so an empty selection is no sign. Setting the trigger
         again would reset the counter, and with it the pairing with another device.
         """
-        signals = self._try("SODX", QUERY).numbers
-        if signals and not set(self._selection) <= set(signals):
+        if not self._selected():
             return False
         for name in ("SHZ", "AVD"):
             found = self._try(name, QUERY).numbers
@@ -299,12 +298,10 @@ class Chrocodile(StreamDevice):
 
     def _averaged(self) -> tuple[int, ...]:
         """Return the exposures in a spectrum, in a reading, and the readings in a sample."""
-        names = ("AVS", "AVD", "AVDS") if self._transport_is_serial() else ("AVS", "AVD")
+        serial = getattr(self._transport, "baud_rate", None) is not None
+        names = ("AVS", "AVD", "AVDS") if serial else ("AVS", "AVD")
         values = (_value(self._identity.get(name, "1")) for name in names)
         return tuple(round(value) if isinstance(value, float) else 1 for value in values)
-
-    def _transport_is_serial(self) -> bool:
-        return getattr(self._transport, "baud_rate", None) is not None
 
     def _unanswered(self, name: str, said: bytes) -> DeviceTimeoutError:
         if said:

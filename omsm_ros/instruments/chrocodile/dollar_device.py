@@ -58,11 +58,6 @@ class ChrocodileDevice(Chrocodile):
         self._device_ns = 0
         self._time_at = 0.0
 
-    def counts(self) -> dict[str, float]:
-        """Return all statistics by name, those of the protocol included."""
-        decoder = self._stream.decoder
-        return super().counts() | (vars(decoder.statistics) if decoder is not None else {})
-
     def _begin(self) -> None:
         self._stream.start()
         self._early.clear()
@@ -76,7 +71,8 @@ class ChrocodileDevice(Chrocodile):
         layout = self._layout()
         self._check_line(layout)
         binary = self._wanted.format == "binary"
-        self._stream.decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
+        self._decoder = BinaryDecoder(layout) if binary else LineDecoder(layout)
+        self._stream.decoder = self._decoder
         self._try("STA")
 
     def _layout(self) -> Layout:
@@ -134,9 +130,8 @@ class ChrocodileDevice(Chrocodile):
 
     def _ahead(self) -> float:
         """Return 1 while a telegram waits for the next one, so it arrived a sample earlier."""
-        decoder = self._stream.decoder
-        binary = isinstance(decoder, BinaryDecoder)
-        return float(binary and decoder is not None and decoder.statistics.bytes_pending > 0)
+        binary = isinstance(self._decoder, BinaryDecoder)
+        return float(binary and self._decoder.statistics.bytes_pending > 0)
 
     def _rest(self) -> Samples:
         return self._converted(self._stream.settle())

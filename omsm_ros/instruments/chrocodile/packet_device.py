@@ -105,7 +105,7 @@ class ChrocodilePacketDevice(Chrocodile):
         while True:
             data = self._read_answer(self._said, partial(self._unanswered, what))
             self._said = (self._said + data)[-64:]
-            self._early += self._receive(data)
+            self._early += self._sorted(self._decoder.feed(data))
             commands, self._commands = self._commands, []
             for command in commands:
                 if wanted(command):
@@ -114,22 +114,14 @@ class ChrocodilePacketDevice(Chrocodile):
                 understood = self._decoder.statistics.packets > 0
                 raise self._unanswered(what, b"" if understood else self._said)
 
-    def _receive(self, data: bytes) -> list[Data]:
-        """Return the samples in ``data``; commands are kept for ``_await``."""
-        return self._sorted(self._decoder.feed(data))
-
     def _sorted(self, messages: Sequence[Message]) -> list[Data]:
-        found = []
-        for message in messages:
-            if isinstance(message, PacketCommand):
-                self._commands.append(message)
-            elif isinstance(message, Data):
-                found.append(message)
-        return found
+        """Return the samples; commands are kept for ``_await``."""
+        self._commands += [each for each in messages if isinstance(each, PacketCommand)]
+        return [each for each in messages if isinstance(each, Data)]
 
     def _decode(self, data: bytes) -> Samples:
         early, self._early = self._early, []
-        return self._joined([*early, *self._receive(data)])
+        return self._joined([*early, *self._sorted(self._decoder.feed(data))])
 
     def _ahead(self) -> float:
         """Return the samples of the next packet that have arrived."""

@@ -92,7 +92,7 @@ class BlockStreamDevice(StreamDevice):
         self._undescribed = False
         self._next: int | None = None  # counter of the next block
         self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
-        self._latest: MeasurementBlock | None = None
+        self._latest: tuple[int, bytes] | None = None  # counter and frames
         self._commands, self._answers_within, self._period = commands, patience, period
         self._identity: dict[str, str] = {}
 
@@ -136,7 +136,8 @@ class BlockStreamDevice(StreamDevice):
         waiting, found = self._doubtful + blocks, []
         self._doubtful = []
         for block, after in itertools.zip_longest(waiting, waiting[1:]):
-            if _alike(block, self._latest):
+            content = (block.counter, block.frames.tobytes())
+            if content == self._latest:
                 found.append(block)
                 continue
             if self._next is not None and block.counter != self._next:
@@ -146,7 +147,7 @@ class BlockStreamDevice(StreamDevice):
                 if after.counter == (self._next + len(block.frames)) % COUNTER_RANGE:
                     block = block._replace(counter=self._next)
             self._next = (block.counter + len(block.frames)) % COUNTER_RANGE
-            self._latest = block
+            self._latest = content
             found.append(block)
         return found
 
@@ -394,14 +395,6 @@ class ConfocalDtEthernetDevice(BlockStreamDevice):
             )
         counts: IntArray = frames[f"encoder {number}"].astype(np.int64)
         return counts
-
-
-def _alike(block: MeasurementBlock, other: MeasurementBlock | None) -> bool:
-    return (
-        other is not None
-        and block.counter == other.counter
-        and np.array_equal(block.frames, other.frames)
-    )
 
 
 def _check_not_silent(name: str, period: float, patience: float, silent: float) -> None:
