@@ -385,10 +385,7 @@ class Instrument:
 
     def _struck(self, rate: float, count: int) -> NDArray[np.bool_]:
         # No random number is used without a fault, so each fault alone repeats with its seed.
-        struck: NDArray[np.bool_] = np.zeros(count, np.bool_)
-        if rate:
-            struck |= self._random.random(count) < rate
-        return struck
+        return self._random.random(count) < rate if rate else np.zeros(count, np.bool_)
 
     def _send(self, pieces: Iterable[bytes], now: float, stop: threading.Event | None) -> None:
         wire = b"".join(pieces)

@@ -106,12 +106,6 @@ class TcpServer:
                 self._drop()
         return len(data) - len(remaining)
 
-    @property
-    def has_reader(self) -> bool:
-        """Return whether a client is connected."""
-        self._accept()
-        return self._client is not None
-
     def _accept(self) -> None:
         while self._listening is not None:
             try:
@@ -224,11 +218,6 @@ class Pty:
                 with contextlib.suppress(BlockingIOError):
                     remaining = remaining[os.write(self._descriptor(), remaining) :]
         return len(data) - len(remaining)
-
-    @property
-    def has_reader(self) -> bool:
-        """Return whether a driver has the port open."""
-        return not self._events(0.0) & select.POLLHUP
 
     def _events(self, timeout: float) -> int:
         poll = select.poll()

@@ -235,6 +235,26 @@ def test_missed_triggers_are_certain_after_three_windows(period: float) -> None:
     assert certain < resumed < certain + 0.1
 
 
+@pytest.mark.parametrize(("quick", "earliest", "latest"), [(0.2, 7.4, 8.5), (0.004, 9.0, 28.0)])
+def test_a_busy_host_tells_later_how_many_were_missed(
+    quick: float, earliest: float, latest: float
+) -> None:
+    """After the missed triggers a share ``quick`` of the arrivals is in time, the others late."""
+    random, detector = np.random.default_rng(4), MissedTriggerDetector(PERIOD)
+    missed, certain = 2, 0.0
+    for due in np.arange(1, 3000) * 0.01:
+        taken = due + missed * PERIOD * (due > 5.0)
+        late = random.exponential(0.03) * (random.random() > quick) * (due > 5.0)
+        arrival = UPTIME_S + taken * (1 + 3e-5) + late + random.uniform(0, 0.1 * PERIOD)
+        confirmed = detector.confirms(due, arrival)
+        assert not (confirmed and taken > 5.0)
+        if not confirmed and (found := detector.forget_missed()):
+            certain = taken
+            break
+    assert found == missed
+    assert earliest < certain < latest
+
+
 def test_what_the_arrivals_cannot_show_is_stated() -> None:
     """Even the earliest of all arrivals of a second is late by more than two periods."""
     random, detector = np.random.default_rng(2), MissedTriggerDetector(PERIOD)

@@ -145,9 +145,8 @@ class Chrocodile(StreamDevice):
         """Return the settings that change a reading or its time: model, head, rate, lamp …"""
         identity = self._identity
         reported = {name: _value(identity[c]) for c, name in _DECISIVE.items() if c in identity}
-        if not reported:
-            return {}
-        return reported | {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
+        chosen = {"latch": self._wanted.latch, "trigger": self._wanted.trigger}
+        return reported | chosen if reported else {}
 
     def counts(self) -> dict[str, float]:
         """Return all statistics by name, those of the protocol included."""

@@ -60,12 +60,12 @@ class ChrocodilePacketDevice(Chrocodile):
 
     def _await_configuration(self) -> None:
         """Wait for the configuration, which a device sends to a new client, or request it."""
-        answer_patience = self._wanted.patience / 2
+        configured = partial(self._await, "CONF", lambda c: c.name == CONFIGURED)
         try:
-            self._await("CONF", lambda c: c.name == CONFIGURED, answer_patience)
+            configured(self._wanted.patience / 2)
         except DeviceTimeoutError:
             self._transport.write(encode_command(PacketCommand(CONFIGURED, (), 0, 0)))
-            self._await("CONF", lambda c: c.name == CONFIGURED, self._wanted.patience)
+            configured(self._wanted.patience)
 
     def _finish(self) -> None:
         self._early.clear()  # measured before the device was set up
