@@ -350,22 +350,6 @@ def test_a_flipped_bit_in_the_counter_of_a_block_renumbers_nothing(bit: int) -> 
     assert driver.statistics.lost == 0
 
 
-def test_a_block_sent_twice_does_not_take_the_place_of_a_lost_one() -> None:
-    flags, script = struct.pack("<II", 1 << 18, 0), []
-    for n in [*range(6), 5, *range(7, 12)]:
-        frames = [wires.little(50_000 + k, 4) for k in range(10 * n, 10 * n + 10)]
-        script.append(wires.block(flags, 10 * n, frames))
-    driver = ConfocalDtEthernetDevice(Script(*script), ConfocalDtSettings(trigger="each"))
-    driver.open()
-    found = [pair.distance for _ in script for pair in driver.poll(0.0)]
-    found += [pair.distance for pair in driver.close()]
-    for block in found:
-        expected = 50e-6 + (block.first_sample + np.arange(len(block))) * 1e-9
-        np.testing.assert_allclose(block.distance, expected, atol=1e-12)
-    counts = driver.statistics
-    assert (counts.duplicates, counts.lost, counts.delivered) == (10, 10, 110)
-
-
 def test_a_trigger_of_another_rate_is_not_published() -> None:
     """2 kHz where 1 kHz is stated."""
     frames = frames_of(np.arange(2000))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from omsm_ros.instruments.micro_epsilon.device import (
 from omsm_ros.instruments.micro_epsilon.emulator import ConfocalDtEmulator, ConfocalDtSerialEmulator
 from omsm_ros.instruments.micro_epsilon.protocol import confocal_dtype
 
+from . import plain_wires as wires
+from .scripted_stream import Script
 from .with_commands import WithCommands
 
 THREE = ConfocalDtSettings(axes=AXIS_SCALING, wired=(0, 1, 2))
@@ -128,3 +131,19 @@ def test_values_of_a_frame_that_are_not_wanted_are_passed_over(bench: Any) -> No
     run.end()
     run.check()
     assert run.delivered > 900
+
+
+def test_a_block_sent_twice_does_not_take_the_place_of_a_lost_one() -> None:
+    flags, script = struct.pack("<II", 1 << 18, 0), []
+    for n in [*range(6), 5, *range(7, 12)]:
+        frames = [wires.little(50_000 + k, 4) for k in range(10 * n, 10 * n + 10)]
+        script.append(wires.block(flags, 10 * n, frames))
+    driver = ConfocalDtEthernetDevice(Script(*script), ConfocalDtSettings(trigger="each"))
+    driver.open()
+    found = [pair.distance for _ in script for pair in driver.poll(0.0)]
+    found += [pair.distance for pair in driver.close()]
+    for block in found:
+        expected = 50e-6 + (block.first_sample + np.arange(len(block))) * 1e-9
+        np.testing.assert_allclose(block.distance, expected, atol=1e-12)
+    counts = driver.statistics
+    assert (counts.duplicates, counts.lost, counts.delivered) == (10, 10, 110)
