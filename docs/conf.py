@@ -9,6 +9,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 import generated  # noqa: E402 - it lies beside this file
+from sphinx.util.inspect import TypeAliasForwardRef  # noqa: E402
 
 from omsm_ros import __version__  # noqa: E402
 
@@ -19,6 +20,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_type_aliases = dict.fromkeys(("ArrayLike", "FloatArray"), "array")
+TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # else a union shows the class
 # Of options such as --fit, typographic dashes would make another text.
 smartquotes = False
 # Notebooks run when the manual is made; one that fails is a warning, which fails the make.

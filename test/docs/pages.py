@@ -84,6 +84,7 @@ STANDS_FOR = {
     "APERTURE": "0.0009", "S.yaml": "mirror.yaml", "M.yaml": "machine.yaml", "U": "20e-9",
 }  # fmt: skip
 IN_COMMAND = {
+    "demo": {"NAME": "steps"},
     "identify": {"BAG": "steps.mcap"},
     "verify": {"BAG": "chirp.mcap"},
     "align": {"BAG": "sphere.mcap", "R": "0.05"},

@@ -39,6 +39,8 @@ def run(package, executable, *arguments):
     name = {"replay": "player"}.get(executable, executable)
     (namespace,) = [a[6:] for a in arguments if a.startswith("__ns:=")] or ["/omsm"]
     own = [REAL, "run", package] if REAL else []
+    if executable == "cell":  # it has nodes of the same names, with the same files
+        end_all_but(KEPT)
     started = background(name, [*own, executable, *arguments])
     wait_for(namespace, [name], started)
 
