@@ -85,6 +85,7 @@ STANDS_FOR = {
 }  # fmt: skip
 IN_COMMAND = {
     "demo": {"NAME": "steps"},
+    "spectrum": {"S": "0.001", "M": "1.8e-6"},
     "identify": {"BAG": "steps.mcap"},
     "verify": {"BAG": "chirp.mcap"},
     "align": {"BAG": "sphere.mcap", "R": "0.05"},

@@ -39,10 +39,12 @@ def run(package, executable, *arguments):
     name = {"replay": "player"}.get(executable, executable)
     (namespace,) = [a[6:] for a in arguments if a.startswith("__ns:=")] or ["/omsm"]
     own = [REAL, "run", package] if REAL else []
+    nodes = [name]
     if executable == "cell":  # it has nodes of the same names, with the same files
         end_all_but(KEPT)
+        nodes = arguments[arguments.index("--nodes") + 1].split()
     started = background(name, [*own, executable, *arguments])
-    wait_for(namespace, [name], started)
+    wait_for(namespace, nodes, started)
 
 
 def launch(package, file, *arguments):

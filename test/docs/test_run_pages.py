@@ -74,7 +74,8 @@ def cases():
     seen = set()
     for path in PAGES:
         shown = shown_on(path)
-        blocks = [part for part in shown if part.block]
+        # Those of LinuxCNC's page are run by test_linuxcnc.py, where LinuxCNC is installed.
+        blocks = [part for part in shown if part.block and path.name != "linuxcnc.md"]
         if blocks:
             yield blocks
         for part in shown:

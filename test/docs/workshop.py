@@ -224,7 +224,8 @@ def shipped(shop, path):
 
 NAMES = {
     "steps.mcap": steps(1), "steps2.mcap": steps(2), "steps3.mcap": steps(3),
-    "scan.mcap": scan(), "fast.mcap": scan(seed=2, spindle_speed=60.0),
+    **dict.fromkeys(("scan.mcap", "scan1.mcap"), scan()),
+    **dict.fromkeys(("fast.mcap", "scan2.mcap"), scan(seed=2, spindle_speed=60.0)),
     "CW.mcap": scan(seed=3), "CCW.mcap": scan(seed=4, spindle_speed=-30.0),
     "chirp.mcap": chirp, "sphere.mcap": sphere,
     "cal.json": calibration("steps.mcap"), "cal1.json": calibration("steps.mcap"),
