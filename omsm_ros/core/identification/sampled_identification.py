@@ -285,7 +285,10 @@ def valid_range(
     biased = (np.abs(missed) > limit * np.abs(own)).astype(np.float64)
     nearby = round(2 * _NEAR_OCTAVES / np.log2(frequency[1] / frequency[0])) + 1
     differs |= ndimage.uniform_filter1d(biased, nearby, mode="nearest") > _MAY_DIFFER
-    agrees = near @ (difference + COVERAGE_FACTOR * spread <= limit) / count >= 1 - _MAY_DIFFER
+    # One difference over a wide block does not show modes inside it.
+    close = near & (highest <= _BLOCK_RATIO * lowest)
+    agreeing = close @ (difference + COVERAGE_FACTOR * spread <= limit)
+    agrees = (agreeing > 0) & (agreeing >= (1 - _MAY_DIFFER) * np.sum(close, axis=1))
     with np.errstate(divide="ignore"):
         shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / limit) ** 2
     excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
