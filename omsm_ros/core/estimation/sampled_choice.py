@@ -300,7 +300,7 @@ def _explore(
     for order in sorted({*_ORDERS, asked}):
         if order > most:
             break
-        found = [_next_fit(early, fits[:n], order, late) for n in {len(fits), best + 1}]
+        found = _next_fits(early, fits, best, order, late)
         missed = [np.mean(_relative(validation_residual(one, whole))) for one in found]
         fits.append(found[int(np.argmin(missed))])
         explained.append(1 - float(np.min(missed)))
@@ -311,16 +311,22 @@ def _explore(
     return fits, np.nan_to_num(np.array(explained), nan=-np.inf)
 
 
-def _next_fit(
-    problem: SectionsProblem, smaller: Sequence[SectionsFit], order: int, late: FloatArray
-) -> SectionsFit:
+def _next_fits(
+    problem: SectionsProblem, fits: Sequence[SectionsFit], best: int, order: int, late: FloatArray
+) -> list[SectionsFit]:
+    """Return fits of ``order``: from spread poles, from the largest of ``fits``, from the best.
+
+    The best is the one that predicts best: poles of a larger one may follow noise.
+    """
     if order == 0:
-        return problem.fit(0, [problem.nonlinear_of(np.empty(0, np.complex128), late)])
-    own = smaller[-1].problem.late(smaller[-1].nonlinear, smaller[-1].order)
-    starts = [
-        problem.nonlinear_of(poles, own) for poles in grown_starts(problem, smaller[-1], order)
-    ]
-    return problem.fit(order, [problem.spread_start(order, late), *starts], _EXPLORING, race=3)
+        return [problem.fit(0, [problem.nonlinear_of(np.empty(0, np.complex128), late)])]
+    found = [problem.fit(order, [problem.spread_start(order, late)], _EXPLORING)]
+    for smaller in {fits[-1], fits[best]}:
+        own = smaller.problem.late(smaller.nonlinear, smaller.order)
+        grown = grown_starts(problem, smaller, order)
+        starts = [problem.nonlinear_of(poles, own) for poles in grown]
+        found.append(problem.fit(order, starts, _EXPLORING, race=3))
+    return found
 
 
 def validation_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[FloatArray]:

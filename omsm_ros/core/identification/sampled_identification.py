@@ -277,8 +277,8 @@ def valid_range(
     spread = np.array([block.uncertainty[input] for block in blocks])
     limit = min(SAMPLED_LIMITS.gain, SAMPLED_LIMITS.phase)
     lines, near_ratio = frequency[:, np.newaxis], 2**_NEAR_OCTAVES
-    near = (lines >= lowest / near_ratio) & (lines <= highest * near_ratio)
-    count = np.maximum(np.sum(near, axis=1), 1)
+    near = ((lines >= lowest / near_ratio) & (lines <= highest * near_ratio)).astype(np.float64)
+    count = np.maximum(np.sum(near, axis=1), 1.0)
     off = (difference > limit) & (difference > _SIGNIFICANT * spread)
     differs = near @ off / count > _MAY_DIFFER
     own = sections.response(frequency)[input]
@@ -286,7 +286,7 @@ def valid_range(
     nearby = round(2 * _NEAR_OCTAVES / np.log2(frequency[1] / frequency[0])) + 1
     differs |= ndimage.uniform_filter1d(biased, nearby, mode="nearest") > _MAY_DIFFER
     # One difference over a wide block does not show modes inside it.
-    close = near & (highest <= _BLOCK_RATIO * lowest)
+    close = near * (highest <= _BLOCK_RATIO * lowest)
     agreeing = close @ (difference + COVERAGE_FACTOR * spread <= limit)
     agrees = (agreeing > 0) & (agreeing >= (1 - _MAY_DIFFER) * np.sum(close, axis=1))
     with np.errstate(divide="ignore"):

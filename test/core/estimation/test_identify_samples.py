@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from omsm_ros.core.estimation.sampled_model import free_run
 from omsm_ros.core.identification.sampled_identification import (
     identify_samples,
     sampled_certificate,
+    valid_range,
 )
 from omsm_ros.core.lti.transfer_function import TransferFunction
 from omsm_ros.errors import ConfigurationError, IdentificationError
@@ -281,6 +283,27 @@ def test_a_model_is_valid_between_the_frequencies_of_the_input():
     # A third of an octave around a line counts as excited.
     assert 5 / 1.3 < low < 5.3
     assert 57 < high < 60 * 1.3
+
+
+@pytest.mark.parametrize(
+    ("different", "wide", "valid"), [(1, 1.1, True), (3, 1.1, False), (0, 2.0, False)]
+)
+def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, wide, valid):
+    """Twenty blocks within a sixth of an octave; a wide one may hide a mode."""
+    sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
+    known = np.full(1, 0.01)
+    blocks = [
+        SimpleNamespace(
+            frequency=(0.5, 0.5 * wide),
+            difference=np.full(1, 0.3 * (k < different)),
+            uncertainty=known,
+        )
+        for k in range(20)
+    ]
+    lines = np.geomspace(0.05, 10, 400)
+    none = np.zeros((0, len(lines)), complex)
+    low, high = valid_range(sections, blocks, lines, 0, none, np.zeros(len(lines)))
+    assert (low < 0.5 < high) if valid else low == high
 
 
 @pytest.mark.parametrize(("lines", "order"), [([16.0], 0), ([16.0, 40.0], 2)])
