@@ -108,8 +108,8 @@ def choose_sampled(
 
     order: number of poles, 0 to choose;  max_delay: whole samples to try, of a held input
 
-    Raises IdentificationError for too few samples or frequencies of the input, for an order beyond
-    MAX_ORDER, or where a value is not finite.
+    Raises IdentificationError for too few samples or frequencies of the input, or an order beyond
+    MAX_ORDER.
     """
     most = check_records(records, order)
     none = np.zeros(records[0].inputs.shape[1], np.int64)
@@ -185,12 +185,6 @@ def check_records(records: Sequence[SampledRecord], order: int) -> int:
             "estimation.too_few_samples", samples=samples, least=needed, order=lowest
         )
     most = min(MAX_ORDER, (samples // _LEAST_SAMPLES_EACH - inputs - 2) // (2 + inputs))
-    for record in records:
-        known = np.all(np.isfinite(record.inputs)) and np.all(
-            np.isfinite(record.output[record.used])
-        )
-        if not known:
-            raise IdentificationError("estimation.not_finite")
     excited = min(
         max(excited_parameters(r.inputs[:, i], min(2 * most + 1, len(r))) for r in records)
         for i in range(inputs)
@@ -325,7 +319,7 @@ def _next_fits(
         own = smaller.problem.late(smaller.nonlinear, smaller.order)
         grown = grown_starts(problem, smaller, order)
         starts = [problem.nonlinear_of(poles, own) for poles in grown]
-        found.append(problem.fit(order, starts, _EXPLORING, race=3))
+        found.append(problem.fit(order, starts, _EXPLORING))
     return found
 
 
@@ -433,8 +427,7 @@ def _against_impulse_response(
     inputs = np.column_stack(
         [np.roll(u, d) for u, d in zip(inputs.T, fitted.problem.delays, strict=True)]
     )
-    middle = np.mean(record.output[own.used])
-    output = record.filled() - middle
+    output = record.filled() - np.mean(record.output[own.used])
     residual = validation_residual(fitted, whole)[0] * np.std(record.output[record.used])
     held_out = ~np.isnan(residual)
     missed, used = np.where(held_out, residual, 0.0), own.used

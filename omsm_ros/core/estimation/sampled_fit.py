@@ -41,8 +41,8 @@ _RANK_TOLERANCE = 1e-13
 _EXCITED = 1e-3
 # Most lines of one record for vector fitting, evenly among the excited ones.
 _MOST_LINES = 4000
-# Iterations of vector fitting: by then it has converged, or will not.
-_RELOCATIONS = 10
+# Iterations of vector fitting: by then it has converged, or will not; of each start in a race.
+_RELOCATIONS, _RACE = 10, 3
 # Damping ratio of pairs at a start, those that are tried for a line of the residual, and the lines.
 _START_DAMPING, _ADDED_DAMPINGS, _TRIED_LINES = 0.05, (0.002, 0.01, 0.05), 40
 # Least damping ratio that a start may have, and range of |pole| T / RATE in a start.
@@ -277,10 +277,8 @@ class SectionsProblem:
         found = one.in_time(np.concatenate(rows))
         return np.asarray(found - (found @ free) @ free.T)
 
-    def fit(
-        self, order: int, starts: Sequence[FloatArray], evaluations: int = 40, race: int = 5
-    ) -> SectionsFit:
-        """Improve each of ``starts`` by ``race`` iterations; return the minimum of the best."""
+    def fit(self, order: int, starts: Sequence[FloatArray], evaluations: int = 40) -> SectionsFit:
+        """Improve each of ``starts`` by a few iterations; return the minimum of the best."""
         box = self.box(order)
 
         def project(nonlinear: FloatArray) -> Projection:
@@ -288,7 +286,7 @@ class SectionsProblem:
 
         tried = [project(np.clip(start, *box)) for start in starts]
         if len(tried) > 1:
-            tried = [descend(project, one, box, race) for one in tried]
+            tried = [descend(project, one, box, _RACE) for one in tried]
         best = min(tried, key=lambda one: float(one.residual @ one.residual))
         best = descend(project, best, box, evaluations)
         linear = best.linear.reshape(self.inputs, -1)
