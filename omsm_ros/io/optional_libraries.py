@@ -56,5 +56,5 @@ def import_optional(name: str, what: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError as err:
         raise FileError(
-            f"{what} needs a further Python package: pip install {name}, or use xyz or PLY instead"
+            f"{what} needs a further Python package: pip install {name}, or convert it to text"
         ) from err

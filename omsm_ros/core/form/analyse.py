@@ -21,17 +21,16 @@ from omsm_ros.core.form.deviation_map import (
 )
 from omsm_ros.core.form.part_extents import MOST_UNSEEN, extents_of_parts
 from omsm_ros.core.form.part_figures import (
+    FORM,
     POWER,
+    SECOND_ORDER,
     SYMMETRIC,
-    asymmetric,
+    TILT,
     best_fit,
     rms_of_part,
     root_of_products,
     short_waves,
-    without_form,
-    without_power,
-    without_second_order,
-    without_tilt,
+    without_terms,
 )
 from omsm_ros.core.form.texture import (
     Bands,
@@ -114,7 +113,7 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     and tilts, RMSi also without power, and RMSa the rms of the asymmetric rest.
     """
     of_noise = _with_noise_of_rings(map_, fit.disc)
-    irregular, uneven = without_power(of_noise, fit.disc), asymmetric(of_noise, fit.disc)
+    irregular, uneven = (without_terms(of_noise, fit.disc, t) for t in (POWER, SYMMETRIC))
     symmetric = replace(
         irregular,
         deviation=irregular.deviation - uneven.deviation,
@@ -127,14 +126,14 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     return {
         "iso10110_A": _sagitta(map_, fit),
         "iso10110_C": extents_of_parts([symmetric], fit.disc)[0][0],
-        "iso10110_RMSt": rms_of_part(without_tilt(map_, fit.disc)),
+        "iso10110_RMSt": rms_of_part(without_terms(map_, fit.disc, TILT)),
         **dict(zip(("iso10110_RMSi", "iso10110_RMSa"), map(rms_of_part, both), strict=True)),
     }
 
 
 def _with_noise_of_rings(map_: DeviationMap, disc: Aperture) -> DeviationMap:
     """Return the map with the noise of its rotationally symmetric terms as its last effects."""
-    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC)
+    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC[len(POWER) :])
     weighted = columns * map_.area
     solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
     covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
@@ -238,7 +237,7 @@ def analyse_form(
     bounded = [*[n for n, s in enumerate(sources) if s in bounds], *held]
     map_ = gathered.map(found, area_weights(x, y, even=even, outline=outline), bounded)
     zernike = _terms(map_, found)
-    cells, rest = GridCells.of(map_, even=even), without_second_order(map_)
+    cells, rest = GridCells.of(map_, even=even), without_terms(map_, found.disc, SECOND_ORDER)
     bands = bands_of(cells, *filters)
     return FormResult(
         registration=found,
@@ -266,7 +265,7 @@ def _figures(
 ) -> dict[str, UncertainValue]:
     """Return figures of the map;  rest: of it without its second order."""
     fitted = best_fit(map_)
-    maps = [map_, fitted, rest, without_power(map_, found.disc)]
+    maps = [map_, fitted, rest, without_terms(map_, found.disc, POWER)]
     extents = extents_of_parts(maps, found.disc, outline, found.spacing)
     whole, robust, _ = extents[0]
     return {
@@ -297,7 +296,7 @@ def _textures(
     outline: Aperture | None,
 ) -> dict[str, UncertainValue]:
     """Return texture and slopes;  maps: of the part, and without its second order."""
-    parts = without_form(maps[0], found.disc), maps[1]
+    parts = without_terms(maps[0], found.disc, FORM), maps[1]
     formless, rest = (GridCells.of(part, even=outline is None) for part in parts)
     steep = slopes(rest, bands)["slope_rms"]
     points = None

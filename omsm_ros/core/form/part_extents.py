@@ -53,11 +53,9 @@ _CELLS, _HALF = (8.0, 4.0, 2.0, 1.0, 0.5), 500
 _CHANCE = 3.0
 # Least variance, so that a part without noise keeps all terms [m²].
 _TINY = 1e-40
-# Points at either extreme that show the form lost there.
-_EXTREME = 100
-# Points at an extreme, and those that continue the form to a place of the rim; how far they may be
-# off, in distances of the tracks; and number of places.
-_AROUND, _REACH, _PLACES = 24, 1.5, 360
+# Points of a chip at an extreme that no test of the whole map shows. Points that continue the form
+# to a place of the rim; how far they may be off, in distances of the tracks; number of places.
+_CHIP, _AROUND, _REACH, _PLACES = 12, 24, 1.5, 360
 # Neighbours on the next tracks, way to the middle between two, and the surroundings of a peak, in
 # distances of the tracks; distance of the middle of the neighbours beyond which it is at the rim.
 _NEXT, _HALF_WAY, _AWAY, _ONE_SIDED = (0.7, 1.3), 0.5, (2.0, 3.5), 0.3
@@ -102,8 +100,10 @@ class _PartForm(NamedTuple):
     value: (n,) [m];  smooth: its smooth terms
     cell, error: number of the cell (n,) whose mean a point has, and its noise [m]
     mean: value without the share of a single point (n,);  rest: deviation less the value (n,) [m]
+    above: value less the smooth terms (n,) [m]
     noise: of the deviation [m]
     local: points that differ from the smooth form (m,);  blurred: rms of the form lost [m]
+    texture: height of waves that the scatter about the value shows, but no mean (n,) [m]
     """
 
     value: FloatArray
@@ -112,25 +112,29 @@ class _PartForm(NamedTuple):
     error: FloatArray
     mean: FloatArray
     rest: FloatArray
+    above: FloatArray
     noise: float
     local: IntArray
     blurred: float
+    texture: FloatArray
 
     @classmethod
     def of(cls, map_: DeviationMap, disc: Aperture) -> _PartForm:
         """Return the form of a map;  disc: of the smooth terms."""
         fit = _smooth(map_.every(_MOST_FITTED), disc)
         mean, cell = fit.height(map_.x, map_.y), np.arange(len(map_))
-        local, form, own, noise, blurred = _local_features(map_, mean)
+        local, form, own, noise = _local_features(map_, mean)
         left = map_.deviation - mean
         # Wiener's factor, and the rms of the form lost by it.
         more = max(float(np.mean(left**2)) - map_.noise**2, 0.0)
         share = more / (more + map_.noise**2) if more else 0.0
         value, error = mean + share * left, np.full(len(map_), share * map_.noise)
         value[local], error[local], cell[local] = form, noise, len(map_) + own
-        mean[local], blurred = form, max(blurred, (1 - share) * float(np.sqrt(more)))
+        above = value - mean
+        mean[local], blurred = form, (1 - share) * float(np.sqrt(more))
         left = map_.deviation - value
-        return cls(value, fit, cell, error, mean, left, map_.noise, local, blurred)
+        texture = _texture(map_, left)
+        return cls(value, fit, cell, error, mean, left, above, map_.noise, local, blurred, texture)
 
     def extents(
         self, map_: DeviationMap, shift: FloatArray, gaps: _Gaps | None
@@ -141,7 +145,8 @@ class _PartForm(NamedTuple):
         order = self.local[np.argsort(form[self.local])]
         some = np.concatenate([even, order[:_HALF], order[-_HALF:]])
         drawn = _drawn(map_.part(some), self, form[some], some)
-        of_gaps = gaps.beyond(form, self.error, map_.area) if gaps else (np.zeros(2), (0.0, 0.0))
+        of_gaps = gaps.beyond(self, form, map_.area) if gaps else (np.zeros(2), (0.0, 0.0))
+        of_waves = [np.max(way * form + self.texture) - np.max(way * form) for way in (-1, 1)]
         found = []
         many = form[_equal_areas(map_.area, _MOST_FITTED)]
         for ends, all_, count in (((0.0, 1.0), form, len(some)), (ROBUST, many, len(even))):
@@ -155,7 +160,7 @@ class _PartForm(NamedTuple):
             # An extent has two ends, each blurred independently.
             of_blur = 2 * of_some * np.sqrt(2) * self.blurred
             figure = of_square(square, length(of_errors, _rms(more - again), of_taken, of_blur))
-            between = of_gaps[0] if all_ is form else np.zeros(2)
+            between = np.maximum(of_gaps[0], of_waves) if all_ is form else np.zeros(2)
             lost, unsure = self._lost(self.mean + shift) if all_ is form else (0.0, 0.0)
             value = (figure.value or 0.0) + lost + _extents(all_, ends) - of_some + sum(between) / 2
             spread = length(figure.uncertainty or 0.0, *(between / 2), unsure)
@@ -168,7 +173,7 @@ class _PartForm(NamedTuple):
         That is what it leaves at its extremes on average, shrunk by the noise of this average.
         """
         order, found, square = np.argsort(mean), 0.0, 0.0
-        for sign, ends in ((-1, order[:_AROUND]), (1, order[-_AROUND:])):
+        for sign, ends in ((-1, order[:_CHIP]), (1, order[-_CHIP:])):
             left, variance = float(np.mean(self.rest[ends])), self.noise**2 / len(ends)
             share = max(1 - variance / left**2, 0.0) if left else 0.0
             found += sign * share * left
@@ -229,32 +234,38 @@ class _Gaps(NamedTuple):
         return cls(map_.x, map_.y, spacing, some[near], weights, share, strip)
 
     def beyond(
-        self, form: FloatArray, noise: FloatArray, area: FloatArray
+        self, part: _PartForm, form: FloatArray, area: FloatArray
     ) -> tuple[FloatArray, tuple[float, float]]:
         """Return how far the form may reach beyond its extremes (2,) [m], and more of its square.
 
         That is what the form between the last track and the rim adds to its mean square, and the
         standard uncertainty of that [m²].
 
-        form, noise, area: of the points, each (n,) [m], the area of any unit
+        form, area: of the points of the ``part``, each (n,) [m], the area of any unit
         """
         rim, further = np.sum(self.weights * form[self.near], axis=2)
         weights, found = np.sum(self.weights, axis=0), []
-        chance = 2 * np.sqrt(np.sum((weights * noise[self.near]) ** 2, axis=1))
+        chance = 2 * np.sqrt(np.sum((weights * part.error[self.near]) ** 2, axis=1))
         for sign in (-1, 1):
             values = sign * form
             at_rim = float(np.max(sign * (rim + further) - chance, initial=-np.inf))
-            found.append(max(self._summit(values, noise), at_rim) - float(values.max()))
+            summit = self._summit(values, sign * part.above, part.error)
+            found.append(max(summit, at_rim) - float(values.max()))
         # The points stand for the way to the rim; along it the form changes by half on average.
         more = float(self.share @ (rim**2 - form[self.near[:, 0]] ** 2)) / 4
         higher = float(np.mean(rim**2) - np.average(form**2, weights=area)) if len(rim) else 0.0
         return np.maximum(found, 0.0), (more, length(more, self.strip * higher))
 
-    def _summit(self, values: FloatArray, noise: FloatArray) -> float:
-        """Return how high ``values`` (n,) [m] may be about the largest, between the tracks."""
-        left, highest = values.copy(), -np.inf
+    def _summit(self, values: FloatArray, above: FloatArray, noise: FloatArray) -> float:
+        """Return how high ``values`` (n,) [m] may be between the tracks.
+
+        above: smooth form (n,) [m], which tells what may be highest
+        """
+        may, highest = values + (MOST_UNSEEN - 1) * np.maximum(above, 0.0), float(values.max())
         for _ in range(_PEAKS):
-            peak = int(np.argmax(left))
+            peak = int(np.argmax(may))
+            if may[peak] <= highest:
+                break
             near = np.flatnonzero(np.abs(self.x - self.x[peak]) < _AWAY[1] * self.spacing)
             at = (self.x[near] - self.x[peak]) + 1j * (self.y[near] - self.y[peak])
             at /= self.spacing
@@ -262,9 +273,7 @@ class _Gaps(NamedTuple):
             near, at = near[about], at[about]
             rise = _rise(at, values[near], values[peak], float(noise[peak]))
             highest = max(highest, float(values[peak]) + rise)
-            left[near] = -np.inf
-            if np.isneginf(left.max()):
-                break
+            may[near] = -np.inf
         return highest
 
 
@@ -316,25 +325,22 @@ def _continued(x: FloatArray, y: FloatArray) -> FloatArray:
 
 def _local_features(
     map_: DeviationMap, smooth: FloatArray
-) -> tuple[IntArray, FloatArray, IntArray, FloatArray, float]:
+) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
     """Return where (m,) grooves, pips, scratches and edges change the ``smooth`` form (n,) [m].
 
     Also the form there [m], the number of the cell whose mean it is, and the noise of that mean
-    [m], each (m,). Last is the rms of the form that these means do not resolve [m].
+    [m], each (m,).
 
     Cells of five sizes whose mean exceeds what noise makes anywhere on the map show them, as do
     single points (D. Donoho, I. Johnstone, Biometrika 81, 425). Each of the largest cells with one
-    has the means of the size with the least expected error (Stein); all cells have, if the means of
-    one size are closer than none all over the map, as for ripple.
+    has the means of the sizes with the least expected error (Stein); all cells have, if the means
+    of one size are closer than none all over the map, as for ripple.
     """
     rest = map_.deviation - smooth
-    spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
-    side = float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
     levels, differs = [], np.abs(rest) > _beyond_chance(len(map_)) * map_.noise
     ripple = False
-    for pitch in side * np.array(_CELLS):
-        column, row = (((v - v.min()) / pitch).astype(np.int64) for v in (map_.x, map_.y))
-        levels.append(column * (int(row.max()) + 1) + row)
+    for pitch in _CELLS:
+        levels.append(_cells(map_, pitch))
         mean, error = _cell_means(levels[-1], rest, map_.noise)
         count = int(np.sum(error > 0))
         differs |= (np.abs(mean) > _beyond_chance(count) * error)[levels[-1]]
@@ -345,7 +351,7 @@ def _local_features(
     chosen = ((np.bincount(levels[0], differs) > 0) | ripple) & (map_.noise > 0)
     some = np.flatnonzero(chosen[levels[0]])
     if not len(some):
-        return some, np.empty(0), some, np.empty(0), 0.0
+        return some, np.empty(0), some, np.empty(0)
     cells = [np.unique(level[some], return_inverse=True)[1] for level in levels]
     cells.append(np.arange(len(some)))
     best = _least_risk(cells, rest[some], map_.noise)
@@ -353,30 +359,55 @@ def _local_features(
     own = np.stack(cells)[best, np.arange(len(some))] + firsts[best]
     mean, error = _cell_means(own, rest[some], map_.noise)
     form = smooth[some] + mean[own]
-    order = np.argsort(form)
-    ends = np.concatenate([order[:_EXTREME], order[-_EXTREME:]])
-    missed = (map_.deviation[some] - form)[ends][best[ends] < len(levels)]
-    variance = float(np.mean(missed**2)) - map_.noise**2 if len(missed) else 0.0
-    return some, form, own, error[own], float(np.sqrt(max(variance, 0.0)))
+    return some, form, own, error[own]
+
+
+def _cells(map_: DeviationMap, side: float) -> IntArray:
+    """Return the number of the square cell of each point (n,); ``side`` in their mean distance."""
+    spans = np.array([np.ptp(map_.x), np.ptp(map_.y)])
+    pitch = side * float(np.sqrt(np.prod(np.maximum(spans, 1e-3 * spans.max())) / len(map_)))
+    column, row = (((v - v.min()) / pitch).astype(np.int64) for v in (map_.x, map_.y))
+    return np.asarray(column * (int(row.max()) + 1) + row)
+
+
+def _texture(map_: DeviationMap, rest: FloatArray) -> FloatArray:
+    """Return the height of waves (n,) [m] that make the ``rest`` (n,) [m] exceed the noise.
+
+    Fine waves, as of a fingerprint, scatter the points of a cell without a change of its mean. That
+    may also be noise, which is larger there.
+    """
+    cell = _cells(map_, _CELLS[0])
+    counts = np.bincount(cell)
+    square, _ = _cell_means(cell, rest**2, 0.0)
+    # R. A. Fisher's √(2 χ²) is nearly normal.
+    usual = np.sqrt(np.maximum(2 * counts - 1, 0)) + _beyond_chance(int(np.sum(counts > 0)))
+    shown = 2 * counts * square > (map_.noise * usual) ** 2
+    return np.asarray(np.sqrt(2 * np.where(shown, square - map_.noise**2, 0.0))[cell])
 
 
 def _least_risk(cells: Sequence[IntArray], values: FloatArray, noise: float) -> IntArray:
-    """Return the level (n,) whose cell means have the least expected error, by largest cell.
+    """Return the level (n,) whose cell means have the least expected error.
+
+    Cells of the level that is best for all are divided where that is certainly better, and so on
+    (dyadic CART: D. Donoho, Ann. Stat. 25, 1870), or united likewise.
 
     cells: number of the cell of each point at each level, each (n,), from the largest to one point
     """
     risks = []
     for cell in cells:
         mean, _ = _cell_means(cell, values, 0.0)
-        size = np.bincount(cell)[cell]
         # Each cell follows the noise of one point.
-        risk = (values - mean[cell]) ** 2 + 2 * noise**2 / size
-        risks.append(np.bincount(cells[0], risk))
-    # A choice of its own follows the noise of a cell, so the gain must exceed that of chance.
-    usual, own = int(np.argmin(np.sum(risks, axis=1))), np.argmin(risks, axis=0)
-    gain = risks[usual] - np.min(risks, axis=0)
-    chance = _CHANCE * noise**2 * np.sqrt(2 * np.bincount(cells[0]))
-    return np.asarray(np.where(gain > chance, own, usual)[cells[0]], np.int64)
+        risks.append((values - mean[cell]) ** 2 + 2 * noise**2 / np.bincount(cell)[cell])
+    usual = int(np.argmin(np.sum(risks, axis=1)))
+    best, risk = np.full(len(values), len(cells) - 1), risks[-1]
+    for level in reversed(range(len(cells) - 1)):
+        cell = cells[level]
+        more = np.bincount(cell, risks[level] - risk)
+        # A choice of its own follows the noise of a cell, so the gain must exceed that of chance.
+        chance = _CHANCE * noise**2 * np.sqrt(2 * np.bincount(cell))
+        whole = (more < (chance if level >= usual else -chance))[cell]
+        best, risk = np.where(whole, level, best), np.where(whole, risks[level], risk)
+    return best
 
 
 def _cell_means(cell: IntArray, values: FloatArray, noise: float) -> tuple[FloatArray, FloatArray]:

@@ -17,11 +17,14 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
-# Piston, both tilts and power; the terms that ISO 25178-2 removes as form; the rotationally
-# symmetric terms up to order 12.
+# The best Σ c_ij x^i y^j, i + j ≤ 2; what is no irregularity (ISO 10110-5), and its rest without
+# symmetry; form to be removed by ISO 25178-2: a Gaussian filter would leave it at the rim, where
+# its window is cut off.
+SECOND_ORDER = terms_up_to(2)
 POWER = (ZernikeIndex(0, 0), ZernikeIndex(1, -1), ZernikeIndex(1, 1), ZernikeIndex(2, 0))
-_FORM = terms_up_to(4)
-SYMMETRIC = tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
+TILT = POWER[:3]
+SYMMETRIC = POWER + tuple(ZernikeIndex(n, 0) for n in range(4, 14, 2))
+FORM = terms_up_to(4)
 
 
 def rms_of_part(map_: DeviationMap, beyond: tuple[float, float] = (0.0, 0.0)) -> UncertainValue:
@@ -146,41 +149,14 @@ def best_fit(map_: DeviationMap) -> DeviationMap:
     return without_columns(map_, moves[size > 0] / size[size > 0, np.newaxis])
 
 
-def without_second_order(map_: DeviationMap) -> DeviationMap:
-    """Return the map without its best ``Σ c_ij x^i y^j``, i + j ≤ 2."""
-    u, v = (_scaled(values) for values in (map_.x, map_.y))
-    return without_columns(map_, np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]))
-
-
-def without_tilt(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the map without piston and tilts."""
-    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER[:3]))
-
-
-def without_power(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the map without piston, tilts and power: the irregularity of ISO 10110-5."""
-    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER))
-
-
-def without_form(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the map without Zernike terms up to order 4: the F-operation of ISO 25178-2.
-
-    A Gaussian filter would leave form at the rim, where its window is cut off.
-    """
-    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), _FORM))
+def without_terms(
+    map_: DeviationMap, disc: Aperture, terms: tuple[ZernikeIndex, ...]
+) -> DeviationMap:
+    """Return the map without its area-weighted fit of Zernike ``terms``."""
+    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), terms))
 
 
 def short_waves(map_: DeviationMap, cells: GridCells, longest: float) -> DeviationMap:
     """Return the points less the waves of their ``cells`` longer than ``longest`` [m]."""
     low = cells.smoothed_at(map_.x, map_.y, longest)
     return replace(map_, deviation=map_.deviation - low[0], effects=map_.effects - low[1:])
-
-
-def asymmetric(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the map without power and without rotationally symmetric terms up to order 12."""
-    return without_columns(map_, zernike_values(*disc.scaled(map_.x, map_.y), POWER + SYMMETRIC))
-
-
-def _scaled(values: FloatArray) -> FloatArray:
-    low, high = float(values.min()), float(values.max())
-    return np.asarray((values - (low + high) / 2) / ((high - low) / 2 or 1.0), np.float64)

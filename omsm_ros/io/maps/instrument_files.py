@@ -203,7 +203,6 @@ def _at(form: str, head: bytes, place: int) -> Any:
     return struct.unpack_from(form, head, place)[0]
 
 
-MAX_FOREIGN_BYTES = 1_000_000_000
 # Readers of SurfaceTopography whose first row has the least y: of standards that say so, and of
 # places. All others begin with the upper row of the image, as Gwyddion does.
 _UPWARDS = ("SDFReader", "XYZReader", "NCReader")
@@ -220,10 +219,8 @@ def read_foreign(
     """
     what = f"map {str(path)!r}"
     open_regular(path, FileError, "map").close()
-    if path.stat().st_size > MAX_FOREIGN_BYTES:
-        raise FileError(f"{what} has more than {MAX_FOREIGN_BYTES} bytes; convert it to xyz")
     topography = import_optional("SurfaceTopography", what)
-    remedy = "if its format is not known, convert it to xyz"
+    remedy = "if it is of no known format, convert it to xyz"
     return read_in_child(
         path, what, remedy, lambda: _by_topography(topography, path, units, channel, what)
     )

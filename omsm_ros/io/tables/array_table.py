@@ -23,7 +23,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
 from omsm_ros.io.child_process import read_in_child
 from omsm_ros.io.files import library_errors, open_regular
-from omsm_ros.io.optional_libraries import walk_in_child
+from omsm_ros.io.optional_libraries import import_optional, walk_in_child
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable, micro_sign
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -110,10 +110,7 @@ class ArrayTable(ForeignTable):
             )
 
     def _hdf5(self) -> Mapping[str, Any]:
-        try:
-            import h5py
-        except ImportError as err:
-            raise FileError(f"{self} needs h5py; pip install h5py, or give CSV") from err
+        h5py = import_optional("h5py", str(self))
         walk_in_child(self.path, str(self))
         found: dict[str, Any] = {}
         file = self._opened.enter_context(h5py.File(self.path, "r"))

@@ -17,12 +17,13 @@ from omsm_ros.core.form.deviation_map import (
 )
 from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import (
-    asymmetric,
+    FORM,
+    POWER,
+    SYMMETRIC,
+    TILT,
     rms_of_part,
     without_columns,
-    without_form,
-    without_power,
-    without_tilt,
+    without_terms,
 )
 from omsm_ros.core.form.texture import UncertainCurve, edge_roll_off, profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
@@ -120,22 +121,23 @@ def test_the_rms_of_the_part_is_without_noise_and_without_the_square_of_errors()
 
 
 @pytest.mark.parametrize(
-    ("remove", "gone"),
+    ("terms", "gone"),
     [
-        (without_tilt, [(0, 0), (1, 1), (1, -1)]),
-        (without_power, [(0, 0), (1, 1), (2, 0)]),
-        (without_form, [(0, 0), (2, 2), (3, -3), (4, 0), (4, 4)]),
-        (asymmetric, [(0, 0), (1, -1), (2, 0), (4, 0), (8, 0), (12, 0)]),
+        (TILT, [(0, 0), (1, 1), (1, -1)]),
+        (POWER, [(0, 0), (1, 1), (2, 0)]),
+        (FORM, [(0, 0), (2, 2), (3, -3), (4, 0), (4, 4)]),
+        (SYMMETRIC, [(0, 0), (1, -1), (2, 0), (4, 0), (8, 0), (12, 0)]),
     ],
 )
-def test_what_is_removed_goes_and_once_is_enough(remove, gone):
+def test_what_is_removed_goes_and_once_is_enough(terms, gone):
     bare = term(5, 5) + term(7, -3)
     spoiled = map_of(bare + sum(term(n, m, 1e-6) for n, m in gone), effects=[term(*gone[-1])])
-    once = remove(spoiled, DISC)
-    plain = remove(map_of(bare), DISC)
+    once = without_terms(spoiled, DISC, terms)
+    plain = without_terms(map_of(bare), DISC, terms)
     np.testing.assert_allclose(once.deviation, plain.deviation, atol=1e-17)
     np.testing.assert_allclose(once.effects, np.zeros((1, 3000)), atol=1e-18)
-    np.testing.assert_allclose(remove(once, DISC).deviation, once.deviation, atol=1e-18)
+    again = without_terms(once, DISC, terms)
+    np.testing.assert_allclose(again.deviation, once.deviation, atol=1e-18)
 
 
 def test_columns_in_any_unit_and_any_mixture_take_the_same_away():

@@ -38,6 +38,23 @@ def test_the_whole_peak_to_valley_contains_local_defects(name):
     assert held >= 3
 
 
+@pytest.mark.parametrize("noise", [5e-9, 14e-9])
+def test_waves_too_fine_for_any_mean_widen_the_figure(noise):
+    """A fingerprint about the highest place of a part, of 2.3 points a wave, below twice the noise.
+
+    The scatter of its points exceeds the noise, whatever its mean.
+    """
+    form = 50e-9 * (Y**2 - X**2) / R**2
+    form += 25e-9 * np.cos(2 * np.pi * X / 0.293e-3) * (np.hypot(X, Y - 0.8 * R) < 0.2 * R)
+    for seed in range(3):
+        scatter = np.random.default_rng(seed).normal(0, noise, len(X))
+        map_ = DeviationMap(x=X, y=Y, deviation=form + scatter, area=np.ones(len(X)),
+                            effects=np.empty((0, len(X))), noise=noise)  # fmt: skip
+        whole = extents_of_parts([map_], Aperture(R))[0][0]
+        assert abs(whole.value - np.ptp(form)) <= 2 * whole.uncertainty
+        assert whole.uncertainty < 0.2 * np.ptp(form)
+
+
 @pytest.mark.parametrize("turns", [60, *soaked(100)])
 def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
     """A spiral reaches the rim at one place only; the rest of it is up to a turn further in.
@@ -67,19 +84,20 @@ def test_a_rolled_edge_beyond_the_last_whole_turn_belongs_to_the_figures(turns):
 
 
 @pytest.mark.parametrize("along", [1.0, 3.0])
-@pytest.mark.parametrize("off", [0.0, 0.25, 0.5])
-def test_a_summit_between_two_tracks_belongs_to_the_figure(along, off):
+@pytest.mark.parametrize(("off", "bow"), [(0.0, 0.0), (0.25, 0.0), (0.5, 0.0), (0.5, 250e-9)])
+def test_a_summit_between_two_tracks_belongs_to_the_figure(along, off, bow):
     """The neighbours across the tracks show how steep it is, also that of a ridge along them.
 
     off: of the summit from a track, along: its length over its width, in distances of the tracks
+    bow: height of the ends of the part [m], above the highest point of the summit on a track
     """
     lines, points = np.linspace(-R, R, 81), np.linspace(-R, R, 240)
     x, y = (v.ravel() for v in np.meshgrid(points, lines))
     pitch, height = lines[1] - lines[0], 300e-9
     away = ((y - (3 + off) * pitch) / (0.9 * pitch)) ** 2 + (x / (0.9 * along * pitch)) ** 2
     noise = np.random.default_rng(0).normal(0, 1e-9, len(x))
-    map_ = DeviationMap(x=x, y=y, deviation=height * np.exp(-away) + noise, area=np.ones(len(x)),
-                        effects=np.empty((0, len(x))), noise=1e-9)  # fmt: skip
+    map_ = DeviationMap(x=x, y=y, noise=1e-9, area=np.ones(len(x)), effects=np.empty((0, len(x))),
+                        deviation=height * np.exp(-away) + bow * (x / R) ** 2 + noise)  # fmt: skip
     square = Aperture(1.5 * R, outline="rectangle", sizes=(R, R))
     whole = extents_of_parts([map_], Aperture(1.5 * R), square, pitch)[0][0]
     assert abs(whole.value - height) <= 2 * whole.uncertainty

@@ -7,7 +7,7 @@ import pytest
 
 from omsm_ros.core.form.analyse import optical_terms
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_figures import without_form
+from omsm_ros.core.form.part_figures import FORM, without_terms
 from omsm_ros.core.form.texture import profiles
 from omsm_ros.core.form.zernike_fit import fit_zernikes
 from omsm_ros.core.surface.aperture import Aperture
@@ -130,5 +130,5 @@ def test_the_sagitta_of_a_part_of_a_disc_is_that_of_the_sphere_that_fits_it(kind
 
 def test_form_goes_and_ripple_stays():
     sizes = {ZernikeIndex(2, 2): 50e-9, ZernikeIndex(3, 1): 15e-9, ZernikeIndex(12, 0): 4e-9}
-    rest = without_form(disc_map(sizes), DISC)
+    rest = without_terms(disc_map(sizes), DISC, FORM)
     assert np.std(rest.deviation) == pytest.approx(4e-9 / np.sqrt(13), rel=0.03)

@@ -1,7 +1,8 @@
 import numpy as np
 
 from omsm_ros.core.form.deviation_map import DeviationMap
-from omsm_ros.core.form.part_figures import best_fit, without_second_order
+from omsm_ros.core.form.part_figures import SECOND_ORDER, best_fit, without_terms
+from omsm_ros.core.surface.aperture import Aperture
 
 
 def test_the_second_order_goes_and_nothing_else():
@@ -13,7 +14,7 @@ def test_the_second_order_goes_and_nothing_else():
     curved = 1e-6 * (1 + x - 3 * y + 4 * x * x - x * y + 9 * y * y)
     map_ = DeviationMap(x=x, y=y, deviation=rest + curved, area=area,
                         effects=np.stack([curved, rest]), noise=1e-9)  # fmt: skip
-    found = without_second_order(map_)
+    found = without_terms(map_, Aperture(0.25), SECOND_ORDER)
     design = np.stack([x**i * y**j for i in range(3) for j in range(3 - i)], axis=1)
     root = np.sqrt(area)
     fitted = np.linalg.lstsq(design * root[:, np.newaxis], rest * root, rcond=None)[0]
@@ -26,7 +27,8 @@ def test_a_profile_has_a_second_order_too():
     x = np.linspace(-1e-2, 1e-2, 500)
     map_ = DeviationMap(x=x, y=0 * x, deviation=1e-9 + 3 * x**2, area=np.ones(500),
                         effects=np.empty((0, 500)), noise=0.0)  # fmt: skip
-    np.testing.assert_allclose(without_second_order(map_).deviation, 0, atol=1e-15)
+    found = without_terms(map_, Aperture(1e-2), SECOND_ORDER)
+    np.testing.assert_allclose(found.deviation, 0, atol=1e-15)
 
 
 def test_where_it_fits_best_a_part_has_no_move_and_keeps_all_else():
