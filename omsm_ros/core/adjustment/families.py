@@ -253,7 +253,7 @@ def _curve(
     def over(position: FloatArray) -> FloatArray:
         return np.stack([np.interp(position, nodes, part) for part in parts])
 
-    bends = legendre.legvander(place, 3)[:, 2:]
+    bends = legendre.legvander(place, 3)[:, ways:]
     shapes = np.kron(np.linalg.lstsq(parts.T, bends, rcond=1e-6)[0], np.eye(ways))
     return Family(name, unit, ways * len(parts), lambda v: columns(v, over), wide, shown_by,
                   default, smooth=shapes)  # fmt: skip

@@ -369,15 +369,14 @@ def places_of(solution: Solution, within: BoolArray | None = None) -> Places:
     seen = np.flatnonzero(number)
     x, y = (np.bincount(part.cell, v, part.cells)[seen] / number[seen]
             for v in (blocks.x, blocks.y))  # fmt: skip
-    angle = 2 * np.pi * np.arange(_RIM) / _RIM
-    # Just inside, where the outermost points are.
-    rim_x = part.disc.x + part.disc.radius * np.cos(angle) * (1 - 1e-3)
-    rim_y = part.disc.y + part.disc.radius * np.sin(angle) * (1 - 1e-3)
-    cell = part.cell_of(rim_x, rim_y)
-    kept = number[cell] > 0
     # Towards the rim cells are narrower than blocks: one without a block between two that have
     # some is scanned too, and they stand for half of it each.
     between = np.roll(number > 0, 1) & (number == 0) & np.roll(number > 0, -1)
+    angle = 2 * np.pi * np.arange(_RIM) / _RIM
+    rim_x = part.disc.x + part.disc.radius * np.cos(angle)
+    rim_y = part.disc.y + part.disc.radius * np.sin(angle)
+    cell = part.cell_of(rim_x, rim_y)
+    kept = (number > 0)[cell] | between[cell]
     weights = (1 + np.roll(between, 1) / 2 + np.roll(between, -1) / 2)[seen]
     return Places(
         np.append(x, rim_x[kept]),

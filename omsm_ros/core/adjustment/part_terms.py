@@ -18,9 +18,9 @@ from omsm_ros.core.streams.blocks import BoolArray, FloatArray, IntArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.zernike_terms import ZernikeIndex, terms_up_to, zernike_values
 
-# Free up to degree 10 (tried: what a turned freeform has beyond is below 2 nm); the variance of
-# each degree above is estimated.
-FREE_DEGREE, HIGHEST_DEGREE = 10, 24
+# Above degree 6 the variance of each degree is estimated: free terms would take what an error of
+# the spindle centre has beyond the regular ones (tried: to degree 10 they raise U by a half).
+FREE_DEGREE, HIGHEST_DEGREE = 6, 24
 # Stands for a degree among the variances that are estimated.
 RINGS = -1
 # Stands for the degrees of rotationally symmetric terms above the free ones: turning leaves them,

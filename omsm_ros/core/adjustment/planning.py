@@ -35,7 +35,7 @@ _POINTS_A_TURN, _MOST_TURNS = 96, 24
 # Terms of a plan: what a form of finer detail adds is the same for all sets.
 _DEGREE = 12
 # Of a reading, a drift after a second, and a cell: where nothing is declared.
-_NOISE_M, _WALK_M, _CELLS_M, _BAND_M = 12e-9, 1e-9, 1e-9, 1e-9
+_NOISE_M, _WALK_M, _CELLS_M, _BAND_M = 12e-9, 1e-9, 1e-9, 5e-9
 # Between two scans: the spindle is stopped, turned over, and the probe driven back.
 _PAUSE_S = 20.0
 # A third turn of the part would leave its third harmonics where they were.

@@ -57,7 +57,7 @@ class Family:
         in the uncertainty with the probability that it is there
     shown_by: code of the scan that shows it best
     named: False for columns that detect, but have no cause of their own
-    smooth: of a curve, what makes parabola and cubic of its columns (size, k)
+    smooth: of a curve, what makes line, parabola and cubic of its columns (size, k)
     """
 
     name: str

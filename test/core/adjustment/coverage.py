@@ -45,6 +45,11 @@ AS_DRAWN = (
     Source("c_error/2", 5e-7, evaluated=True),
     Source("positioning_x", 1e-9, evaluated=True),
     Source("spindle_radial/1", 1e-9, evaluated=True),
+    # One scan shows none of these.
+    Source("probe_latency", 1e-7, evaluated=True),
+    *(Source(f"lag_{name}", 1e-7, evaluated=True) for name in ("motion", "x", "time", "c")),
+    Source("lag_curvature", 1e-9, evaluated=True),
+    Source("creep", 1e-6, evaluated=True),
 )
 
 

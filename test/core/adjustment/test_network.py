@@ -1,14 +1,18 @@
 """The normal equations against dense generalised least squares, and the blocks against sums."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from coverage import PRIORS
-from plain_world import MIRROR, Machine
+from plain_world import MIRROR, RADIUS_M, Machine
 
 from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
 from omsm_ros.core.adjustment.evidence import evidence_of
+from omsm_ros.core.adjustment.figures import places_of
 from omsm_ros.core.adjustment.network import Factor, solve
+from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import start_scales
 from omsm_ros.core.adjustment.scan_data import view_of, zero_of
 
@@ -160,3 +164,16 @@ def test_cells_are_alike_in_area(small):
     assert len(count) == network.part.cells
     even = 200_000 / network.part.cells
     assert np.all(np.abs(count - even) < 6 * np.sqrt(even))
+
+
+def test_the_map_reaches_the_peaks_at_the_rim():
+    """A wave of 7 a turn that grows towards the rim, of a spiral with fewer blocks than cells."""
+    share = np.arange(42 * SECTORS + 1) / SECTORS
+    place = RADIUS_M * (1 - share / 42) * np.exp(2j * np.pi * share)
+    blocks = SimpleNamespace(x=place.real, y=place.imag)
+    part = part_model(blocks, 42)
+    assert 6 * part.rings - 3 > SECTORS
+    places = places_of(SimpleNamespace(network=SimpleNamespace(blocks=blocks, part=part)))
+    wave = ((places.x + 1j * places.y) / RADIUS_M) ** 7
+    turned = np.exp(1j * np.arange(0, 2 * np.pi, 0.1))[:, np.newaxis]
+    assert np.min(np.ptp((wave * turned).real, axis=1)) > 0.997 * 2
