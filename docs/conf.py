@@ -2,6 +2,7 @@
 
 import inspect
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -25,6 +26,12 @@ TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # else a union shows th
 smartquotes = False
 # Notebooks run when the manual is made; one that fails is a warning, which fails the make.
 nb_execution_mode = "cache"
+nb_execution_cache_path = str(ROOT / "out" / ".jupyter_cache")
+# What they show is of this code: results of former code are not kept.
+_cache = Path(nb_execution_cache_path)
+_changed = max(path.stat().st_mtime for path in (ROOT / "omsm_ros").rglob("*.py"))
+if _cache.exists() and _cache.stat().st_mtime < _changed:
+    shutil.rmtree(_cache)
 nb_execution_timeout = 300
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
