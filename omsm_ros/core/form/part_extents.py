@@ -404,7 +404,7 @@ def _least_risk(cells: Sequence[IntArray], values: FloatArray, noise: float) -> 
         cell = cells[level]
         more = np.bincount(cell, risks[level] - risk)
         # A choice of its own follows the noise of a cell, so the gain must exceed that of chance.
-        chance = _CHANCE * noise**2 * np.sqrt(2 * np.bincount(cell))
+        chance = _beyond_chance(len(more)) * noise**2 * np.sqrt(2 * np.bincount(cell))
         whole = (more < (chance if level >= usual else -chance))[cell]
         best, risk = np.where(whole, level, best), np.where(whole, risks[level], risk)
     return best
