@@ -24,6 +24,7 @@ import sys
 from configparser import ConfigParser
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -48,7 +49,7 @@ CYCLE_S = 1e-3
 TAPS, AHEAD = 100, 2
 # What the response may be before it is measured: how much a tap is of the one before it, and the
 # variance of the first.
-DECAYS, SIZES = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95), (0.01, 0.1, 1.0, 10.0)
+DECAYS, SIZES = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95), (0.1, 3.0, 100.0)
 # The inverse is whole up to the first and ends at the second frequency [Hz].
 BAND_HZ = (60.0, 120.0)
 # The path is continued by this time at both ends, where the filter settles [s].
@@ -103,9 +104,9 @@ def rms_of(off):
 def servo(command, encoder):
     """Return the response from command to encoder (n,) each.
 
-    The taps decay, how fast is what makes the encoder most likely (Chen, Ohlsson and Ljung,
-    Automatica 48 (2012) 1525): where the step test moves little, as at the frequency of the
-    segments, least squares alone would take noise for a response.
+    The taps decay; how fast, and whether smoothly, is what makes the encoder most likely (Chen,
+    Ohlsson and Ljung, Automatica 48 (2012) 1525): where the step test moves little, as at the
+    frequency of the segments, least squares alone would take noise for a response.
     """
     command, encoder = command - command[0], encoder - encoder[:100].mean()
     count = AHEAD + TAPS
@@ -113,17 +114,21 @@ def servo(command, encoder):
     lagged = np.lib.stride_tricks.sliding_window_view(padded, count)[:, ::-1]
     square, seen = lagged.T @ lagged, lagged.T @ encoder
     noise = float(np.std(encoder - lagged @ np.linalg.lstsq(square, seen, rcond=1e-12)[0]))
-    later = np.maximum.outer(np.arange(count), np.arange(count))
+    place = np.arange(count)
+    later = np.maximum.outer(place, place)
 
-    def likely(decay, size):
-        root = cholesky(size * decay**later + 1e-15 * np.eye(count), lower=True)
+    def likely(smooth, decay, size):
+        prior = decay**later
+        if smooth:
+            prior = decay ** (np.add.outer(place, place) + later) / 2 - decay ** (3 * later) / 6
+        root = cholesky(size * prior + 1e-15 * np.eye(count), lower=True)
         inner = root.T @ square @ root / noise**2 + np.eye(count)
         found = np.linalg.solve(inner, root.T @ seen / noise**2)
         evidence = seen @ root @ found / noise**2 - np.linalg.slogdet(inner)[1]
         return evidence, root, inner, found
 
     _, root, inner, found = max(
-        (likely(d, s) for d in DECAYS for s in SIZES), key=lambda one: one[0]
+        (likely(*one) for one in product((False, True), DECAYS, SIZES)), key=lambda one: one[0]
     )
     factor = root @ solve_triangular(cholesky(inner, lower=True), np.eye(count), lower=True).T
     return Response(root @ found, factor, noise)

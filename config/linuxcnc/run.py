@@ -64,3 +64,4 @@ until(
 # A reader that came late takes what waits in the sampler; the last lines are still on their way.
 until("samples that nobody reads", lambda: waiting() < 200, 30.0)
 time.sleep(0.5)
+print("program done", flush=True)

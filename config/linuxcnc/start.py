@@ -35,6 +35,8 @@ PROCESSES = ("rtapi_app", "linuxcncsvr")
 # Keys of that shared memory: messages, motion, RTAPI, HAL, sampler.
 SEGMENTS = (1001, 1002, 1003, 1004, 1005, 100, 0x48484C34, 0x48414C32, 0x48534130)
 LOCK = Path("/tmp/linuxcnc.lock")
+# The last that run.py says.
+DONE = "program done"
 
 
 def missing():
@@ -135,18 +137,23 @@ def running(program, port, cycle=1e-3, servo=200.0):
                 shutil.chown(path, OTHER_USER)
             user = pwd.getpwnam(OTHER_USER)
             other = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": ()}
-        process = subprocess.Popen(
-            ["linuxcnc", str(folder / "cell.ini")],
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            start_new_session=True,
-            **other,
-        )
+        said = folder / "said.txt"
+        with said.open("w") as log:
+            process = subprocess.Popen(
+                ["linuxcnc", "-r", str(folder / "cell.ini")],
+                cwd=folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                **other,
+            )
         try:
             yield process
         finally:
+            if process.poll() is not None and DONE not in (text := said.read_text()):
+                print(f"LinuxCNC ended early ({process.returncode}): {text}", file=sys.stderr)
             # Asked to end, LinuxCNC ends its own processes; what then remains is cleared.
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGTERM)
@@ -155,8 +162,6 @@ def running(program, port, cycle=1e-3, servo=200.0):
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            with contextlib.suppress(OSError):  # written if it ended with an error
-                print((folder / "linuxcnc_debug.txt").read_text()[-2000:], file=sys.stderr)
 
 
 if __name__ == "__main__":
