@@ -144,7 +144,8 @@ class BlockStreamDevice(StreamDevice):
                 if after is None:
                     self._doubtful = [block]
                     break
-                if after.counter == (self._next + len(block.frames)) % COUNTER_RANGE:
+                follows = (self._next + len(block.frames)) % COUNTER_RANGE
+                if block.counter != after.counter == follows:
                     block = block._replace(counter=self._next)
             self._next = (block.counter + len(block.frames)) % COUNTER_RANGE
             self._latest = content
