@@ -60,21 +60,22 @@ def test_a_killed_driver_leaves_a_gap_that_is_counted(cell, true_calibration, se
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(10))
 def test_a_killed_corrector_goes_on_where_it_comes_back(cell, true_calibration, seed):
-    start_scanning(cell, true_calibration)
+    start_scanning(cell, true_calibration, 2)
+    sent = 2 * SCAN
     path = str(cell.folder / "cal.json")
     when = random.Random(seed).randrange(1000, SCAN // 3)
     kill_at(cell, "corrector", when, lambda: cell.processes.start("corrector", calibration=path))
-    cell.wait("the end", lambda: cell.operator.value("cell_emulator", "samples_played") >= SCAN)
+    cell.wait("the end", lambda: cell.operator.value("cell_emulator", "samples_played") >= sent)
     cell.settle("corrector", "axes_received")
     received = {stream: cell.closed_account(stream) for stream in ("axes", "distance")}
     assert min(received.values()) > 0
     # It says where it came in; from there on none is missing. Streams are found a moment apart.
     for stream, count in received.items():
-        assert cell.operator.value("corrector", f"begins_at_{stream}") + count == SCAN
+        assert cell.operator.value("corrector", f"begins_at_{stream}") + count == sent
     assert cell.operator.value("corrector", "missing_axes") == 0
     assert cell.operator.value("corrector", "missing_distance") == 0
     assert cell.operator.value("corrector", "axes_corrected") > 0
-    assert cell.operator.value("confocal_driver", "delivered") == SCAN
+    assert cell.operator.value("confocal_driver", "delivered") == sent
 
 
 def single_samples(cell, count):
