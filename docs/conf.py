@@ -22,12 +22,12 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_type_aliases = dict.fromkeys(("ArrayLike", "FloatArray"), "array")
 TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # else a union shows the class
-# Of options such as --fit, typographic dashes would make another text.
+# Typographic dashes would change the text of options such as --fit.
 smartquotes = False
 # Notebooks run when the manual is made; one that fails is a warning, which fails the make.
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "out" / ".jupyter_cache")
-# What they show is of this code: results of former code are not kept.
+# Results of former code are removed, so that the pages show those of this code.
 _cache = Path(nb_execution_cache_path)
 _changed = max(path.stat().st_mtime for path in (ROOT / "omsm_ros").rglob("*.py"))
 if _cache.exists() and _cache.stat().st_mtime < _changed:
