@@ -443,9 +443,11 @@ def _resembled(
         effect = effects.get(family.name, NO_EFFECT)
         if effect.free < least or not family.named or base_name(family.name) in FREE:
             continue
-        ways = np.eye(family.size) if family.smooth is None else family.smooth
-        shape = effect.shape @ ways
-        gain, values = form.looks_like(fit @ shape, ways.T @ effect.known @ ways)
+        shape, known = effect.shape, effect.known
+        if family.smooth is not None:
+            # Of many components, whose rounding would pass for information.
+            shape, known = shape @ family.smooth, np.zeros((family.smooth.shape[1],) * 2)
+        gain, values = form.looks_like(fit @ shape, known)
         if gain > _POSITIVE:
             change = shape @ values
             weight = made.places.area * change
