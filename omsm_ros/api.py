@@ -1,6 +1,15 @@
 """The Python interface: arrays in, results out. Works without ROS.
 
-Use it as ``import omsm_ros as omsm``, which lists the public names. All quantities are in SI units.
+``omsm_ros`` lists the public names. All quantities are in SI units. The examples of the functions
+go on from these lines:
+
+>>> import numpy as np
+>>> import omsm_ros as omsm
+>>> calibration = omsm.identify(omsm.simulate("step_test"))
+>>> mirror = omsm.surface("off_axis_paraboloid", parent_focal_length=0.0254,
+...                       off_axis_distance=0.0508)
+>>> scan = omsm.simulate("scan", radius=1e-3)
+>>> points = omsm.correct(scan, calibration)
 """
 
 from __future__ import annotations
@@ -13,9 +22,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.errors import ConfigurationError
 from omsm_ros.interface_calibration import Calibration
+from omsm_ros.interface_inputs import load
+from omsm_ros.interface_inputs import read as read
+from omsm_ros.interface_inputs import simulate as simulate
+from omsm_ros.interface_inputs import surface as surface
 from omsm_ros.interface_results import (
     Adjusted,
     Difference,
@@ -25,54 +37,11 @@ from omsm_ros.interface_results import (
     Prediction,
     Recording,
     Spectrum,
-    load_saved,
 )
 
 if TYPE_CHECKING:
     from omsm_ros.core.kinematics.kinematics import Surface
     from omsm_ros.core.surface.aperture import Aperture
-
-
-def read(path: Path | str, columns: Path | str | None = None) -> Recording:
-    """Read axes and distance on one trigger count.
-
-    path: ``.mcap`` or ``.db3`` file, or the folder of a bag; a table (CSV, HDF5 …) with ``columns``
-    columns: ``MAP.yaml`` with names, units and signs, as for ``omsm import``
-    Raises BagError, FileError or DataError for a path that holds no such recording.
-    """
-    if columns is not None:
-        return _read_table(Path(path), Path(columns))
-    from omsm_ros.io import bags
-    from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
-
-    axes: list[AxisBlock] = []
-    distance: list[DistanceBlock] = []
-    with bags.BagReader(path) as bag:
-        for _, _, block in bag.blocks(AXES_TOPIC, DISTANCE_TOPIC):
-            (axes if isinstance(block, AxisBlock) else distance).append(block)
-    if not axes or not distance:
-        raise DataError(f"{str(path)!r} has no samples of axes and probe; record both")
-    first = min(b.first_sample for b in (*axes, *distance))
-    last = max(b.first_sample + len(b) for b in (*axes, *distance))
-    made = {name: np.full(last - first, np.nan) for name in ("z", "x", "c", "distance")}
-    for block in (*axes, *distance):
-        names = ("z", "x", "c") if isinstance(block, AxisBlock) else ("distance",)
-        begin = block.first_sample - first
-        for name in names:
-            made[name][begin : begin + len(block)] = getattr(block, name)
-    return Recording(**made, period=float(axes[0].sample_period), name=str(path))
-
-
-def _read_table(path: Path, columns: Path) -> Recording:
-    from omsm_ros.io.tables.table import load_column_map
-    from omsm_ros.pipelines.importing import import_recording
-
-    mapped, form = load_column_map(columns)
-    with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / "recording.mcap"
-        import_recording([path], mapped, form, bag)
-        found = read(bag)
-    return Recording(found.z, found.distance, found.period, found.x, found.c, str(path))
 
 
 def identify(
@@ -96,10 +65,20 @@ def identify(
     settings
         What the calibration belongs to, such as machine, probe rate and exposure.
 
+    Returns
+    -------
+    Calibration
+        Lag, static gain, dynamics and verdict.
+
     Raises
     ------
     StepTestError, IdentificationError
         Where the data hold no usable motion.
+
+    Examples
+    --------
+    >>> calibration.verdict
+    'accepted'
     """
     from omsm_ros.core.identification.identify import identify as identify_record
     from omsm_ros.core.streams.motion_record import assemble
@@ -130,8 +109,28 @@ def correct(
 ) -> Points:
     """Correct a scan: heights free of the dynamic error, with an uncertainty for each.
 
-    nominal: surface of the part, for its slopes;  latency: of the probe [s], None: as certified
-    polarity: 1 if the distance falls when z rises, else -1
+    Parameters
+    ----------
+    recording
+        The scan, of n samples.
+    calibration
+        Of the machine and probe that made it.
+    nominal
+        Surface of the part, for its slopes.
+    latency
+        Of the probe [s]; None takes the certified one.
+    polarity
+        1 if the distance falls when z rises, else -1.
+
+    Returns
+    -------
+    Points
+        At most n; ``counted`` has the number of samples that are none, by reason.
+
+    Examples
+    --------
+    >>> bool(points.uncertainty.max() < 1e-6)
+    True
     """
     from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
     from omsm_ros.core.correction.surface_points import join_points
@@ -163,8 +162,30 @@ def form(
 ) -> Form:
     """Register points to their nominal surface, and evaluate the form.
 
-    fit: degrees of freedom of the pose that are fitted, or "auto";  aperture: disc of the part
-    Raises DataError for points that do not determine the pose.
+    Parameters
+    ----------
+    points
+        Corrected points, or what :func:`load` read.
+    nominal
+        Surface of the part.
+    fit
+        Degrees of freedom of the pose that are fitted, or ``"auto"``.
+    aperture
+        Part of the surface that counts; None takes all points.
+
+    Returns
+    -------
+    Form
+        Figures with standard uncertainty [m], Zernike terms [m], and the map of the deviation.
+
+    Raises
+    ------
+    DataError
+        For points that do not determine the pose.
+
+    Examples
+    --------
+    >>> value, uncertainty = omsm.form(points, mirror).figures["rms"]
     """
     from omsm_ros.core.form.analyse import analyse_form
     from omsm_ros.core.registration.placement import PointBatch
@@ -200,6 +221,8 @@ def adjust(
     ----------
     scans
         Recordings or bags of one part; two that differ in speed or direction can verify the result.
+    calibration
+        Of the machine and probe that made them.
     nominal
         Surface of the part; None fits a polynomial.
     sources
@@ -208,6 +231,16 @@ def adjust(
         Angle by which the part is turned on the chuck in each scan [rad].
     accuracy, tolerance
         Expanded uncertainty asked for, and tolerance of the peak to valley [m].
+
+    Returns
+    -------
+    Adjusted
+        Verdict, figures and found sources in ``facts``; the form [m] with standard uncertainty.
+
+    Examples
+    --------
+    >>> omsm.adjust([scan], calibration, nominal=mirror).verdict  # one scan does not verify itself
+    'not_verified'
     """
     from omsm_ros.core.correction.machine_sources import NOTHING_STATED
     from omsm_ros.io.descriptions import load_sources
@@ -250,9 +283,31 @@ def difference(
 ) -> Difference:
     """Compare two measurements of one part, the second moved onto the first.
 
-    a, b: points, or files of any instrument;  nominal: surface to subtract from both first
-    fit: pose parameters of the move;  uncertainty: standard, of heights that state none [m]
-    Raises DataError for measurements that hardly overlap, or cover no area.
+    Parameters
+    ----------
+    a, b
+        Points, or files of any instrument.
+    nominal
+        Surface to subtract from both first.
+    fit
+        Pose parameters of the move.
+    uncertainty
+        Standard uncertainty of heights that state none [m].
+
+    Returns
+    -------
+    Difference
+        b - a [m] at the matched points, and whether it is within the uncertainties.
+
+    Raises
+    ------
+    DataError
+        For measurements that hardly overlap, or cover no area.
+
+    Examples
+    --------
+    >>> float(np.abs(omsm.difference(points, points, nominal=mirror).difference).max()) < 1e-12
+    True
     """
     from omsm_ros.core.comparison.compare import compare_measurements_of_part
     from omsm_ros.core.comparison.stated_errors import ComparedMeasurement
@@ -299,13 +354,35 @@ def plan(
     dialect: str = "linuxcnc",
     **steps: Any,
 ) -> Plan:
-    """Plan a step test, or a scan of ``nominal`` from ``radius`` [m] to the centre.
+    """Plan a step test, or a scan of ``nominal`` from ``radius`` to the centre.
 
-    period: of the samples [s];  feed: per turn [m]
-    dialect: of the controller, ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``
-    steps: ``step``, ``second_step``, ``half_range`` [m], ``count``, ``dwell``, ``rise`` [s]
+    Parameters
+    ----------
+    nominal
+        Surface of the part; None plans a step test.
+    period
+        Sample period [s].
+    rpm, radius, feed
+        Speed of the spindle, radius at the start [m], and feed per turn [m].
+    dialect
+        Of the controller: ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``.
+    **steps
+        ``step``, ``second_step``, ``half_range`` [m], ``count``, ``dwell``, ``rise`` [s].
 
-    Raises ConfigurationError for a motion that the probe or the sampling cannot follow.
+    Returns
+    -------
+    Plan
+        Motion of the axes (n,), and the program as G-code.
+
+    Raises
+    ------
+    ConfigurationError
+        For a motion that the probe or the sampling cannot follow.
+
+    Examples
+    --------
+    >>> omsm.plan(dialect="fanuc").gcode.count("G04") > 20
+    True
     """
     from omsm_ros.core.adjustment import ScanDesign
     from omsm_ros.core.kinematics.trajectories import (
@@ -338,8 +415,29 @@ def predict(
 ) -> Prediction:
     """Predict the dynamic error of a motion, what the correction leaves, and the maximum speed.
 
-    accuracy: expanded uncertainty asked for, k = 2 [m]
-    Raises DataError for a motion that is shorter than the filter takes to settle.
+    Parameters
+    ----------
+    motion
+        A plan, or a recording.
+    calibration
+        Of the machine and probe that will execute it.
+    accuracy
+        Expanded uncertainty asked for, k = 2 [m].
+
+    Returns
+    -------
+    Prediction
+        Error (n,) and what remains of it [m], and by which factor the speed may rise.
+
+    Raises
+    ------
+    DataError
+        For a motion that is shorter than the filter takes to settle.
+
+    Examples
+    --------
+    >>> omsm.predict(scan, calibration).residual < 20e-9
+    True
     """
     from omsm_ros.core.correction.predict import dynamic_error, predict_error
     from omsm_ros.core.kinematics.scan_path import ScanPath
@@ -357,90 +455,28 @@ def predict(
 
 
 def spectrum(values: ArrayLike, step: float) -> Spectrum:
-    """Return the power spectral density of evenly spaced ``values``, their mean removed.
+    """Return the power spectral density of evenly spaced values, their mean removed.
 
-    step: between the values [s], or [m] along a path
+    Parameters
+    ----------
+    values
+        Of any unit, (n,).
+    step
+        Between the values [s], or [m] along a path.
+
+    Returns
+    -------
+    Spectrum
+        Frequency [1/s or 1/m] and density [unit² s or unit² m], (n // 2 + 1,).
+
+    Examples
+    --------
+    >>> wave = np.sin(2 * np.pi * 50 * np.arange(1000) * 1e-3)
+    >>> round(omsm.spectrum(wave, 1e-3).rms(40, 60), 3)
+    0.707
     """
     from omsm_ros.core.ripple.density import density
 
     array = np.asarray(values, np.float64)
     found = density(array - array.mean(), step)
     return Spectrum(found.frequency, found.density)
-
-
-def surface(shape: str | Path, **parameters: Any) -> Surface:
-    """Return a nominal surface: a shape with its parameters, or a ``SURFACE.yaml``.
-
-    >>> surface("sphere", radius=0.1).height(np.zeros(1), np.zeros(1))
-    array([0.])
-    """
-    from omsm_ros.io.descriptions import load_surface, surface_of
-
-    if Path(shape).suffix in (".yaml", ".yml"):
-        return load_surface(shape)
-    return surface_of({"shape": str(shape), **parameters}, f"surface {shape!r}")
-
-
-def simulate(
-    motion: str = "scan",
-    *,
-    seed: int = 1,
-    rpm: float = 30.0,
-    radius: float = 2e-3,
-    outward: bool = False,
-    part: int | None = None,
-) -> Recording:
-    """Simulate the paper's machine: ``"step_test"``, or ``"scan"`` of its mirror.
-
-    seed: of noise and part;  rpm: spindle speed;  radius: of the scan [m]
-    outward: from the centre;  part: seed of the part alone, for several scans of one part
-    Raises ConfigurationError for another motion.
-    """
-    from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of
-
-    scenario = Scenario(
-        seed=seed, spindle_speed=rpm, start_radius=radius, outward=outward, part_seed=part
-    )
-    motions = {"scan": scan_of, "step_test": planned_test_of}
-    if motion not in motions:
-        raise ConfigurationError(f"motion {motion!r} is unknown, expected one of {[*motions]}")
-    made = motions[motion](scenario)
-    return Recording(
-        z=made.axes.z,
-        distance=made.distance.distance,
-        period=made.axes.sample_period,
-        x=made.axes.x,
-        c=made.axes.c,
-        name=f"twin, seed {seed}",
-    )
-
-
-def load(path: Path | str) -> Any:
-    """Load a result: ``CAL.json``, what ``save`` wrote, or points of a cloud or map.
-
-    Maps and clouds of other instruments are read as Points (csv, xyz, ply, x3p, Zygo .dat …).
-    Raises FileError for a file that holds none of these.
-    """
-    file = Path(path)
-    if file.suffix == ".json":
-        from omsm_ros.io.calibration_file import load_calibration
-
-        return Calibration(load_calibration(file))
-    if file.suffix == ".npz":
-        return load_saved(file)
-    return _points_of(file)
-
-
-def _points_of(file: Path) -> Points:
-    from omsm_ros.io.maps.read_map import read_points
-
-    found = read_points(file)
-    zero = np.zeros(len(found), np.int64)
-    return Points(
-        x=found.x,
-        y=found.y,
-        height=found.height,
-        uncertainty=zero * np.nan if found.uncertainty is None else found.uncertainty,
-        dynamic_error=zero.astype(np.float64),
-        sample=zero if found.sample is None else found.sample,
-    )

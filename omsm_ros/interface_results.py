@@ -122,7 +122,7 @@ class Recording(Result):
 
     >>> import numpy as np
     >>> t = np.arange(1000) * 1e-3
-    >>> print(Recording(z=1e-6 * np.sin(t), distance=-1e-6 * np.sin(t), period=1e-3))
+    >>> print(omsm.Recording(z=1e-6 * np.sin(t), distance=-1e-6 * np.sin(t), period=1e-3))
     recording  1000 samples, 1.00 s
     from       arrays
     """

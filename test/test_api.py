@@ -1,5 +1,6 @@
 """The Python interface: arrays in, results out, the same numbers as the commands."""
 
+import doctest
 import subprocess
 import sys
 
@@ -17,6 +18,8 @@ PUBLIC = {
     "Spectrum", "adjust", "correct", "difference", "form", "identify", "load", "plan", "predict",
     "read", "simulate", "spectrum", "surface",
 }  # fmt: skip
+MIRROR = omsm.surface("off_axis_paraboloid", parent_focal_length=25.4e-3,
+                      off_axis_distance=50.8e-3)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +111,7 @@ def test_the_spectrum_holds_the_mean_square():
 
 @pytest.fixture(scope="module")
 def results(identified, points):
-    mirror = omsm.surface("off_axis_paraboloid", parent_focal_length=25.4e-3,
-                          off_axis_distance=50.8e-3)  # fmt: skip
+    mirror = MIRROR
     fast = omsm.twin("scan", seed=2, part=1, rpm=60, radius=1e-3)
     scans = [omsm.twin("scan", radius=1e-3), fast]
     return (
@@ -198,6 +200,25 @@ def test_files_of_the_commands_are_read(results, tmp_path):
     found = omsm.read(tmp_path / "log.csv", tmp_path / "map.yaml")
     np.testing.assert_allclose(found.distance, [-25e-6, -50e-6, -25e-6])
     np.testing.assert_allclose(found.z, 1.5e-3)
+
+
+def test_the_examples_of_the_functions_run(results, monkeypatch, tmp_path):
+    """They go on from a calibration, a scan, its points and surface, as the module's lines do."""
+    monkeypatch.chdir(tmp_path)
+    names = {
+        "np": np, "omsm": omsm, "calibration": results[0], "scan": results[1],
+        "points": results[2], "mirror": MIRROR,
+    }  # fmt: skip
+    functions = [name for name in omsm.__all__ if name[0].islower()]
+    examples = [*functions, "Recording"]
+    for name in examples:
+        (found,) = doctest.DocTestFinder(recurse=False).find(getattr(omsm, name), name)
+        assert found.examples, f"{name} has no example"
+        found.globs = dict(names)
+        ran = doctest.DocTestRunner().run(found)
+        assert (ran.attempted, ran.failed) == (len(found.examples), 0), name
+    for name in functions:
+        assert "    Parameters\n    ----------\n" in getattr(omsm, name).__doc__
 
 
 def test_a_plan_is_the_motion_of_its_program(results):

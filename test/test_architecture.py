@@ -18,7 +18,7 @@ ROOT = PACKAGE.parent
 MODULES = sorted(p for p in PACKAGE.rglob("*.py") if "interfaces" not in p.parts)
 
 LONGEST_FILE, LONGEST_FUNCTION, LARGEST_ROOM = 500, 50, 22
-MOST_FILES, MOST_LINES, MOST_SINGLE_IMPORTERS = 292, 73_065, 21
+MOST_FILES, MOST_LINES, MOST_SINGLE_IMPORTERS = 293, 73_297, 21
 
 
 def _name(path):
@@ -100,10 +100,12 @@ def evaluates_foreign_text(name, tree):
 
 
 def functions_are_too_long(name, tree):
-    """From the first line of a function to its last, docstring and nested functions included."""
+    """From the first line of a function to its last, without its docstring."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             lines = node.end_lineno - node.lineno + 1
+            if ast.get_docstring(node) is not None:
+                lines -= node.body[0].end_lineno - node.body[0].lineno + 1
             if lines > LONGEST_FUNCTION:
                 yield f"{name}.{node.name} has {lines} lines, at most {LONGEST_FUNCTION}"
 
