@@ -177,9 +177,9 @@ class FormTerms:
 
     def _best(self, columns: FloatArray) -> tuple[float, FloatArray]:
         """Return the largest log likelihood with ``columns`` of unit variance, and its spread."""
-        known = self.covariance + columns @ columns.T
-        # A small scan leaves terms of which only the rounding is known.
-        known += _ROUNDING * np.max(np.diag(known)) * np.eye(len(known))
+        share, axes = np.linalg.eigh(self.covariance + columns @ columns.T)
+        # A small scan leaves terms of which only the rounding is known, of either sign.
+        known = axes * np.maximum(share, _ROUNDING * share[-1]) @ axes.T
         start = np.log(np.mean(self.values**2 * self.degrees**_START_POWER) + 1e-30)
 
         def own(law: FloatArray) -> FloatArray:

@@ -61,7 +61,9 @@ def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
     """Three directions of 42 are known, the rest by rounding; nothing looks like the machine."""
     rng = np.random.default_rng(3)
     known = rng.normal(size=(len(DEGREES), 3)) * 1e-7
-    terms = FormTerms(known @ [0.3, -0.2, 0.1], known @ known.T, DEGREES, SYMMETRIC)
+    # A pose that is removed leaves a rounding of its own size.
+    covariance = known @ known.T - 1e-24 * np.eye(len(DEGREES))
+    terms = FormTerms(known @ [0.3, -0.2, 0.1], covariance, DEGREES, SYMMETRIC)
     gain, values = terms.looks_like(1e-7 * rng.normal(size=(len(DEGREES), 1)), UNKNOWN)
     assert gain < 2
     assert np.all(np.isfinite(values))
