@@ -9,8 +9,8 @@ Not imitated: latency of the link, baud rate and UART overrun, jitter of the tri
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -20,7 +20,7 @@ from omsm_ros.core.streams.blocks import FloatArray, Status
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.scaling import AXES, AxisScaling
 from omsm_ros.twin.cell import Recording
-from omsm_ros.units import NANOSECONDS_PER_S, PPM
+from omsm_ros.units import NANOSECONDS_PER_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,42 +130,23 @@ class InstrumentFaults:
     """Faults to come: counts are used up, the other values last until they are set back.
 
     lose, duplicate: samples not sent, sent twice
-    saturate, drop_out: samples with status SATURATED, and NO_TARGET
-    noise: random bytes before the next samples
-    cut: bytes missing in the middle of the next ones sent
-    garbage_answers: commands answered with random bytes
     slow_answers: delay of answers [s]
-    ignore_commands: commands without answer
-    merge: time for which samples are collected before they are sent [s]
     rate: actual rate over the rate set [1]
-    drift: of its clock [ppm]
     noise_rate, flip_rate, drop_rate: probability, for each sample, of random bytes before it, of
         one inverted bit in it, of its loss [1]
     """
 
     lose: int = 0
     duplicate: int = 0
-    saturate: int = 0
-    drop_out: int = 0
-    noise: int = 0
-    cut: int = 0
-    garbage_answers: int = 0
     slow_answers: float = 0.0
-    ignore_commands: int = 0
-    merge: float = 0.0
     rate: float = 1.0
-    drift: float = 0.0
     noise_rate: float = 0.0
     flip_rate: float = 0.0
     drop_rate: float = 0.0
 
 
 class Instrument:
-    """A device that is switched on when made; ``step`` does what is due.
-
-    truth: ``(true number, device counter)`` of each sample sent, in order; the true number counts
-        triggers since the source began
-    """
+    """A device that is switched on when made; ``step`` does what is due."""
 
     counter_range = 2**16
 
@@ -180,8 +161,6 @@ class Instrument:
     ) -> None:
         """triggered: samples only while a motion plays, with the motion's own trigger."""
         self.faults = InstrumentFaults()
-        self.truth: list[tuple[int, int]] = []
-        self.keep_truth = False
         self._line = line
         self._source: Source | None = source if source or triggered else NumberedSource()
         self._triggered = triggered
@@ -192,10 +171,8 @@ class Instrument:
         self._counter = 0
         self._origin = self._started = clock()
         self._due = 0.0  # samples measured since ``_origin``
-        self._clock_offset = 0
         self._quiet_until = self._off_until = 0.0
         self._unplugged = False
-        self._kept, self._kept_since = b"", 0.0
         self._later: list[tuple[float, bytes]] = []
         self._session = 0
         self.reset()
@@ -253,12 +230,9 @@ class Instrument:
         if data:
             self.receive(data)
         while self._later and self._later[0][0] <= now:
-            # Samples measured before the answer are sent first, so that no telegram is split.
-            if self._kept:
-                self._line.write(self._kept, stop)
-                self._kept = b""
             self._line.write(self._later.pop(0)[1], stop)
-        self._send(self._measure(now), now, stop)
+        if wire := b"".join(self._measure(now)):
+            self._line.write(wire, stop)
 
     def serve(self, stop: threading.Event) -> None:
         """Work until ``stop``."""
@@ -300,7 +274,6 @@ class Instrument:
     def restart(self) -> None:
         """Set settings and counter as after switching on; the line stays connected."""
         self._counter = 0
-        self._kept = b""
         self._later.clear()
         self._started = self._clock()
         self.reset()
@@ -312,10 +285,6 @@ class Instrument:
     def reset_counter(self) -> None:
         """Count from zero again, as upon a trigger command."""
         self._counter = 0
-
-    def step_clock(self, nanoseconds: int) -> None:
-        """Set the device's clock ahead."""
-        self._clock_offset += nanoseconds
 
     def _measure(self, now: float) -> list[bytes]:
         """Return the bytes of the samples that are due; empty while none are to be sent."""
@@ -330,9 +299,9 @@ class Instrument:
         if count <= 0:
             return []
         counters = (self._counter + np.arange(count)) % self.counter_range
-        measured = self._disturb(self._source.take(self._taken, count))
+        measured = self._source.take(self._taken, count)
         packed = self.pack(measured, counters, self._times(count, now)) if self._sending() else []
-        pieces = self._spoil(packed, self._taken, counters)
+        pieces = self._spoil(packed)
         self._taken += count
         self._counter = (self._counter + count) % self.counter_range
         return pieces
@@ -348,22 +317,10 @@ class Instrument:
         else:
             last = (self._taken + count) * true_period
         seconds = last - np.arange(count)[::-1] * true_period
-        device = seconds * (1 + self.faults.drift * PPM) * NANOSECONDS_PER_S
-        ticks: np.ndarray = np.rint(device).astype(np.int64)
-        return ticks + self._clock_offset
+        ticks: np.ndarray = np.rint(seconds * NANOSECONDS_PER_S).astype(np.int64)
+        return ticks
 
-    def _disturb(self, measured: Measured) -> Measured:
-        status, distance = measured.status.copy(), measured.distance.copy()
-        intensity = measured.intensity.copy()
-        saturated = _use(self.faults, "saturate", len(measured))
-        status[:saturated] = Status.SATURATED
-        lost = slice(
-            saturated, saturated + _use(self.faults, "drop_out", len(measured) - saturated)
-        )
-        status[lost], distance[lost], intensity[lost] = Status.NO_TARGET, np.nan, 0.0
-        return replace(measured, status=status, distance=distance, intensity=intensity)
-
-    def _spoil(self, packed: list[bytes], first: int, counters: np.ndarray) -> list[bytes]:
+    def _spoil(self, packed: list[bytes]) -> list[bytes]:
         pieces: list[bytes] = []
         dropped, noisy, flipped = (
             self._struck(rate, len(packed))
@@ -372,8 +329,6 @@ class Instrument:
         for i, piece in enumerate(packed):
             if piece and (dropped[i] or _use(self.faults, "lose", 1)):
                 continue
-            if self.keep_truth:
-                self.truth.append((first + i, int(counters[i])))
             if piece and flipped[i]:
                 damaged = bytearray(piece)
                 damaged[self._random.integers(len(piece))] ^= 1 << int(self._random.integers(8))
@@ -387,29 +342,8 @@ class Instrument:
         # No random number is used without a fault, so each fault alone repeats with its seed.
         return self._random.random(count) < rate if rate else np.zeros(count, np.bool_)
 
-    def _send(self, pieces: Iterable[bytes], now: float, stop: threading.Event | None) -> None:
-        wire = b"".join(pieces)
-        if self.faults.noise and wire:
-            wire = self._random.bytes(_use(self.faults, "noise", 1 << 20)) + wire
-        if self.faults.cut and len(wire) > self.faults.cut:
-            place = len(wire) // 2
-            wire = wire[:place] + wire[place + _use(self.faults, "cut", len(wire)) :]
-        if self.faults.merge:
-            self._kept_since = self._kept_since if self._kept else now
-            self._kept += wire
-            if now - self._kept_since < self.faults.merge:
-                return
-            wire = b""
-        wire, self._kept = self._kept + wire, b""
-        if wire:
-            self._line.write(wire, stop)
-
     def say(self, wire: bytes) -> None:
-        """Queue an answer, delayed, replaced or dropped by the faults."""
-        if _use(self.faults, "ignore_commands", 1):
-            return
-        if _use(self.faults, "garbage_answers", 1):
-            wire = self._random.bytes(len(wire))
+        """Queue an answer, delayed by the faults."""
         self._later.append((self._clock() + self.faults.slow_answers, wire))
 
 

@@ -16,10 +16,11 @@ from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import OffAxisParaboloid
 from omsm_ros.errors import DeviceError
 from omsm_ros.instruments.blocks import BlockPair
-from omsm_ros.instruments.emulator import Instrument
 from omsm_ros.instruments.reader import BACK_OFF_S
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.twin.cell import Cell, Recording, record
+
+from .faulty import Faulty, faulty
 
 NANOMETRE = 1e-9
 
@@ -33,10 +34,9 @@ class Bench:
     resolution = 2e-11
     modulus = 2**62
 
-    def __init__(self, loop: Loopback, instrument: Instrument, device: StreamDevice) -> None:
+    def __init__(self, loop: Loopback, instrument: Faulty, device: StreamDevice) -> None:
         self.loop, self.instrument, self.device = loop, instrument, device
         loop.instrument = instrument
-        instrument.keep_truth = True
         self.blocks: list[BlockPair] = []
         self.troubles: list[str] = []
         self.connections = 0
@@ -68,7 +68,7 @@ class Bench:
         self._connected = False
 
     def is_back_within_five_seconds_of(
-        self, strike: Callable[[Instrument], None], lasts: float
+        self, strike: Callable[[Faulty], None], lasts: float
     ) -> None:
         """Let a fault ``strike`` that ``lasts`` [s], and hold that all samples come after it."""
         self.run(1.0)
@@ -173,7 +173,7 @@ def bench() -> Callable[..., Any]:
         loop = Loopback(
             interval=options.pop("interval", 0.01), portion=options.pop("portion", 1 << 20)
         )
-        instrument = emulator(loop.line, clock=loop.clock, **options)
+        instrument = faulty(emulator)(loop.line, clock=loop.clock, **options)
         driver = device(loop, settings, loop.clock.nanoseconds, loop.clock)
         return Bench(loop, instrument, driver)
 

@@ -16,8 +16,10 @@ from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
 from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
 from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator
 from omsm_ros.instruments.chrocodile.telegram import Layout
-from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
+from omsm_ros.instruments.emulator import AXIS_SCALING
 from omsm_ros.instruments.scaling import ProbeReading
+
+from .faulty import Faulty
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 
@@ -138,7 +140,7 @@ def test_saturation_and_dropouts_are_verdicts_not_losses(cell: Any) -> None:
     assert np.isnan(distance[status == Status.NO_TARGET]).all()
 
 
-FAULTS: dict[str, Callable[[Instrument], None]] = {
+FAULTS: dict[str, Callable[[Faulty], None]] = {
     "unplug": lambda i: i.unplug(1.0),
     "power cycle": lambda i: i.power_cycle(1.5),
     "restart with the line up": lambda i: i.restart(),

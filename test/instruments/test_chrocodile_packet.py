@@ -13,7 +13,9 @@ from omsm_ros.errors import DeviceError, DeviceTimeoutError
 from omsm_ros.instruments.chrocodile.device import ChrocodileSettings, RefusedError
 from omsm_ros.instruments.chrocodile.emulator import ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
+from omsm_ros.instruments.emulator import AXIS_SCALING
+
+from .faulty import Faulty
 
 SIX = ChrocodileSettings(axes=AXIS_SCALING)
 
@@ -59,7 +61,7 @@ def test_stamps_follow_the_packets_own_time(cell: Any) -> None:
         assert passed == pytest.approx(step * 1e6, abs=12e6)
 
 
-FAULTS: dict[str, Callable[[Instrument], None]] = {
+FAULTS: dict[str, Callable[[Faulty], None]] = {
     "unplug": lambda i: i.unplug(1.0),
     "power cycle": lambda i: i.power_cycle(1.5),
     "restart with the line up": lambda i: i.restart(),

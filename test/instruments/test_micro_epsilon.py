@@ -24,10 +24,11 @@ from omsm_ros.instruments.micro_epsilon.emulator import (
     ConfocalDtSerialEmulator,
 )
 
+from .faulty import Faulty
 from .with_commands import WithCommands
 
 THREE = ConfocalDtSettings(axes=AXIS_SCALING, wired=(0, 1, 2))
-FAULTS: dict[str, Callable[[Instrument], None]] = {
+FAULTS: dict[str, Callable[[Faulty], None]] = {
     "unplug": lambda i: i.unplug(1.0),
     "power cycle": lambda i: i.power_cycle(1.5),
     "stall": lambda i: i.stall(1.0),

@@ -13,7 +13,7 @@ from omsm_ros.instruments.chrocodile.device import ChrocodileSettings
 from omsm_ros.instruments.chrocodile.dollar_device import ChrocodileDevice
 from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator, ChrocodilePacketEmulator
 from omsm_ros.instruments.chrocodile.packet_device import ChrocodilePacketDevice
-from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument
+from omsm_ros.instruments.emulator import AXIS_SCALING
 from omsm_ros.instruments.micro_epsilon.capancdt_device import CapaNcdtDevice, CapaNcdtSettings
 from omsm_ros.instruments.micro_epsilon.device import (
     ConfocalDtDevice,
@@ -30,11 +30,13 @@ from omsm_ros.instruments.scaling import ProbeReading
 from omsm_ros.instruments.six_channel.device import CsvSettings, CsvStreamDevice
 from omsm_ros.instruments.six_channel.emulator import CsvStreamEmulator
 
+from .faulty import Faulty
+
 # As `docs/devices.md` states it: the fault itself, the silence that shows it and a new set-up,
 # and for each command that is not answered, or with rubbish, the patience and the longest pause.
 LASTS_S, NOTICED_S, UNANSWERED_S = 3.0, 5.0, 2.0 + BACK_OFF_S[1]
 
-Fault = Callable[[Instrument], None]
+Fault = Callable[[Faulty], None]
 Story = list[tuple[Fault, float]]
 
 

@@ -18,6 +18,7 @@ from omsm_ros.instruments.six_channel.emulator import SixChannelEmulator
 from omsm_ros.instruments.six_channel.protocol import FRAME, FrameArray, StreamScaling
 
 from .conftest import Bench
+from .faulty import faulty
 from .test_random_faults import (
     LASTS_S,
     MEMORY_FAULTS,
@@ -128,7 +129,7 @@ def ring_bench(monkeypatch: pytest.MonkeyPatch) -> Any:
         fake = SimpleNamespace(Connection=lambda *_: connected, ADSError=OSError)
         monkeypatch.setattr("omsm_ros.instruments.six_channel.device._pyads", lambda: fake)
         driver = device(SimulatedRing(loop), settings, loop.clock.nanoseconds, loop.clock)
-        return Bench(loop, emulator(ring, clock=loop.clock), driver)
+        return Bench(loop, faulty(emulator)(ring, clock=loop.clock), driver)
 
     return make
 

@@ -16,6 +16,8 @@ from omsm_ros.instruments.six_channel.emulator import SixChannelEmulator
 from omsm_ros.instruments.six_channel.protocol import FrameDecoder
 from omsm_ros.twin.cell import Recording
 
+from .faulty import Faults
+
 STEP_S = 0.005
 
 
@@ -99,7 +101,7 @@ def test_faults_repeat_with_their_seed(recording: Recording) -> None:
 
 def test_every_sample_is_delivered_or_lost_with_all_faults(bench: Callable[..., Any]) -> None:
     made = bench(SixChannelEmulator, GenericStreamDevice, StreamSettings())
-    made.instrument.faults = InstrumentFaults(noise_rate=0.02, flip_rate=0.02, drop_rate=0.02)
+    made.instrument.faults = Faults(noise_rate=0.02, flip_rate=0.02, drop_rate=0.02)
     made.run(5.0)
     made.end()
     found = made.device.statistics
