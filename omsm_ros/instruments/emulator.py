@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.streams.blocks import FloatArray, Status
 from omsm_ros.errors import DeviceError
-from omsm_ros.instruments.scaling import AXES, AxisScaling
+from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
 from omsm_ros.twin.cell import Recording
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -156,14 +156,20 @@ class Instrument:
         source: Source | None = None,
         *,
         triggered: bool = False,
+        probe: ProbeReading | None = None,
+        axes: tuple[AxisScaling, ...] = AXIS_SCALING,
         clock: Callable[[], float] = time.monotonic,
         seed: int = 1,
     ) -> None:
-        """triggered: samples only while a motion plays, with the motion's own trigger."""
+        """triggered: samples only while a motion plays, with the motion's own trigger.
+
+        probe, axes: how readings and positions are sent
+        """
         self.faults = InstrumentFaults()
         self._line = line
         self._source: Source | None = source if source or triggered else NumberedSource()
         self._triggered = triggered
+        self._probe, self._axes = probe or ProbeReading(), axes
         self._clock = clock
         self._random = np.random.default_rng(seed)
         self._lapse = 1.0

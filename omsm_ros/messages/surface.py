@@ -27,7 +27,6 @@ surface.outside: {outside} of {points} points lie where the nominal surface {nom
 surface.unlike: the points deviate from the nominal surface by {deviation:m} rms after removal of
     tilt, which itself deviates from a plane by {shape:m}: they belong to another surface, or to
     another place on it; check its parameters, and sign, unit and zero of each axis
-surface.weights: weights from {least!r} to {most!r}, expected areas
 surface.no_points: 0 points have no statistics; give one or more
 surface.spacing: spacing of a profile is {spacing!r} m, expected a positive number
 surface.intervals: spacing {spacing!r} m divides the profile into {intervals:plain} intervals; widen

@@ -59,7 +59,10 @@ def test_a_trigger_is_below_the_rate_of_what_is_averaged(bench: Any) -> None:
 
 
 def test_another_sync_left_by_somebody_else_is_set_back(bench: Any) -> None:
-    run = bench(ChrocodileEmulator, ChrocodileDevice, SIX, sync=b"xy")
+    class OwnSync(ChrocodileEmulator):
+        _sync = b"xy"
+
+    run = bench(OwnSync, ChrocodileDevice, SIX)
     run.run(4.0)
     run.end()
     assert len(run.troubles) == 1

@@ -19,19 +19,20 @@ from omsm_ros.instruments.micro_epsilon.emulator import ConfocalDtEmulator, Conf
 from omsm_ros.instruments.micro_epsilon.protocol import confocal_dtype
 
 from . import plain_wires as wires
+from . import with_commands
 from .scripted_stream import Script
 from .with_commands import WithCommands
 
 THREE = ConfocalDtSettings(axes=AXIS_SCALING, wired=(0, 1, 2))
 
 
-class Greeting(ConfocalDtEmulator):
+class Greeting(with_commands.ConfocalDtEmulator):
     """A terminal that greets with a prompt, asks for options, and answers late."""
 
     greeting = b"\xff\xfb\x01Welcome\r\n->"
 
     def work(self) -> None:
-        if self._commands is not None and self._commands.sessions and self.greeting:
+        if self._commands.sessions and self.greeting:
             self._commands.write(self.greeting)
             self.greeting = b""
         super().work()
@@ -39,7 +40,7 @@ class Greeting(ConfocalDtEmulator):
 
 @pytest.mark.parametrize("kept", ["", "2.5"])
 def test_a_greeting_is_no_answer(kept: str) -> None:
-    run = WithCommands(Greeting, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING)
+    run = WithCommands(Greeting, ConfocalDtEthernetDevice, THREE)
     usual = run.emulator.obey
     answers = {"MEASRATE": f"MEASRATE\r\nMEASRATE {kept}\r\n->"} if kept else {}
     run.emulator.obey = lambda line: answers.get(line, usual(line))
@@ -53,7 +54,7 @@ def test_a_greeting_is_no_answer(kept: str) -> None:
 
 @pytest.mark.parametrize(("said", "fits"), [("1.0", True), ("MEASRATE 5", False), ("", False)])
 def test_the_rate_is_read_back_without_echo_too(said: str, fits: bool) -> None:
-    run = WithCommands(ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING)
+    run = WithCommands(with_commands.ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE)
     usual = run.emulator.obey
     run.emulator.obey = lambda line: f"{said}\r\n->" if line == "MEASRATE" else usual(line)
     if fits:
@@ -67,13 +68,15 @@ def test_the_rate_is_read_back_without_echo_too(said: str, fits: bool) -> None:
 
 def test_a_controller_that_sends_the_intensity_first_is_read(bench: Any) -> None:
     class Turned(ConfocalDtEmulator):
+        wired = (0, 1, 2)
+
         def pack(self, measured: Any, counters: Any, times_ns: Any) -> list[bytes]:
             return [
                 turned(piece) if piece else piece
                 for piece in super().pack(measured, counters, times_ns)
             ]
 
-    run = bench(Turned, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING, wired=(0, 1, 2))
+    run = bench(Turned, ConfocalDtEthernetDevice, THREE)
     run.instrument.faults.drop_out = 7
     run.run(1.0)
     run.end()
@@ -95,7 +98,7 @@ def turned(wire: bytes) -> bytes:
 @pytest.mark.parametrize("rate", [0.5, 0.85, 2.0])
 def test_a_grossly_wrong_rate_shows_within_some_two_seconds(bench: Any, rate: float) -> None:
     """By its arrivals, for the device tells no time."""
-    run = bench(ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE, axes=AXIS_SCALING)
+    run = bench(ConfocalDtEmulator, ConfocalDtEthernetDevice, THREE)
     run.instrument.faults.rate = rate
     run.run(4.0)
     assert 0 < run.delivered < 1300
@@ -125,7 +128,7 @@ def test_noise_is_no_sample(bench: Any, noise: Any, values: Any, trigger: str) -
 
 def test_values_of_a_frame_that_are_not_wanted_are_passed_over(bench: Any) -> None:
     wanted = ConfocalDtSettings(values=("distance", "-", "counter"))
-    run = bench(ConfocalDtSerialEmulator, ConfocalDtDevice, wanted, width=3)
+    run = bench(ConfocalDtSerialEmulator, ConfocalDtDevice, wanted)
     run.resolution, run.modulus = 100e-6 / 2**16, 2**18
     run.run(1.0)
     run.end()

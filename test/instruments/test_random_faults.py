@@ -49,10 +49,13 @@ class Kind(NamedTuple):
     emulator: type
     device: type
     settings: Any
-    options: tuple[tuple[str, Any], ...] = ()
     checked: bool = False
     resolution: float = 2e-11
     modulus: int = 2**16
+
+
+class XyzEmulator(ConfocalDtEmulator):
+    wired = (0, 1, 2)
 
 
 MICRO = ProbeReading()  # 100 µm
@@ -64,10 +67,9 @@ KINDS = {
     ),
     "packet": Kind(ChrocodilePacketEmulator, ChrocodilePacketDevice, SIX, checked=True),
     "confocalDT, Ethernet": Kind(
-        ConfocalDtEmulator,
+        XyzEmulator,
         ConfocalDtEthernetDevice,
         ConfocalDtSettings(axes=AXIS_SCALING, wired=(0, 1, 2)),
-        (("axes", AXIS_SCALING), ("wired", (0, 1, 2))),
         checked=True,
         modulus=2**32,
     ),
@@ -75,7 +77,6 @@ KINDS = {
         ConfocalDtSerialEmulator,
         ConfocalDtDevice,
         ConfocalDtSettings(values=("distance", "intensity", "counter")),
-        (("width", 3),),
         resolution=100e-6 / 2**16,
         modulus=2**18,
     ),
@@ -125,7 +126,7 @@ def stories(kind: Kind) -> st.SearchStrategy[Story]:
 
 
 def play(bench: Any, kind: Kind, story: Story) -> None:
-    run = bench(kind.emulator, kind.device, kind.settings, interval=0.02, **dict(kind.options))
+    run = bench(kind.emulator, kind.device, kind.settings, interval=0.02)
     run.resolution, run.modulus = kind.resolution, kind.modulus
     run.run(0.5)
     for fault, pause in story:

@@ -18,10 +18,11 @@ from omsm_ros.instruments.chrocodile.emulator import ChrocodileEmulator
 from omsm_ros.instruments.emulator import Instrument
 from omsm_ros.instruments.emulator_factory import TcpServer, emulated, line_for
 from omsm_ros.instruments.factory import make_device, make_reference
-from omsm_ros.instruments.micro_epsilon.emulator import CapaNcdtEmulator
 from omsm_ros.instruments.parameters import REFERENCE_PARAMETERS, defaults
 from omsm_ros.instruments.reader import DeviceReader, State
 from omsm_ros.instruments.stream import StreamDevice
+
+from .with_commands import CapaNcdtEmulator
 
 SOON = 20.0
 

@@ -80,7 +80,7 @@ def level(
     """Return the deviation (n,) [m] minus its least-squares piston and, with ``tilt``, its tilt.
 
     The piston is the unknown stand-off of the probe; the tilt is the seat of the part on the
-    spindle. ``weights`` (n,) as for :func:`statistics`.
+    spindle. ``weights`` (n,): the points stand for areas ∝ them.
     """
     weight = np.ones_like(deviation) if weights is None else weights
     _check(x=x, y=y, deviation=deviation, weights=weight)
@@ -110,24 +110,6 @@ def mismatch(x: FloatArray, y: FloatArray, height: FloatArray, nominal: Surface)
     if shape < _ROUNDING_M or left < max(_UNLIKE * shape, _FORM_M):
         return []
     return [Notice("surface.unlike", deviation=left, shape=shape)]
-
-
-def statistics(deviation: FloatArray, weights: FloatArray) -> FormStatistics:
-    """Return the statistics of a deviation (n,) [m] of points with areas ∝ ``weights`` (n,).
-
-    Raises DataError for values that are not finite or weights that are not areas.
-    """
-    _check(deviation=deviation, weights=weights)
-    total = float(np.sum(weights))
-    if np.any(weights < 0) or total <= 0:
-        raise DataError("surface.weights", least=float(weights.min()), most=float(weights.max()))
-    square = np.square(deviation)
-    return FormStatistics(
-        peak_to_valley=float(np.ptp(deviation)),
-        rms=float(np.sqrt(np.mean(square))),
-        rms_area_weighted=float(np.sqrt(np.sum(weights * square) / total)),
-        points=len(deviation),
-    )
 
 
 class RunningStatistics:

@@ -14,7 +14,7 @@ and clients.
 
 import re
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -55,9 +55,9 @@ from omsm_ros.instruments.chrocodile.telegram import (
     Records,
     unit_of,
 )
-from omsm_ros.instruments.emulator import AXIS_SCALING, Instrument, InstrumentLink, Measured, Source
+from omsm_ros.instruments.emulator import Instrument, Measured
 from omsm_ros.instruments.emulator_factory import OWN_ENCODERS, TWIN_READING, Emulated
-from omsm_ros.instruments.scaling import AXES, AxisScaling, ProbeReading
+from omsm_ros.instruments.scaling import AXES
 from omsm_ros.units import MICROMETRE_M
 
 # The exposure is a multiple of this, so rates are rounded [s].
@@ -112,21 +112,7 @@ class ChrocodileEmulator(Instrument):
 
     counter_range = 2**16
 
-    def __init__(
-        self,
-        line: InstrumentLink,
-        source: Source | None = None,
-        *,
-        probe: ProbeReading | None = None,
-        axes: tuple[AxisScaling, ...] = AXIS_SCALING,
-        sync: bytes = SYNC,
-        **options: Any,
-    ) -> None:
-        self._probe = probe or ProbeReading()
-        self._axes = axes
-        self._sync = sync
-        self._requests = RequestParser()
-        super().__init__(line, source, **options)
+    _sync = SYNC
 
     def reset(self) -> None:
         """Go back to the factory's settings: ASCII, distance and intensity, 1 kHz, free running."""
