@@ -10,6 +10,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
 
 import generated  # noqa: E402 - it lies beside this file
+from docutils import nodes  # noqa: E402
 from sphinx.util.inspect import TypeAliasForwardRef  # noqa: E402
 
 from omsm_ros import __version__  # noqa: E402
@@ -19,6 +20,7 @@ author = "The omsm_ros developers"
 version = release = __version__
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_member_order = "bysource"
+add_module_names = False
 autodoc_typehints = "description"
 autodoc_type_aliases = dict.fromkeys(("ArrayLike", "FloatArray"), "array")
 TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # else a union shows the class
@@ -78,8 +80,15 @@ def parameters_as_fields(app, what, name, obj, options, lines):
     lines[:] = [line for line in made if line is not None]
 
 
+def colons(app, page):
+    """Replace the two hyphens after the name of a parameter by a colon."""
+    for text in list(page.findall(lambda node: isinstance(node, nodes.Text) and node == " -- ")):
+        text.parent.replace(text, nodes.Text(": "))
+
+
 def setup(app):
     """Write the generated pages before Sphinx reads any page."""
     generated.write(ROOT / "docs" / "reference")
     app.connect("source-read", outside_as_text)
     app.connect("autodoc-process-docstring", parameters_as_fields)
+    app.connect("doctree-read", colons)

@@ -106,18 +106,15 @@ def parameters() -> str:
 
 def messages() -> str:
     """Return the definitions of the messages and services of ``omsm_msgs``."""
-    lines = ["# Messages and services"]
+    lines = [
+        "# Messages and services",
+        "",
+        "Messages are in `omsm_msgs/msg`, services in `omsm_msgs/srv`.",
+    ]
     for path in sorted((ROOT / "msg_defs").glob("*/*.*")):
         if path.suffix in (".msg", ".srv"):
             text = path.read_text(encoding="utf-8").rstrip()
-            lines += [
-                "",
-                f"## omsm_msgs/{path.parent.name}/{path.stem}",
-                "",
-                "```text",
-                text,
-                "```",
-            ]
+            lines += ["", f"## {path.stem}", "", "```text", text, "```"]
     return "\n".join(lines) + "\n"
 
 

@@ -85,7 +85,7 @@ def live(folder: Path) -> None:
             time.sleep(1.0)
         browser = subprocess.Popen(
             ["chromium", "--headless=new", "--no-sandbox", "--hide-scrollbars",
-             "--window-size=1380,900", f"--remote-debugging-port={port}",
+             "--window-size=1380,1060", f"--remote-debugging-port={port}",
              f"--user-data-dir={folder / 'browser'}", page],
             stderr=subprocess.DEVNULL,
         )  # fmt: skip

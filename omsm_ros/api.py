@@ -58,8 +58,10 @@ def identify(
     ----------
     recording
         A recording, or the positions of the encoder [m], (n,).
-    distance, period
-        Reading of the probe [m], (n,), and sample period [s], where arrays are given.
+    distance
+        Reading of the probe [m], (n,), where arrays are given.
+    period
+        Sample period [s], where arrays are given.
     order
         Number of poles; 0 lets the data choose.
     settings
@@ -229,8 +231,10 @@ def adjust(
         ``SOURCES.yaml`` with the declared sources, the priors of the adjustment.
     clocking
         Angle by which the part is turned on the chuck in each scan [rad].
-    accuracy, tolerance
-        Expanded uncertainty asked for, and tolerance of the peak to valley [m].
+    accuracy
+        Expanded uncertainty asked for [m].
+    tolerance
+        Tolerance of the peak to valley [m].
 
     Returns
     -------
@@ -362,8 +366,12 @@ def plan(
         Surface of the part; None plans a step test.
     period
         Sample period [s].
-    rpm, radius, feed
-        Speed of the spindle, radius at the start [m], and feed per turn [m].
+    rpm
+        Speed of the spindle [1/min].
+    radius
+        Radius at the start [m].
+    feed
+        Feed per turn [m].
     dialect
         Of the controller: ``linuxcnc``, ``fanuc``, ``siemens`` or ``nanotech``.
     **steps

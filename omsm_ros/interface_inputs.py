@@ -165,10 +165,14 @@ def simulate(
     ----------
     motion
         ``"step_test"``, or ``"scan"`` of its mirror.
-    seed, part
-        Of noise and part; of the part alone, for several scans of one part.
-    rpm, radius
-        Speed of the spindle, and radius of the scan [m].
+    seed
+        Of noise and part.
+    part
+        Seed of the part alone, for several scans of one part.
+    rpm
+        Speed of the spindle [1/min].
+    radius
+        Radius of the scan [m].
     outward
         True for a scan from the centre.
 

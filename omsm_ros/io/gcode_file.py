@@ -11,7 +11,7 @@ import numpy as np
 
 from omsm_ros.core.kinematics.planner import PlannedPath
 from omsm_ros.core.kinematics.trajectories import StepPlan
-from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, MILLISECOND_S
+from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M
 
 # Rest at the start of a path, in which the transient of the approach decays [s].
 _SETTLE_S = 0.3
@@ -21,36 +21,37 @@ _SETTLE_S = 0.3
 class Dialect:
     """Words of a controller.
 
-    comment, metric, dwell: patterns and words;  dwell_unit: value of one in the dwell word [s]
-    dwell_decimals: 0 for a word without a decimal point;  frame, end: first and last lines
-    before_scan: path tolerance;  measuring, measured: around what the probe measures
-    c_word: of the spindle;  c_relative: it takes increments, because absolute angles
-    are reduced to one turn;  decimals: of X and Z [mm]
+    comment, metric, dwell: patterns and words;  dwell_decimals: of its time [s]
+    frame, end: first and last lines;  before_scan: path tolerance, X by radius
+    measuring, measured: around what the probe measures;  c_word: of the spindle
+    increments: axes that take increments in a scan; absolute angles would be reduced to one turn
+    decimals: of X and Z [mm]
     note: what the controller must be set to
     """
 
     comment: str
     metric: str
     dwell: str
-    dwell_unit: float = 1.0
     dwell_decimals: int = 6
     frame: tuple[str, ...] = ()
     before_scan: tuple[str, ...] = ()
     measuring: tuple[str, ...] = ()
     measured: tuple[str, ...] = ()
     c_word: str = "C{}"
-    c_relative: bool = False
+    increments: str = ""
     decimals: int = 7
     end: tuple[str, ...] = ("M30",)
     note: str = ""
 
     def remark(self, text: str) -> str:
-        """Return a comment; a bracket would end that of some controllers."""
-        return self.comment.format(text.translate({ord("("): "[", ord(")"): "]"}))
+        """Return a comment; one in brackets has capitals, and no brackets, colon or plus."""
+        if self.comment == "({})":
+            text = text.upper().translate(str.maketrans("();", ",,,", ":+"))
+        return self.comment.format(text)
 
     def rest(self, time: float) -> str:
         """Return the block that waits for ``time`` [s]."""
-        return self.dwell.format(f"{time / self.dwell_unit:.{self.dwell_decimals}f}")
+        return self.dwell.format(f"{time:.{self.dwell_decimals}f}")
 
 
 DIALECTS = {
@@ -68,23 +69,21 @@ DIALECTS = {
     "fanuc": Dialect(
         comment="({})",
         metric="G21",
-        dwell="G04 P{}",
-        dwell_unit=MILLISECOND_S,
-        dwell_decimals=0,
+        dwell="G04 X{}",  # seconds; the unit of P depends on the increment system
+        dwell_decimals=3,
         frame=("%", "O0001"),
-        c_word="H{}",
-        c_relative=True,
+        increments="XZC",  # by G91; U, W and H are words of G-code system A
         decimals=6,
         end=("M30", "%"),
-        note="G-code system B or C, increment system IS-E, H: increment of C",
+        note="G-code system B or C, increment system IS-E, X by radius",
     ),
     "siemens": Dialect(
         comment="; {}",
-        metric="G71",
+        metric="G710",  # G71 would leave the unit of the feed to a setting
         dwell="G4 F{}",
-        before_scan=("G642", "CTOL=0.0001"),
+        before_scan=("DIAMOF", "G642", "CTOL=0.0001"),
         c_word="C=IC({})",
-        c_relative=True,
+        increments="C",
         note="SINUMERIK 840D; C is a rotary axis, not the spindle",
     ),
     "nanotech": Dialect(
@@ -105,8 +104,9 @@ def steps_gcode(plan: StepPlan, dialect: str = "linuxcnc") -> str:
         "step test for the identification of the measuring loop",
         f"{len(plan.starts)} edges, rise {plan.rise * 1e3:g} ms, set as S-curve time",
     ]
-    body = [words.metric, *words.measuring, "G91"]
-    step = words.dwell_unit * 10.0**-words.dwell_decimals
+    # On a lathe, feeds may be per revolution until G94.
+    body = [words.metric, *words.measuring, "G91", "G94"]
+    step = 10.0**-words.dwell_decimals
     ends = [*plan.starts[1:], plan.duration]
     body.append(words.rest(plan.starts[0]))
     for start, height, following in zip(plan.starts, plan.heights, ends, strict=True):
@@ -133,7 +133,13 @@ def path_gcode(
     measures: whether the probe measures along the path
     """
     words = DIALECTS[dialect]
-    turned = np.round(np.degrees(path.c), 6)
+    digits = words.decimals
+    places = [np.round(v / MILLIMETRE_M, digits) for v in (path.x, path.z)]
+    places.append(np.round(np.degrees(path.c), 6))
+    x, z, c = (
+        np.diff(v) if axis in words.increments else v[1:]
+        for axis, v in zip("XZC", places, strict=True)
+    )
     per_minute = 60 / path.segment
     lines = [
         *remarks,
@@ -142,18 +148,15 @@ def path_gcode(
         f"largest acceleration to {np.degrees(path.c_acceleration):.0f} deg/s2",
     ]
 
-    def at(axis: str, value: float) -> str:
-        return f"{axis}{value / MILLIMETRE_M:.{words.decimals}f}"
-
-    x, z, c = path.x, path.z, np.diff(turned) if words.c_relative else turned[1:]
-    body = [words.metric, "G90", *words.before_scan]
-    body += [f"G0 {at('X', x[0])}", f"G0 {at('Z', z[0])} C{turned[0]:.5f}"]
-    body += [words.rest(_SETTLE_S), *(words.measuring if measures else ()), "G93"]
+    body = [words.metric, "G90", "G94", *words.before_scan, f"G0 X{places[0][0]:.{digits}f}"]
+    body += [f"G0 Z{places[1][0]:.{digits}f} C{places[2][0]:.5f}", words.rest(_SETTLE_S)]
+    body += [*(words.measuring if measures else ()), "G93"]
+    body += ["G91"] if "X" in words.increments else []
     body += [
-        f"G1 {at('X', a)} {at('Z', b)} {words.c_word.format(f'{d:.6f}')} F{per_minute:.4f}"
-        for a, b, d in zip(x[1:], z[1:], c, strict=True)
+        f"G1 X{a:.{digits}f} Z{b:.{digits}f} {words.c_word.format(f'{d:.6f}')} F{per_minute:.4f}"
+        for a, b, d in zip(x, z, c, strict=True)
     ]
-    return _program(words, lines, [*body, "G94", *(words.measured if measures else ())])
+    return _program(words, lines, [*body, "G90", "G94", *(words.measured if measures else ())])
 
 
 def _program(words: Dialect, remarks: list[str], body: list[str]) -> str:

@@ -50,10 +50,10 @@ from omsm_ros.pipelines.recording import Recording
 
 SCHEMA = "omsm-spectrum/1"
 NORMALISATION = (
-    "densities are one-sided and per hertz (time) or per 1/m (path), Blackman-Harris window of "
+    "Densities are one-sided and per hertz (time) or per 1/m (path), Blackman-Harris window of "
     "mean square one: their sum times the spacing is the mean square; a line of amplitude a "
     "(half of peak to valley) has the power a²/2; significance is that of a normal variable with "
-    "the probability that noise alone gives such a line anywhere in the spectrum"
+    "the probability that noise alone gives such a line anywhere in the spectrum."
 )
 # Twenty minutes at 1 kHz; more samples do not improve the lines.
 MOST_SAMPLES = 1_250_000

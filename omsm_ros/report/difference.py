@@ -34,6 +34,7 @@ def profiles(found: Comparison) -> dict[str, Figure]:
     x, y = matched.x - x0, matched.y - y0
     a, b = matched.without_fit(np.stack([matched.a, matched.b]))
     spread = None if agreement is None else agreement.uncertainty
+    shown = (a, b, matched.difference)
     made = {}
     for name, (angle, title, position) in _LINES.items():
 
@@ -43,13 +44,11 @@ def profiles(found: Comparison) -> dict[str, Figure]:
                 half_width=_HALF_WIDTH_CELLS * side, spacing=_SEGMENT_CELLS * side,
             )  # fmt: skip
 
-        cuts = [line(values) for values in (a, b, matched.difference)]
+        cuts = [line(values) for values in shown]
         band = None if spread is None else line(spread)
         if len(cuts[0].position):
             made[name] = _profile(cuts, band, f"Profile {title}", position)
-    rings = [
-        radial_profile(x, y, values, spacing=2 * side) for values in (a, b, matched.difference)
-    ]
+    rings = [radial_profile(x, y, values, spacing=2 * side) for values in shown]
     if len(rings[0].position):
         made["profile_radius"] = _profile(rings, None, "Mean over each ring", "radius")
     return made
@@ -162,17 +161,11 @@ def headlines(facts: Mapping[str, Any]) -> list[Headline]:
     """Return the main results."""
     difference = facts["difference"]
     spread = difference["uncertainty"]
+    extent = f"peak to valley {quantity(difference['peak_to_valley'], 'm')}"
+    bound = "not evaluated" if spread is None else quantity(COVERAGE_FACTOR * spread, "m")
     found = [
-        Headline(
-            "Difference, rms",
-            quantity(difference["rms"], "m"),
-            f"peak to valley {quantity(difference['peak_to_valley'], 'm')}",
-        ),
-        Headline(
-            "Expanded uncertainty of a point",
-            "not evaluated" if spread is None else quantity(COVERAGE_FACTOR * spread, "m"),
-            "k = 2, rms over the area",
-        ),
+        Headline("Difference, rms", quantity(difference["rms"], "m"), extent),
+        Headline("Expanded uncertainty of a point", bound, "k = 2, rms over the area"),
     ]
     if facts["within"] is not None:
         text = f"probability of such a difference {probability(facts['probability'])}"
@@ -197,11 +190,8 @@ def _numbers(facts: Mapping[str, Any]) -> Table:
         )
         for name, n in facts["e_n"].items()
     ]
-    return Table(
-        "Figures of both measurements; U: 95 % for all figures together",
-        ("A", "B", "U of the difference", "E_n"),
-        rows,
-    )
+    title = "Figures of both measurements; U: 95 % for all figures together"
+    return Table(title, ("A", "B", "U of the difference", "E_n"), rows)
 
 
 def _terms(facts: Mapping[str, Any]) -> Table:
@@ -228,8 +218,7 @@ def _sides(facts: Mapping[str, Any]) -> Table:
         ("cell", "cell size of the local fits"),
     ):
         rows.append((name, quantity(a[key], "m"), quantity(b[key], "m")))
-    sources = dict.fromkeys([*(a["sources"] or {}), *(b["sources"] or {})])
-    for source in sources:
+    for source in dict.fromkeys([*(a["sources"] or {}), *(b["sources"] or {})]):
         sizes = ((side["sources"] or {}).get(source) for side in (a, b))
         name = f"{source.replace('_', ' ')}, common to all points, rms"
         rows.append((name, *(quantity(size, "m") for size in sizes)))
@@ -253,10 +242,7 @@ def _matching(facts: Mapping[str, Any]) -> Table:
     rows += [
         ("resampling", facts["resampling"]["method"]),
         ("grid spacing", quantity(facts["resampling"]["spacing"], "m")),
-        ("errors common to both", ", ".join(facts["common_errors"]) or "none"),
-        (
-            "correlation length of errors of unknown form",
-            quantity(facts["correlation_length"], "m"),
-        ),
+        ("errors common to both", ", ".join(facts["common_errors"]).replace("_", " ") or "none"),
+        ("correlation length, unknown form", quantity(facts["correlation_length"], "m")),
     ]
     return Table("Matching", (), rows)

@@ -37,7 +37,6 @@ COLOURS = {
     UNDECIDED: "#1F2933",
 }
 _WIDTH_IN, _ROW_IN = 9.2, 2.5
-_MOST_NAMED = 8
 
 
 def over_time(scans: Sequence[tuple[StudiedScan, Sequence[NamedLine]]]) -> Figure:

@@ -14,18 +14,19 @@ from omsm_ros.core.surface.nominal import PAPER_MIRROR
 from omsm_ros.io.gcode_file import DIALECTS, path_gcode, steps_gcode
 from omsm_ros.pipelines.plan_scans import scan_path
 
-# How a block waits, as the manuals say: pattern and value of one in seconds.
+# How a block waits, in seconds. FANUC counts P in steps of the increment system, and takes a
+# decimal point with X alone, where the thousandth is the finest that every such system has.
 DWELL = {
-    "linuxcnc": (r"G4 P(\d+\.\d+)$", 1.0),
-    "fanuc": (r"G04 P(\d+)$", 1e-3),  # a decimal point is refused
-    "siemens": (r"G4 F(\d+\.\d+)$", 1.0),
-    "nanotech": (r"G04 P(\d+\.\d+)$", 1.0),
+    "linuxcnc": r"G4 P(\d+\.\d+)$",
+    "fanuc": r"G04 X(\d+\.\d{3})$",
+    "siemens": r"G4 F(\d+\.\d+)$",
+    "nanotech": r"G04 P(\d+\.\d+)$",
 }
 COMMENT = {
     "linuxcnc": r";[^\n]*",
     "siemens": r";[^\n]*",
-    "fanuc": r"\([^()\n]*\)",
-    "nanotech": r"\([^()\n]*\)",
+    "fanuc": r"\([A-Z0-9 .,/=_-]*\)",
+    "nanotech": r"\([A-Z0-9 .,/=_-]*\)",
 }
 LAST = {"linuxcnc": "M2", "fanuc": "%", "siemens": "M30", "nanotech": "M30"}
 
@@ -39,18 +40,18 @@ def blocks(text, dialect):
 
 def edges(text, dialect):
     """Yield start [s] and height [m] of each move, and the end of the program last."""
-    pattern, unit = DWELL[dialect]
     now = 0.0
     for block in blocks(text, dialect):
-        if waited := re.fullmatch(pattern, block):
-            now += float(waited[1]) * unit
+        if waited := re.fullmatch(DWELL[dialect], block):
+            now += float(waited[1])
         elif moved := re.fullmatch(r"G1 Z(\S+) F(\S+)", block):
             height, feed = (float(part) * 1e-3 for part in moved.groups())
             yield now, height
             now += abs(height) / feed * 60
         else:
             assert block in (
-                "G21", "G71", "G91", "G90", "%", "O0001", "M2", "M30", "M64 P0", "M65 P0",
+                "G21", "G710", "G71", "G91", "G94", "G90", "%", "O0001", "M2", "M30",
+                "M64 P0", "M65 P0",
             )  # fmt: skip
     yield now, 0.0
 
@@ -74,20 +75,23 @@ def test_a_scan_turns_steadily_to_its_end(dialect):
     design = ScanDesign(rpm=30.0, start=1e-3, end=0.0, pitch=5e-4)
     path = plan_path(partial(scan_path, design, PAPER_MIRROR), design.duration, 1e-3, 1e-7)
     text = blocks(path_gcode(path, ["a scan"], dialect), dialect)
-    word = {"fanuc": r"H(\S+)", "siemens": r"C=IC\((\S+)\)"}.get(dialect, r"C(\S+)")
+    word = r"C=IC\((\S+)\)" if dialect == "siemens" else r"C(\S+)"
     moves = [re.fullmatch(rf"G1 X(\S+) Z(\S+) {word} F(\S+)", b) for b in text if b[:3] == "G1 "]
     read = np.array([[float(v) for v in move.groups()] for move in moves])
     at = np.cumsum(read[:, 2]) if dialect in ("fanuc", "siemens") else read[:, 2]
+    first = text.index("G93")
+    if text[first + 1] == "G91":
+        start = re.search(r"G0 X(\S+)\nG0 Z(\S+)", "\n".join(text[:first])).groups()
+        read[:, :2] = np.cumsum(read[:, :2], axis=0) + np.array(start, float)
     np.testing.assert_allclose(read[:, 0], path.x[1:] * 1e3, atol=6e-7)
     np.testing.assert_allclose(read[:, 1], path.z[1:] * 1e3, atol=6e-7)
     np.testing.assert_allclose(at, np.degrees(path.c[1:]), atol=2e-6)
     # Inverse time: a segment takes 1/F minutes; the spindle turns at its speed.
     assert 60 / read[0, 3] * len(read) == pytest.approx(design.duration, rel=1e-6)
-    first = text.index("G93")
     assert any(block.startswith("G0 X") for block in text[:first])
     assert "G94" in text[first:]
 
 
 def test_the_command_writes_the_dialect(tmp_path):
     assert cli.main(["plan", "steps", "--dialect", "fanuc", "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "steps.nc").read_text().startswith("%\nO0001\n(step test")
+    assert (tmp_path / "steps.nc").read_text().startswith("%\nO0001\n(STEP TEST")
