@@ -9,15 +9,15 @@ draws of the map.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import scipy  # whose parts are loaded when they are used
 
 from omsm_ros.core.adjustment.evidence import evidence_of
-from omsm_ros.core.adjustment.network import Solution
-from omsm_ros.core.adjustment.part_terms import FormTerms
+from omsm_ros.core.adjustment.network import Solution, solve
+from omsm_ros.core.adjustment.part_terms import FREE_M, FormTerms
 from omsm_ros.core.adjustment.refutation import ODDS_ABSENT, SURE, Doubt
 from omsm_ros.core.adjustment.sources import FREE, Family, base_name
 from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences
@@ -157,7 +157,8 @@ class Effect(NamedTuple):
     left: by what scans and prior leave open;  free: by what the scans alone leave open if the prior
         is worth nothing, and the family may have its size ``wide``
     shape: change of the map by the size ``wide`` of each parameter (n, size) [m]
-    known: information that the scans have of the parameters over ``wide`` (size, size)
+    known: information that the scans have of the parameters over ``wide``, whatever form the part
+        has (size, size)
     """
 
     left: float
@@ -176,7 +177,10 @@ def effects_on_form(
     made = _Made.of(solution, nominal, removed)
     # L P, with P the covariance of the parameters that take part.
     through = made.free(made.rows[:, solution.active] @ solution.covariance)
-    found = {}
+    # What forms are probable speaks once only, where the form is compared with each family.
+    bands = dict.fromkeys(solution.scales.bands, FREE_M**2)
+    scales, found = replace(solution.scales, bands=bands), {}
+    any_part = solve(solution.network, solution.y, scales, solution.sizes)
     for family in solution.network.families:
         if family.name not in solution.sizes:
             continue
@@ -185,8 +189,8 @@ def effects_on_form(
         change = through[:, here] @ np.linalg.pinv(covariance, rcond=1e-10)
         share, axes = np.linalg.eigh(covariance)
         left = _rms(made.places, change @ (axes * np.sqrt(np.maximum(share, 0.0))))
-        root = evidence_of(solution, family).free
-        free = _rms(made.places, change @ root)
+        free = _rms(made.places, change @ evidence_of(solution, family).free)
+        root = evidence_of(any_part, family).free
         # Without the plausible size itself: (root rootᵀ)⁻¹ = information + wide⁻².
         known = family.wide**2 * np.linalg.pinv(root @ root.T, rcond=1e-10) - np.eye(family.size)
         found[family.name] = Effect(left, max(left, free), family.wide * change, known)
@@ -210,13 +214,9 @@ class Contribution:
 
 
 def largest_contribution(
-    solution: Solution,
-    effects: Mapping[str, Effect],
-    nominal: Surface,
-    removed: Sequence[str],
-    doubts: Sequence[Doubt],
-    accuracy: float | None,
-) -> Contribution | None:
+    solution: Solution, effects: Mapping[str, Effect], nominal: Surface,
+    removed: Sequence[str], doubts: Sequence[Doubt], accuracy: float | None,
+) -> Contribution | None:  # fmt: skip
     """Return the source with the largest effect on the form, and the size that ``accuracy`` allows.
 
     effects: of :func:`effects_on_form`;  doubts: as for :func:`form_map`
@@ -275,12 +275,9 @@ class _Made:
 
     @classmethod
     def of(
-        cls,
-        solution: Solution,
-        nominal: Surface | None,
-        removed: Sequence[str],
+        cls, solution: Solution, nominal: Surface | None, removed: Sequence[str],
         places: Places | None = None,
-    ) -> _Made:
+    ) -> _Made:  # fmt: skip
         """Return the map of ``solution`` at ``places``; None: at all that were scanned."""
         net, scales = solution.network, solution.scales
         places = places or places_of(solution)

@@ -31,7 +31,7 @@ _CONE = 1
 # Knots over the radius, a turn apart at least.
 _MOST_KNOTS, _TURNS_A_KNOT = 64, 1
 # A form that large is no form error of a finished part: no prior at all.
-_FREE_M = 1e-5
+FREE_M = 1e-5
 # Of the radius: a spiral about the axis begins and ends within a pitch of where it should.
 _CENTRED = 0.03
 # Rings of half a millimetre on a part of 25 mm; two turns at least in a ring.
@@ -84,8 +84,8 @@ class PartModel:
     @property
     def free(self) -> FloatArray:
         """Standard deviations where nothing is known [m]; 0 for those that are estimated."""
-        terms = [_FREE_M if t.n <= FREE_DEGREE else 0.0 for t in self.terms]
-        return np.array([*terms, _FREE_M, *np.zeros(self.ring_knots)])
+        terms = [FREE_M if t.n <= FREE_DEGREE else 0.0 for t in self.terms]
+        return np.array([*terms, FREE_M, *np.zeros(self.ring_knots)])
 
     @property
     def degrees(self) -> IntArray:

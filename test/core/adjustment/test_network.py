@@ -1,5 +1,6 @@
 """The normal equations against dense generalised least squares, and the blocks against sums."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from plain_world import MIRROR, RADIUS_M, Machine
 from omsm_ros.core.adjustment.adjust import _network
 from omsm_ros.core.adjustment.blocks import SECTORS, block_begins, white_noise
 from omsm_ros.core.adjustment.evidence import evidence_of
-from omsm_ros.core.adjustment.figures import places_of
+from omsm_ros.core.adjustment.figures import effects_on_form, places_of
 from omsm_ros.core.adjustment.network import Factor, solve
 from omsm_ros.core.adjustment.part_terms import part_model
 from omsm_ros.core.adjustment.refutation import start_scales
@@ -143,6 +144,19 @@ def test_score_of_a_family_equals_its_fit(small):
     chi_square = estimate @ np.linalg.solve(free.covariance_of(here), estimate)
     assert evidence.chi_square == pytest.approx(chi_square, rel=1e-3)
     assert evidence.dof == 2
+
+
+def test_a_smooth_part_does_not_tell_the_size_of_a_source(small):
+    """The adjustment knows a source better where the part is smooth; the scans alone do not."""
+    _, network, sizes = small
+    family = next(f for f in network.families if f.name == "parallelism")
+    scales, y = start_scales(network, 1e-9), network.blocks.deviation
+    bands = [dict.fromkeys(scales.bands, height**2) for height in (1e-7, 1e-11)]
+    rough, smooth = (solve(network, y, replace(scales, bands=b), sizes) for b in bands)
+    left = [np.linalg.norm(evidence_of(s, family).free) for s in (rough, smooth)]
+    assert left[1] < 0.6 * left[0]
+    known = [effects_on_form(s, MIRROR)[family.name].known for s in (rough, smooth)]
+    np.testing.assert_allclose(*known, rtol=1e-6, atol=1e-6)
 
 
 def test_white_noise_is_separated_from_a_slow_form():
