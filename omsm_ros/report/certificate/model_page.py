@@ -9,7 +9,7 @@ from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, percent, plain, probability, quantity
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as drawn
-from omsm_ros.report.certificate.tables import known_rows, texts
+from omsm_ros.report.certificate.tables import known_rows, limit_rows, texts
 from omsm_ros.report.page_parts import (
     Headline,
     Issue,
@@ -19,7 +19,7 @@ from omsm_ros.report.page_parts import (
     picture,
     present,
 )
-from omsm_ros.report.tables import Table, mapping_table, part
+from omsm_ros.report.tables import Table, part
 from omsm_ros.report.verdict import PageVerdict
 
 BAND, RECORD, CORRELATION = "band", "record", "correlation"
@@ -78,26 +78,20 @@ def verdict_on_model(model: SampledModel) -> PageVerdict:
         return PageVerdict("bad", "Rejected", tuple(reasons) or ("no reason is given",))
     if not stated:
         return PageVerdict("unknown", "Not judged", ("the model has no certificate",))
-    return PageVerdict(
-        "care" if warnings else "good", stated[:1].upper() + stated[1:], tuple(warnings)
-    )
+    level = "care" if warnings else "good"
+    return PageVerdict(level, stated[:1].upper() + stated[1:], tuple(warnings))
 
 
 def _headlines(model: SampledModel, run: FreeRun) -> list[Headline]:
     certificate = model.certificate
+    valid = "; ".join(" to ".join(quantity(end, "Hz") for end in ends) for ends in model.valid)
+    half = quantity(0.5 / model.sections.period, "Hz")
+    hidden = percent(certificate.get("predicted"), 4)
     return [
         Headline("Free run accounts for", percent(run.explained, 4), "of this record"),
         Headline("Residual, rms", plain(run.rms, 4), "in the units of the output"),
-        Headline(
-            "Hidden parts accounted for",
-            percent(certificate.get("predicted"), 4),
-            "when the model was identified",
-        ),
-        Headline(
-            "Valid",
-            "; ".join(" to ".join(quantity(end, "Hz") for end in ends) for ends in model.valid),
-            f"half the sampling rate is {quantity(0.5 / model.sections.period, 'Hz')}",
-        ),
+        Headline("Hidden parts accounted for", hidden, "when the model was identified"),
+        Headline("Valid", valid, f"half the sampling rate is {half}"),
         Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.sections.hold}"),
     ]
 
@@ -146,4 +140,5 @@ def _identity(model: SampledModel, issue: Issue) -> Table:
 
 def _limits(certificate: Mapping[str, Any]) -> Table:
     limits = part(certificate, "limits")
-    return mapping_table("Limits of the verdict", limits if isinstance(limits, Mapping) else {})
+    rows = limit_rows(limits if isinstance(limits, Mapping) else {})
+    return Table("Limits of the verdict", (), known_rows(rows, 1))

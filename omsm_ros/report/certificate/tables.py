@@ -232,16 +232,21 @@ _LIMITS = (
     ("χ² where the axis moves, at most", "chi_square_greatest", ""),
     ("valid range, to at least", "valid_up_to_least_hz", "Hz"),
     ("delay that is harmless on the intended scan", "harmless_delay_s", "s"),
+    ("share of hidden parts accounted for, at least", "predicted_least", ""),
 )
+
+
+def limit_rows(limits: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return names and values of the limits of a calibration or model."""
+    return [
+        (name, quantity(limits.get(key), unit) if unit else plain(limits.get(key)))
+        for name, key, unit in _LIMITS
+    ]
 
 
 def limit_table(certificate: Certificate) -> Table:
     """Return what the verdict was measured against."""
-    limits, use = certificate.limits, certificate.validity.use
-    rows = [
-        (name, quantity(limits.get(key), unit) if unit else plain(limits.get(key)))
-        for name, key, unit in _LIMITS
-    ]
+    rows, use = limit_rows(certificate.limits), certificate.validity.use
     rows.append(("motion taken from", certificate.origin.input or NOTHING))
     if use is not None:
         highest = quantity(use.highest_hz, "Hz")
