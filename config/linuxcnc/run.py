@@ -23,7 +23,8 @@ def until(what, reached, patience=60.0):
             if reached():
                 return
             found = errors.poll()
-            if found:
+            # It also hands on messages to the operator.
+            if found and found[0] in (linuxcnc.NML_ERROR, linuxcnc.OPERATOR_ERROR):
                 sys.exit(f"LinuxCNC, {what}: {found[1]}")
         if time.monotonic() > end:
             sys.exit(f"LinuxCNC, {what}: no answer in time {found or ''}")
