@@ -22,6 +22,7 @@ extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 autodoc_member_order = "bysource"
 add_module_names = False
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented_params"
 autodoc_type_aliases = dict.fromkeys(("ArrayLike", "FloatArray"), "array")
 TypeAliasForwardRef.__repr__ = lambda alias: alias.name  # else a union shows the class
 # Typographic dashes would change the text of options such as --fit.

@@ -86,11 +86,11 @@ def _headlines(model: SampledModel, run: FreeRun) -> list[Headline]:
     certificate = model.certificate
     valid = "; ".join(" to ".join(quantity(end, "Hz") for end in ends) for ends in model.valid)
     half = quantity(0.5 / model.sections.period, "Hz")
-    hidden = percent(certificate.get("predicted"), 4)
+    predicted = percent(certificate.get("predicted"), 4)
     return [
         Headline("Free run accounts for", percent(run.explained, 4), "of this record"),
         Headline("Residual, rms", plain(run.rms, 4), "in the units of the output"),
-        Headline("Hidden parts accounted for", hidden, "when the model was identified"),
+        Headline("Hidden parts accounted for", predicted, "when the model was identified"),
         Headline("Valid", valid, f"half the sampling rate is {half}"),
         Headline("Poles", str(certificate.get("order", NOTHING)), f"input: {model.sections.hold}"),
     ]
