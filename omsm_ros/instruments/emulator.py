@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,18 +40,8 @@ class Measured:
         return len(self.distance)
 
 
-class Source(Protocol):
-    """Supplies the samples that an instrument measures, one for each trigger."""
-
-    length: float
-    period: float
-
-    def take(self, first: int, count: int) -> Measured:
-        """Return samples ``first`` to ``first + count``, as far as the length reaches."""
-
-
 class RecordingSource:
-    """Supplies a motion of the twin, once."""
+    """Supplies a motion of the twin, once: a sample for each trigger."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -59,6 +49,7 @@ class RecordingSource:
         self.period = recording.axes.sample_period
 
     def take(self, first: int, count: int) -> Measured:
+        """Return samples ``first`` to ``first + count``, as far as the length reaches."""
         part = slice(first, first + count)
         axes, distance = self._recording.axes, self._recording.distance
         size = len(axes.z[part])
@@ -77,9 +68,7 @@ class NumberedSource:
     All channels follow from k: see ``NumberedSource.take``.
     """
 
-    def __init__(self, period: float = 1e-3) -> None:
-        self.length = math.inf
-        self.period = period
+    length, period = math.inf, 1e-3
 
     def take(self, first: int, count: int) -> Measured:
         """Return distance (10 + k mod 80) µm, y -k nm, z k mod 1000 µm, b k µrad, c k mrad."""
@@ -92,6 +81,7 @@ class NumberedSource:
         )
 
 
+Source: TypeAlias = RecordingSource | NumberedSource
 # The encoders of an emulated cell. One turn is 2^28 counts: 32 bits hold 16 whole turns, so
 # nothing is lost when they wrap.
 _LINEAR = AxisScaling(counts_per_unit=1e10, wrap=2**32)
@@ -148,7 +138,7 @@ class InstrumentFaults:
 class Instrument:
     """A device that is switched on when made; ``step`` does what is due."""
 
-    counter_range = 2**16
+    counter_range = 2**32
 
     def __init__(
         self,
@@ -194,9 +184,6 @@ class Instrument:
         """Return whether samples are to be sent."""
         return True
 
-    def work(self) -> None:
-        """Serve other lines than that of the samples."""
-
     def greet(self) -> None:
         """Send the greeting to a new client."""
 
@@ -227,7 +214,6 @@ class Instrument:
                 raise
 
     def _exchange(self, now: float, stop: threading.Event | None) -> None:
-        self.work()
         data = self._line.read()
         if self._line.sessions != self._session:
             self._session = self._line.sessions

@@ -37,7 +37,7 @@ class TcpServer:
 
     A second client is refused at once, as by a device with one connection. Bytes written without a
     client are lost; a client that does not read delays the writer. ``sessions`` counts the clients
-    that were accepted, ``turned_away`` the others.
+    that were accepted.
 
     Not imitated: delay, loss and reordering of a network, keep-alive, several clients.
     """
@@ -47,7 +47,7 @@ class TcpServer:
         self._port = port
         self._listening: socket.socket | None = None
         self._client: socket.socket | None = None
-        self.turned_away = self.sessions = 0
+        self.sessions = 0
 
     def __enter__(self) -> TcpServer:
         self.plug()
@@ -113,7 +113,6 @@ class TcpServer:
             except OSError:
                 return
             if not self._gone():
-                self.turned_away += 1
                 client.close()
                 continue
             self._drop()

@@ -40,6 +40,15 @@ BAG_FOLDERS = Parameter(
     "folders from which a service may read bags, separated by ':'; ~ = home, . = where the node "
     "was started; empty = any folder",
 )
+
+
+def _numbers(prefix: str, record: type, text: str) -> list[Parameter]:
+    return [
+        Parameter(f"{prefix}.{field.name}", 0.0, text, field.metadata["quantity"])
+        for field in fields(record)
+    ]
+
+
 PARAMETERS = (
     Parameter("calibration", "", "calibration file to start with; empty = wait for one"),
     Parameter(
@@ -65,15 +74,7 @@ PARAMETERS = (
     Parameter("machine_frame", "machine", "frame of the axes"),
     Parameter("probe_frame", "probe", "frame of the distance"),
     FRAME_PREFIX,
-    *(
-        Parameter(
-            f"geometry.{field.name}",
-            0.0,
-            "of the probe, see `omsm align`",
-            field.metadata["quantity"],
-        )
-        for field in fields(Geometry)
-    ),
+    *_numbers("geometry", Geometry, "of the probe, see `omsm align`"),
     Parameter(
         "accuracy",
         _NOT_REQUESTED,
@@ -83,14 +84,8 @@ PARAMETERS = (
     ),
     Parameter("nominal", "", "SURFACE.yaml, for the effect of lateral errors; '' = slopes unknown"),
     Parameter("sources_file", "", "SOURCES.yaml: uncertainties of the machine; '' = none stated"),
-    *(
-        Parameter(
-            f"sources.{field.name}",
-            0.0,
-            "standard uncertainty, k = 1; 0 = what the certificate states",
-            field.metadata["quantity"],
-        )
-        for field in fields(ErrorSources)
+    *_numbers(
+        "sources", ErrorSources, "standard uncertainty, k = 1; 0 = what the certificate states"
     ),
 )
 

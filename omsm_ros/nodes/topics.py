@@ -33,18 +33,15 @@ SAMPLES_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=2000,
 )
-LATCHED_QOS = QoSProfile(
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-)
-# For subscribers of several latched publishers: the last to arrive may not be the newest.
-LATCHED_BY_MANY_QOS = QoSProfile(
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    history=HistoryPolicy.KEEP_LAST,
-    depth=20,
+# By many: for subscribers of several latched publishers, the last to arrive may not be the newest.
+LATCHED_QOS, LATCHED_BY_MANY_QOS = (
+    QoSProfile(
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+    )
+    for depth in (1, 20)
 )
 # Requests wait while a node computes; the usual depth of ten overflows soon.
 REQUESTS_QOS = QoSProfile(depth=1000)

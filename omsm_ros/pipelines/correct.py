@@ -34,7 +34,6 @@ from omsm_ros.core.streams.blocks import (
 )
 from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
-from omsm_ros.core.streams.trigger_slips import TriggerSlip
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.errors import BagError, ConfigurationError, DataError, Notice
 from omsm_ros.io.results import PlyWriter, with_added_variance
@@ -76,14 +75,14 @@ class StampJoining:
 class CorrectedScan:
     """The surface points of an open recording, corrected block by block.
 
-    sample_period: of the scan [s]
+    sample_period: of the scan [s];  corrector: budget, trace and skew of what was read so far
     time_lapse: how much faster it was played [1], by the settings; 1 if they do not say
     reasons, admitted: mismatches of calibration and scan, and how the calibration was admitted
     recorded_ns: when the recording began [ns, ROS time], None if unknown
     temperatures: as recorded (n,) [°C], in their order; NaN: implausible
     by_stamps: join the streams by their stamps, for which all samples are held in memory;
         None: by the trigger counter they share, in bounded memory
-    most_traced: largest number of points in ``trace``
+    most_traced: largest number of points in ``corrector.trace``
 
     Raises BagError for a bag without samples, CalibrationError for a calibration that does not
     match the scan, unless overridden.
@@ -121,7 +120,7 @@ class CorrectedScan:
             polarity=options.polarity,
         )
         self.admitted = admit(calibration, self.reasons, admission.override)
-        self._corrector = Corrector(calibration, options, MAX_PENDING_SAMPLES, most_traced)
+        self.corrector = Corrector(calibration, options, MAX_PENDING_SAMPLES, most_traced)
 
     def steps(self) -> Iterator[tuple[AxisBlock | DistanceBlock | None, SurfacePoints | None]]:
         """Yield each block with the points that it completed; at the end None with the rest.
@@ -130,11 +129,11 @@ class CorrectedScan:
         """
         for block in self._rest:
             if isinstance(block, AxisBlock):
-                self._corrector.push_axes(block)
+                self.corrector.push_axes(block)
             else:
-                self._corrector.push_distance(block)
-            yield block, self._corrector.take()
-        yield None, self._corrector.finish()
+                self.corrector.push_distance(block)
+            yield block, self.corrector.take()
+        yield None, self.corrector.finish()
         self._check_complete()
 
     def read(self) -> tuple[list[AxisBlock], list[SurfacePoints]]:
@@ -146,27 +145,7 @@ class CorrectedScan:
     @property
     def account(self) -> Account:
         """Account of every sample read so far."""
-        return self._corrector.account
-
-    @property
-    def budget(self) -> dict[str, float]:
-        """Standard uncertainty of the heights by its source [m], rms of all points so far."""
-        return self._corrector.budget
-
-    @property
-    def trace(self) -> ScanTrace:
-        """Points that represent the scan so far."""
-        return self._corrector.trace
-
-    @property
-    def stamp_skew(self) -> float | None:
-        """Time of the axes minus time of the distance at the newest common trigger [s]."""
-        return self._corrector.stamp_skew
-
-    @property
-    def slip(self) -> TriggerSlip | None:
-        """The last slip of the two counters so far, None without one."""
-        return self._corrector.slips.found
+        return self.corrector.account
 
     def _check_complete(self) -> None:
         name = RejectionReason.OVERDUE.name.lower()
@@ -378,7 +357,7 @@ class _RunningResults:
             found += self._axes.step_faults(resolution, self._lateral)
             samples = scan.account.distance.counted.get("slipped", 0)
             if samples:
-                found.append(f"{samples} samples were not corrected: {scan.slip}")
+                found.append(f"{samples} samples were not corrected: {scan.corrector.slips.found}")
             else:
                 found += skew_fault(skew, scan.sample_period, scan.options.trigger)
         return (*self._on_one_spot(), *map(str, found), *self._beyond(scan.options.pitch))
@@ -437,14 +416,14 @@ class _RunningResults:
 def _correction(scan: CorrectedScan, found: _RunningResults) -> Correction:
     return Correction(
         account=scan.account.as_dict(),
-        budget=scan.budget,
-        stamp_skew=scan.stamp_skew,
+        budget=scan.corrector.budget,
+        stamp_skew=scan.corrector.stamp_skew,
         admission=scan.admitted,
         reasons=scan.reasons,
         statistics=found.statistics(),
         largest_uncertainty=found.largest,
         points=found.drawn.rows(),
-        trace=scan.trace,
+        trace=scan.corrector.trace,
         path=found.path.path(),
         sample_period=scan.sample_period,
         recorded_ns=scan.recorded_ns,

@@ -115,8 +115,7 @@ class Demonstration:
     @property
     def lapse(self) -> float:
         """Speed of the cell relative to real time [1]."""
-        slow = emulated(self.device).baud_rate > 0
-        return self.time_lapse or (_SLOW_LAPSE if slow else _LAPSE)
+        return self.time_lapse or (_SLOW_LAPSE if emulated(self.device).baud_rate else _LAPSE)
 
     @property
     def radius(self) -> float:

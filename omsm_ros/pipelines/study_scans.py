@@ -112,7 +112,9 @@ def alignment_of(
         for _ in scan.steps():
             pass
         _check_points(scan)
-        return align_on_sphere(SphereScan.of(scan.trace.points()), radius, geometry), scan.account
+        return align_on_sphere(
+            SphereScan.of(scan.corrector.trace.points()), radius, geometry
+        ), scan.account
 
 
 def _check_points(scan: CorrectedScan) -> None:

@@ -51,7 +51,7 @@ def test_a_second_client_is_turned_away_and_the_first_stays() -> None:
         with pytest.raises(DeviceError, match=r"closed by the device|was lost"):
             second.read(SOON)
         assert read(first, 15) == b"still the first"
-        assert server.turned_away == 1
+        assert server.sessions == 1
         first.close()
         second.close()
 

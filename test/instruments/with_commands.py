@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 from loopback import Loopback
@@ -33,7 +34,12 @@ class Controller(Instrument):
         """Return the answer to a command, prompt included."""
         raise NotImplementedError
 
+    def _exchange(self, now: float, stop: threading.Event | None) -> None:
+        self.work()
+        super()._exchange(now, stop)
+
     def work(self) -> None:
+        """Answer the commands that arrived."""
         typed = self._typed + self._commands.read()
         *lines, self._typed = typed.replace(b"\r", b"\n").split(b"\n")
         for line in lines:

@@ -15,15 +15,13 @@ _MAX_NOISE_ORDER = 12
 _RANK_TOLERANCE = 1e-11
 
 
-def autoregression(
-    residual: FloatArray, highest: int = _MAX_NOISE_ORDER
-) -> tuple[FloatArray, float]:
+def autoregression(residual: FloatArray) -> tuple[FloatArray, float]:
     """Return the whitening filter [1, a1 …] of a residual (n,) and the variance of its output.
 
-    By Yule and Walker, order 0 to ``highest`` chosen by BIC; order 0 is white.
+    By Yule and Walker, order 0 to 12 chosen by BIC; order 0 is white.
     """
     n = len(residual)
-    highest = min(highest, n - 1)
+    highest = min(_MAX_NOISE_ORDER, n - 1)
     lagged = [residual[lag:] @ residual[: n - lag] for lag in range(highest + 1)]
     lags = np.array(lagged, np.float64) / n
     coefficients: FloatArray = np.ones(1)

@@ -33,9 +33,8 @@ from omsm_ros.instruments.chrocodile.packet_protocol import (
     encode_data,
     encode_format,
 )
-from omsm_ros.instruments.chrocodile.packet_protocol import QUERY as CHROCODILE_PACKET_QUERY
+from omsm_ros.instruments.chrocodile.packet_protocol import QUERY as PACKET_QUERY
 from omsm_ros.instruments.chrocodile.protocol import QUERY, READY
-from omsm_ros.instruments.chrocodile.protocol import QUERY as ASK
 from omsm_ros.instruments.chrocodile.telegram import (
     DISTANCE,
     DISTANCE_16,
@@ -251,7 +250,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
                 self._obey(message)
 
     def _obey(self, asked: PacketCommand) -> None:
-        words = (ASK,) if asked.flags & CHROCODILE_PACKET_QUERY else tuple(map(_text, asked.values))
+        words = (QUERY,) if asked.flags & PACKET_QUERY else tuple(map(_text, asked.values))
         text = self._answer(Request(b"", asked.name, words))
         flags = ERROR if text == _REFUSED else 0
         if asked.name == "VER" or flags:
@@ -259,7 +258,7 @@ class ChrocodilePacketEmulator(ChrocodileEmulator):
         else:
             values = tuple(map(_number, text.split())) if text else asked.values
         self.say(encode_command(PacketCommand(asked.name, values, flags, asked.ticket)))
-        if asked.name in ("SODX", "SHZ") and not asked.flags & CHROCODILE_PACKET_QUERY:
+        if asked.name in ("SODX", "SHZ") and not asked.flags & PACKET_QUERY:
             self._describe()
             self.say(encode_format(self._format))
 

@@ -347,12 +347,11 @@ class Answer(NamedTuple):
 class DollarStream:
     """Separates the bytes of the device, in any portions, into telegrams and answers.
 
-    Without a decoder, and after ``start``, all bytes but those of answers are counted and dropped.
+    Without a decoder, and after ``start``, all bytes but those of answers are dropped.
     """
 
     def __init__(self) -> None:
         self.decoder: BinaryDecoder | LineDecoder | None = None
-        self.bytes_outside = 0
         self.last_outside = b""
         self._pending = b""  # a command without echo so far
         self._held = b""
@@ -438,7 +437,6 @@ class DollarStream:
     def _decode(self, data: bytes) -> list[Records]:
         if self.decoder is not None:
             return [self.decoder.feed(data)]
-        self.bytes_outside += len(data)
         self.last_outside = (self.last_outside + data)[-64:]
         return []
 

@@ -44,7 +44,6 @@ _NO_PEAK = 0x7FFFFF04
 class ConfocalDtSerialEmulator(Instrument):
     """Sends distance, intensity and counter over RS-422, or only the first ``width`` of them."""
 
-    counter_range = 2**32
     width = 3
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
@@ -67,7 +66,6 @@ class ConfocalDtEmulator(Instrument):
     wired: the axis on each encoder (0 = X … 4 = C)
     """
 
-    counter_range = 2**32
     wired = (0, 2, 4)
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
@@ -88,7 +86,6 @@ class ConfocalDtEmulator(Instrument):
 class CapaNcdtEmulator(Instrument):
     """A capaNCDT 62xx with two channels, of which the first measures."""
 
-    counter_range = 2**32
     _KIND = (0b0101, 0)
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:

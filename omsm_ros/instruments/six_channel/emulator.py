@@ -26,7 +26,6 @@ from omsm_ros.units import NANOMETRE_M
 class SixChannelEmulator(Instrument):
     """Sends one frame a trigger."""
 
-    counter_range = 2**32
     _scaling = StreamScaling()
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
@@ -44,7 +43,6 @@ class SixChannelEmulator(Instrument):
 class CsvStreamEmulator(Instrument):
     """Sends one line a trigger."""
 
-    counter_range = 2**32
     _scaling = StreamScaling()
 
     def pack(self, measured: Measured, counters: np.ndarray, times_ns: np.ndarray) -> list[bytes]:
