@@ -28,6 +28,8 @@ INSTALL = "apt-get install -y --no-install-recommends linuxcnc-uspace"
 HERE = Path(__file__).resolve().parent
 OTHER_USER = "nobody"
 END_S = 10.0
+# An earlier run waits half a minute for a reader of its last samples before it ends.
+BEFORE_S = 60.0
 # Marks the processes of this script; LinuxCNC hands its environment on to all of them.
 MARK = "OMSM_PROGRAM"
 # Processes of any LinuxCNC: realtime, and the owner of its shared memory.
@@ -106,14 +108,19 @@ def clear():
 
 @contextlib.contextmanager
 def alone():
-    """Lock LinuxCNC for this process; RuntimeError if another run of this script holds it."""
+    """Lock LinuxCNC for this process; RuntimeError if another run of this script does not end."""
     with Path(shutil.which("linuxcnc")).open() as locked:
-        try:
-            fcntl.flock(locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as err:
-            raise RuntimeError(
-                "this script runs LinuxCNC already; wait until it has ended"
-            ) from err
+        end = time.monotonic() + BEFORE_S
+        while True:
+            try:
+                fcntl.flock(locked, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError as err:
+                if time.monotonic() > end:
+                    raise RuntimeError(
+                        "this script runs LinuxCNC already; wait until it has ended"
+                    ) from err
+                time.sleep(0.2)
         clear()
         try:
             yield
