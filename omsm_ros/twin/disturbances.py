@@ -142,6 +142,11 @@ class TrueResponse:
         return np.asarray(turning * np.sinc(f * self.disturbances.probe.window_s), np.complex128)
 
     @property
+    def static_gain(self) -> float:
+        """Static gain: reading over travel of the encoder [1]."""
+        return self.probe.scale * self.plant_dynamics.dc_gain / self._encoder_gain
+
+    @property
     def _encoder_gain(self) -> float:
         return float(self.disturbances.encoder.response(np.zeros(1, np.complex128))[0].real)
 
