@@ -39,6 +39,7 @@ def _seen(errors, motion=None, **cell):
 def test_the_scale_stretches_the_reading_and_nothing_else():
     made = _seen(EncoderErrors(scale_ppm=100.0))
     np.testing.assert_allclose(made.axes.z, made.truth.slide * (1 + 100e-6), atol=1e-18)
+    assert made.truth.response.static_gain == pytest.approx(1 / (1 + 100e-6))
     clean = _seen(EncoderErrors())
     np.testing.assert_allclose(made.distance.distance, clean.distance.distance, atol=1e-18)
 
@@ -77,8 +78,7 @@ def test_pitch_under_acceleration_is_in_the_true_response(frequency):
         return cosine + 1j * sine
 
     found = -phasor(made.distance.distance) / phasor(made.axes.z)
-    static_gain = 1 / (1 + 0.1 * 1e-3)
-    expected = made.truth.response.response(frequency) * static_gain
+    expected = made.truth.response.response(frequency) * made.truth.response.static_gain
     assert found == pytest.approx(complex(expected), rel=3e-5)
 
 
