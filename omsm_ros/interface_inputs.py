@@ -1,4 +1,4 @@
-"""What the Python interface begins with: recordings, saved results, surfaces, the twin."""
+"""Inputs of the Python interface: recordings, saved results, surfaces, the twin."""
 
 from __future__ import annotations
 

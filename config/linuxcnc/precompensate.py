@@ -47,7 +47,7 @@ CYCLE_S = 1e-3
 # Cycles of the response of the encoder after a command; and before it, for the command between two
 # cycles depends on the next ones.
 TAPS, AHEAD = 100, 2
-# What the response may be before it is measured: how much a tap is of the one before it, and the
+# Responses that are assumed before one is measured: ratio of each tap to the one before it, and
 # variance of the first.
 DECAYS, SIZES = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95), (0.1, 3.0, 100.0)
 # The inverse is whole up to the first and ends at the second frequency [Hz].
@@ -299,11 +299,11 @@ def ripple(plan, moved, time):
 
 
 class Rehearsal(NamedTuple):
-    """What a rehearsal shows.
+    """Lag, gain and noise that a rehearsal shows.
 
     frequency: of the waves of the path [Hz]
-    found: lag that the filter left [s], share by which the gain is larger than calibrated [1], and
-        gains of the ripple of the segments, in phase and a quarter late [1], (4,)
+    found: (4,): lag that the filter left [s]; relative excess of the gain over its calibration [1];
+        gains of the ripple of the segments, in phase and a quarter late [1]
     factor: as of Response;  noise: of the probe [m]
     """
 
@@ -317,7 +317,7 @@ def rehearsed(bag, plan, path, moved, static):
     """Return the Rehearsal of a recording.
 
     plan, path, moved: of the rehearsal;  bag: as recorded; time is that of its spindle
-    static: gain of the probe at rest and its uncertainty [1]
+    static: static gain of the probe and its uncertainty [1]
     """
     with bags.BagReader(Path(bag)) as reader:
         c = np.concatenate([block.c for _, block in reader.records(AXES_TOPIC)])

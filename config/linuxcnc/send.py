@@ -10,7 +10,7 @@ import time
 
 import hal
 
-# Before HAL is told that this component is ready: LinuxCNC does not start without the port.
+# The port opens before this component is reported as ready: without it LinuxCNC does not start.
 server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
 component = hal.component(f"send-{sys.argv[1]}")
 component.ready()

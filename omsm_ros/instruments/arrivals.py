@@ -188,7 +188,7 @@ _SHOWING = 3
 # That is certain if the latest spans, of one of these numbers, agree with those before: in each
 # window, a third of them but at most so long, the earliest arrival is this near a line [period].
 _LATEST, _LONGEST, _EVEN_PERIODS = (12, 24, 48, 96), 16, 0.3
-# So far from the number that the old line shows [periods] the true one is searched.
+# The true number is searched within this distance of the one that the old line shows [periods].
 _NEAR = 4
 
 

@@ -56,7 +56,7 @@ def test_axes_from_linuxcnc_and_a_second_driver_make_true_points(cell, true_cali
     lost = {"axis_driver": axes, "confocal_driver": distance}
     assert value("axis_driver", "lost") == value("confocal_driver", "lost") == 0
     if killed:
-        # What the dead driver had taken is missing, nothing else; the points between are left out.
+        # Only the samples that the dead driver had taken are missing; points between are left out.
         missing = value("corrector", "missing_axes" if "axis" in killed else "missing_distance")
         assert 0 < missing < 4000
         assert lost[killed] + missing == max(axes, distance) > 5000

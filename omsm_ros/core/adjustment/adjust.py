@@ -304,7 +304,7 @@ def _findings(
     stated = {p.name: p.uncertainty for p in priors}
     alike = {r.name: r.alike for r in refutations}
     found = []
-    # Of a released family, what released it.
+    # A released family has the evidence that released it.
     released = {r.name: r.evidence for r in refutations}
     for family in solution.network.families:
         evidence = released.get(family.name) or evidence_of(solution, family)

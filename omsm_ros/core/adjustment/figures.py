@@ -177,7 +177,7 @@ def effects_on_form(
     made = _Made.of(solution, nominal, removed)
     # L P, with P the covariance of the parameters that take part.
     through = made.free(made.rows[:, solution.active] @ solution.covariance)
-    # What forms are probable speaks once only, where the form is compared with each family.
+    # Which forms are probable counts once only, where the form is compared with each family.
     bands = dict.fromkeys(solution.scales.bands, FREE_M**2)
     scales, found = replace(solution.scales, bands=bands), {}
     any_part = solve(solution.network, solution.y, scales, solution.sizes)
@@ -442,7 +442,7 @@ def _resembled(
             continue
         shape, known = effect.shape, effect.known
         if family.smooth is not None:
-            # Of many components, whose rounding would pass for information.
+            # Rounding of its many components would pass for information.
             shape, known = shape @ family.smooth, np.zeros((family.smooth.shape[1],) * 2)
         gain, values = form.looks_like(fit @ shape, known)
         if gain > _POSITIVE:

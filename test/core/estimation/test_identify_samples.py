@@ -286,15 +286,15 @@ def test_a_model_is_valid_between_the_frequencies_of_the_input():
 
 
 @pytest.mark.parametrize(
-    ("different", "wide", "valid"), [(1, 1.1, True), (3, 1.1, False), (0, 2.0, False)]
+    ("different", "ratio", "valid"), [(1, 1.1, True), (3, 1.1, False), (0, 2.0, False)]
 )
-def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, wide, valid):
+def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, ratio, valid):
     """Twenty blocks within a sixth of an octave; a wide one may hide a mode."""
     sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
     known = np.full(1, 0.01)
     blocks = [
         SimpleNamespace(
-            frequency=(0.5, 0.5 * wide),
+            frequency=(0.5, 0.5 * ratio),
             difference=np.full(1, 0.3 * (k < different)),
             uncertainty=known,
         )
