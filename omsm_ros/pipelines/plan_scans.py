@@ -147,16 +147,11 @@ def path_entry(path: PlannedPath, design: ScanDesign, nominal: Surface) -> dict[
     """
     found = {f: getattr(path, f) for f in ("error", "rms", "segment", "c_acceleration")}
     if isinstance(nominal, BoundedSurface):
-        found["points"] = _on_the_part(design, nominal)
+        time = np.arange(0.0, design.duration, 1 / design.rate, dtype=np.float64)
+        x = design.start + (design.end - design.start) * time / design.duration
+        place = x * np.exp(-1j * (design.rpm * RPM_RAD_S * time + design.clocking))
+        found["points"] = int(np.count_nonzero(nominal.aperture.holds(place.real, place.imag)))
     return found
-
-
-def _on_the_part(design: ScanDesign, nominal: BoundedSurface) -> int:
-    """Return the number of readings on the part."""
-    time = np.arange(0.0, design.duration, 1 / design.rate, dtype=np.float64)
-    x = design.start + (design.end - design.start) * time / design.duration
-    place = x * np.exp(-1j * (design.rpm * RPM_RAD_S * time + design.clocking))
-    return int(np.count_nonzero(nominal.aperture.holds(place.real, place.imag)))
 
 
 def write_scans(

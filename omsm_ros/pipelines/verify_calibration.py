@@ -15,7 +15,6 @@ from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.lti.discretisation import discretise
 from omsm_ros.core.lti.recursion import through
 from omsm_ros.core.streams.blocks import AxisBlock, Block, DistanceBlock, FloatArray
-from omsm_ros.core.streams.motion_record import MotionRecord
 from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import CalibrationError, DataError
 from omsm_ros.io.topics import AnyBag
@@ -42,7 +41,8 @@ def path_check_of(
         record = recording.motion(trigger=trigger, by_stamps=by_stamps)
     check_usable(record)
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
-    distance = _bridged(record)
+    index = np.arange(len(record))
+    distance = np.interp(index, index[record.ok], record.distance[record.ok])
     _check_follows(predicted, -distance / calibration.static_gain)
     return check_path(record.z, distance, predicted, calibration.static_gain, record.sample_period)
 
@@ -60,12 +60,6 @@ def _check_follows(predicted: FloatArray, seen: FloatArray) -> None:
             "the distance changes with Z in the other direction than in the calibration's step "
             "test; invert its sign in the driver or the map"
         )
-
-
-def _bridged(record: MotionRecord) -> FloatArray:
-    """Return the distance with dropouts interpolated, for the Hilbert transform."""
-    index = np.arange(len(record))
-    return np.interp(index, index[record.ok], record.distance[record.ok])
 
 
 # Largest error of the stamps [s]: a link that delivers late, a clock that is still adjusting.

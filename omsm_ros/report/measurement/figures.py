@@ -297,7 +297,8 @@ def profile_cuts(
     """Return the profiles of each kind of deviation (n,) [m], by the names of the figures."""
     x, y = cloud.x, cloud.y
     size = 2 * float(np.hypot(x, y).max())
-    feed = _feed(cloud)
+    turns = abs(np.ptp(np.unwrap(np.arctan2(cloud.y, cloud.x)))) / (2 * np.pi)
+    feed = float(np.ptp(np.hypot(cloud.x, cloud.y)) / turns) if turns >= 1 else 0.0
     # Segments of full turns average out the errors of other orders.
     spacing = feed * np.ceil(size / _SEGMENTS / feed) if feed else size / _SEGMENTS
     band = {"half_width": size * _BAND_SHARE / 2, "spacing": spacing}
@@ -307,12 +308,6 @@ def profile_cuts(
     }
     rings = {k: form.radial_profile(x, y, v, spacing=spacing) for k, v in deviations.items()}
     return {**cuts, "profile_radius": rings}
-
-
-def _feed(cloud: CloudView) -> float:
-    """Return the feed per turn of a spiral [m]; 0 for less than one turn."""
-    turns = abs(np.ptp(np.unwrap(np.arctan2(cloud.y, cloud.x)))) / (2 * np.pi)
-    return float(np.ptp(np.hypot(cloud.x, cloud.y)) / turns) if turns >= 1 else 0.0
 
 
 # Figures of a registered part, from the contents of ``form.json`` and ``curves.json``.
