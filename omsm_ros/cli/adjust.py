@@ -22,20 +22,8 @@ def _declare(add: Arguments) -> None:
     add("--nominal", "SURFACE.yaml")
     add("--geometry", "GEOMETRY.yaml", "from 'omsm align'")
     add("--sources", "SOURCES.yaml", "declared sources: the priors")
-    add(
-        "--clocking",
-        ANGLE,
-        "angle by which the part is turned on the chuck in each scan [rad]",
-        nargs="+",
-        default=[],
-    )
-    add(
-        "--clamping",
-        int,
-        "number of the clamping of each scan, where the part was taken off",
-        nargs="+",
-        default=[],
-    )
+    add("--clocking", ANGLE, nargs="+", default=[])
+    add("--clamping", int, nargs="+", default=[])
     add("--accuracy", UNCERTAINTY, "asked for, k = 2 [m]")
     add("--tolerance", UNCERTAINTY, "of the peak to valley [m]")
     add(

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from omsm_ros.cli.words import OPTIONS
 from omsm_ros.core.streams.trigger_slips import TWO_DRIVERS_S, CommonTrigger
 from omsm_ros.errors import ConfigurationError, OmsmError, one_line, shortened
 from omsm_ros.io import json_and_yaml
@@ -135,11 +136,11 @@ def trigger_of(args: argparse.Namespace) -> CommonTrigger:
 class Arguments:
     """Declares the arguments of a command: each call adds one, each method some that are shared."""
 
-    def __init__(self, parser: argparse._ActionsContainer) -> None:
-        self._parser = parser
+    def __init__(self, parser: argparse._ActionsContainer, command: str = "") -> None:
+        self._parser, self._command = parser, command
 
     def __call__(self, name: str, kind: Any, text: str | None = None, **more: Any) -> None:
-        """Add an argument with its help ``text``.
+        """Add an argument with its help ``text``; None takes that of ``words.OPTIONS``, if any.
 
         kind: a Quantity for a plausible number, the placeholder of a path, None for a flag, or a
             function that parses the text;  more: as for ``add_argument``
@@ -151,11 +152,13 @@ class Arguments:
         else:
             read = number(kind) if isinstance(kind, Quantity) else kind
             more["type"] = _as_argument(read) if kind not in (int, str, Path) else kind
+        if text is None:
+            text = OPTIONS.get(f"{self._command} {name}") or OPTIONS.get(name)
         self._parser.add_argument(name, help=text, **more)
 
     def group(self, title: str) -> Arguments:
         """Return a group of arguments, which ``--help`` lists under its title."""
-        return Arguments(self._parser.add_argument_group(title))
+        return Arguments(self._parser.add_argument_group(title), self._command)
 
     def epilog(self, text: str) -> None:
         """Add a text to the end of ``--help``."""

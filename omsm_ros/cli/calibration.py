@@ -88,12 +88,7 @@ def _show_verify(facts: Facts) -> None:
 def _declare_compare(add: Arguments) -> None:
     add("old", "OLD.json")
     add("new", "NEW.json")
-    add(
-        "more",
-        "MORE.json",
-        "three or more: test whether they repeat within their uncertainties",
-        nargs="*",
-    )
+    add("more", "MORE.json", nargs="*")
 
 
 def _compare(args: argparse.Namespace) -> Facts:
@@ -150,8 +145,7 @@ def _placed(text: str) -> tuple[Path, str, float]:
 
 
 def _declare_calset(add: Arguments) -> None:
-    add("placed", _placed, "calibrations and their positions: x or z in metres, b in radians",
-        nargs="+", metavar="CAL.json@x=POSITION")  # fmt: skip
+    add("placed", _placed, nargs="+", metavar="CAL.json@x=POSITION")
     add("--out", "SET.json", required=True)
 
 

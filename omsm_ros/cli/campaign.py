@@ -312,13 +312,7 @@ def _declare_batch(add: Arguments) -> None:
     add("--calibration", "CAL.json", required=True)
     add("--out", "DIR", required=True)
     add("--jobs", PROCESSES, "number of parallel processes; default: one per core", default=0)
-    add(
-        "--scheduler",
-        str,
-        "address of a Dask scheduler: tcp:// on this host, or tls://",
-        default="",
-        metavar="URL",
-    )
+    add("--scheduler", str, default="", metavar="URL")
     add.catalogue()
     add.epilog("Options of 'omsm correct' for every bag follow after '--'.")
 

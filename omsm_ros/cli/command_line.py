@@ -233,11 +233,11 @@ def parser_of(wanted: Collection[str]) -> argparse.ArgumentParser:
 
 def _declare(word: str, sub: argparse.ArgumentParser) -> None:
     if word == DEMO:
-        _declare_demo(Arguments(sub))
+        _declare_demo(Arguments(sub, word))
         return
     command = _command(word)
     sub.set_defaults(run=command)
-    command.declare(Arguments(sub))
+    command.declare(Arguments(sub, word))
 
 
 def _declare_demo(add: Arguments) -> None:
@@ -247,12 +247,7 @@ def _declare_demo(add: Arguments) -> None:
     add("--disturbances", str, "errors of the emulated machine", metavar="FILE")
     add("--view", None, "show the scan in a browser")
     add("--seed", SEED, "seed of the twin's noise", default=1)
-    add(
-        "--experiment",
-        str,
-        "repeat an experiment of the paper on the twin, Fig. 6 to 11; needs no ROS",
-        choices=("mirror", "steps", "chirp", "circles", "vibration"),
-    )
+    add("--experiment", str, choices=("mirror", "steps", "chirp", "circles", "vibration"))
 
 
 def _experiment(args: argparse.Namespace) -> int:

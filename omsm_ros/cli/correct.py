@@ -65,25 +65,12 @@ def _declare_correct(add: Arguments) -> None:
     add("--out", "DIR", required=True)
     add("--nominal", "SURFACE.yaml")
     add("--geometry", "GEOMETRY.yaml", "from 'omsm align'")
-    add(
-        "--pitch",
-        "PITCH.csv",
-        "measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry",
-    )
-    add(
-        "--probe-latency",
-        LAG,
-        "latency of the probe against X and C [s]; default: of the calibration",
-    )
+    add("--pitch", "PITCH.csv")
+    add("--probe-latency", LAG)
     add("--lateral-lag", LAG, SUPPRESS, dest="probe_latency")  # its former name
     _declare_uncertain(add)
     add("--settings", json_object, "settings of this scan", metavar="JSON")
-    add(
-        "--delay",
-        STAMP_DELAY,
-        "time from the probe's stamp to the middle of its exposure [s]",
-        default=0.0,
-    )
+    add("--delay", STAMP_DELAY, default=0.0)
     add("--exposure", EXPOSURE, "exposure time of the probe [s]", default=0.0)
     add.trigger()
     add("--no-report", None, "write cloud and summary only")
@@ -96,17 +83,8 @@ def _declare_correct(add: Arguments) -> None:
 
 
 def _declare_uncertain(add: Arguments) -> None:
-    add(
-        "--sources",
-        str,
-        'uncertainty sources of the machine, or JSON such as {"encoder_noise": 4e-10}',
-        metavar="SOURCES.yaml",
-    )
-    add(
-        "--accuracy",
-        BUDGET,
-        "required expanded uncertainty, k = 2 [m], which the verdict is based on",
-    )
+    add("--sources", str, metavar="SOURCES.yaml")
+    add("--accuracy", BUDGET)
     add("--lateral", UNCERTAINTY, "standard uncertainty of x and y [m]", default=0.0)
 
 
@@ -198,12 +176,7 @@ def _declare_predict(add: Arguments) -> None:
     add.bags("motion", help="a bag, or a planned motion as CSV time_s,z_m")
     add("--calibration", "CAL.json", required=True)
     add("--budget", BUDGET, "allowed residual error, k = 2 [m]", default=DEFAULT_BUDGET_M)
-    add(
-        "--limits",
-        "LIMITS.yaml",
-        "limits of servo, probe, spindle and axes, as config/limits.yaml; default: the "
-        "paper's machine",
-    )
+    add("--limits", "LIMITS.yaml")
 
 
 def _predict(args: argparse.Namespace) -> Facts:

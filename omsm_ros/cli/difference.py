@@ -41,31 +41,12 @@ def _declare_difference(add: Arguments) -> None:
         metavar="PARAMETERS",
     )
     add("--nominal", "SURFACE.yaml", "surface to subtract from both first")
-    add(
-        "--register",
-        parse_dofs,
-        "register each to the nominal surface first, as 'omsm form' does: 'auto', or of "
-        "piston,tip,tilt,x,y,clocking,power",
-        metavar="PARAMETERS",
-    )
-    add(
-        "--uncertainty",
-        UNCERTAINTY,
-        "standard uncertainty of the heights of a file that states none [m]",
-    )
-    add(
-        "--drift",
-        UNCERTAINTY,
-        "standard deviation of the drift at the end of a scan [m]; default: from its sources, "
-        "or estimated from the difference",
-    )
+    add("--register", parse_dofs, metavar="PARAMETERS")
+    add("--uncertainty", UNCERTAINTY)
+    add("--drift", UNCERTAINTY)
     add.unit()
     add("--spacing", SPACING, "spacing of the compared grid [m]")
-    add(
-        "--correlation-length",
-        SPACING,
-        "correlation length of errors of unknown form [m]; default: half the radius",
-    )
+    add("--correlation-length", SPACING)
 
 
 def _difference(args: argparse.Namespace) -> Facts:

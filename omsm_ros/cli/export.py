@@ -130,12 +130,7 @@ def _write_map(
 
 def _declare_export(add: Arguments) -> None:
     add("source", Path, "a result folder, a cloud or a map of any format")
-    add(
-        "--out",
-        "FILE",
-        "points: .csv .xyz .h5 .ply .pcd; a map: .x3p, .sdf, .dat (grid sag)",
-        required=True,
-    )
+    add("--out", "FILE", required=True)
     add.unit()
     add.channel()
     add("--spacing", SPACING, "grid spacing for scattered points [m]")

@@ -46,41 +46,15 @@ def placement(text: str) -> dict[str, float]:
 
 def declare_fit(add: Arguments, default: tuple[str, ...] | None) -> None:
     """Add the options of a registration."""
-    add(
-        "--fit",
-        parse_dofs,
-        "pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power; and unknown "
-        "parameters of the shape: radius, radius_x, radius_y, conic, 'focal length', …",
-        default=default,
-        metavar="PARAMETERS",
-    )
-    add(
-        "--aperture",
-        Aperture.parse,
-        "area of the part to evaluate [m]: R, annulus:R,INNER, ellipse:A,B or rectangle:A,B (half "
-        "lengths along x and y), each with ,X,Y of its middle if that is not the origin, or "
-        "polygon:X,Y,X,Y…; default: that of the nominal surface, else around all points",
-        metavar="APERTURE",
-    )
+    add("--fit", parse_dofs, default=default, metavar="PARAMETERS")
+    add("--aperture", Aperture.parse, metavar="APERTURE")
 
-    add(
-        "--placement",
-        placement,
-        "standard uncertainty of x and y of the part [m], and of its clocking [rad]; what the "
-        "surface hardly determines is held with it; default: a part that is placed by hand",
-        metavar="M[,RAD]",
-    )
+    add("--placement", placement, metavar="M[,RAD]")
 
 
 def declare_tolerance(add: Arguments) -> None:
     """Add the tolerance of a registered part, and the rule for dust."""
-    add(
-        "--dust",
-        dust_rule,
-        "leave out no points (none), those that no neighbouring track confirms (isolated), or "
-        "clusters of N points and less; default: isolated ones, which count against the tolerance",
-        metavar="none|isolated|N",
-    )
+    add("--dust", dust_rule, metavar="none|isolated|N")
     add("--tolerance", TOLERANCE, "tolerance of the peak to valley of the part [m]; needs --fit")
 
 

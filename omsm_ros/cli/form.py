@@ -278,8 +278,7 @@ def _declare_form(add: Arguments) -> None:
     add.channel()
     declare_fit(add, (AUTO,))
     declare_tolerance(add)
-    add("--drawing", Drawing.parsed, metavar="INDICATION",
-        text="tolerances of ISO 10110-5, such as '3/0.5(0.2/0.1); RMSi < 20 nm'")  # fmt: skip
+    add("--drawing", Drawing.parsed, metavar="INDICATION")
     add.origin()
     add("--no-report", None, "write results without a report")
     for name, what in (("s", "shorter"), ("l", "longer")):
@@ -347,13 +346,7 @@ def _drawing_rows(found: Facts | None) -> list[tuple[str, str]]:
 def _declare_compensate(add: Arguments) -> None:
     add("measured", Path, "result folder, cloud or map")
     add("--nominal", "SURFACE.yaml", required=True)
-    add(
-        "--low-pass",
-        SPACING,
-        "cutoff wavelength, of which half is compensated [m]; shorter waves remain",
-        required=True,
-        metavar="WAVELENGTH",
-    )
+    add("--low-pass", SPACING, required=True, metavar="WAVELENGTH")
     add("--out", "DIR", required=True)
     add.unit()
     add.channel()
@@ -366,8 +359,7 @@ def _declare_compensate(add: Arguments) -> None:
     add("--per-turn", SPIRAL_PLACES, "points per turn of the spiral", default=360)
     add("--tool-radius", LENGTH, f"nose of the tool [m]: write {CUT}, the complete next cut")
     add("--rpm", SPEED, "spindle speed of the cut [rpm]", default=60.0)
-    add("--previous", COMPENSATION, "of the cut that made this part: its effect is checked, and "
-        "the offsets are added to it")  # fmt: skip
+    add("--previous", COMPENSATION)
     declare_fit(add, (AUTO,))
 
 
@@ -407,22 +399,13 @@ def _show_compensate(facts: Facts) -> None:
 
 
 def _declare_surface(add: Arguments) -> None:
-    add(
-        "what",
-        str,
-        "show: extent, slopes, and whether probe and axes can follow",
-        choices=("show",),
-    )
+    add("what", str, choices=("show",))
     add("surface", "SURFACE.yaml")
     add("--radius", STEP, "radius of the disc [m]", required=True)
     add("--feed", FEED, "feed per turn of the spiral [m]", default=1e-4)
     add("--rpm", SPEED, "spindle speed [rpm]", default=30.0)
     add("--limits", "LIMITS.yaml", "machine limits, as of 'omsm predict'")
-    add(
-        "--probe-angle",
-        PROBE_ANGLE,
-        "largest angle to the surface normal at which the probe reads [rad]",
-    )
+    add("--probe-angle", PROBE_ANGLE)
     add("--out", "DIR", "folder for a figure")
 
 

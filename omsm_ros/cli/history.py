@@ -28,13 +28,7 @@ _NO_NAME = """(machine not named; identify and correct with --settings '{"machin
 def _declare_history(add: Arguments) -> None:
     add.catalogue()
     add("--machine", str, "list this machine only", default="")
-    add(
-        "--add",
-        "CAL.json|DIR",
-        "add earlier calibrations or result folders to the catalogue",
-        nargs="+",
-        default=[],
-    )
+    add("--add", "CAL.json|DIR", nargs="+", default=[])
     add("--plot", "FILE.png", "draw lag, gain and form over time")
 
 

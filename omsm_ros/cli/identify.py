@@ -75,31 +75,13 @@ _MAX_DELAY = 3
 
 
 def _declare(add: Arguments) -> None:
-    add.bags(
-        "recordings",
-        nargs="+",
-        metavar="RECORDING",
-        help="bags of motions on a fixed target, or tables RECORD.csv, that one model describes",
-    )
+    add.bags("recordings", nargs="+", metavar="RECORDING")
     add("--out", "CAL.json", required=True)
     add("--order", ORDER, "number of poles; 0 = choose", default=0)
-    add(
-        "--input",
-        str,
-        "of a bag, 'encoder' or 'reference' for Z, then other axes that move the probe, as "
-        "encoder,x,c; of a table, the input columns, A or A,B,C",
-        default=ENCODER,
-    )
+    add("--input", str, default=ENCODER)
     add("--output", str, "of a table, the output column")
     add("--period", SAMPLE_PERIOD, "of a table, the sample period [s]")
-    add(
-        "--hold",
-        str,
-        "behaviour of the input between samples: 'band-limited' for a measured input; the "
-        "others, for a command signal, give a model instead of a calibration",
-        choices=HOLDS,
-        default=BAND_LIMITED,
-    )
+    add("--hold", str, choices=HOLDS, default=BAND_LIMITED)
     add(
         "--max-delay",
         MAX_DELAY_SAMPLES,
@@ -107,15 +89,8 @@ def _declare(add: Arguments) -> None:
         metavar="SAMPLES",
     )
     add("--duration", DURATION, "use the first seconds only [s]; 0 = all", default=0.0)
-    add(
-        "--settings",
-        json_object,
-        "settings of machine and probe that the calibration is valid for",
-        default={},
-        metavar="JSON",
-    )
-    add("--equivalent-time", None, "find a mode beyond half the sampling rate from the edges, if "
-        "they are sharp and start at different fractions of a sample")  # fmt: skip
+    add("--settings", json_object, default={}, metavar="JSON")
+    add("--equivalent-time", None)
     _declare_use(add)
     add.trigger()
     add("--report", "DIR", "write the certificate, or the model's page")
@@ -123,25 +98,10 @@ def _declare(add: Arguments) -> None:
 
 
 def _declare_use(add: Arguments) -> None:
-    add(
-        "--for",
-        "SCAN",
-        "intended scan, a bag or a plan as CSV time_s,z_m, for the limits of the verdict; "
-        "default: the paper's, 30 rpm over its mirror",
-        dest="scan",
-    )
-    add(
-        "--accuracy",
-        UNCERTAINTY,
-        "required expanded uncertainty of a height of that scan, k = 2 [m]",
-    )
+    add("--for", "SCAN", dest="scan")
+    add("--accuracy", UNCERTAINTY)
     add.origin()
-    add(
-        "--multisine",
-        "BAG",
-        "recording of a multisine on the fixed target: confirms the response without a model, and "
-        "tells whether the machine is linear enough",
-    )
+    add("--multisine", "BAG")
     add("--plan", "PLAN.json", "plan of the multisine, as 'omsm plan multisine' writes it")
 
 

@@ -42,33 +42,12 @@ def _declare_selfcal(add: Arguments) -> None:
     add.bags("scans", nargs="+", metavar="SCAN", help="two or more scans of one part")
     add("--calibration", "STEP.json", "calibration from a step test")
     add("--out", "CAL.json", required=True)
-    add(
-        "--harmonics",
-        HARMONICS,
-        "highest harmonic of the surface in a turn",
-        default=DEFAULT_HARMONICS,
-    )
-    add(
-        "--clocking",
-        ANGLE_UNCERTAINTY,
-        "standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted",
-        default=DEFAULT_CLOCKING_RAD,
-    )
+    add("--harmonics", HARMONICS, default=DEFAULT_HARMONICS)
+    add("--clocking", ANGLE_UNCERTAINTY, default=DEFAULT_CLOCKING_RAD)
     add.polarity()
     add("--static-gain", GAIN, "static gain of the probe, used without a step test", default=1.0)
-    add(
-        "--gain-uncertainty",
-        GAIN_UNCERTAINTY,
-        "relative standard uncertainty of the static gain",
-        default=UNINFORMATIVE_GAIN,
-    )
-    add(
-        "--settings",
-        json_object,
-        "settings of the calibration, used without a step test",
-        default={},
-        metavar="JSON",
-    )
+    add("--gain-uncertainty", GAIN_UNCERTAINTY, default=UNINFORMATIVE_GAIN)
+    add("--settings", json_object, default={}, metavar="JSON")
 
 
 def _selfcal(args: argparse.Namespace) -> Facts:

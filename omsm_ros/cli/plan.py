@@ -51,21 +51,17 @@ from omsm_ros.readable import count, quantity
 
 
 def _declare_plan(add: Arguments) -> None:
-    add("what", str, "a step test, a multisine that shows how linear the machine is, scans of a "
-        "part, or speed and feed that avoid modes and lines", choices=tuple(_PLANS))  # fmt: skip
+    add("what", str, choices=tuple(_PLANS))
     add("--out", "DIR", required=True)
     add("--dialect", str, "controller that reads the G-code", choices=DIALECTS, default="linuxcnc")
     steps = add.group("steps")
     steps("--sample-period", SAMPLE_PERIOD, "sample period of the probe [s]", default=1e-3)
     steps("--step", STEP, "height of a step [m]", default=9.8e-6)
     steps("--second-step", STEP, "height of every other step [m]; 3/9.8 of --step by default")
-    steps("--count", COUNT, "number of steps up, and of steps down, from the middle",
-          default=PLANNED_COUNT)  # fmt: skip
-    steps("--dwell", DWELL, "time from edge to edge [s]; four times the dwell halves the "
-          "undetected creep", default=PLANNED_DWELL_S)  # fmt: skip
+    steps("--count", COUNT, default=PLANNED_COUNT)
+    steps("--dwell", DWELL, default=PLANNED_DWELL_S)
     steps("--rise", RISE, "rise time of an edge [s]", default=20e-3)
-    steps("--sharp", None, "edges as sharp as the axis makes them, for 'omsm identify "
-          "--equivalent-time' alone: as a calibration they mislead")  # fmt: skip
+    steps("--sharp", None)
     steps("--half-range", STEP, "half the measuring range of the probe [m]", default=50e-6)
     _declare_scans(add.group("scans and motion"))
     _declare_multisine(add.group("multisine"))
@@ -74,8 +70,7 @@ def _declare_plan(add: Arguments) -> None:
     motion("--mode", FREQUENCY, "further modes of the machine [Hz]", nargs="+", default=[])
     motion("--line", FREQUENCY, "known vibrations [Hz]", nargs="+", default=[])
     motion("--marks", SPACING, "pitch of the rings that the tool left [m]", nargs="+", default=[])
-    motion("--rate", FREQUENCY, "rates of the probe [Hz], the preferred one first", nargs="+",
-           default=[1000.0])  # fmt: skip
+    motion("--rate", FREQUENCY, nargs="+", default=[1000.0])
 
 
 def _declare_multisine(add: Arguments) -> None:

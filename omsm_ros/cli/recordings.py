@@ -103,12 +103,7 @@ def _topic_facts(topic: bags.TopicSummary, watch: StreamWatch | None) -> Facts:
 
 def _declare_inspect(add: Arguments) -> None:
     add.bags("bag")
-    add(
-        "--repair",
-        None,
-        "copy the intact part of a damaged MCAP bag to <bag>.repaired.mcap; the bag itself "
-        "is not changed",
-    )
+    add("--repair", None)
 
 
 def _inspect(args: argparse.Namespace) -> Facts:
@@ -170,8 +165,7 @@ def _declare_record(add: Arguments) -> None:
     add("--out", "BAG.mcap", required=True)
     add("--seconds", DURATION, "duration in samples [s]; 0: until Ctrl+C", default=0.0)
     add("--silence", SILENCE, "end when no sample came for so long [s]; 0: never", default=0.0)
-    add("--set", str, "parameters of the driver, such as sample_period=0.00025", nargs="+",
-        default=[], metavar="NAME=VALUE")  # fmt: skip
+    add("--set", str, nargs="+", default=[], metavar="NAME=VALUE")
 
 
 def _record(args: argparse.Namespace) -> Facts:

@@ -20,15 +20,7 @@ def _declare_spectrum(add: Arguments) -> None:
     add("--calibration", "CAL.json", "correct the scans with it first")
     add("--out", "DIR", required=True)
     add("--nominal", "SURFACE.yaml", "surface to subtract first")
-    add(
-        "--stop",
-        FREQUENCY,
-        "remove this band from the heights, with zero phase; may be repeated",
-        nargs=2,
-        action="append",
-        default=[],
-        metavar=("FROM_HZ", "TO_HZ"),
-    )
+    add("--stop", FREQUENCY, nargs=2, action="append", default=[], metavar=("FROM_HZ", "TO_HZ"))
     add("--remove-vibration", None, "remove lines of the bag's accelerometer, in their phase")
     add("--exposure", EXPOSURE, "exposure of a reading [s]; estimated from scans at two speeds")
     add("--spot", SPOT, "diameter of the probe's spot [m], for the amplitude of marks", default=0.0)

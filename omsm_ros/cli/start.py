@@ -14,25 +14,13 @@ from omsm_ros.twin.scenario import PASSES, SPHERE, STAND_OFFS, STILL, TURNED, Sc
 def _declare_twin(add: Arguments) -> None:
     usual = Scenario()
     add("--out", "DIR", required=True)
-    add(
-        "--radius",
-        RADIUS,
-        "start radius of the spiral [m]; 0.002 scans for 20 s, 0.0127 the inner circle, 0.01796 "
-        "the whole ellipse of the mirror",
-        default=2e-3,
-    )
+    add("--radius", RADIUS, default=2e-3)
     add("--rpm", SPEED, "spindle speed [rpm]", default=usual.spindle_speed)
     add("--feed", FEED, "feed per turn [m]", default=usual.feed_per_turn)
     add("--disturbances", "FILE", "errors of the machine")
     add("--seed", SEED, "seed of noise and part", default=1)
     add("--outward", None, "scan from the centre outward")
-    add(
-        "--recordings",
-        str,
-        "write the recordings that 'omsm sources' evaluates instead of step test and scan",
-        nargs="*",
-        choices=(SPHERE, STILL, TURNED, PASSES, STAND_OFFS),
-    )
+    add("--recordings", str, nargs="*", choices=(SPHERE, STILL, TURNED, PASSES, STAND_OFFS))
     add("--part", SEED, "seed of the part alone, for several scans of one part")
 
 

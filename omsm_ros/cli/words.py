@@ -1,4 +1,4 @@
-"""The commands of ``omsm``: the module of each, and its line of help.
+"""The commands of ``omsm``: the module of each, its line of help, and the help of its options.
 
 They are listed here so that ``omsm --help`` need not load their modules, which takes seconds.
 """
@@ -88,3 +88,77 @@ TASKS: dict[str, dict[str, Word]] = {
     for task, text in _HELP.items()
 }
 WORDS = {name: word for words in TASKS.values() for name, word in words.items()}
+
+# The help of an option that says more than the line of its declaration holds, by command and
+# option, or by the option alone where several commands share it.
+OPTIONS = catalogue("""
+--aperture: area of the part to evaluate [m]: R, annulus:R,INNER, ellipse:A,B or rectangle:A,B (half
+    lengths along x and y), each with ,X,Y of its middle if that is not the origin, or
+    polygon:X,Y,X,Y…; default: that of the nominal surface, else around all points
+--dust: leave out no points (none), those that no neighbouring track confirms (isolated), or
+    clusters of N points and less; default: isolated ones, which count against the tolerance
+--fit: pose parameters to fit: 'auto', or of piston,tip,tilt,x,y,clocking,power; and unknown
+    parameters of the shape: radius, radius_x, radius_y, conic, 'focal length', …
+--placement: standard uncertainty of x and y of the part [m], and of its clocking [rad]; what the
+    surface hardly determines is held with it; default: a part that is placed by hand
+adjust --clamping: number of the clamping of each scan, where the part was taken off
+adjust --clocking: angle by which the part is turned on the chuck in each scan [rad]
+batch --scheduler: address of a Dask scheduler: tcp:// on this host, or tls://
+calset placed: calibrations and their positions: x or z in metres, b in radians
+compare more: three or more: test whether they repeat within their uncertainties
+compensate --low-pass: cutoff wavelength, of which half is compensated [m]; shorter waves remain
+compensate --previous: of the cut that made this part: its effect is checked, and the offsets are
+    added to it
+correct --accuracy: required expanded uncertainty, k = 2 [m], which the verdict is based on
+correct --delay: time from the probe's stamp to the middle of its exposure [s]
+correct --pitch: measured pitch of Z: columns z_m,pitch_rad; needs abbe_arm in the geometry
+correct --probe-latency: latency of the probe against X and C [s]; default: of the calibration
+correct --sources: uncertainty sources of the machine, or JSON such as {"encoder_noise": 4e-10}
+demo --experiment: repeat an experiment of the paper on the twin, Fig. 6 to 11; needs no ROS
+difference --correlation-length: correlation length of errors of unknown form [m]; default: half the
+    radius
+difference --drift: standard deviation of the drift at the end of a scan [m]; default: from its
+    sources, or estimated from the difference
+difference --register: register each to the nominal surface first, as 'omsm form' does: 'auto', or
+    of piston,tip,tilt,x,y,clocking,power
+difference --uncertainty: standard uncertainty of the heights of a file that states none [m]
+export --out: points: .csv .xyz .h5 .ply .pcd; a map: .x3p, .sdf, .dat (grid sag)
+form --drawing: tolerances of ISO 10110-5, such as '3/0.5(0.2/0.1); RMSi < 20 nm'
+history --add: add earlier calibrations or result folders to the catalogue
+identify --accuracy: required expanded uncertainty of a height of that scan, k = 2 [m]
+identify --equivalent-time: find a mode beyond half the sampling rate from the edges, if they are
+    sharp and start at different fractions of a sample
+identify --for: intended scan, a bag or a plan as CSV time_s,z_m, for the limits of the verdict;
+    default: the paper's, 30 rpm over its mirror
+identify --hold: behaviour of the input between samples: 'band-limited' for a measured input; the
+    others, for a command signal, give a model instead of a calibration
+identify --input: of a bag, 'encoder' or 'reference' for Z, then other axes that move the probe, as
+    encoder,x,c; of a table, the input columns, A or A,B,C
+identify --multisine: recording of a multisine on the fixed target: confirms the response without a
+    model, and tells whether the machine is linear enough
+identify --settings: settings of machine and probe that the calibration is valid for
+identify recordings: bags of motions on a fixed target, or tables RECORD.csv, that one model
+    describes
+inspect --repair: copy the intact part of a damaged MCAP bag to <bag>.repaired.mcap; the bag itself
+    is not changed
+plan --count: number of steps up, and of steps down, from the middle
+plan --dwell: time from edge to edge [s]; four times the dwell halves the undetected creep
+plan --rate: rates of the probe [Hz], the preferred one first
+plan --sharp: edges as sharp as the axis makes them, for 'omsm identify --equivalent-time' alone: as
+    a calibration they mislead
+plan what: a step test, a multisine that shows how linear the machine is, scans of a part, or speed
+    and feed that avoid modes and lines
+predict --limits: limits of servo, probe, spindle and axes, as config/limits.yaml; default: the
+    paper's machine
+record --set: parameters of the driver, such as sample_period=0.00025
+selfcal --clocking: standard uncertainty of C between the scans [rad]; 10 if the part was re-mounted
+selfcal --gain-uncertainty: relative standard uncertainty of the static gain
+selfcal --harmonics: highest harmonic of the surface in a turn
+selfcal --settings: settings of the calibration, used without a step test
+spectrum --stop: remove this band from the heights, with zero phase; may be repeated
+surface --probe-angle: largest angle to the surface normal at which the probe reads [rad]
+surface what: show: extent, slopes, and whether probe and axes can follow
+twin --radius: start radius of the spiral [m]; 0.002 scans for 20 s, 0.0127 the inner circle,
+    0.01796 the whole ellipse of the mirror
+twin --recordings: write the recordings that 'omsm sources' evaluates instead of step test and scan
+""")
