@@ -18,7 +18,7 @@ ROSDEP = {
     "rosbags": ("rosbags", "python3-rosbags-pip"),
     "serial": ("pyserial", "python3-serial"),
     "yaml": ("PyYAML", "python3-yaml"),
-    "lz4": ("lz4", "python3-lz4"),
+    "lz4": ("lz4", "python3-rosbags-pip"),  # which brings it: rosdep has no key
     "jinja2": ("jinja2", "python3-jinja2"),
     "jsonschema": ("jsonschema", "python3-jsonschema"),
     "tqdm": ("tqdm", "python3-tqdm"),
