@@ -347,6 +347,7 @@ def _source_entry(source: SourceFinding) -> dict[str, Any]:
         "found": np.atleast_1d(source.found).tolist(),
         "uncertainty": np.atleast_1d(source.uncertainty).tolist(),
         "effect": number(source.effect),
+        "effect_uncertainty": number(source.effect_uncertainty),
         "identifiable": source.shown,
         "identified_by": source.shown_by,
         "deviate": number(source.deviate),

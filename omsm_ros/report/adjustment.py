@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from omsm_ros.core.adjustment import Adjustment
 from omsm_ros.core.adjustment.sources import WITH_CALIBRATION
-from omsm_ros.readable import column, count, expanded, measured, plain, quantity
+from omsm_ros.readable import NOTHING, count, expanded, measured, plain, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import Section, StudyPage, fill_study, title_block
 from omsm_ros.report.tables import Table, sized
@@ -98,12 +98,12 @@ def source_table(facts: Mapping[str, Any]) -> Table:
     """Return each source that was declared or is significant: declared against found."""
     shown = [s for s in facts["sources"] if s["declared"] is not None or s["refuted"]]
     shown.sort(key=lambda s: -(s["effect"] or 0.0))
-    effects = column([s["effect"] if s["identifiable"] else None for s in shown], "m")
     rows = [
-        (source["text"], declared_text(source), found_text(source), effect, _status(source))
-        for source, effect in zip(shown, effects, strict=True)
-    ]
-    heads = ("declared (k = 1)", "found (k = 1)", "effect, rms", "")
+        (source["text"], declared_text(source), found_text(source), effect_text(source),
+         _status(source))
+        for source in shown
+    ]  # fmt: skip
+    heads = ("declared (k = 1)", "found (k = 1)", "effect on the heights, rms (k = 1)", "")
     return Table("", heads, rows)
 
 
@@ -135,6 +135,13 @@ def found_text(source: Mapping[str, Any]) -> str:
     size = float(np.linalg.norm(source["found"]))
     spread = float(np.sqrt(np.mean(np.square(source["uncertainty"]))))
     return measured(size, spread, "" if source["unit"] == "1" else source["unit"])
+
+
+def effect_text(source: Mapping[str, Any]) -> str:
+    """Return the effect of the found value on the heights, if these scans show it."""
+    if not source["identifiable"]:
+        return NOTHING
+    return measured(source["effect"], source["effect_uncertainty"], "m")
 
 
 def _scans(facts: Mapping[str, Any]) -> Table:

@@ -76,8 +76,8 @@ class SourceFinding:
     name, unit: of the family;  declared: standard uncertainty [unit], None where nothing was
     found, uncertainty: by the adjustment, each component (size,) [unit]; of a family that takes
         no part, by its score test
-    effect: rms of what was found on the heights [m];  possible: of what is left
-        open on the form, k = 1 [m]
+    effect, effect_uncertainty: rms of what was found on the heights, and its standard uncertainty
+        [m];  possible: of what is left open on the form, k = 1 [m]
     shown: True if the scans determine it, else ``shown_by`` would
     deviate: of found from declared, in standard deviations
     refuted: True if released;  alike: families that explain the same
@@ -89,6 +89,7 @@ class SourceFinding:
     found: FloatArray
     uncertainty: FloatArray
     effect: float
+    effect_uncertainty: float
     possible: float
     shown: bool
     shown_by: str
@@ -183,14 +184,6 @@ def adjust(
     surface: Surface = fitted_surface(scans[0]) if nominal is None else nominal
     if calibration is not None:
         priors = with_dynamics(priors, calibration)
-    return _adjusted(scans, priors, calibration, surface, accuracy, removed, accepted)
-
-
-def _adjusted(
-    scans: Sequence[ScanData], priors: Sequence[Source], calibration: Calibration | None,
-    surface: Surface, accuracy: float | None, removed: Sequence[str], accepted: Collection[str],
-) -> Adjustment:  # fmt: skip
-    """Return the adjustment of ``scans`` to the nominal ``surface``."""
     zero = zero_of(scans, surface)
     views = [view_of(s, k, zero, surface) for k, s in enumerate(scans)]
     network, sizes = _network(scans, views, priors)
@@ -211,26 +204,18 @@ def _adjusted(
         not_evaluated(families, effects, priors, open_limit(accuracy))
         + looks_like(form.resembled, families, accepted, open_limit(accuracy)),
         rests_on(families, effects, form.mean_uncertainty),
-        enough,
-        2 * form.pv.uncertainty,
-        accuracy,
+        enough, 2 * form.pv.uncertainty, accuracy,
         None if enough else best_addition(scans[0], priors, surface, removed)[:2],
         calibration,
         largest_contribution(solution, effects, surface, removed, doubts, accuracy),
-    )
+    )  # fmt: skip
     return Adjustment(
         form=form,
         sources=_findings(detecting, effects, priors, refutations),
-        refutations=refutations,
-        agreement=agreement,
-        wrong_sign=wrong,
-        verdict=verdict,
-        scales=solution.scales,
-        noise=network.blocks.noise,
-        solution=solution,
-        nominal=surface,
-        zero=zero,
-    )
+        refutations=refutations, agreement=agreement, wrong_sign=wrong, verdict=verdict,
+        scales=solution.scales, noise=network.blocks.noise,
+        solution=solution, nominal=surface, zero=zero,
+    )  # fmt: skip
 
 
 def _walk(solution: Solution, priors: Sequence[Source]) -> tuple[float, float, float | None]:
@@ -308,18 +293,21 @@ def _findings(
     released = {r.name: r.evidence for r in refutations}
     for family in solution.network.families:
         evidence = released.get(family.name) or evidence_of(solution, family)
-        takes_part = family.name in solution.sizes
-        here = solution.network.place[family.name]
+        values, free = evidence.values, evidence.free
+        covariance = free @ free.T
+        if family.name in solution.sizes:
+            here = solution.network.place[family.name]
+            values, covariance = solution.values[here], solution.covariance_of(here)
+        effect, spread = solution.network.effect(family.name, values, covariance)
         found.append(
             SourceFinding(
                 name=family.name,
                 unit=family.unit,
                 declared=stated.get(base_name(family.name)),
-                found=solution.values[here] if takes_part else evidence.values,
-                uncertainty=(
-                    solution.uncertainty(family.name) if takes_part else evidence.uncertainty
-                ),
-                effect=evidence.effect,
+                found=values,
+                uncertainty=np.sqrt(np.maximum(np.diag(covariance), 0.0)),
+                effect=effect,
+                effect_uncertainty=spread,
                 possible=effects.get(family.name, NO_EFFECT).left,
                 shown=evidence.shown,
                 shown_by=family.shown_by,

@@ -26,8 +26,7 @@ _NO_COLUMN = 1e-100
 class Evidence:
     """One family against its declaration.
 
-    values, uncertainty: by the scans alone, of each column (size,) [unit]; where nothing is
-        shown, 0 and the plausible size
+    values: by the scans alone, of each column (size,) [unit]; 0 where nothing is shown
     chi_square, dof: against the declared size, of the directions that the scans show
     effect: rms of the family's share of the heights [m], by ``values``
     gain: twice the logarithm by which the likelihood grows if the prior has the size ``wide``, or
@@ -41,7 +40,6 @@ class Evidence:
 
     family: Family
     values: FloatArray
-    uncertainty: FloatArray
     chi_square: float
     dof: int
     effect: float
@@ -53,6 +51,11 @@ class Evidence:
     def shown(self) -> bool:
         """True if the scans determine any direction of it."""
         return self.dof > 0
+
+    @property
+    def uncertainty(self) -> FloatArray:
+        """Standard uncertainty of each column (size,) by ``free`` [unit]."""
+        return np.asarray(np.sqrt(np.sum(self.free**2, axis=1)))
 
     @property
     def deviate(self) -> float:
@@ -97,14 +100,13 @@ def _of_declared(solution: Solution, family: Family) -> Evidence:
     chi_square = float(np.sum(moved[shown] ** 2 / taken[shown]))
     alone = np.where(shown, moved / np.where(shown, taken, 1.0), moved)
     values = size * (axes @ alone)
-    uncertainty = size * np.sqrt(np.sum(axes**2 * np.where(shown, own, share), axis=1))
     free = size[:, np.newaxis] * axes / np.sqrt(np.maximum(taken, 0.0) / share + wide**-2)
     gain = sum(
         _gain((m / t) ** 2, o + 1.0, o + max(w**2, (m / t) ** 2))
         for m, t, o, w in zip(moved[shown], taken[shown], own[shown], wide[shown], strict=True)
     )
     tested = chi_square, int(np.sum(shown)), gain
-    return _evidence(solution, family, values, uncertainty, tested, free)
+    return _evidence(solution, family, values, tested, free)
 
 
 def _gain(square: float, before: float, after: float) -> float:
@@ -130,7 +132,6 @@ def _of_absent(solution: Solution, family: Family) -> Evidence:
     values = (axes @ np.where(shown, moved / known, 0.0)) / scale
     # A direction that is not shown keeps the plausible size of the family.
     variance = 1 / (np.maximum(information, 0.0) + plausible)
-    uncertainty = np.sqrt(axes**2 @ variance) / scale
     free = axes * np.sqrt(variance) / scale[:, np.newaxis]
     chi_square = float(np.sum(np.where(shown, moved**2 / known, 0.0)))
     ratio = (family.wide * np.median(scale)) ** 2
@@ -139,24 +140,18 @@ def _of_absent(solution: Solution, family: Family) -> Evidence:
         for m, i in zip(moved[shown], information[shown], strict=True)
     )
     tested = chi_square, int(np.sum(shown)), gain
-    return _evidence(solution, family, values, uncertainty, tested, free)
+    return _evidence(solution, family, values, tested, free)
 
 
 def _evidence(
-    solution: Solution,
-    family: Family,
-    values: FloatArray,
-    uncertainty: FloatArray,
-    tested: tuple[float, int, float],
+    solution: Solution, family: Family, values: FloatArray, tested: tuple[float, int, float],
     free: FloatArray,
-) -> Evidence:
+) -> Evidence:  # fmt: skip
     """Return the evidence with the size of what the family does to the heights.
 
     tested: χ², its degrees of freedom, and the gain;  free: root of the covariance (size, size)
     """
-    net = solution.network
-    change = net.column(family.name) @ values
-    effect = float(np.sqrt(np.average(change**2, weights=net.blocks.count)))
+    effect, _ = solution.network.effect(family.name, values, free @ free.T)
     chi_square, dof, gain = tested
     declared = family.name in solution.sizes
-    return Evidence(family, values, uncertainty, chi_square, dof, effect, gain, free, declared)
+    return Evidence(family, values, chi_square, dof, effect, gain, free, declared)

@@ -218,6 +218,15 @@ class Network:
         """Return the columns of family ``name``, (b, size)."""
         return np.asarray(self.blocks.columns[:, self.place[name]])
 
+    def effect(self, name: str, values: FloatArray, covariance: FloatArray) -> tuple[float, float]:
+        """Return what ``values`` (size,) of family ``name`` do to the heights, rms over the points,
+        and its standard uncertainty by ``covariance`` (size, size) [m]."""
+        columns = self.column(name)
+        power = (columns * self.blocks.count[:, np.newaxis]).T @ columns / self.blocks.count.sum()
+        square = np.array([values @ power @ values, np.sum(power * covariance)])
+        effect, uncertainty = np.sqrt(np.maximum(square, 0.0))
+        return float(effect), float(uncertainty)
+
     def active(self, sizes: Sizes) -> BoolArray:
         """Return which parameters take part where the families in ``sizes`` do, (size,)."""
         made = np.ones(self.size, np.bool_)

@@ -59,6 +59,17 @@ def test_the_lag_is_found_to_a_fifth_of_a_microsecond(table):
     assert one.source("lag_change").uncertainty[0] > 0.9 * LAG_S
 
 
+def test_the_effect_of_a_source_is_that_of_its_found_value(table):
+    """Of a lag by the rate of Z; of pitch by its declaration, not by what the scans alone know."""
+    _, scans, (_, two, _) = table
+    rate = np.concatenate([s.removed for s in scans[:2]]) / 340e-6
+    lag, pitch = two.source("lag_change"), two.source("pitch")
+    size = np.sqrt(np.mean(rate**2))
+    assert lag.effect == pytest.approx(lag.found[0] * size, rel=0.02)
+    assert lag.effect_uncertainty == pytest.approx(lag.uncertainty[0] * size, rel=0.02)
+    assert pitch.effect <= 3 * pitch.effect_uncertainty < 6e-9
+
+
 def test_one_scan_is_too_uncertain_and_names_the_scan_to_add(table):
     _, _, (one, two, three) = table
     assert one.verdict.code == TOO_UNCERTAIN

@@ -72,7 +72,7 @@ def test_terms_that_a_small_scan_leaves_open_are_no_evidence():
 def cause(name, deviate, explains=True):
     """A family that the scans show beyond its declaration."""
     family = Family(name, "m", 1, lambda view: view.x[np.newaxis], 1e-6, "reclocked")
-    found = Evidence(family, np.ones(1), np.ones(1), deviate**2, 1, 1e-8, deviate**2,
+    found = Evidence(family, np.ones(1), deviate**2, 1, 1e-8, deviate**2,
                      np.eye(1), declared=True)  # fmt: skip
     return Refutation(found, (), explains=explains)
 
