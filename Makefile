@@ -80,7 +80,7 @@ $(VENV): $(addprefix bootstrap/,install.sh repair_wheels.py lock.txt runtime.in 
 	@touch $@
 
 $(PEERS): bootstrap/peers.txt $(PACKAGE)
-	.venv/bin/python -m pip install --quiet --constraint bootstrap/lock.txt --requirement $<
+	.venv/bin/python -m pip install --quiet --constraint .venv/constraints.txt --requirement $<
 	.venv/bin/python -m venv .venv/peers
 	.venv/peers/bin/python -m pip install --quiet prysm==0.21.1 SurfaceTopography==1.27.1 surfalize==0.19.2
 	@touch $@

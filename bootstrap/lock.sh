@@ -6,5 +6,5 @@ tools=$(mktemp -d)
 trap 'rm -rf "$tools"' EXIT
 python3 -m venv "$tools"
 "$tools/bin/pip" install --quiet --disable-pip-version-check uv
-"$tools/bin/uv" --native-tls pip compile --quiet --universal --upgrade --python-version 3.10 \
-    --no-annotate --custom-compile-command bootstrap/lock.sh *.in --output-file lock.txt
+"$tools/bin/uv" --native-tls pip compile --quiet --universal --upgrade --generate-hashes \
+    --python-version 3.10 --no-annotate --custom-compile-command bootstrap/lock.sh *.in --output-file lock.txt

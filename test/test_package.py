@@ -106,3 +106,11 @@ def test_what_is_optional_is_an_extra():
     extras = ast.literal_eval(found[1])
     for package, extra in OPTIONAL.items():
         assert any(line.lower().startswith(package) for line in extras[extra])
+
+
+def test_each_locked_package_has_its_hashes():
+    text = (ROOT / "bootstrap" / "lock.txt").read_text(encoding="utf-8")
+    locked = re.split(r"^(?=\w)", text, flags=re.MULTILINE)[1:]
+    assert len(locked) > 200
+    assert all("==" in package and "--hash=sha256:" in package for package in locked)
+    assert "--require-hashes" in (ROOT / "bootstrap" / "install.sh").read_text(encoding="utf-8")
