@@ -23,8 +23,6 @@ correction.stated_twice: {source} is stated {times} times; state it once
 correction.parameter: {source} has no parameter {parameter!r}, expected one of {known:list}
 correction.needs_parameter: {source} needs {parameter} [{unit}]; state it with value
 correction.no_slope: the slope of the surface is not known; give a nominal surface
-correction.negative_uncertainty: {source}: standard uncertainty {value!r} {unit}, expected zero or
-    more
 # Correction
 correction.polarity: polarity {polarity!r}, expected 1 or -1
 correction.period_changed: sample period {period!r} s after blocks of {before!r} s; both streams

@@ -13,13 +13,13 @@ from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.calibration.applicability import admit, objections
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
+from omsm_ros.core.correction.source_kinds import standard_fields
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.correction.systematic import (
     MOST_TRACED,
     ScanTrace,
     resolves_per_turn_waves,
     scan_fields,
-    standard_fields,
 )
 from omsm_ros.core.correction.uncertainty import with_lateral_uncertainty
 from omsm_ros.core.kinematics.kinematics import PitchCurve, Surface
@@ -252,7 +252,7 @@ def with_lateral_errors(
     Return ``done`` with their budget, largest uncertainty and points; unchanged if there is no
     such source, or a nominal surface is given.
     """
-    sources = [source for source in options.systematic if source.needs_slope]
+    sources = [source for source in options.systematic if source.kind.needs_slope]
     if not sources or options.surface is not None or not done.trace.seen:
         return done
     points = done.trace.points()

@@ -24,13 +24,13 @@ from omsm_ros.core.streams.blocks import (
     part_of,
 )
 from omsm_ros.core.streams.motion_record import MotionRecord, assemble
-from omsm_ros.errors import ConfigurationError, DataError
+from omsm_ros.errors import DataError
 from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part import UnderSpot, mounted_surface
 from omsm_ros.twin.plant import Plant, TimeGrid, Trajectory, move
 from omsm_ros.twin.probe import LEVEL, Probe, ProbeRandom, read, slope_of
-from omsm_ros.twin.record_checks import is_default
+from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
 from omsm_ros.twin.structure import deform
 from omsm_ros.units import NANOMETRE_M
@@ -70,20 +70,6 @@ class ProbeTarget(NamedTuple):
 
 
 ShiftFunction = Callable[[FloatArray, AxisPositions], Shift]
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """``samples`` every ``period`` [s], each period simulated in ``substeps``."""
-
-    samples: int
-    period: float
-    substeps: int
-
-    @property
-    def duration(self) -> float:
-        """Duration [s]."""
-        return self.samples * self.period
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,17 +166,14 @@ def scene_of(
     motion: Motion,
     surface: Surface,
     stand_off: float,
-    timing: Timing,
+    grid: TimeGrid,
     random: Random,
 ) -> Scene:
     """Simulate ``motion`` and return the scene; ``random``: generators by the name of their use."""
-    if disturbances.servo_bandwidth_hz is not None:
-        plant = replace(plant, servo_bandwidth=disturbances.servo_bandwidth_hz)
-    grid = _grid(plant, disturbances, timing)
-    times = np.arange(-grid.lead, grid.samples + 1, dtype=np.float64) * timing.period
+    times = np.arange(-grid.lead, grid.samples + 1, dtype=np.float64) * grid.sample_period
     moved = move(plant, motion, grid)
     if not is_default(disturbances.structure):
-        slide_x = Trajectory(times[0], timing.period, motion.positions(times).x)
+        slide_x = Trajectory(times[0], grid.sample_period, motion.positions(times).x)
         moved = deform(disturbances.structure, moved, slide_x)
     if spot := disturbances.probe.spot_m:
         surface = UnderSpot(surface, spot)
@@ -225,25 +208,27 @@ def _shifting(disturbances: Disturbances, times: FloatArray, random: Random) -> 
     return result
 
 
-def _grid(plant: Plant, disturbances: Disturbances, timing: Timing) -> TimeGrid:
-    forgotten = int(np.ceil(plant.lead_in() / timing.period))
+def _grid(
+    plant: Plant, disturbances: Disturbances, samples: int, period: float, substeps: int
+) -> TimeGrid:
+    forgotten = int(np.ceil(plant.lead_in() / period))
     if is_default(disturbances):
-        return TimeGrid(forgotten, timing.samples, timing.period, timing.substeps, timing.substeps)
-    probe, clocks = disturbances.probe, disturbances.clocks.reach_s(timing.duration)
+        return TimeGrid(forgotten, samples, period, substeps, substeps)
+    probe, clocks = disturbances.probe, disturbances.clocks.reach_s(samples * period)
     reference = disturbances.reference.latency_s if disturbances.reference else 0.0
     late = max(probe.latency_s + probe.window_s, reference)
     lead = late + clocks + disturbances.structure.lead_s
     return TimeGrid(
-        lead=forgotten + int(np.ceil(lead / timing.period)) + _SPARE_SAMPLES,
-        samples=timing.samples + int(np.ceil(clocks / timing.period)) + _SPARE_SAMPLES,
-        sample_period=timing.period,
-        substeps=timing.substeps,
+        lead=forgotten + int(np.ceil(lead / period)) + _SPARE_SAMPLES,
+        samples=samples + int(np.ceil(clocks / period)) + _SPARE_SAMPLES,
+        sample_period=period,
+        substeps=substeps,
         every=1,
     )
 
 
 @dataclass(frozen=True)
-class Cell:
+class Cell(CheckedNumbers):
     """Configuration of the twin.
 
     encoder_noise: standard deviation [m]
@@ -256,10 +241,7 @@ class Cell:
     sample_period: float = 1e-3
     seed: int = 1
     disturbances: Disturbances = field(default_factory=Disturbances)
-
-    def __post_init__(self) -> None:
-        if not self.sample_period > 0:
-            raise ConfigurationError(f"sample_period {self.sample_period!r} s is not positive")
+    positive = ("sample_period",)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -326,9 +308,13 @@ def record(
     random = {n: np.random.default_rng(child) for n, child in zip(_STREAMS, children, strict=True)}
     errors = cell.disturbances
     steps = substeps or max(_LEAST_SUBSTEPS, int(np.ceil(cell.sample_period / _LONGEST_STEP_S)))
-    timing = Timing(round(motion.duration / cell.sample_period), cell.sample_period, steps)
-    scene = scene_of(cell.plant, errors, motion, surface, stand_off, timing, random)
-    nominal = np.arange(timing.samples, dtype=np.float64) * cell.sample_period
+    nominal = np.arange(round(motion.duration / cell.sample_period), dtype=np.float64)
+    nominal *= cell.sample_period
+    plant = cell.plant
+    if errors.servo_bandwidth_hz is not None:
+        plant = replace(plant, servo_bandwidth=errors.servo_bandwidth_hz)
+    grid = _grid(plant, errors, len(nominal), cell.sample_period, steps)
+    scene = scene_of(plant, errors, motion, surface, stand_off, grid, random)
     instants = errors.clocks.instants(nominal, random["clocks"])
     seen = scene.over_an_exposure(instants.probe)
     return Recording(
@@ -336,7 +322,7 @@ def record(
         distance=_distance(cell, scene, instants, seen, random),
         probe_motion=seen.probe,
         surface_height=seen.surface,
-        **_further_channels(scene, instants, timing, random),
+        **_further_channels(scene, instants, cell.sample_period, random),
         truth=Truth(
             time=instants.trigger,
             slide=scene.slide.at(instants.trigger),
@@ -366,11 +352,7 @@ def _axes(cell: Cell, scene: Scene, when: Instants, random: np.random.Generator)
 
 
 def _distance(
-    cell: Cell,
-    scene: Scene,
-    when: Instants,
-    seen: ProbeTarget,
-    random: Mapping[str, np.random.Generator],
+    cell: Cell, scene: Scene, when: Instants, seen: ProbeTarget, random: Random
 ) -> DistanceBlock:
     errors, slope = scene.disturbances.probe, LEVEL
     if errors.is_slope_sensitive:
@@ -381,16 +363,17 @@ def _distance(
 
 
 def _further_channels(
-    scene: Scene, when: Instants, timing: Timing, random: Mapping[str, np.random.Generator]
+    scene: Scene, when: Instants, trigger_period: float, random: Random
 ) -> dict[str, Any]:
     channels: dict[str, Any] = {}
     if reference := scene.disturbances.reference:
         channels["reference"] = reference.read(
-            scene.slide, when.trigger, timing.period, random["reference"]
+            scene.slide, when.trigger, trigger_period, random["reference"]
         )
     if accelerometer := scene.disturbances.accelerometer:
-        period = accelerometer.sample_period_s or timing.period
-        time = np.arange(round(timing.duration / period), dtype=np.float64) * period
+        period = accelerometer.sample_period_s or trigger_period
+        duration = len(when.trigger) * trigger_period
+        time = np.arange(round(duration / period), dtype=np.float64) * period
         channels["acceleration"] = accelerometer.read(
             scene.acceleration(time, period), period, random["accelerometer"]
         )

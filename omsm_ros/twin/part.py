@@ -6,7 +6,6 @@ import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
@@ -93,7 +92,7 @@ class UnderSpot:
 
 
 @dataclass(frozen=True, slots=True)
-class FigureError:
+class FigureError(CheckedNumbers):
     """Surface ``nominal`` with a figure error: astigmatism, trefoil, concentric ripple, tool marks.
 
     radius: of the aperture [m], where astigmatism and trefoil reach their full size
@@ -112,14 +111,7 @@ class FigureError:
     ripple_pitch: float = 1.6 * MILLIMETRE_M
     tool_marks: float = 0.0
     tool_feed: float = 15 * MICROMETRE_M
-
-    def __post_init__(self) -> None:
-        for name in ("radius", "ripple_pitch", "tool_feed"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise ConfigurationError(
-                    f"figure error: {name} is {value!r} m, expected a positive number"
-                )
+    positive = ("radius", "ripple_pitch", "tool_feed")
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Return the height [m] at x, y [m], of their broadcast shape."""
@@ -146,7 +138,7 @@ class FigureError:
 
 
 @dataclass(frozen=True, slots=True)
-class AzimuthalRipple:
+class AzimuthalRipple(CheckedNumbers):
     """A surface: ``nominal`` plus waves across every circle about the spindle axis.
 
     wavelength: along the circle of ``radius`` [m], rounded to a whole number a turn
@@ -158,14 +150,7 @@ class AzimuthalRipple:
     wavelength: float = 15 * MICROMETRE_M
     rms: float = 11 * NANOMETRE_M
     second: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("radius", "wavelength"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise ConfigurationError(
-                    f"azimuthal ripple: {name} is {value!r} m, expected a positive number"
-                )
+    positive = ("radius", "wavelength")
 
     @property
     def count(self) -> int:

@@ -12,6 +12,7 @@ from omsm_ros.core.kinematics.trajectories import Motion
 from omsm_ros.core.lti.transfer_function import ComplexArray, TransferFunction
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
+from omsm_ros.twin.record_checks import CheckedNumbers
 
 # Distance from the grid, in steps, that is rounding of k · period.
 _ON_THE_GRID = 1e-7
@@ -78,17 +79,17 @@ _CHUNK_SAMPLES = 50_000
 
 
 @dataclass(frozen=True)
-class Plant:
+class Plant(CheckedNumbers):
     """Critically damped servo of ``servo_bandwidth`` [Hz] and dynamics G(s) of the probe."""
 
     dynamics: TransferFunction = PAPER_DYNAMICS
     servo_bandwidth: float = 200.0
+    positive = ("servo_bandwidth",)
 
     def __post_init__(self) -> None:
+        CheckedNumbers.__post_init__(self)
         if not self.dynamics.is_stable:
             raise ConfigurationError(f"plant with poles {self.dynamics.poles()!r} is unstable")
-        if not self.servo_bandwidth > 0:
-            raise ConfigurationError(f"servo_bandwidth {self.servo_bandwidth!r} Hz is not positive")
 
     @property
     def servo(self) -> TransferFunction:
@@ -182,7 +183,7 @@ def _zero_order_hold_sections(system: TransferFunction, step: float) -> FloatArr
     Poles are mapped exactly; zeros are those of the Rosenbrock pencil of the discrete system; the
     gain follows from G(0). A single polynomial would lose digits.
     """
-    a, b, c, d = signal.cont2discrete(_state_space(system, 1 / step), 1.0, method="zoh")[:4]
+    a, b, c, d = signal.cont2discrete(_state_space(system, step), 1.0, method="zoh")[:4]
     n = len(a)
     # y at the end of the step: C x[k+1] + D u[k] = C A x[k] + (C B + D) u[k].
     pencil = np.block([[a, b], [c @ a, c @ b + d]])
@@ -199,17 +200,9 @@ def _at_one(roots: ComplexArray) -> complex:
 
 
 def _state_space(
-    system: TransferFunction, rate: float
+    system: TransferFunction, step: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return controllable canonical form, time in units of 1/rate to keep its entries near 1."""
-    order = len(system.denominator) - 1
-    leading = system.denominator[-1] * rate**order
-    monic = system.denominator * rate ** np.arange(order + 1) / leading
-    numerator = np.zeros(order + 1)
-    used = len(system.numerator)
-    numerator[:used] = system.numerator * rate ** np.arange(used) / leading
-    a = np.eye(order, k=1)
-    a[-1] = -monic[:-1]
-    b = np.eye(order)[:, -1:]
-    c = (numerator[:-1] - numerator[-1] * monic[:-1])[np.newaxis]
-    return a, b, c, numerator[-1:, np.newaxis]
+    """Return controllable canonical form, time in units of ``step`` to keep its entries near 1."""
+    top, bottom = (p / step ** np.arange(len(p)) for p in (system.numerator, system.denominator))
+    a, b, c, d = signal.tf2ss(top[::-1], bottom[::-1])
+    return a, b, c, d

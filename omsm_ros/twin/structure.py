@@ -7,22 +7,19 @@ imitated: backlash and friction within the servo loop, stiffness that changes th
 mode (it scales the whole deflection), temperature.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from scipy import signal
 
 from omsm_ros.core.kinematics.trajectories import s_curve
 from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.model_errors.families import dahl_friction, through_backlash
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import Movement, Trajectory
 from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 
-# A smaller change between two steps is rounding, not a reversal [m].
-_STILL_M = 1e-16
 # Time in which the motion is faded in, so that it does not excite a soft mode.
 _SPIN_UP_S = 4.0
 # Two relaxations per decade approximate logarithmic creep to 0.5 %.
@@ -39,61 +36,25 @@ _SLOW_STEPS = 30
 class BacklashOutput(Trajectory):
     """Motion behind backlash, as exact between its values as the motion of its driver.
 
-    driver: driving motion;  held: position while it is not driven, (n,) [m]
-    half_width: half of the backlash [m]
+    driver: driving motion;  half_width: half of the backlash [m]
     """
 
     driver: Trajectory
-    held: FloatArray
     half_width: float
 
     def at(self, time: FloatArray) -> FloatArray:
         """Return the position [m] at ``time`` [s], of its shape, with sharp kinks."""
         driver = self.driver.at(time)
-        following = np.ceil((time - self.start) / self.step).astype(np.int64)
-        held = self.held[np.minimum(following, len(self.held) - 1)]
+        latest = np.floor((time - self.start) / self.step).astype(np.int64)
+        held = self.values[np.clip(latest, 0, len(self.values) - 1)]
         low, high = driver - self.half_width, driver + self.half_width
         return np.asarray(np.clip(held, low, high), np.float64)
 
 
 def backlash(driver: Trajectory, width: float) -> BacklashOutput:
     """Return the motion behind a backlash of ``width`` [m], at first in its middle."""
-    position, half = driver.values, width / 2
-    runs, state, states = list(_monotone_runs(position)), position[0], []
-    for _, last, up in runs:
-        states.append(state)
-        end = position[last - 1]
-        state = max(state, end - half) if up else min(state, end + half)
-    held = np.repeat(states, [last - first for first, last, _ in runs])
-    values = np.clip(held, position - half, position + half)
-    return BacklashOutput(driver.start, driver.step, values, driver, held, half)
-
-
-def friction(position: FloatArray, presliding: float) -> FloatArray:
-    """Return Dahl's friction, -1 to 1 (n,), along ``position`` (n,) [m], none at first.
-
-    Along a run of one direction s: ``F = s - (s - F₀) exp(-|z - z₀| / presliding)``.
-    """
-    result, state = np.empty_like(position), 0.0
-    for first, last, up in _monotone_runs(position):
-        sign = 1.0 if up else -1.0
-        travel = abs(position[first:last] - position[max(first - 1, 0)])
-        result[first:last] = sign - (sign - state) * np.exp(-travel / presliding)
-        state = result[last - 1]
-    return result
-
-
-def _monotone_runs(position: FloatArray) -> Iterator[tuple[int, int, bool]]:
-    """Yield slices ``first:last`` in which the position only rises (True) or only falls."""
-    change = np.diff(position, prepend=position[0])
-    moving = abs(change) > _STILL_M
-    # At standstill the direction is that of the last move.
-    latest = np.maximum.accumulate(np.where(moving, np.arange(len(position)), 0))
-    up = change[latest] > 0
-    cuts = np.flatnonzero(up[1:] != up[:-1]) + 1
-    bounds = [0, *cuts.tolist(), len(position)]
-    for first, last in pairwise(bounds):
-        yield first, last, bool(up[first])
+    values = through_backlash(driver.values, width / 2)
+    return BacklashOutput(driver.start, driver.step, values, driver, width / 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,7 +189,9 @@ def deform(errors: StructureErrors, moved: Movement, slide_x: Trajectory) -> Mov
     if errors.hardening_deflection_m is not None:
         probe = slide - hardened(slide - probe, errors.hardening_deflection_m)
     if errors.friction:
-        probe = probe - errors.friction.drag_m * friction(probe, errors.friction.presliding_m)
+        probe = (
+            probe - errors.friction.drag_m * dahl_friction(probe, errors.friction.presliding_m)[0]
+        )
     result = Trajectory(moved.probe.start, moved.probe.step, probe)
     if errors.backlash_m:
         result = backlash(result, errors.backlash_m)

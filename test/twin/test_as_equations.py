@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.twin_motions import respond
 from omsm_ros.core.kinematics.trajectories import Chirp
+from omsm_ros.core.model_errors.families import dahl_friction
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.disturbances import Vibration, VibrationLine
 from omsm_ros.twin.part import AzimuthalRipple, PartPose
@@ -20,15 +21,7 @@ from omsm_ros.twin.sensors import (
     Pitch,
     acceleration_of,
 )
-from omsm_ros.twin.structure import (
-    Creep,
-    SoftMode,
-    StructureErrors,
-    backlash,
-    deform,
-    friction,
-    hardened,
-)
+from omsm_ros.twin.structure import Creep, SoftMode, StructureErrors, backlash, deform, hardened
 
 STEP = 1e-3
 EXACT = {"rtol": 1e-9, "atol": 1e-16, "method": "LSODA"}
@@ -116,7 +109,7 @@ def test_friction_obeys_dahl_s_law_in_time():
 
     times = probe.times[1:]
     (force,) = integrated(rate, 1, times)
-    np.testing.assert_allclose(friction(probe.values, presliding)[1:], force, atol=2e-3)
+    np.testing.assert_allclose(dahl_friction(probe.values, presliding)[0][1:], force, atol=2e-3)
 
 
 def test_backlash_is_the_play_of_a_pin_in_a_slot():

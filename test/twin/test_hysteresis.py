@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from omsm_ros.core.model_errors.families import dahl_friction
 from omsm_ros.twin.plant import Trajectory
-from omsm_ros.twin.structure import backlash, friction
+from omsm_ros.twin.structure import backlash
 
 
 def behind(position, width):
@@ -47,13 +48,13 @@ def test_friction_obeys_dahls_equation_step_by_step(path):
         sign = np.sign(dz)
         state = sign - (sign - state) * np.exp(-abs(dz) / 30e-9) if dz else state
         expected.append(state)
-    np.testing.assert_allclose(friction(path, 30e-9), expected, atol=1e-12)
+    np.testing.assert_allclose(dahl_friction(path, 30e-9)[0], expected, atol=1e-12)
 
 
 def test_friction_turns_over_within_the_presliding_distance():
     there = np.linspace(0, 100e-6, 10_001)
     path = np.r_[there, there[-2::-1]]
-    found = friction(path, 1e-6)
+    found = dahl_friction(path, 1e-6)[0]
     assert found[10_000] == pytest.approx(1.0)
     # One micrometre after the reversal:
     assert found[10_100] == pytest.approx(-1 + 2 * np.exp(-1), abs=1e-3)

@@ -22,8 +22,9 @@ from omsm_ros.core.correction.motion_filter import (
     MotionFilters,
     undetected_rows,
 )
+from omsm_ros.core.correction.source_kinds import SystematicSource
 from omsm_ros.core.correction.surface_points import SurfacePoints, join_points
-from omsm_ros.core.correction.systematic import MOST_TRACED, ScanPoints, ScanTrace, SystematicSource
+from omsm_ros.core.correction.systematic import MOST_TRACED, ScanPoints, ScanTrace
 from omsm_ros.core.correction.uncertainty import (
     SCAN_SCATTER,
     ErrorSources,
@@ -121,7 +122,7 @@ class Corrector:
         self._systematic = [
             source
             for source in options.systematic
-            if options.surface is not None or not source.needs_slope
+            if options.surface is not None or not source.kind.needs_slope
         ]
         self.trace = ScanTrace(most_traced)
 

@@ -16,15 +16,18 @@ import numpy as np
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.calibration_set import CalibrationSet
-from omsm_ros.core.correction.source_kinds import FORMER_NAMES, KINDS, source_of
+from omsm_ros.core.correction.source_kinds import (
+    FORMER_NAMES,
+    KINDS,
+    SystematicSource,
+    standard_fields,
+)
 from omsm_ros.core.correction.systematic import (
     ASSUMED,
     DECLARED,
     EVALUATED,
     NOT_EVALUATED,
     ScanPoints,
-    SystematicSource,
-    standard_fields,
 )
 from omsm_ros.core.correction.uncertainty import SCAN_SCATTER, ErrorSources, covariance_parts
 from omsm_ros.core.kinematics.kinematics import Geometry
@@ -101,7 +104,7 @@ class StatedSource:
 
     def systematic(self) -> SystematicSource:
         """Return the source with its sensitivity fields."""
-        return source_of(
+        return SystematicSource(
             self.source, self.standard_uncertainty, self.how, self.reason, self.parameters
         )
 
@@ -181,7 +184,7 @@ def whole_scan_sources(
     for name, part in zip(OF_CALIBRATION, (0, 1), strict=True):
         if any(covariance_parts(member)[part].covariance.any() for member in members):
             reason = Notice("correction.from_covariance")
-            found.append(source_of(name, 1.0, EVALUATED, reason, {}))
+            found.append(SystematicSource(name, 1.0, EVALUATED, reason))
     parameters: dict[str, Mapping[str, float]] = {
         "static_gain": {"gain": calibration.static_gain},
         "pitch": {"arm": geometry.abbe_arm},
@@ -189,7 +192,7 @@ def whole_scan_sources(
     for name in _ALSO_SYSTEMATIC:
         if size := getattr(points, name):
             how, reason = origin_of(name, calibration, stated)
-            found.append(source_of(name, size, how, reason, parameters.get(name, {})))
+            found.append(SystematicSource(name, size, how, reason, parameters.get(name, {})))
     return (*found, *stated.scan_sources())
 
 

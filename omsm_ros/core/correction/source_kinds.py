@@ -7,13 +7,13 @@ Each field function returns the change of the heights [m] of n points per unit o
 for its k independent components or (n,) for one. Fields of lateral shifts need the slopes.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from omsm_ros import quantities
-from omsm_ros.core.correction.systematic import ScanPoints, SystematicSource
+from omsm_ros.core.correction.systematic import ScanPoints
 from omsm_ros.core.kinematics.kinematics import workpiece_xy
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError, Notice
@@ -138,38 +138,68 @@ class SourceKind:
     squares: Callable[[ScanPoints, Parameters], FloatArray] | None = None
 
 
-def source_of(
-    name: str, value: float, origin: str, reason: str | Notice, parameters: Parameters
-) -> SystematicSource:
-    """Return the source of kind ``name`` with standard uncertainty ``value``.
+@dataclass(frozen=True)
+class SystematicSource:
+    """A source of error that is common to a whole scan.
+
+    name: of its kind;  standard_uncertainty: of each of its independent components, k = 1
+    origin: EVALUATED from data, DECLARED or ASSUMED;  reason: where the size comes from
+    parameters: of its kind
 
     Raises ConfigurationError for implausible values and for parameters that are unknown or missing.
     """
-    kind = KINDS[name]
-    kind.quantity.checked(value, ConfigurationError, name)
-    for key, size in parameters.items():
-        if key not in kind.parameters:
-            raise ConfigurationError(
-                "correction.parameter", source=name, parameter=key, known=sorted(kind.parameters)
-            )
-        kind.parameters[key].checked(size, ConfigurationError, f"{name}.{key}")
-    for key in kind.parameters:
-        if key not in parameters and key not in kind.optional:
-            unit = kind.parameters[key].unit or "1"
-            raise ConfigurationError(
-                "correction.needs_parameter", source=name, parameter=key, unit=unit
-            )
-    squares = kind.squares
-    return SystematicSource(
-        name=name,
-        unit=kind.quantity.unit or "1",
-        standard_uncertainty=float(value),
-        fields=lambda points: np.atleast_2d(kind.fields(points, parameters)),
-        origin=origin,
-        reason=reason,
-        needs_slope=kind.needs_slope,
-        squares=None if squares is None else lambda points: squares(points, parameters),
-    )
+
+    name: str
+    standard_uncertainty: float
+    origin: str
+    reason: str | Notice
+    parameters: Parameters = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        name, known = self.name, self.kind.parameters
+        self.kind.quantity.checked(self.standard_uncertainty, ConfigurationError, name)
+        for key, size in self.parameters.items():
+            if key not in known:
+                raise ConfigurationError(
+                    "correction.parameter", source=name, parameter=key, known=sorted(known)
+                )
+            known[key].checked(size, ConfigurationError, f"{name}.{key}")
+        for key in known:
+            if key not in self.parameters and key not in self.kind.optional:
+                unit = known[key].unit or "1"
+                raise ConfigurationError(
+                    "correction.needs_parameter", source=name, parameter=key, unit=unit
+                )
+
+    @property
+    def kind(self) -> SourceKind:
+        """Kind of the source."""
+        return KINDS[self.name]
+
+    def standard_fields(self, points: ScanPoints) -> FloatArray:
+        """Return the change of the heights [m] per standard uncertainty, (k, n)."""
+        fields = np.atleast_2d(self.kind.fields(points, self.parameters))
+        return np.asarray(self.standard_uncertainty * fields, np.float64)
+
+    def variance(self, points: ScanPoints) -> FloatArray:
+        """Return the variance of each height [m²], (n,)."""
+        if self.kind.squares is None:
+            return np.asarray(np.sum(self.standard_fields(points) ** 2, axis=0), np.float64)
+        squares = self.kind.squares(points, self.parameters)
+        return np.asarray(self.standard_uncertainty**2 * squares, np.float64)
+
+
+def standard_fields(
+    sources: Sequence[SystematicSource], points: ScanPoints
+) -> dict[str, FloatArray]:
+    """Return by name the change of the heights [m] per standard uncertainty, each (k, n).
+
+    Components of sources with the same name are concatenated.
+    """
+    found: dict[str, list[FloatArray]] = {}
+    for source in sources:
+        found.setdefault(source.name, []).append(source.standard_fields(points))
+    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 _METRES, _RADIANS = quantities.UNCERTAINTY, quantities.ANGLE_UNCERTAINTY

@@ -12,7 +12,7 @@ between them. Components with a negligible share are left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -27,7 +27,7 @@ from omsm_ros.core.kinematics.kinematics import (
 )
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.streams.statistics import EvenSelection
-from omsm_ros.errors import ConfigurationError, DataError, Notice
+from omsm_ros.errors import DataError
 
 EVALUATED, DECLARED, NOT_EVALUATED = "evaluated", "declared", "not evaluated"
 ASSUMED = "assumed"
@@ -102,62 +102,6 @@ class ScanPoints:
         if self.slope_x is None or self.slope_y is None:
             raise DataError("correction.no_slope")
         return np.asarray(-self.slope_x * x - self.slope_y * y, np.float64)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SystematicSource:
-    """A source of error that is common to a whole scan.
-
-    name: of the source;  unit: of its size, SI
-    standard_uncertainty: of each of its independent components [unit], k = 1
-    fields: change of each height [m] per unit of each component, (k, n), for ``ScanPoints``
-    origin: EVALUATED from data, or DECLARED;  reason: where the size comes from
-    needs_slope: True if the fields need the slope of the surface
-    squares: sum of the squares of the fields, (n,), where a shorter way exists
-
-    Raises ConfigurationError for an uncertainty that is negative or not finite.
-    """
-
-    name: str
-    unit: str
-    standard_uncertainty: float
-    fields: Callable[[ScanPoints], FloatArray]
-    origin: str = DECLARED
-    reason: str | Notice = ""
-    needs_slope: bool = False
-    squares: Callable[[ScanPoints], FloatArray] | None = None
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.standard_uncertainty < np.inf:
-            raise ConfigurationError(
-                "correction.negative_uncertainty",
-                source=self.name,
-                value=self.standard_uncertainty,
-                unit=self.unit,
-            )
-
-    def standard_fields(self, points: ScanPoints) -> FloatArray:
-        """Return the change of the heights [m] per standard uncertainty, (k, n)."""
-        return np.asarray(self.standard_uncertainty * self.fields(points), np.float64)
-
-    def variance(self, points: ScanPoints) -> FloatArray:
-        """Return the variance of each height [m²], (n,)."""
-        if self.squares is None:
-            return np.asarray(np.sum(self.standard_fields(points) ** 2, axis=0), np.float64)
-        return np.asarray(self.standard_uncertainty**2 * self.squares(points), np.float64)
-
-
-def standard_fields(
-    sources: Sequence[SystematicSource], points: ScanPoints
-) -> dict[str, FloatArray]:
-    """Return by name the change of the heights [m] per standard uncertainty, each (k, n).
-
-    Components of sources with the same name are concatenated.
-    """
-    found: dict[str, list[FloatArray]] = {}
-    for source in sources:
-        found.setdefault(source.name, []).append(source.standard_fields(points))
-    return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
 # Share of the variance that may be left out: of one source (0.5 % of its standard uncertainty), and

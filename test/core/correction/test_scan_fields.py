@@ -7,21 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.source_kinds import source_of
-from omsm_ros.core.correction.systematic import (
-    DECLARED,
-    resolves_per_turn_waves,
-    scan_fields,
-    standard_fields,
-)
+from omsm_ros.core.correction.source_kinds import SystematicSource, standard_fields
+from omsm_ros.core.correction.systematic import DECLARED, resolves_per_turn_waves, scan_fields
 
 from .systematic_scan import spiral_points
 
 SOURCES = [
-    source_of("tilt", 1e-5, DECLARED, "r", {}),
-    source_of("drift_walk", 1e-9, DECLARED, "r", {}),
-    source_of("spindle_axial", 1e-8, DECLARED, "r", {"per_turn": 2}),
-    source_of("encoder_scale", 1e-12, DECLARED, "r", {}),
+    SystematicSource("tilt", 1e-5, DECLARED, "r", {}),
+    SystematicSource("drift_walk", 1e-9, DECLARED, "r", {}),
+    SystematicSource("spindle_axial", 1e-8, DECLARED, "r", {"per_turn": 2}),
+    SystematicSource("encoder_scale", 1e-12, DECLARED, "r", {}),
 ]
 
 

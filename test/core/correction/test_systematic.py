@@ -7,13 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from omsm_ros.core.correction.source_kinds import KINDS, source_of
-from omsm_ros.core.correction.systematic import (
-    DECLARED,
-    ScanPoints,
-    SystematicSource,
-    standard_fields,
-)
+from omsm_ros.core.correction.source_kinds import KINDS, SystematicSource, standard_fields
+from omsm_ros.core.correction.systematic import DECLARED, ScanPoints
 from omsm_ros.core.kinematics.kinematics import Geometry, workpiece_points
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat, Sphere
 from omsm_ros.errors import ConfigurationError, DataError
@@ -42,7 +37,7 @@ def points() -> ScanPoints:
 
 
 def made(name: str, value: float = 1.0) -> SystematicSource:
-    return source_of(name, value, DECLARED, "stated here", PARAMETERS.get(name, {}))
+    return SystematicSource(name, value, DECLARED, "stated here", PARAMETERS.get(name, {}))
 
 
 def fields(name: str, points: ScanPoints) -> np.ndarray:
@@ -161,7 +156,7 @@ def test_without_slopes_what_needs_them_is_refused() -> None:
 
 
 def test_sources_of_one_name_are_one_source(points: ScanPoints) -> None:
-    twice = [source_of("spindle_axial", 1e-9, DECLARED, "", {"per_turn": k}) for k in (1, 2)]
+    twice = [SystematicSource("spindle_axial", 1e-9, DECLARED, "", {"per_turn": k}) for k in (1, 2)]
     assert standard_fields(twice, points)["spindle_axial"].shape == (4, len(points))
 
 
@@ -185,14 +180,12 @@ def test_what_is_no_source_is_refused(
     name: str, value: float, parameters: dict[str, float], says: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=says):
-        source_of(name, value, DECLARED, "", parameters)
+        SystematicSource(name, value, DECLARED, "", parameters)
 
 
 def test_a_source_of_no_number_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match="thing: standard uncertainty nan m"):
-        SystematicSource(
-            name="thing", unit="m", standard_uncertainty=float("nan"), fields=lambda p: p.x
-        )
+    with pytest.raises(ConfigurationError, match="tilt"):
+        SystematicSource("tilt", float("nan"), DECLARED, "")
 
 
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.squares])
