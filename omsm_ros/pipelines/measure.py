@@ -222,7 +222,9 @@ def live_verdict(
 
 
 def _without_slopes(corrector: Corrector, stated: MachineSources) -> Iterator[str]:
-    lateral = {s.name for s in stated.scan_sources() if s.kind.needs_slope and s.standard_uncertainty}
+    lateral = {
+        s.name for s in stated.scan_sources() if s.kind.needs_slope and s.standard_uncertainty
+    }
     missing = sorted(lateral - set(corrector.budget))
     if missing and corrector.trace.seen:
         yield (

@@ -29,11 +29,18 @@ _PRECISION = 1e-4
 _TINY = 1e-12
 
 
+# Plausible ranges: a value in another unit, as 100 for micrometres, is refused.
+_FREQUENCY = Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz")
+_LENGTH = Quantity("limit", "m", 1e-10, 1.0, "give it in metres")
+_SPEED = Quantity("limit", "rpm", 1e-3, 1e6, "give it in turns a minute")
+_ACCELERATION = Quantity("limit", "m/s²", 1e-9, 1e5, "give it in m/s²")
+_JERK = Quantity("limit", "m/s³", 1e-9, 1e9, "give it in m/s³")
+_TIME = Quantity("limit", "s", 1e-15, 10.0, "give it in seconds")
+
+
 @dataclass(frozen=True, kw_only=True)
 class MachineLimits(CheckedRecord):
     """Limits of machine and probe; None if not declared.
-
-    Ranges are plausible ones: a value in another unit, as 100 for micrometres, is refused.
 
     servo_frequency: natural frequency of the Z servo, taken as critically damped [Hz]; typical
         of a slow tool servo, and that of the paper, are 50 Hz
@@ -43,27 +50,15 @@ class MachineLimits(CheckedRecord):
     exposure: of one reading [s];  timing: standard uncertainty of a trigger [s]
     """
 
-    servo_frequency: float | None = Quantity("limit", "Hz", 1e-3, 1e6, "give it in hertz").of_field(
-        50.0
-    )
-    probe_range: float | None = Quantity("limit", "m", 1e-9, 1.0, "give it in metres").of_field(
-        100 * MICROMETRE_M
-    )
-    spindle_speed_rpm: float | None = Quantity(
-        "limit", "rpm", 1e-3, 1e6, "give it in turns a minute"
-    ).of_field(120.0)
-    motion_frequency: float | None = Quantity(
-        "limit", "Hz", 1e-3, 1e6, "give it in hertz"
-    ).of_field(50.0)
-    z_acceleration: float | None = Quantity("limit", "m/s²", 1e-9, 1e5, "give it in m/s²").of_field(
-        None
-    )
-    z_jerk: float | None = Quantity("limit", "m/s³", 1e-9, 1e9, "give it in m/s³").of_field(None)
-    point_spacing: float | None = Quantity("limit", "m", 1e-10, 1.0, "give it in metres").of_field(
-        None
-    )
-    exposure: float | None = Quantity("limit", "s", 1e-9, 10.0, "give it in seconds").of_field(None)
-    timing: float | None = Quantity("limit", "s", 1e-15, 1.0, "give it in seconds").of_field(None)
+    servo_frequency: float | None = _FREQUENCY.of_field(50.0)
+    probe_range: float | None = _LENGTH.of_field(100 * MICROMETRE_M)
+    spindle_speed_rpm: float | None = _SPEED.of_field(120.0)
+    motion_frequency: float | None = _FREQUENCY.of_field(50.0)
+    z_acceleration: float | None = _ACCELERATION.of_field(None)
+    z_jerk: float | None = _JERK.of_field(None)
+    point_spacing: float | None = _LENGTH.of_field(None)
+    exposure: float | None = _TIME.of_field(None)
+    timing: float | None = _TIME.of_field(None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.polynomial import Legendre
+from scipy import fft
 
 from omsm_ros.core.streams.blocks import (
     SAME_PERIOD,
@@ -20,9 +22,8 @@ _MOST_NAMED = 3
 # Share of the mean square velocity that defines the bandwidth; the rest may be encoder noise.
 _CONTENT_SHARE = 0.999
 # Length from which the end of a record is cut to a length with small prime factors, whose Fourier
-# transform is ten times as fast; less than 0.5 % is cut.
+# transform is ten times as fast; less than 1 % is cut.
 _LONG = 65_536
-_SMALL_FACTORS = (2, 3, 5, 7, 11, 13)
 # Half width of the quintics that give derivatives: a quarter period of the bandwidth, within these
 # limits [samples]. The lower one keeps the encoder's noise below the path.
 _LEAST_HALF_WIDTH, _MOST_HALF_WIDTH = 4, 250
@@ -138,11 +139,13 @@ def content_frequency(z: FloatArray, sample_period: float) -> float:
     """
     velocity = np.diff(z)
     if len(velocity) > _LONG:
-        velocity = velocity[: _with_small_factors(len(velocity))]
-    steady = np.full(len(velocity), np.mean(velocity))
-    return min(
-        _content_without(slow, velocity, sample_period) for slow in (steady, _slow_part(velocity))
+        velocity = velocity[: fft.prev_fast_len(len(velocity), real=True)]
+    along = np.linspace(-1.0, 1.0, len(velocity))
+    slow = (
+        np.asarray(Legendre.fit(along, velocity, degree)(along), np.float64)
+        for degree in (0, min(3, len(velocity) - 1))
     )
+    return min(_content_without(part, velocity, sample_period) for part in slow)
 
 
 def _content_without(slow: FloatArray, velocity: FloatArray, sample_period: float) -> float:
@@ -161,25 +164,6 @@ def _content_without(slow: FloatArray, velocity: FloatArray, sample_period: floa
     gathered = slowly + np.cumsum(moved)
     place = int(np.argmax(gathered >= _CONTENT_SHARE * gathered[-1]))
     return float(place / (len(velocity) * sample_period))
-
-
-def _with_small_factors(number: int) -> int:
-    for found in range(number, 1, -1):
-        rest = found
-        for factor in _SMALL_FACTORS:
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return found
-    return 1
-
-
-def _slow_part(velocity: FloatArray) -> FloatArray:
-    """Return the least-squares cubic of ``velocity`` (n,)."""
-    along = np.linspace(-1.0, 1.0, len(velocity))
-    legendre = np.polynomial.legendre
-    degree = min(3, len(velocity) - 1)
-    return np.asarray(legendre.legval(along, legendre.legfit(along, velocity, degree)), np.float64)
 
 
 def steepest(z: FloatArray, sample_period: float, content: float) -> tuple[float, float, float]:

@@ -156,6 +156,22 @@ def power_over(
     return np.asarray(power, np.float64), spacing
 
 
+def magnitudes(
+    values: FloatArray | NDArray[np.complex128], place: FloatArray, frequencies: FloatArray
+) -> FloatArray:
+    """Return ``|Σ_j y_j exp(-2πi f u_j)|`` (k,) of values y at places u, at even ``frequencies``.
+
+    From one frequency to the next each value turns by a constant angle.
+    """
+    turning = values * np.exp(-2j * np.pi * frequencies[0] * place)
+    turn = np.exp(-2j * np.pi * (frequencies[1] - frequencies[0]) * place)
+    found = np.empty(len(frequencies))
+    for k in range(len(frequencies)):
+        found[k] = abs(np.sum(turning))
+        turning = turning * turn
+    return found
+
+
 def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[float, float]:
     """Return the share of the power of a line in ``one`` that a line in ``other`` has, and where.
 
@@ -169,12 +185,6 @@ def same_line(one: Coordinate, frequency: float, other: Coordinate) -> tuple[flo
     reach = _SEARCHED_BINS * _STEPS_IN_A_BIN
     step = other.resolution / _STEPS_IN_A_BIN
     tried = guess + step * np.arange(-reach, reach + 1)
-    # From one frequency to the next each sample turns by a constant angle.
-    turning = np.exp(2j * np.pi * (phase - tried[0] * place))
-    turn = np.exp(-2j * np.pi * step * place)
-    share = np.empty(len(tried))
-    for k in range(len(tried)):
-        share[k] = abs(np.mean(turning)) ** 2
-        turning = turning * turn
+    share = (magnitudes(np.exp(2j * np.pi * phase), place, tried) / len(place)) ** 2
     best = int(np.argmax(share))
     return float(share[best]), abs(float(tried[best]))

@@ -33,8 +33,7 @@ LOWEST_ORDER = 2
 LOWEST_ON_CIRCLE = 3
 # Degree of the drift over time in a scan that turns; faster changes are searched as lines.
 _DRIFT_DEGREE = 3
-# Even degrees of Zernike terms. The number of columns grows with their square, so degrees above
-# the usual one are tried on demand.
+# Even degrees of Zernike terms. Those above the usual one are tried only where it is needed.
 _DEGREES = range(2, 15, 2)
 _USUAL_DEGREE = 6
 # Least share of the residual power that a higher degree must remove, or it fits noise and lines;
@@ -103,26 +102,30 @@ class FormFit:
         return _Basis.of(self._signal).up_to(self._degree)
 
     def _sufficient_degree(self, values: FloatArray, worth: float) -> int:
-        """Return the degree beyond which less than the share ``worth`` is removed."""
-        for top in (_USUAL_DEGREE, max(_DEGREES)):
-            basis = _Basis.of(self._signal).up_to(top)
-            gram, moment = _normal_equations(basis, self._signal, values, self._chosen)
-            energy = float(np.sum(values[self._chosen] ** 2))
-            degree = _sufficient_degree(basis, gram, moment, energy, worth)
-            # The residual is fitted again, because rounding of millimetres would look like form.
-            kept = basis.within(degree)
-            some = self._selected()
-            columns = basis.columns(self._signal, some)
-            left = values[some] - columns[:, kept] @ _solved(gram, moment, kept)
-            gram, moment = columns.T @ columns, columns.T @ left
-            degree = _worthwhile_degree(basis, gram, moment, float(left @ left), worth, degree)
-            if degree < top:
+        """Return the highest degree that is worth all degrees up to it.
+
+        A form with six lobes, for example, needs the sixth degree although the fourth removes
+        nothing. The columns are made orthogonal, lowest degree first.
+        """
+        drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
+        some = self._chosen[np.sort(drawn)]
+        basis = _Basis.of(self._signal)
+        own = np.array([basis.degree(name) for name in basis.names])
+        order = np.argsort(own, kind="stable")
+        columns = basis.columns(self._signal, some)[:, order]
+        columns /= np.linalg.norm(columns, axis=0)
+        free = abs(np.diag(np.linalg.qr(columns, "r"))) > _LEAST_DETERMINED**0.5
+        rows, own = np.linalg.qr(columns[:, free])[0], own[order][free]
+        residual, degree, left = values[some], 0, np.inf
+        for higher in _DEGREES:
+            part = rows[:, own <= higher]
+            residual = residual - part @ (part.T @ residual)
+            now = float(residual @ residual)
+            if now <= (1 - worth) ** ((higher - degree) // _DEGREES.step) * left:
+                left, degree = now, higher
+            if degree < _USUAL_DEGREE <= higher:
                 break
         return degree
-
-    def _selected(self) -> np.ndarray:
-        drawn = np.random.default_rng(0).permutation(len(self._chosen))[:_CHUNK]
-        return np.asarray(self._chosen[np.sort(drawn)])
 
     def refine(self, heights: FloatArray) -> None:
         """Choose the degree again with the ``heights`` of all lines (n,) [m] subtracted."""
@@ -199,10 +202,6 @@ class _Basis:
         kept = tuple(name for name in self.names if self.degree(name) <= degree)
         return replace(self, names=kept)
 
-    def within(self, degree: int) -> np.ndarray:
-        """Return the indices of the columns of a fit of ``degree``, (q,)."""
-        return np.flatnonzero([self.degree(name) <= degree for name in self.names])
-
     def degree(self, name: tuple[str, int, int]) -> int:
         """Return the lowest degree of a fit that includes the column ``name``."""
         kind, n, _ = name
@@ -248,43 +247,6 @@ def _normal_equations(
         gram += columns.T @ columns
         moment += columns.T @ values[part]
     return gram, moment
-
-
-def _sufficient_degree(
-    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float
-) -> int:
-    """Return the degree after which the next one removes less than the share ``worth``."""
-    highest = max(map(basis.degree, basis.names))
-    left, kept = energy, 0
-    for degree in (d for d in _DEGREES if d <= highest):
-        columns = basis.within(degree)
-        solution = _solved(gram, moment, columns)
-        now = energy - float(solution @ moment[columns])
-        if degree > _DEGREES[0] and now > (1 - worth) * left:
-            break
-        left, kept = now, degree
-    return kept
-
-
-def _worthwhile_degree(
-    basis: _Basis, gram: FloatArray, moment: FloatArray, energy: float, worth: float, degree: int
-) -> int:
-    """Return the highest degree that is worth all degrees up to it, or ``degree``.
-
-    A form with six lobes, for example, needs the sixth degree although the fourth removes nothing.
-    """
-    highest = max(map(basis.degree, basis.names))
-    left = energy
-    for higher in (d for d in _DEGREES if degree < d <= highest):
-        columns = basis.within(higher)
-        now = energy - float(_solved(gram, moment, columns) @ moment[columns])
-        if now <= (1 - worth) ** ((higher - degree) // _DEGREES.step) * left:
-            left, degree = now, higher
-    return degree
-
-
-def _solved(gram: FloatArray, moment: FloatArray, columns: np.ndarray) -> FloatArray:
-    return np.asarray(_inverse(gram[np.ix_(columns, columns)]) @ moment[columns])
 
 
 def _inverse(gram: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from omsm_ros.core.ripple.coordinates import Coordinate, same_line
+from omsm_ros.core.ripple.coordinates import Coordinate, magnitudes, same_line
 from omsm_ros.core.ripple.scan_signal import PATH, ScanSignal
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -56,16 +56,8 @@ def texture(
     step = 0.5 / float(np.ptp(place))
     reach = min(int(spread / step) + 1, _MOST_TRIED)
     tried = frequency + step * np.arange(-reach, reach + 1)
-    # From one frequency to the next each sample turns by a constant angle.
-    turning = values * np.exp(-2j * np.pi * tried[0] * place)
-    turn = np.exp(-2j * np.pi * step * place)
-    power = np.empty(len(tried))
-    for k in range(len(tried)):
-        power[k] = abs(np.sum(turning))
-        turning = turning * turn
-    return SpectralLine(
-        coordinate=PATH, frequency=float(tried[np.argmax(power)]), cosine=0.0, sine=0.0
-    )
+    best = float(tried[np.argmax(magnitudes(values, place, tried))])
+    return SpectralLine(coordinate=PATH, frequency=best, cosine=0.0, sine=0.0)
 
 
 def start(coordinate: Coordinate, frequency: float, values: FloatArray) -> SpectralLine:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from omsm_ros.core.lti.transfer_function import ComplexArray
+from omsm_ros.core.ripple.coordinates import magnitudes
 from omsm_ros.core.ripple.density import aliased_frequency, significance
 from omsm_ros.core.ripple.form_removal import HIGHEST_ORDER
 from omsm_ros.core.ripple.scan_signal import TIME, TURN
@@ -198,6 +199,5 @@ def _clock_shift(
     half = 2 if clock is not None else int(_CLOCKS * frequency / step) + 2
     for width, spacing in ((half, step), (10, step / 10), (10, step / 100)):
         trials = best + spacing * np.arange(-width, width + 1)
-        match = [abs(np.sum(product * np.exp(-2j * np.pi * t * middle))) for t in trials]
-        best = float(trials[int(np.argmax(match))])
+        best = float(trials[np.argmax(magnitudes(product, middle, trials))])
     return best, 2 * half + 1
