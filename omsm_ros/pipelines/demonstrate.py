@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,7 +48,7 @@ from omsm_ros.pipelines.publish import publish_scan
 from omsm_ros.pipelines.record_bags import NOMINAL, write_nominal
 from omsm_ros.readable import quantity
 from omsm_ros.report.verdict import headline
-from omsm_ros.twin.cell import Probe, Recording, TruthComparison, compare_with_truth
+from omsm_ros.twin.cell import Probe, Recording, compare_with_truth
 from omsm_ros.twin.disturbances import NOTHING, Disturbances, TrueResponse
 from omsm_ros.twin.part import FigureError
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, spiral_of, verifying
@@ -331,12 +331,11 @@ def form_truth(part: FigureError, found: Adjustment) -> dict[str, float]:
 
 def truth_entries(recording: Recording, cloud: NDArray[np.void]) -> dict[str, Any]:
     """Return the entries of the summary that need the true values; lengths in metres."""
-    truth: TruthComparison = compare_with_truth(
+    entries: dict[str, Any] = compare_with_truth(
         recording, cloud["sample"], cloud["height"], cloud["dynamic_error"].astype(np.float64)
     )
     probe = Probe()
     floor = float(np.hypot(probe.noise, probe.resolution / np.sqrt(12)))
-    entries = asdict(truth)
     entries["surface_deviation"]["probe_noise_and_resolution"] = floor
     return entries
 

@@ -391,55 +391,39 @@ def blocks_of(recording: Recording, size: int = 100) -> list[tuple[AxisBlock, Di
     return list(zip(pieces(recording.axes, size), pieces(recording.distance, size), strict=True))
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorFigures:
-    """Peak to valley and root mean square about zero of an error [m]."""
-
-    peak_to_valley: float
-    rms: float
-
-
-def spread(error: FloatArray, weight: FloatArray | None = None) -> ErrorFigures:
-    """Return the figures of ``error`` (n,) [m], the rms weighted by ``weight`` (n,) if given."""
-    if not len(error):
-        raise DataError("no points to compare with the truth")
-    return ErrorFigures(float(np.ptp(error)), float(np.sqrt(np.average(error**2, weights=weight))))
-
-
-@dataclass(frozen=True, slots=True)
-class TruthComparison:
-    """Errors at the corrected points; rms of the dynamic errors is weighted by area.
-
-    dynamic_error_before: true motion of the probe minus the encoder
-    dynamic_error_after: true motion of the probe minus the filtered encoder
-    surface_deviation: corrected height minus the true surface
-    """
-
-    dynamic_error_before: ErrorFigures
-    dynamic_error_after: ErrorFigures
-    surface_deviation: ErrorFigures
-
-
 def compare_with_truth(
     recording: Recording, sample: ArrayLike, height: FloatArray, dynamic_error: FloatArray
-) -> TruthComparison:
+) -> dict[str, dict[str, float]]:
     """Compare corrected points, each array (n,), with the true values of their recording.
 
     sample: trigger counter;  height, dynamic_error: as in ``cloud.ply`` [m]
+
+    Return peak to valley and rms about zero [m] of
+
+    dynamic_error_before: true motion of the probe minus the encoder; rms weighted by area
+    dynamic_error_after: true motion of the probe minus the filtered encoder, likewise
+    surface_deviation: corrected height minus the true surface
     """
     index: IntArray = np.asarray(sample, np.int64) - recording.axes.first_sample
+    if not len(index):
+        raise DataError("no points to compare with the truth")
     if np.any((index < 0) | (index >= len(recording.axes))):
         raise DataError(
             f"samples {index.min()}…{index.max()} do not belong to this recording of "
             f"{len(recording.axes)}"
         )
-    encoder = recording.axes.z[index]
-    filtered = encoder - dynamic_error
-    motion = recording.probe_motion[index]
+    before = recording.probe_motion[index] - recording.axes.z[index]
     # In a spiral of constant feed and speed a point stands for an area proportional to its radius.
     radius = np.abs(recording.axes.x[index])
-    return TruthComparison(
-        dynamic_error_before=spread(motion - encoder, radius),
-        dynamic_error_after=spread(motion - filtered, radius),
-        surface_deviation=spread(height - recording.surface_height[index]),
-    )
+    errors = {
+        "dynamic_error_before": (before, radius),
+        "dynamic_error_after": (before + dynamic_error, radius),
+        "surface_deviation": (height - recording.surface_height[index], None),
+    }
+    return {
+        name: {
+            "peak_to_valley": float(np.ptp(error)),
+            "rms": float(np.sqrt(np.average(error**2, weights=weight))),
+        }
+        for name, (error, weight) in errors.items()
+    }

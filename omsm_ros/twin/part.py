@@ -6,6 +6,7 @@ import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
+from omsm_ros.core.surface.posed import Pose
 from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 from omsm_ros.units import MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
 
@@ -33,14 +34,8 @@ class PartPose(CheckedNumbers):
     @property
     def rotation(self) -> FloatArray:
         """Rotation from the frame of the part to that of the chuck (3, 3): about x, y, then z."""
-        (sx, sy, sz), (cx, cy, cz) = (
-            f(np.array([self.tilt_x_rad, self.tilt_y_rad, self.clocking_rad]))
-            for f in (np.sin, np.cos)
-        )
-        about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
-        about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-        about_z = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-        return np.asarray(about_z @ about_y @ about_x, np.float64)
+        pose = Pose(tip=self.tilt_x_rad, tilt=self.tilt_y_rad, clocking=self.clocking_rad)
+        return pose.rotation
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from omsm_ros.core.kinematics.kinematics import Surface
+from omsm_ros.core.kinematics.kinematics import Surface, slopes_by_differences, workpiece_xy
 from omsm_ros.core.streams.blocks import DistanceBlock, FloatArray, Status
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.twin.plant import PAPER_STATIC_GAIN
@@ -122,13 +122,7 @@ class Slope(NamedTuple):
 
 def slope_of(surface: Surface, x: FloatArray, y: FloatArray, c: FloatArray) -> Slope:
     """Return the slope of ``surface`` at x, y [m] of the chuck, rotated by ``c`` [rad]."""
-    h = _SLOPE_STEP_M
-    cosine, sine = np.cos(c), np.sin(c)
-    along_x = surface.height(x + h * cosine, y - h * sine)
-    along_x = along_x - surface.height(x - h * cosine, y + h * sine)
-    along_y = surface.height(x + h * sine, y + h * cosine)
-    along_y = along_y - surface.height(x - h * sine, y - h * cosine)
-    return Slope(along_x / (2 * h), along_y / (2 * h))
+    return Slope(*workpiece_xy(*slopes_by_differences(surface, x, y, _SLOPE_STEP_M), -c))
 
 
 LEVEL = Slope(np.zeros(1), np.zeros(1))

@@ -12,7 +12,7 @@ from omsm_ros.core.comparison.agreement import (
     root_mean_square,
 )
 from omsm_ros.core.comparison.matching import SEATED, Matched, match
-from omsm_ros.core.comparison.resampling import LocalQuadratic, cell_side
+from omsm_ros.core.comparison.resampling import LocalQuadratic, cell_side, occupied
 from omsm_ros.core.comparison.stated_errors import (
     ESTIMATED,
     NOT_KNOWN,
@@ -318,12 +318,5 @@ def _lateral_shift(matched: Matched) -> tuple[Notice, ...]:
 
 
 def _shared(a: MeasuredPoints, b: MeasuredPoints, matched: Matched, side: float) -> float:
-    both = float(np.sum(matched.filled)) * side**2
-    return min(both / min(_area(points, side) for points in (a, b)), 1.0)
-
-
-def _area(points: MeasuredPoints, side: float) -> float:
-    """Return the area that the points cover [m²], by cells of ``side`` that hold any."""
-    column, row = (np.floor(v / side).astype(np.int64) for v in (points.x, points.y))
-    cells = np.unique((column - column.min()) * (int(np.ptp(row)) + 1) + row - row.min())
-    return len(cells) * side**2
+    own = min(occupied(points.x, points.y, side) for points in (a, b))
+    return min(float(np.sum(matched.filled)) / own, 1.0)

@@ -84,13 +84,14 @@ def cell_side(x: FloatArray, y: FloatArray, most: int) -> float:
         raise DataError("comparison.no_area", width=width, height=high)
     side = max(float(np.sqrt(width * high / len(x))), extent / most)
     while extent / side > _FEWEST_CELLS_ACROSS:
-        if _occupied(x, y, side) >= _FILLED * _occupied(x, y, 2 * side):
+        if occupied(x, y, side) >= _FILLED * occupied(x, y, 2 * side):
             break
         side *= 2 ** (1 / 2)
     return side
 
 
-def _occupied(x: FloatArray, y: FloatArray, side: float) -> int:
+def occupied(x: FloatArray, y: FloatArray, side: float) -> int:
+    """Return the number of square cells of ``side`` [m] that hold any of the points (n,)."""
     column, row = _place(x, side), _place(y, side)
     return int(np.count_nonzero(np.bincount(column * (int(row.max()) + 1) + row)))
 

@@ -179,30 +179,42 @@ class LiveOffset:
         self._gain = abs(calibration.static_gain)
         self._lag = calibration.dynamics.low_frequency_delay
         self._lag_uncertainty = calibration.low_frequency_delay_uncertainty
-        self._axes, self._distance = _Newest(), _Newest()
+        self._axes: deque[tuple[int, FloatArray]] = deque()
+        self._distance: deque[tuple[int, FloatArray]] = deque()
         self._found: tuple[int, int] | None = None
+        self._period = 0.0
 
     def add(self, block: AxisBlock | DistanceBlock) -> None:
         """Take the next block of either stream."""
-        if isinstance(block, AxisBlock):
-            anew = self._axes.add(block.first_sample, block.z, block.sample_period)
+        first, parts = block.first_sample, self._axes
+        if isinstance(block, DistanceBlock):
+            first, parts = first + self.in_use, self._distance
+            values = np.where(block.ok, block.distance, np.nan)
         else:
-            reading = np.where(block.ok, block.distance, np.nan)
-            first = block.first_sample + self.in_use
-            anew = self._distance.add(first, reading, block.sample_period)
-        if anew:
+            values = block.z
+        if parts and first < _end(parts):
+            parts.clear()
             self.established = self._found = None
+        parts.append((first, values))
+        self._period = block.sample_period
+        while _end(parts) - parts[0][0] - len(parts[0][1]) >= self._most:
+            parts.popleft()
+
+    @property
+    def _most(self) -> int:
+        """Number of samples that are kept and judged."""
+        return min(max(round(_SPAN_S / self._period), 1), _MOST_SAMPLES)
 
     def judge(self) -> None:
         """Establish the offset if two successive motions give the same whole number."""
-        period = self._axes.period
-        end = min(self._axes.end, self._distance.end)
-        first = max(self._axes.first, self._distance.first, end - self._axes.most)
-        if not period or end <= first:
+        if not self._axes or not self._distance:
             return
-        if self._found is not None and end < self._found[0] + _APART_S / period:
+        period, streams = self._period, (self._axes, self._distance)
+        end = min(map(_end, streams))
+        first = max(*(parts[0][0] for parts in streams), end - self._most)
+        if end <= first or (self._found is not None and end < self._found[0] + _APART_S / period):
             return
-        z, distance = (stream.column(first, end) for stream in (self._axes, self._distance))
+        z, distance = (_column(parts, first, end) for parts in streams)
         known = np.flatnonzero(np.isfinite(z))
         if not len(known):
             return
@@ -225,35 +237,16 @@ class LiveOffset:
             self.established = found
 
 
-class _Newest:
-    """The newest samples of one stream, by count.
+def _end(parts: deque[tuple[int, FloatArray]]) -> int:
+    """Return the count after the last of ``parts``, which are (first count, values)."""
+    return parts[-1][0] + len(parts[-1][1])
 
-    first, end: range of counts;  most: number of samples kept;  period: sample period [s]
-    """
 
-    def __init__(self) -> None:
-        self.first = self.end = self.most = 0
-        self.period = 0.0
-        self._parts: deque[tuple[int, FloatArray]] = deque()
-
-    def add(self, first: int, values: FloatArray, period: float) -> bool:
-        """Append a block; return True if its counter was reset."""
-        anew = bool(self._parts) and first < self.end
-        if anew:
-            self._parts.clear()
-        self.period, self.most = period, min(max(round(_SPAN_S / period), 1), _MOST_SAMPLES)
-        self._parts.append((first, values))
-        self.end = first + len(values)
-        while self._parts[0][0] + len(self._parts[0][1]) <= self.end - self.most:
-            self._parts.popleft()
-        self.first = self._parts[0][0]
-        return anew
-
-    def column(self, first: int, end: int) -> FloatArray:
-        """Return the values of counts ``first`` to ``end`` (n,), NaN for missing ones."""
-        made = np.full(end - first, np.nan)
-        for start, values in self._parts:
-            low, high = max(start, first), min(start + len(values), end)
-            if low < high:
-                made[low - first : high - first] = values[low - start : high - start]
-        return made
+def _column(parts: deque[tuple[int, FloatArray]], first: int, end: int) -> FloatArray:
+    """Return the values of counts ``first`` to ``end`` (n,), NaN for missing ones."""
+    made = np.full(end - first, np.nan)
+    for start, values in parts:
+        low, high = max(start, first), min(start + len(values), end)
+        if low < high:
+            made[low - first : high - first] = values[low - start : high - start]
+    return made

@@ -5,7 +5,7 @@ which both are equal; velocities grow with k, accelerations with k² and jerks w
 are not declared are reported as not evaluated.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -121,35 +121,25 @@ def speed_limits(
     dynamics: from encoder to probe, which adds to the following error of the servo
     budget: allowed error of a height, k = 2 [m], for exposure and timing
     """
-    evaluated, missing = [], []
-    for limit in _all_limits(path, limits, valid_up_to, budget, dynamics):
-        if isinstance(limit, str):
-            missing.append(limit)
-        else:
-            evaluated.append(limit)
-    return evaluated, missing
-
-
-def _all_limits(
-    path: ScanPath,
-    limits: MachineLimits,
-    valid_up_to: float,
-    budget: float,
-    dynamics: TransferFunction | None,
-) -> Iterator[SpeedLimit | str]:
     content = content_frequency(path.z, path.sample_period)
     velocity, acceleration, jerk = steepest(path.z, path.sample_period, content)
-    yield _power("calibrated band", content, valid_up_to, "Hz", 1)
-    yield _power("motion frequency", content, limits.motion_frequency, "Hz", 1)
-    yield _following(path, limits, dynamics)
-    yield _power("Z acceleration", acceleration, limits.z_acceleration, "m/s²", 2)
-    yield _power("Z jerk", jerk, limits.z_jerk, "m/s³", 3)
-    yield _power("spindle speed", _spindle_rpm(path), limits.spindle_speed_rpm, "rpm", 1)
-    yield _power("spacing at the rim", _spacing(path), limits.point_spacing, "m", 1)
     exposed = None if limits.exposure is None else limits.exposure**2 / 24 * acceleration
-    yield _power("path within one exposure", exposed, budget / 2, "m", 2)
     late = None if limits.timing is None else limits.timing * velocity
-    yield _power("timing of the trigger", late, budget / 2, "m", 1)
+    every = (
+        _power("calibrated band", content, valid_up_to, "Hz", 1),
+        _power("motion frequency", content, limits.motion_frequency, "Hz", 1),
+        _following(path, limits, dynamics),
+        _power("Z acceleration", acceleration, limits.z_acceleration, "m/s²", 2),
+        _power("Z jerk", jerk, limits.z_jerk, "m/s³", 3),
+        _power("spindle speed", _spindle_rpm(path), limits.spindle_speed_rpm, "rpm", 1),
+        _power("spacing at the rim", _spacing(path), limits.point_spacing, "m", 1),
+        _power("path within one exposure", exposed, budget / 2, "m", 2),
+        _power("timing of the trigger", late, budget / 2, "m", 1),
+    )
+    return (
+        [limit for limit in every if isinstance(limit, SpeedLimit)],
+        [limit for limit in every if isinstance(limit, str)],
+    )
 
 
 def _power(

@@ -245,15 +245,11 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class SourceHypothesis:
-    """Source of a line that its ``partners`` support and no scan contradicts.
-
-    texture: for an artefact, the line in the scan that resolves it
-    """
+    """Source of a line that its ``partners`` support and no scan contradicts."""
 
     kind: str
     hypothesis: Hypothesis
     partners: tuple[Key, ...]
-    texture: Key | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,7 +368,7 @@ def _images(
             for partner in texture.partners:
                 place = place_in(scans[partner[0]], texture.hypothesis)
                 if place is not None and place.aliased and place.coordinate == TIME:
-                    image = SourceHypothesis(ARTEFACT, texture.hypothesis, (key,), key)
+                    image = SourceHypothesis(ARTEFACT, texture.hypothesis, (key,))
                     found.setdefault(partner, []).append(image)
     return found
 
