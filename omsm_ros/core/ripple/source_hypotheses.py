@@ -8,7 +8,7 @@ source is no evidence for another.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -245,25 +245,15 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class SourceHypothesis:
-    """Source of a line that its ``partners`` support and no scan contradicts."""
+    """Source of a line: ``partners`` support it; it is missing in the scans ``absent``.
+
+    kind: that of the hypothesis, or ARTEFACT
+    """
 
     kind: str
     hypothesis: Hypothesis
     partners: tuple[Key, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class TestedHypothesis:
-    """Hypothesis with the partners that support it, and the scans in which it is missing."""
-
-    hypothesis: Hypothesis
-    present: tuple[Key, ...]
-    absent: tuple[int, ...]
-
-    @property
-    def kind(self) -> str:
-        """Kind of the hypothesis."""
-        return self.hypothesis.kind
+    absent: tuple[int, ...] = ()
 
     @property
     def alive(self) -> bool:
@@ -273,10 +263,10 @@ class TestedHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class LineEvidence:
-    """Tested hypotheses of one line, and the sources that they support."""
+    """All hypotheses of one line, and those that a scan separates from the others."""
 
     line: SpectralLine
-    tested: tuple[TestedHypothesis, ...]
+    tested: tuple[SourceHypothesis, ...]
     sources: tuple[SourceHypothesis, ...]
 
 
@@ -296,7 +286,7 @@ def _line(scans: Sequence[StudiedScan], key: Key) -> SpectralLine:
     return scans[key[0]].lines[key[1]]
 
 
-def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[TestedHypothesis]:
+def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[SourceHypothesis]:
     own, line = key[0], _line(scans, key)
     for hypothesis in hypotheses_of(scans[own], line):
         present, absent = [], []
@@ -312,7 +302,7 @@ def _tests(scans: Sequence[StudiedScan], key: Key) -> Iterator[TestedHypothesis]
                     present.append((other, index))
             elif shown is not None:
                 absent.append(other)
-        yield TestedHypothesis(hypothesis, tuple(present), tuple(absent))
+        yield SourceHypothesis(hypothesis.kind, hypothesis, tuple(present), tuple(absent))
 
 
 def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
@@ -322,7 +312,7 @@ def _same_part(one: StudiedScan, other: StudiedScan) -> bool:
 
 
 def _sources(
-    scans: Sequence[StudiedScan], tested: Sequence[TestedHypothesis]
+    scans: Sequence[StudiedScan], tested: Sequence[SourceHypothesis]
 ) -> tuple[SourceHypothesis, ...]:
     """Return the hypotheses that a scan separates from all other kinds and none contradicts."""
     alive = [t for t in tested if t.alive]
@@ -331,16 +321,16 @@ def _sources(
         rivals = [t for t in alive if _is_rival(one, t)]
         decisive = tuple(
             key
-            for key in one.present
+            for key in one.partners
             for place in [place_in(scans[key[0]], one.hypothesis)]
             if all(apart(place, place_in(scans[key[0]], r.hypothesis)) for r in rivals)
         )
         if decisive:
-            found.append(SourceHypothesis(one.kind, one.hypothesis, decisive))
+            found.append(replace(one, partners=decisive))
     return tuple(_least_aliased(found))
 
 
-def _is_rival(one: TestedHypothesis, other: TestedHypothesis) -> bool:
+def _is_rival(one: SourceHypothesis, other: SourceHypothesis) -> bool:
     """Return True for another kind that needs no aliasing."""
     if one.kind == SYNCHRONOUS and other.hypothesis.coordinate == PATH:
         return False  # on circles of one radius form of the part repeats in the same way
@@ -480,7 +470,7 @@ def _family(kind: str) -> str:
     return PART if kind == ARTEFACT else kind
 
 
-def is_ring_or_spindle(tested: Sequence[TestedHypothesis]) -> bool:
+def is_ring_or_spindle(tested: Sequence[SourceHypothesis]) -> bool:
     """Return True if partners support both rings on the part and a spindle error."""
-    kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.present}
+    kinds = {(t.kind, t.hypothesis.coordinate) for t in tested if t.alive and t.partners}
     return (PART, RADIUS) in kinds and any(kind == SYNCHRONOUS for kind, _ in kinds)
