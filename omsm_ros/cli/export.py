@@ -104,10 +104,9 @@ def _write_map(
     method, error = "none: the points are a map", 0.0
     if grid is None:
         try:
-            made = on_grid(points, _MOST_ACROSS, spacing)
+            grid, error = on_grid(points, _MOST_ACROSS, spacing)
         except DataError as err:
             raise FileError(f"cannot write {str(out)!r} as a map: {err}") from err
-        grid, error = made.grid, made.method_error
         method = "local quadratic regression, tricube weights"
     comment = f"{_COMMENT}; resampling: {method}, rms error at most {error:.2g} m"
     if form == ".x3p":

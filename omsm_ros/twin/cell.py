@@ -29,7 +29,7 @@ from omsm_ros.twin.disturbances import Disturbances, TrueResponse, Vibration
 from omsm_ros.twin.machine_errors import Shift, random_walk
 from omsm_ros.twin.part import UnderSpot, mounted_surface
 from omsm_ros.twin.plant import Plant, TimeGrid, Trajectory, move
-from omsm_ros.twin.probe import LEVEL, Probe, ProbeRandom, read, slope_of
+from omsm_ros.twin.probe import LEVEL, Probe, read, slope_of
 from omsm_ros.twin.record_checks import CheckedNumbers, is_default
 from omsm_ros.twin.sensors import Instants, acceleration_of
 from omsm_ros.twin.structure import deform
@@ -358,8 +358,7 @@ def _distance(
     if errors.is_slope_sensitive:
         c = scene.positions(when.probe - errors.lag_s).c
         slope = slope_of(scene.surface, seen.x, seen.y, c)
-    streams = ProbeRandom(random["probe"], random["dropout"])
-    return read(cell.probe, errors, seen.distance, slope, cell.sample_period, streams)
+    return read(cell.probe, errors, seen.distance, slope, cell.sample_period, random)
 
 
 def _further_channels(

@@ -1,5 +1,6 @@
 """Simulate a chromatic confocal probe: exposure, linearity, light and noise."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -128,35 +129,30 @@ def slope_of(surface: Surface, x: FloatArray, y: FloatArray, c: FloatArray) -> S
 LEVEL = Slope(np.zeros(1), np.zeros(1))
 
 
-@dataclass(frozen=True)
-class ProbeRandom:
-    """Random numbers of the probe: of its noise, and of its dropouts."""
-
-    noise: np.random.Generator
-    dropout: np.random.Generator
-
-
 def read(
     probe: Probe,
     errors: ProbeErrors,
     true_distance: FloatArray,
     slope: Slope,
     period: float,
-    random: ProbeRandom,
+    random: Mapping[str, np.random.Generator],
 ) -> DistanceBlock:
-    """Return the readings for ``true_distance`` (n,) [m] to a surface of ``slope``."""
+    """Return the readings for ``true_distance`` (n,) [m] to a surface of ``slope``.
+
+    random: generators of the noise, "probe", and of lost readings, "dropout"
+    """
     samples = len(true_distance)
     light = _intensity(errors, slope)
     noise = probe.noise if not errors.noise_m else float(np.hypot(probe.noise, errors.noise_m))
     seen = probe.scale * (true_distance + _error(probe, errors, true_distance, slope))
-    noisy = seen + random.noise.normal(0.0, noise, samples) / np.sqrt(light)
+    noisy = seen + random["probe"].normal(0.0, noise, samples) / np.sqrt(light)
     resolution = probe.resolution
     reading = np.round(noisy / resolution) * resolution if resolution else noisy
     there = abs(true_distance) <= probe.half_range
     if errors.dropout_slope_rad is not None:
         there &= slope.steepness <= errors.dropout_slope_rad
     if errors.dropout_probability:
-        there &= random.dropout.random(samples) >= errors.dropout_probability
+        there &= random["dropout"].random(samples) >= errors.dropout_probability
     return DistanceBlock(
         stamp_ns=0,
         first_sample=0,

@@ -8,14 +8,14 @@ import pytest
 from omsm_ros.core.streams.blocks import Status
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Sphere
 from omsm_ros.errors import ConfigurationError
-from omsm_ros.twin.probe import LEVEL, Probe, ProbeErrors, ProbeRandom, Slope, read, slope_of
+from omsm_ros.twin.probe import LEVEL, Probe, ProbeErrors, Slope, read, slope_of
 
 QUIET = Probe(scale=1.0, noise=0.0, resolution=0.0)
 DISTANCE = np.linspace(-49e-6, 49e-6, 2001)
 
 
 def _read(errors, distance=DISTANCE, slope=LEVEL, probe=QUIET):
-    random = ProbeRandom(np.random.default_rng(1), np.random.default_rng(2))
+    random = {"probe": np.random.default_rng(1), "dropout": np.random.default_rng(2)}
     return read(probe, errors, distance, slope, 1e-3, random)
 
 

@@ -7,7 +7,7 @@ shorter than the radius are averaged out. Places that the cells do not surround 
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -328,16 +328,12 @@ def _first_rows(
     return np.asarray(solved.transpose(0, 2, 1) @ weighted, np.float64)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Resampled:
-    """Map made of scattered points;  method_error: upper bound of its rms error [m]."""
-
-    grid: HeightGrid
-    method_error: float
-
-
-def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> Resampled:
+def on_grid(
+    points: MeasuredPoints, most: int, spacing: float | None = None
+) -> tuple[HeightGrid, float]:
     """Return the points as a map of at most ``most`` columns or rows, as fine as they allow.
+
+    The second value is an upper bound of the rms error of the map [m].
 
     spacing: of the map [m], None for the finest that the points fill
 
@@ -356,5 +352,4 @@ def on_grid(points: MeasuredPoints, most: int, spacing: float | None = None) -> 
     height = surface.at(x, y).value.reshape(shape)
     if not np.any(np.isfinite(height)):
         raise DataError("comparison.empty_map", spacing=side)
-    grid = HeightGrid(height=height, x0=x0, y0=y0, dx=side, dy=side)
-    return Resampled(grid, surface.method_error(x, y))
+    return replace(empty, height=height), surface.method_error(x, y)

@@ -276,23 +276,16 @@ class Corrector:
             stamp_ns=round(axes.stamp_of(int(sample[0]))) if len(sample) else 0,
         )
 
-    def _dynamics_variances(self, points: ScanPoints) -> tuple[FloatArray, FloatArray]:
-        """Return the variances of H(z) [m²], (n,), from noise and from undetected model error."""
-        noise, undetected = np.zeros((2, len(points)))
-        for row, may_be_undetected in zip(points.dynamics, points.undetected, strict=True):
-            total = undetected if may_be_undetected else noise
-            total += row**2
-        return noise, undetected
-
     def _uncertainty(
         self, reading: FloatArray, points: ScanPoints, excess: FloatArray
     ) -> FloatArray:
+        squares = points.dynamics**2
         variances = contributions(
             self._sources,
             self._noise_gain,
             self._static_gain,
             reading,
-            *self._dynamics_variances(points),
+            *(np.sum(squares[rows], axis=0) for rows in (~points.undetected, points.undetected)),
             points.z_rate,
             self._options.geometry.abbe_arm,
         )

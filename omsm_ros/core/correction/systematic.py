@@ -134,14 +134,8 @@ class ScanFields:
         """Return the fields (s, count) [m] at the scan's points from ``first`` on."""
         if not self.fields.size:
             return np.zeros((len(self.names), count))
-        last = self.fields.shape[1] - 1
-        place = np.minimum((first + np.arange(count)) / self.every, last)
-        below = np.minimum(place.astype(np.int64), max(last - 1, 0))
-        share = place - below
-        above = np.minimum(below + 1, last)
-        return np.asarray(
-            self.fields[:, below] * (1 - share) + self.fields[:, above] * share, np.float64
-        )
+        place, kept = (first + np.arange(count)) / self.every, np.arange(self.fields.shape[1])
+        return np.stack([np.interp(place, kept, row) for row in self.fields])
 
 
 def scan_fields(

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import interpolate
 
 from omsm_ros.core.streams.blocks import FloatArray
 
@@ -71,20 +72,12 @@ def executed(at: FloatArray, time: FloatArray, values: FloatArray, cycle: float)
 
 def averaged(at: FloatArray, time: FloatArray, values: FloatArray, ramp: float) -> FloatArray:
     """Return the polygon through ``values`` (n,) at ``time`` (n,), averaged over ``ramp`` [s]."""
-    step = time[1] - time[0]
     if ramp <= 0:
         return np.asarray(np.interp(at, time, values))
-    area = np.concatenate([[0.0], np.cumsum((values[1:] + values[:-1]) / 2) * step])
-
-    def integral(when: FloatArray) -> FloatArray:
-        place = np.clip((when - time[0]) / step, 0.0, len(time) - 1.0)
-        k = np.minimum(place.astype(np.int64), len(time) - 2)
-        u = place - k
-        within = step * (values[k] * u + (values[k + 1] - values[k]) * u * u / 2)
-        beyond = np.minimum(when - time[0], 0.0) * values[0]
-        beyond = beyond + np.maximum(when - time[-1], 0.0) * values[-1]
-        return np.asarray(area[k] + within + beyond)
-
+    reach = ramp + max(float(time[0] - np.min(at)), float(np.max(at) - time[-1]), 0.0)
+    longer = np.concatenate([[time[0] - reach], time, [time[-1] + reach]])
+    held = np.concatenate([values[:1], values, values[-1:]])
+    integral = interpolate.make_interp_spline(longer, held, k=1).antiderivative()
     return np.asarray((integral(at + ramp / 2) - integral(at - ramp / 2)) / ramp)
 
 

@@ -172,7 +172,7 @@ def test_a_dense_patch_counts_by_its_area():
 
 
 def test_a_map_of_points_is_as_fine_as_was_asked_for():
-    made = on_grid(points(polynomial(X, Y)), 200, spacing=2.5e-4).grid
+    made, _ = on_grid(points(polynomial(X, Y)), 200, spacing=2.5e-4)
     assert (made.dx, made.dy) == (2.5e-4, 2.5e-4)
     assert made.height.shape == (41, 41)
     x, y = np.meshgrid(made.x, made.y)

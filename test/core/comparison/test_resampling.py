@@ -95,14 +95,14 @@ def test_no_height_is_made_up_outside_or_in_a_hole():
 
 def test_the_whole_aperture_has_heights():
     points = _points(paraboloid)
-    made = on_grid(points, 200)
-    x, y = np.meshgrid(made.grid.x, made.grid.y)
-    inside = np.hypot(x, y) < RADIUS - made.grid.dx
-    assert np.all(np.isfinite(made.grid.height[inside]))
-    outside = np.hypot(x, y) > RADIUS + made.grid.dx
-    assert not np.any(np.isfinite(made.grid.height[outside]))
-    filled = np.isfinite(made.grid.height)
-    error = made.grid.height[filled] - paraboloid(x, y)[filled]
+    grid, _ = on_grid(points, 200)
+    x, y = np.meshgrid(grid.x, grid.y)
+    inside = np.hypot(x, y) < RADIUS - grid.dx
+    assert np.all(np.isfinite(grid.height[inside]))
+    outside = np.hypot(x, y) > RADIUS + grid.dx
+    assert not np.any(np.isfinite(grid.height[outside]))
+    filled = np.isfinite(grid.height)
+    error = grid.height[filled] - paraboloid(x, y)[filled]
     assert np.max(np.abs(error)) < 1e-10
 
 
