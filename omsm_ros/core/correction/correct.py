@@ -285,7 +285,8 @@ class Corrector:
             self._noise_gain,
             self._static_gain,
             reading,
-            *(np.sum(squares[rows], axis=0) for rows in (~points.undetected, points.undetected)),
+            np.sum(squares[~points.undetected], axis=0),
+            np.sum(squares[points.undetected], axis=0),
             points.z_rate,
             self._options.geometry.abbe_arm,
         )

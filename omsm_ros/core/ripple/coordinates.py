@@ -156,9 +156,7 @@ def power_over(
     return np.asarray(power, np.float64), spacing
 
 
-def magnitudes(
-    values: FloatArray | NDArray[np.complex128], place: FloatArray, frequencies: FloatArray
-) -> FloatArray:
+def magnitudes(values: np.ndarray, place: FloatArray, frequencies: np.ndarray) -> FloatArray:
     """Return ``|Σ_j y_j exp(-2πi f u_j)|`` (k,) of values y at places u, at even ``frequencies``.
 
     From one frequency to the next each value turns by a constant angle.
