@@ -18,6 +18,7 @@ from omsm_ros.core.surface.zernike_terms import terms_up_to, zernike_values
 
 SPINDLE = {2: 12e-9, 3: 9e-9, 4: 5e-9}
 STRAIGHTNESS_M, STRETCH = 2e-9, 2e-6
+ASIDE_M, BEND_M, SQUARENESS_RAD, PARALLELISM_RAD = 3e-8, 1e-9, 1e-7, 1e-5
 LAG_S, RAMP_M_S, DECENTRE_M, CLOCKING_RAD = 50e-6, 0.15e-9, 2e-8, 5e-7
 PRIORS = (
     Source("lag_change", LAG_S),
@@ -27,11 +28,11 @@ PRIORS = (
     Source("part_turn", CLOCKING_RAD),
     # What a spiral to the centre does not show.
     Source("straightness_x", STRAIGHTNESS_M, evaluated=True),
-    Source("straightness_z", 3e-8, evaluated=True),
-    Source("pitch", 1e-9, evaluated=True),
+    Source("straightness_z", ASIDE_M, evaluated=True),
+    Source("pitch", BEND_M, evaluated=True),
     Source("lag_speed", 1e-7, evaluated=True),
-    Source("squareness", 1e-7, evaluated=True),
-    Source("parallelism", 1e-5, evaluated=True),
+    Source("squareness", SQUARENESS_RAD, evaluated=True),
+    Source("parallelism", PARALLELISM_RAD, evaluated=True),
     Source("encoder_scale", STRETCH, evaluated=True),
     Source("clocking", 5e-7, evaluated=True),
     Source("probe_slope_square", 1e-8, evaluated=True),
@@ -53,15 +54,30 @@ AS_DRAWN = (
 )
 
 
+def curve(random, first, last, size):
+    """Return places, and a curve whose covariance is ``size``² exp(-2 (distance / range)²)."""
+    place = np.linspace(first, last, 60)
+    kernel = np.exp(-2 * ((place - place[:, np.newaxis]) / (last - first)) ** 2)
+    return place, size * random.multivariate_normal(np.zeros(60), kernel, method="eigh")
+
+
 def drawn(seed, scans, pitch=0.4e-3, **errors):
     """Return a machine whose errors are as large as declared, and scans by it."""
     random = np.random.default_rng(1000 + seed)
     spindle = [(n, *(size * random.standard_normal(2))) for n, size in SPINDLE.items()]
-    slide = np.linspace(0.0, RADIUS_M, 60)
-    kernel = np.exp(-0.5 * ((slide - slide[:, np.newaxis]) / (RADIUS_M / 2)) ** 2)
-    bow = STRAIGHTNESS_M * random.multivariate_normal(np.zeros(60), kernel, method="eigh")
+    slide, bow = curve(random, 0.0, RADIUS_M, STRAIGHTNESS_M)
     stretch = STRETCH * random.standard_normal()
-    errors = {"straightness": (slide, bow), "stretch": stretch, **errors}
+    angle = np.linspace(0.0, 2 * np.pi, 60)
+    lift = MIRROR.height(RADIUS_M * np.cos(angle), RADIUS_M * np.sin(angle))
+    more = np.random.default_rng(2000 + seed)
+    ways = {}
+    for name in ("x_of_z", "y_of_z"):
+        height, way = curve(more, min(0.0, *lift), max(lift), ASIDE_M)
+        # The mean is the spindle centre, a source of its own.
+        ways[name] = height, way - np.mean(way) + PARALLELISM_RAD * more.normal() * height
+    ways["bend_of_z"] = curve(more, min(0.0, *lift), max(lift), BEND_M)
+    bow = bow + SQUARENESS_RAD * more.normal() * slide
+    errors = {"straightness": (slide, bow), "stretch": stretch, **ways, **errors}
     machine = Machine(
         seed, lag=LAG_S * random.standard_normal(), ramp=RAMP_M_S * random.standard_normal(),
         spindle=spindle, pitch=pitch, **errors,

@@ -106,9 +106,11 @@ class Machine:
         there = place(c, r)
         z = MIRROR.height(*there)
         bow = wrong.get("bow_of_z", 0.0) * (np.cos(np.pi * (z / 0.6e-3)) - 1)
+        aside = [np.interp(z, *wrong[n]) if n in wrong else 0.0 for n in ("x_of_z", "y_of_z")]
         seen = place(
             c - self.latency * omega + wrong.get("c_lost", 0.0) * (t > 0.5 * duration),
-            r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow, wrong.get("centre_y", 0.0),
+            r - self.latency * r_rate, wrong.get("centre_x", 0.0) + bow + aside[0],
+            wrong.get("centre_y", 0.0) + aside[1],
         )  # fmt: skip
         at = (seen[0] + 1j * seen[1]) * np.exp(-1j * turned) - complex(*moved)
         seen = (at.real, at.imag)
@@ -154,7 +156,8 @@ class Machine:
         made = made + wrong.get("height_step", 0.0) * (t > 0.4 * duration)
         made = made + wrong.get("hum", 0.0) * np.sin(2 * np.pi * 50.0 * t + 1.0)
         made = made + wrong.get("floor", 0.0) * np.sin(2 * np.pi * 2.13 * t + 1.0)
-        if "straightness" in wrong:
-            made = made + np.interp(r, *wrong["straightness"])
+        for name, along in (("straightness", r), ("bend_of_z", z)):
+            if name in wrong:
+                made = made + np.interp(along, *wrong[name])
         tilt = wrong.get("growth", 0.0)
         return made + tilt * r / RADIUS_M + wrong.get("bow", 0.0) * (r / RADIUS_M) ** 2
