@@ -61,6 +61,21 @@ def check(found, family, true):
         assert np.all(np.abs(source.found - np.array(true)) < 4 * source.uncertainty + 1e-9)
 
 
+@pytest.mark.soak
+def test_a_scale_of_c_that_nobody_looked_at_is_found_as_large_as_it_is():
+    """C off by 20″ once a turn: two scans show it to 5″, and no guess pulls it towards zero."""
+    priors = [p for p in PRIORS if p.name != "clocking"]
+    off = []
+    for seed in range(2):
+        machine, made = drawn(seed, 2, 0.8e-3, c_once=1e-4)
+        found = adjust(made, priors, nominal=MIRROR, accuracy=25e-9)
+        error = found.source("c_error/1")
+        assert np.max(error.uncertainty) < 3e-5
+        off.append((error.found - np.array([-1e-4, 0.0])) / error.uncertainty)
+        assert np.max(np.abs(normalised(machine, found)[3])) < 3
+    assert np.all(np.abs(np.mean(off, axis=0)) < 2 / np.sqrt(2))
+
+
 @pytest.mark.parametrize(("kind", "family", "true"), ONE_SCAN)
 def test_one_scan_refutes_what_no_part_can_have(kind, family, true):
     _, found = disturbed(kind, 1)
