@@ -9,8 +9,7 @@ from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
 from omsm_ros.io.files import SPECTRUM
 from omsm_ros.pipelines.correct import Admission
-from omsm_ros.pipelines.publish import publish_spectra
-from omsm_ros.pipelines.spectrum import SpectrumOptions
+from omsm_ros.pipelines.spectrum import SpectrumOptions, publish_spectra
 from omsm_ros.quantities import EXPOSURE, FREQUENCY, SPOT
 from omsm_ros.readable import plain, quantity
 

@@ -34,6 +34,8 @@ from omsm_ros.quantities import COUNTER, POSITION, SAMPLE_PERIOD, SIGNAL, STAMP
 _PLY_TYPES = {"<f4": "float", "<f8": "double", "<u4": "uint"}
 _PLY_HEADER_BYTES = 512
 _PLY_DTYPE = np.dtype(list(CLOUD_FIELDS))
+# More than the pixels of a figure; the numbers of a summary come from all points.
+MOST_DRAWN = 2**19
 
 
 class PlyWriter:

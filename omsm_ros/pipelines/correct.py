@@ -36,7 +36,7 @@ from omsm_ros.core.streams.statistics import EvenSelection
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, deviation
 from omsm_ros.errors import BagError, ConfigurationError, DataError, Notice
-from omsm_ros.io.results import PlyWriter, with_added_variance
+from omsm_ros.io.results import MOST_DRAWN, PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording, scan_data
@@ -200,8 +200,6 @@ LATERAL_SOURCES = (
 _SPOT_M = 10 * MICROMETRE_M
 # A quarter of an hour at 1 kHz, whose adjustment needs 1 GB; longer scans are not adjusted.
 _MOST_ADJUSTED = 1_000_000
-# More than the pixels of a figure; the numbers of a summary come from all points.
-MOST_DRAWN = 2**19
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,29 +1,21 @@
 """From a cloud and a nominal surface to ``form.json``."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from omsm_ros.core.comparison.stated_errors import ComparedMeasurement, ErrorFields
 from omsm_ros.core.correction.systematic import ScanFields
 from omsm_ros.core.form.analyse import FormResult, analyse_form
 from omsm_ros.core.form.deviation_map import UncertainValue, conformity
 from omsm_ros.core.form.drawing import Drawing
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
-from omsm_ros.core.registration.placement import (
-    POSE_PARAMETERS,
-    Placed,
-    PointBatch,
-    PointBatches,
-    placed,
-)
+from omsm_ros.core.registration.placement import POSE_PARAMETERS, PointBatch, PointBatches
 from omsm_ros.core.registration.pose_parameters import MOVES, Registration
-from omsm_ros.core.registration.register import register
-from omsm_ros.core.streams.blocks import FloatArray, IntArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.deviation import mismatch
 from omsm_ros.core.surface.height_grid import as_grid
@@ -135,14 +127,11 @@ def open_measurement(
     )
 
 
-def _slices(
-    points: MeasuredPoints, fields: ErrorFields | None = None, size: int = _PORTION
-) -> Iterator[PointBatch]:
-    for first in range(0, len(points), size):
-        part = slice(first, first + size)
+def _slices(points: MeasuredPoints) -> Iterator[PointBatch]:
+    for first in range(0, len(points), _PORTION):
+        part = slice(first, first + _PORTION)
         x, y, height = points.x[part], points.y[part], points.height[part]
-        effects = np.empty((0, len(x))) if fields is None else fields.at(first, len(x))
-        yield PointBatch(x, y, height, effects)
+        yield PointBatch(x, y, height, np.empty((0, len(x))))
 
 
 def _portions(cloud: CloudFile, fields: ScanFields | None) -> Iterator[PointBatch]:
@@ -309,106 +298,3 @@ def _terms(form: FormResult) -> list[dict[str, Any]]:
         for t, value, spread in zip(fit.terms, fit.coefficients, fit.uncertainty, strict=True)
     ]
     return known + [{"n": t.n, "m": t.m, "value": None, "uncertainty": None} for t in fit.left_out]
-
-
-_REGISTERED_PORTION = 65_536
-POSE = "pose of the part"
-
-
-def registered(
-    m: ComparedMeasurement, nominal: Surface, dofs: Sequence[str]
-) -> ComparedMeasurement:
-    """Return the measurement's deviations along the normal, in the frame of its part.
-
-    The effects of its errors are those after the fit of the pose, and the uncertainty of the pose
-    is a further source. Outliers such as dust are left out and noted.
-
-    Raises DataError for points that do not fit the surface.
-    """
-    points, fields = m.points, m.fields
-    names = fields.names if fields is not None else ()
-
-    def portions() -> Iterator[PointBatch]:
-        return _slices(points, fields, _REGISTERED_PORTION)
-
-    found = register(nominal, portions, dofs, sources=names, even=as_grid(points) is not None)
-    where = [placed(nominal, found.placement, portion) for portion in portions()]
-    whole = Placed(*(np.concatenate(parts, axis=-1) for parts in zip(*where, strict=True)))
-    kept = np.flatnonzero(np.isfinite(whole.deviation) & found.good(0, len(points)))
-    placed_points = whole.part(kept)
-    return replace(
-        m,
-        points=_points(points, placed_points, kept, found),
-        fields=None if fields is None else _RegisteredFields(found, placed_points, kept, fields),
-        pose=_PoseFields(found, placed_points),
-    )
-
-
-def _points(
-    points: MeasuredPoints, at: Placed, kept: IntArray, found: Registration
-) -> MeasuredPoints:
-    note = "registered by " + ", ".join(
-        f"{name} {found.placement.value(name):.4g}" for name in found.dofs.fitted
-    )
-    left_out = len(points) - len(kept)
-    return replace(
-        points.part(kept),
-        x=at.x,
-        y=at.y,
-        height=at.deviation,
-        notes=(*points.notes, note, *([f"{left_out} points left out"] if left_out else ())),
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _RegisteredFields:
-    """Fields of a scan's errors after the fit of the pose."""
-
-    found: Registration
-    at_: Placed
-    kept: IntArray
-    fields: ErrorFields
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.fields.names
-
-    @property
-    def aligned(self) -> tuple[str, ...]:
-        return self.fields.aligned
-
-    def at(self, first: int, count: int) -> FloatArray:
-        """Return the fields (s, count) [m] of the kept points from ``first`` on."""
-        chosen = self.kept[first : first + count]
-        low = int(chosen[0]) if len(chosen) else 0
-        rows = self.fields.at(low, int(chosen[-1]) - low + 1 if len(chosen) else 0)
-        part = _slice(self.at_, first, count)
-        return self.found.effects(part, rows[:, chosen - low])[1][: len(rows)]
-
-
-@dataclass(frozen=True, eq=False)
-class _PoseFields:
-    """Fields of the uncertainty of the pose, one row for each independent component."""
-
-    found: Registration
-    at_: Placed
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (POSE,) * (len(self.found.pose_effects) + 2 * len(self.found.held_effects))
-
-    @property
-    def aligned(self) -> tuple[str, ...]:
-        """Return no names: errors of two poses are independent."""
-        return ()
-
-    def at(self, first: int, count: int) -> FloatArray:
-        """Return the fields (p, count) [m] of the kept points from ``first`` on."""
-        part = _slice(self.at_, first, count)
-        none = np.zeros((self.found.moved.shape[1] - 2 * len(self.found.held_effects), len(part.x)))
-        pose, sources = self.found.effects(part, none)
-        return np.concatenate([pose, sources[len(none) :]])
-
-
-def _slice(at: Placed, first: int, count: int) -> Placed:
-    return Placed(*(values[..., first : first + count] for values in at))

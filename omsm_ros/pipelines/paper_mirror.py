@@ -21,8 +21,7 @@ from omsm_ros.core.surface.nominal import (
 )
 from omsm_ros.io.files import CLOUD
 from omsm_ros.io.maps.columns_file import write_columns
-from omsm_ros.io.results import CloudFile
-from omsm_ros.pipelines.correct import MOST_DRAWN
+from omsm_ros.io.results import MOST_DRAWN, CloudFile
 from omsm_ros.pipelines.measure import measure
 from omsm_ros.pipelines.publish import view_of
 from omsm_ros.pipelines.record_bags import write_recording

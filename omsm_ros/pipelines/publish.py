@@ -1,6 +1,6 @@
-"""Write the report of a measurement, of a registered part, or of spectra."""
+"""Write the report of a measurement or of a registered part."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from types import MappingProxyType
@@ -11,36 +11,18 @@ from numpy.typing import NDArray
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.kinematics.kinematics import Surface
-from omsm_ros.core.ripple.density import Density
-from omsm_ros.core.ripple.scan_signal import PATH, TIME
 from omsm_ros.core.surface.deviation import RunningStatistics, deviation
 from omsm_ros.errors import CalibrationError, ConfigurationError
-from omsm_ros.io.files import (
-    CLOUD,
-    CURVES,
-    DEVIATION,
-    FORM,
-    REPORT,
-    SPECTRUM,
-    SUMMARY,
-    save_json,
-    save_text,
-)
-from omsm_ros.io.folders import result_folder
-from omsm_ros.io.maps.columns_file import write_columns
+from omsm_ros.io.files import CLOUD, CURVES, DEVIATION, FORM, REPORT, SUMMARY, save_text
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import (
+    MOST_DRAWN,
     CloudFile,
-    PlyWriter,
     read_curves,
     read_form,
     read_summary,
     summary_of_points,
 )
-from omsm_ros.io.topics import AnyBag
-from omsm_ros.pipelines.correct import MOST_DRAWN
-from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.spectrum import SpectrumOptions, cleaned_points, spectra_of, summary_of
 from omsm_ros.readable import date_text, quantity
 from omsm_ros.report import style
 from omsm_ros.report.measurement.figures import (
@@ -166,65 +148,6 @@ def publish_form(
     kept = {name: v for name, v in summary.items() if name not in ("figures", "conformity")}
     title = f"Form of {measured.resolve().name}"
     publish(out, title, kept, None, {}, embedded([layer]), origin)
-
-
-def publish_spectra(
-    paths: Sequence[AnyBag],
-    options: SpectrumOptions,
-    out: Path,
-    *,
-    report: bool = True,
-    progress: Progress = no_progress,
-) -> dict[str, Any]:
-    """Analyse the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
-    kind = "band_stopped" if options.stop else "vibration_removed"
-    clouds = [f"{kind}_{k + 1}.ply" for k in range(len(paths))]
-    densities = [n.format(k + 1) for k in range(len(paths)) for _, n, _ in _DENSITIES]
-    owned = (*clouds, *densities, *_files_before(out), REPORT, SPECTRUM)
-    with result_folder(out, owned) as folder:
-        scans = spectra_of(paths, options, progress)
-        summary = summary_of(scans, options)
-        files = {"spectrum": SPECTRUM}
-        is_cleaned = options.stop or options.remove_vibration
-        for name, scan in zip(clouds, scans, strict=True) if is_cleaned else ():
-            with PlyWriter(folder / name, f"omsm_ros, metres, {kind.replace('_', ' ')}") as ply:
-                ply.write(cleaned_points(scan))
-            what = "the band" if options.stop else "its vibration"
-            files[f"{scan.studied.signal.name} without {what}"] = name
-        for k, scan in enumerate(scans, 1):
-            for coordinate, name, units in _DENSITIES:
-                if coordinate == TIME or coordinate in scan.studied.coordinates:
-                    files[f"density {k} over {coordinate}"] = name.format(k)
-                    _write_density(folder / name.format(k), scan.studied.density(coordinate), units)
-        if report:
-            # Imported on demand, because loading the figures takes longer than the analysis.
-            from omsm_ros.report.spectrum import drawn, render
-
-            valid = options.calibration.valid_up_to if options.calibration else None
-            figures = drawn([(s.studied, s.named, s.read.motion) for s in scans], valid)
-            save_text(folder / REPORT, render(summary, figures))
-            files["report"] = REPORT
-        summary["files"] = files
-        save_json(folder / SPECTRUM, summary)
-    return summary
-
-
-# Coordinate, file, and columns of the densities of each scan.
-_DENSITIES = (
-    (TIME, "density_{}.csv", ("frequency_Hz", "density_m2_per_Hz")),
-    (PATH, "density_path_{}.csv", ("frequency_per_m", "density_m3")),
-)
-
-
-def _write_density(path: Path, found: Density, names: tuple[str, str]) -> None:
-    columns = dict(zip(names, (found.frequency, found.density), strict=True))
-    write_columns(path, columns, csv=True)
-
-
-def _files_before(out: Path) -> list[str]:
-    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply", "density_*.csv")
-    is_result = (out / SPECTRUM).is_file()
-    return [path.name for kind in kinds for path in out.glob(kind) if is_result]
 
 
 # Relative difference of the rms of evenly chosen points from that of the whole cloud.

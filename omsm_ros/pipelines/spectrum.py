@@ -1,4 +1,4 @@
-"""Compute spectra of scans and classify their lines: from bags to ``spectrum.json``."""
+"""Compute spectra of scans and classify their lines: from bags to ``spectrum.json`` and report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -43,6 +43,10 @@ from omsm_ros.core.ripple.vibration_removal import REMOVED, RemovedVibration, re
 from omsm_ros.core.streams.blocks import AccelerationBlock, FloatArray
 from omsm_ros.errors import ConfigurationError
 from omsm_ros.io import bags
+from omsm_ros.io.files import REPORT, SPECTRUM, save_json, save_text
+from omsm_ros.io.folders import result_folder
+from omsm_ros.io.maps.columns_file import write_columns
+from omsm_ros.io.results import PlyWriter
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
@@ -354,3 +358,62 @@ def _stop_facts(
             if f is not None
         ],
     }
+
+
+def publish_spectra(
+    paths: Sequence[AnyBag],
+    options: SpectrumOptions,
+    out: Path,
+    *,
+    report: bool = True,
+    progress: Progress = no_progress,
+) -> dict[str, Any]:
+    """Analyse the scans, write the results into ``out``, and return ``spectrum.json``'s content."""
+    kind = "band_stopped" if options.stop else "vibration_removed"
+    clouds = [f"{kind}_{k + 1}.ply" for k in range(len(paths))]
+    densities = [n.format(k + 1) for k in range(len(paths)) for _, n, _ in _DENSITIES]
+    owned = (*clouds, *densities, *_files_before(out), REPORT, SPECTRUM)
+    with result_folder(out, owned) as folder:
+        scans = spectra_of(paths, options, progress)
+        summary = summary_of(scans, options)
+        files = {"spectrum": SPECTRUM}
+        is_cleaned = options.stop or options.remove_vibration
+        for name, scan in zip(clouds, scans, strict=True) if is_cleaned else ():
+            with PlyWriter(folder / name, f"omsm_ros, metres, {kind.replace('_', ' ')}") as ply:
+                ply.write(cleaned_points(scan))
+            what = "the band" if options.stop else "its vibration"
+            files[f"{scan.studied.signal.name} without {what}"] = name
+        for k, scan in enumerate(scans, 1):
+            for coordinate, name, units in _DENSITIES:
+                if coordinate == TIME or coordinate in scan.studied.coordinates:
+                    files[f"density {k} over {coordinate}"] = name.format(k)
+                    _write_density(folder / name.format(k), scan.studied.density(coordinate), units)
+        if report:
+            # Imported on demand, because loading the figures takes longer than the analysis.
+            from omsm_ros.report.spectrum import drawn, render
+
+            valid = options.calibration.valid_up_to if options.calibration else None
+            figures = drawn([(s.studied, s.named, s.read.motion) for s in scans], valid)
+            save_text(folder / REPORT, render(summary, figures))
+            files["report"] = REPORT
+        summary["files"] = files
+        save_json(folder / SPECTRUM, summary)
+    return summary
+
+
+# Coordinate, file, and columns of the densities of each scan.
+_DENSITIES = (
+    (TIME, "density_{}.csv", ("frequency_Hz", "density_m2_per_Hz")),
+    (PATH, "density_path_{}.csv", ("frequency_per_m", "density_m3")),
+)
+
+
+def _write_density(path: Path, found: Density, names: tuple[str, str]) -> None:
+    columns = dict(zip(names, (found.frequency, found.density), strict=True))
+    write_columns(path, columns, csv=True)
+
+
+def _files_before(out: Path) -> list[str]:
+    kinds = ("band_stopped_*.ply", "vibration_removed_*.ply", "density_*.csv")
+    is_result = (out / SPECTRUM).is_file()
+    return [path.name for kind in kinds for path in out.glob(kind) if is_result]

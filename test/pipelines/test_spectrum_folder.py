@@ -12,9 +12,8 @@ import pytest
 from omsm_ros.core.correction.surface_points import SurfacePoints
 from omsm_ros.core.ripple.density import Density
 from omsm_ros.errors import ConfigurationError, FileError
-from omsm_ros.pipelines import publish as publish_spectrum
-from omsm_ros.pipelines.publish import publish_spectra
-from omsm_ros.pipelines.spectrum import SpectrumOptions, cleaned_points
+from omsm_ros.pipelines import spectrum
+from omsm_ros.pipelines.spectrum import SpectrumOptions, cleaned_points, publish_spectra
 
 
 def points(count):
@@ -45,11 +44,11 @@ def scan(name, count, removed=0.25):
 @pytest.fixture
 def publish(monkeypatch, tmp_path):
     """Replace the analysis; these tests are about files only."""
-    monkeypatch.setattr(publish_spectrum, "summary_of", lambda scans, _: {"scans": len(scans)})
+    monkeypatch.setattr(spectrum, "summary_of", lambda scans, _: {"scans": len(scans)})
 
     def made(counts, stop=((1.0, 2.0),)):
         scans = [scan(f"s{k}", count) for k, count in enumerate(counts)]
-        monkeypatch.setattr(publish_spectrum, "spectra_of", lambda *_: scans)
+        monkeypatch.setattr(spectrum, "spectra_of", lambda *_: scans)
         options = SpectrumOptions(stop=stop)
         return publish_spectra([""] * len(scans), options, tmp_path / "out", report=False)
 
@@ -88,7 +87,7 @@ def test_clouds_of_an_earlier_run_with_more_scans_go(publish, tmp_path, counts, 
 def test_a_run_that_fails_leaves_the_earlier_one(publish, tmp_path, monkeypatch):
     publish([5, 6])
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
-    monkeypatch.setattr(publish_spectrum, "cleaned_points", lambda _: 1 / 0)
+    monkeypatch.setattr(spectrum, "cleaned_points", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         publish([1])
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before

@@ -27,6 +27,9 @@ from omsm_ros.core.form.part_figures import (
     SYMMETRIC,
     TILT,
     best_fit,
+    fitted,
+    less,
+    products,
     rms_of_part,
     root_of_products,
     short_waves,
@@ -40,7 +43,6 @@ from omsm_ros.core.form.texture import (
     edge_roll_off,
     power_density,
     profiles,
-    slopes,
     texture,
 )
 from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
@@ -112,33 +114,40 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
     tilts; C that of the rotationally symmetric part of the rest. RMSt is the rms without piston
     and tilts, RMSi also without power, and RMSa the rms of the asymmetric rest.
     """
-    of_noise = _with_noise_of_rings(map_, fit.disc)
-    irregular, uneven = (without_terms(of_noise, fit.disc, t) for t in (POWER, SYMMETRIC))
-    symmetric = replace(
-        irregular,
-        deviation=irregular.deviation - uneven.deviation,
-        effects=irregular.effects - uneven.effects,
-    )
-    both = (
-        replace(part, effects=part.effects[: len(map_.effects)], noise=map_.noise)
-        for part in (irregular, uneven)
+    columns = zernike_values(*fit.disc.scaled(map_.x, map_.y), SYMMETRIC)
+    weighted, power = columns * map_.area, slice(len(POWER))
+    gram, right = weighted @ columns.T, products(map_, weighted)
+    even, best_sphere = fitted(gram, right), fitted(gram[power, power], right[power])
+    symmetric = np.concatenate([even, _noise_of_rings(map_.noise, weighted, gram)], axis=1)
+    symmetric[power, : right.shape[1]] -= best_sphere
+    # A function of the distance from the middle, whose largest and least are kept.
+    reach = np.argsort(columns[POWER.index(ZernikeIndex(2, 0))])
+    few = reach[np.linspace(0, len(reach) - 1, min(len(reach), _MOST_POINTS)).astype(np.int64)]
+    rings = replace(
+        map_.part(few),
+        deviation=symmetric[:, 0] @ columns[:, few],
+        effects=symmetric[:, 1:].T @ columns[:, few],
+        noise=0.0,
     )
     return {
         "iso10110_A": _sagitta(map_, fit),
-        "iso10110_C": extents_of_parts([symmetric], fit.disc)[0][0],
+        "iso10110_C": extents_of_parts([rings], fit.disc)[0][0],
         "iso10110_RMSt": rms_of_part(without_terms(map_, fit.disc, TILT)),
-        **dict(zip(("iso10110_RMSi", "iso10110_RMSa"), map(rms_of_part, both), strict=True)),
+        "iso10110_RMSi": rms_of_part(less(map_, columns[power], best_sphere)),
+        "iso10110_RMSa": rms_of_part(less(map_, columns, even)),
     }
 
 
-def _with_noise_of_rings(map_: DeviationMap, disc: Aperture) -> DeviationMap:
-    """Return the map with the noise of its rotationally symmetric terms as its last effects."""
-    columns = zernike_values(*disc.scaled(map_.x, map_.y), SYMMETRIC[len(POWER) :])
-    weighted = columns * map_.area
-    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
-    covariance = map_.noise**2 * solve @ (weighted @ weighted.T) @ solve
-    effects = np.concatenate([map_.effects, root_of_products(covariance) @ columns])
-    return replace(map_, effects=effects, noise=0.0)
+def _noise_of_rings(noise: float, weighted: FloatArray, gram: FloatArray) -> FloatArray:
+    """Return the noise of the symmetric irregularity, as independent shares of SYMMETRIC (k, s).
+
+    noise: of a point [m];  weighted: values of the terms times area (k, n);  gram: of them (k, k)
+    """
+    power, own = slice(len(POWER)), slice(len(POWER), None)
+    squares = weighted[own] @ weighted[own].T
+    covariance = fitted(gram[own, own], fitted(gram[own, own], squares).T)
+    root = noise * root_of_products(covariance).T
+    return np.concatenate([-fitted(gram[power, power], gram[power, own]) @ root, root])
 
 
 def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
@@ -298,12 +307,11 @@ def _textures(
     """Return texture and slopes;  maps: of the part, and without its second order."""
     parts = without_terms(maps[0], found.disc, FORM), maps[1]
     formless, rest = (GridCells.of(part, even=outline is None) for part in parts)
-    steep = slopes(rest, bands)["slope_rms"]
     points = None
     # Without an S-filter the surface has waves that the cells do not resolve.
     if cells.width > 0 and bands.s_filter is None:
         points = short_waves(parts[0], formless, bands.l_filter)
-    made = texture(cells, formless, bands, points) | {"slope_rms_without_second_order": steep}
+    made = texture(cells, formless, bands, points, rest)
     if points is not None:
         whole, _, beyond = extents_of_parts([points], found.disc, outline, found.spacing)[0]
         made |= {"Sq": rms_of_part(points, beyond), "Sz": whole}

@@ -132,11 +132,26 @@ def of_square(square: float, spread: float) -> UncertainValue:
 def without_columns(map_: DeviationMap, columns: FloatArray) -> DeviationMap:
     """Return the map without its area-weighted fit of ``columns`` (k, n), effects included."""
     weighted = columns * map_.area
-    # For points on a line some columns coincide; the minimum-norm solution is used.
-    solve = np.linalg.pinv(weighted @ columns.T, rcond=1e-12, hermitian=True)
-    rest = np.concatenate([map_.deviation[np.newaxis], map_.effects])
-    rest -= (solve @ (weighted @ rest.T)).T @ columns
-    return replace(map_, deviation=rest[0], effects=rest[1:])
+    return less(map_, columns, fitted(weighted @ columns.T, products(map_, weighted)))
+
+
+def products(map_: DeviationMap, weighted: FloatArray) -> FloatArray:
+    """Return the sums (k, 1 + e) of ``weighted`` columns (k, n) times deviation and effects."""
+    return np.column_stack([weighted @ map_.deviation, weighted @ map_.effects.T])
+
+
+def fitted(gram: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve normal equations; for points on a line, where columns coincide, by minimum norm."""
+    return np.asarray(np.linalg.pinv(gram, rcond=1e-12, hermitian=True) @ right)
+
+
+def less(map_: DeviationMap, columns: FloatArray, shares: FloatArray) -> DeviationMap:
+    """Return the map less ``shares`` (k, 1 + e) of ``columns`` (k, n)."""
+    return replace(
+        map_,
+        deviation=map_.deviation - shares[:, 0] @ columns,
+        effects=map_.effects - shares[:, 1:].T @ columns,
+    )
 
 
 def best_fit(map_: DeviationMap) -> DeviationMap:

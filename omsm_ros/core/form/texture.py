@@ -9,7 +9,7 @@ density is the mean square per radian of half a turn.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -87,6 +87,10 @@ def bands_of(
     return Bands(s_filter and shortest, resolved, longest, found)
 
 
+# The figures (f,) of one image.
+_Measure = Callable[[FloatArray], FloatArray]
+
+
 @dataclass(frozen=True, eq=False)
 class _FilteredBand:
     """One band of the cells after each cutoff of the S-filter, to extrapolate to none.
@@ -108,57 +112,70 @@ class _FilteredBand:
         noisy = np.stack([m[0] + m[1:] for m in made], axis=1)
         return cls(values, noisy, effects, cells.noise_known)
 
-    def figure(self, of: Callable[[FloatArray], float], *, square: bool = True) -> UncertainValue:
-        """Return a figure of the values, without noise and without loss by the S-filter.
+    def figures(self, of: _Measure, sizes: int) -> list[UncertainValue]:
+        """Return figures of the values, without noise and without loss by the S-filter.
 
         Noise adds to the square of a size, so that its own addition is subtracted. The loss of the
         square is a smooth function of the square of the cutoff, so that the cutoffs 1, √2, √3 give
         it at zero. That number of them is used for which noise and the next step are smallest.
         Both belong to the uncertainty, with all effects and the change by every other cell alone.
 
-        square: of a figure that is a size
+        of: the figures of one image, of which the first ``sizes`` are sizes
         """
 
         def measure(levels: FloatArray) -> FloatArray:
-            return np.array([of(v) ** 2 if square else of(v) for v in levels])
+            found = np.array([of(v) for v in levels])
+            return np.where(np.arange(found.shape[1]) < sizes, found**2, found)
 
         weights = _EXTRAPOLATED[: len(self.values), : len(self.values)]
         here = weights @ measure(self.values)
         again = np.array([weights @ measure(levels) for levels in self.noisy])
         added = again.mean(axis=0) - here
         values = here - added if self.noise_known else here
-        steps = np.append(np.diff(values), values[-1] - values[-2:][0])
+        steps = np.diff(values, axis=0)
+        steps = np.concatenate([steps, steps[-1:] if len(steps) else np.zeros_like(values)])
         of_noise = np.hypot(again.std(axis=0), added * (_UNSURE if self.noise_known else 1.0))
         spread = np.hypot(of_noise, steps)
-        best = int(np.argmin(spread))
-        value, deviation = float(values[best]), float(spread[best])
-        figure = of_square(value, deviation) if square else UncertainValue(value, deviation)
         first = self.values[0]
         shares = [(of(first + e) - of(first - e)) / 2 for e in self.effects]
         shares.append(of(first) - of(first[..., ::2]))
-        whole = np.hypot(figure.uncertainty or 0.0, np.sqrt(np.sum(np.square(shares))))
-        return UncertainValue(figure.value, float(whole))
+        systematic, found = np.sqrt(np.sum(np.square(shares), axis=0)), []
+        for k, best in enumerate(np.argmin(spread, axis=0)):
+            value, deviation = float(values[best, k]), float(spread[best, k])
+            one = of_square(value, deviation) if k < sizes else UncertainValue(value, deviation)
+            whole = float(np.hypot(one.uncertainty or 0.0, systematic[k]))
+            found.append(UncertainValue(one.value, whole))
+        return found
 
 
 def texture(
-    cells: GridCells, formless: GridCells, bands: Bands, points: DeviationMap | None = None
+    cells: GridCells,
+    formless: GridCells,
+    bands: Bands,
+    points: DeviationMap | None = None,
+    rest: GridCells | None = None,
 ) -> dict[str, UncertainValue]:
     """Return Sa, Sq, Sz [m], Ssk, Sku [1] of the S-L surface, rms by band [m], slopes [1].
 
     formless: the same cells after the F-operation
     points: the S-L surface, None for that of the cells
+    rest: the same cells without their second order, whose slope is found too
     """
-    waves = _waves(formless, bands.s_filter)
+    shown = [cells] if rest is None else [cells, rest]
+    images = [np.concatenate([c.mean[np.newaxis], c.effects]) for c in shown]
+    cutoffs = _cutoffs(cells, bands.s_filter)
+    *steep, levels = _planes(cells, [*images, formless.mean[np.newaxis]], cutoffs)
+    waves = _waves(formless, bands.s_filter, levels)
     surface = waves.without(bands.l_filter) if points is None else _of_points(points)
-    found = {name: surface.figure(of) for name, of in _SIZES.items()}
-    found |= {
-        f"S{name}": surface.figure(lambda v, n=order: _moment(v, n), square=False)  # type: ignore[misc]
-        for name, order in (("sk", 3), ("ku", 4))
-    }
+    found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
     for name, (long, short) in bands.rms_bands.items():
-        band = waves if long and not short else _waves(formless if long else cells, short)
-        found[f"rms_{name}"] = band.without(long).figure(_rms)
-    return found | slopes(cells, bands)
+        same = long and short in (None, bands.s_filter)
+        band = waves if same else _waves(formless if long else cells, short)
+        found[f"rms_{name}"] = band.without(long).figures(lambda v: np.array([_rms(v)]), 1)[0]
+    found["slope_rms"], found["slope_largest"] = _slopes(cells, steep[0])
+    if rest is not None:
+        found["slope_rms_without_second_order"] = _slopes(rest, steep[1])[0]
+    return found
 
 
 def _of_points(map_: DeviationMap) -> _FilteredBand:
@@ -171,28 +188,43 @@ def _of_points(map_: DeviationMap) -> _FilteredBand:
     return _FilteredBand(values, noisy, map_.effects[:, even], map_.noise_known)
 
 
-def slopes(cells: GridCells, bands: Bands) -> dict[str, UncertainValue]:
+# Of one image: level and slopes along x and y (3, 1 + draws + e, r, c), for each cutoff.
+_Planes = list[FloatArray]
+
+
+def _planes(
+    cells: GridCells, images: Sequence[FloatArray], cutoffs: Sequence[tuple[float, float]]
+) -> list[_Planes]:
+    """Return the planes of images (1 + e, r, c) and noise; of effects after the first cutoff."""
+    noise, found = _noise(cells), [_Planes() for _ in images]
+    for cutoff in cutoffs:
+        fit = cells.planes(cutoff)
+        of_noise = fit(noise)
+        for planes, image in zip(found, images, strict=True):
+            own = fit(image[:1] if planes else image)
+            planes.append(np.concatenate([own[:, :1], of_noise, own[:, 1:]], axis=1))
+    return found
+
+
+def _slopes(cells: GridCells, planes: _Planes) -> list[UncertainValue]:
     """Return the rms and the largest slope [1] of the cells."""
     chosen = cells.present & _neighboured(cells.present)
     if not np.any(chosen):
-        return dict.fromkeys(("slope_rms", "slope_largest"), UncertainValue(None, None))
-    images = np.concatenate([_with_noise(cells), cells.effects])
-    made: list[FloatArray] = []
-    for cutoff in _cutoffs(cells, bands.s_filter):
-        steep = cells.planes(images if not made else images[: 1 + _DRAWS], cutoff)[1:]
-        made.append(np.stack(steep, axis=1)[..., chosen])
-    band = _FilteredBand.of([m[: 1 + _DRAWS] for m in made], made[0][1 + _DRAWS :], cells)
-    return {
-        "slope_rms": band.figure(lambda v: float(np.sqrt(np.mean(np.sum(v**2, axis=0))))),
-        "slope_largest": band.figure(lambda v: float(np.max(np.hypot(*v)))),
-    }
+        return 2 * [UncertainValue(None, None)]
+    steep = [np.moveaxis(p[1:, :, chosen], 0, 1) for p in planes]
+    band = _FilteredBand.of([s[: 1 + _DRAWS] for s in steep], steep[0][1 + _DRAWS :], cells)
+
+    def sizes(values: FloatArray) -> FloatArray:
+        square = values[0] ** 2 + values[1] ** 2
+        return np.sqrt([np.mean(square), np.max(square)])
+
+    return band.figures(sizes, 2)
 
 
-def _with_noise(cells: GridCells) -> FloatArray:
-    """Return the means of the cells, and draws of their noise (1 + draws, r, c)."""
+def _noise(cells: GridCells) -> FloatArray:
+    """Return draws of the noise of the cells (draws, r, c)."""
     random = np.random.default_rng(_NOISE_SEED)
-    noise = random.normal(size=(_DRAWS, *cells.mean.shape)) * cells.noise
-    return np.concatenate([cells.mean[np.newaxis], noise])
+    return np.asarray(random.normal(size=(_DRAWS, *cells.mean.shape)) * cells.noise)
 
 
 def _cutoffs(cells: GridCells, short: float | None) -> list[tuple[float, float]]:
@@ -220,16 +252,17 @@ class _Waves(NamedTuple):
         return _FilteredBand.of([*map(kept, self.levels)], kept(self.effects), self.cells)
 
 
-def _waves(cells: GridCells, short: float | None) -> _Waves:
-    images = _with_noise(cells)
-    if short is not None and short > _MANY_CELLS * cells.pitch:
-        return _Waves(cells, [cells.smoothed(images, short)], cells.smoothed(cells.effects, short))
-    if short is None and cells.width == 0:
-        return _Waves(cells, [images], cells.effects)
+def _waves(cells: GridCells, short: float | None, planes: _Planes | None = None) -> _Waves:
+    """Return the cells after an S-filter;  planes: of their mean, if they are known."""
+    mean, effects = cells.mean[np.newaxis], cells.effects
+    if (short is None and cells.width == 0) or (short or 0.0) > _MANY_CELLS * cells.pitch:
+        images = np.concatenate([mean, _noise(cells)])
+        if short is None:
+            return _Waves(cells, [images], effects)
+        return _Waves(cells, [cells.smoothed(images, short)], cells.smoothed(effects, short))
     # The effects of systematic errors have no short waves.
-    return _Waves(
-        cells, [cells.planes(images, c)[0] for c in _cutoffs(cells, short)], cells.effects
-    )
+    [planes] = [planes] if planes else _planes(cells, [mean], _cutoffs(cells, short))
+    return _Waves(cells, [p[0] for p in planes], effects)
 
 
 def _neighboured(present: BoolArray) -> BoolArray:
@@ -246,20 +279,14 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean((values - values.mean()) ** 2)))
 
 
-def _moment(values: FloatArray, order: int) -> float:
-    size = _rms(values)
-    if size == 0:
-        return 0.0
-    about = (values - values.mean()) / size
+def _moments(values: FloatArray) -> FloatArray:
+    """Return Sa, Sq, Sz, Ssk, Sku of the values (n,)."""
+    about = values - values.mean()
     square = about * about  # a general power takes ten times as long
-    return float(np.mean(square * (about if order % 2 else square)))
-
-
-_SIZES: dict[str, Callable[[FloatArray], float]] = {
-    "Sa": lambda values: float(np.mean(np.abs(values - values.mean()))),
-    "Sq": _rms,
-    "Sz": lambda values: float(np.ptp(values)),
-}
+    size = float(np.sqrt(np.mean(square)))
+    third, fourth = float(np.mean(square * about)), float(np.mean(square * square))
+    shape = (third / size**3, fourth / size**4) if size else (0.0, 0.0)
+    return np.array([np.mean(np.abs(about)), size, np.ptp(values), *shape])
 
 
 @dataclass(frozen=True, eq=False)
@@ -329,9 +356,9 @@ def power_density(cells: GridCells) -> PowerDensity:
     image = cells.mean
     if cells.width > 0:
         # The mean position of the points is not the middle of the cell.
-        _, *steep = cells.planes(image[np.newaxis], _cutoffs(cells, None)[0])
+        steep = cells.planes(_cutoffs(cells, None)[0])(image[np.newaxis])[1:]
         steps = np.reshape(cells.steps, (2, 1, 1))
-        image = image - np.sum(np.concatenate(steep) * cells.offset[::-1] * steps, axis=0)
+        image = image - np.sum(steep[:, 0] * cells.offset[::-1] * steps, axis=0)
     # The mean under the window would leak into the lowest frequencies.
     content = np.abs(np.fft.fft2(window * (image - np.average(image, weights=window)))) ** 2
     areal = content * np.prod(cells.steps) / np.sum(window**2) / passed
@@ -429,7 +456,7 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     made["angle"] = lambda d: _around(x, y, d, disc.radius)
     if np.any(rim := np.hypot(x, y) >= _EDGE * disc.radius):
         narrow = _ring(x[rim], y[rim], disc.radius / _FINER_AT_EDGE, disc.radius)
-        made["edge"] = lambda d: radial_profile(x[rim], y[rim], d[rim], spacing=narrow)
+        made["edge"] = lambda d: radial_profile(x[rim], y[rim], d[:, rim], spacing=narrow)
     found = {name: _curve(map_, average) for name, average in made.items()}
     return {name: curve for name, curve in found.items() if len(curve.position)}
 
@@ -444,7 +471,7 @@ def edge_roll_off(map_: DeviationMap, outline: Aperture) -> UncertainValue:
     angle = np.arctan2(map_.y - outline.y, map_.x - outline.x)
     x, y = size * np.cos(angle), size * np.sin(angle)
     width = _ring(x, y, 1.0 / _FINER_AT_EDGE, 1.0)
-    rings = radial_profile(x, y, map_.deviation, spacing=width)
+    rings = radial_profile(x, y, _with_effects(map_), spacing=width)
     inner = (rings.position > _FLAT[0]) & (rings.position < _FLAT[1])
     if np.sum(inner) < 4 or rings.position[-1] < _EDGE:
         return UncertainValue(None, None)
@@ -453,12 +480,9 @@ def edge_roll_off(map_: DeviationMap, outline: Aperture) -> UncertainValue:
     weights = np.append(weights, 1.0)
     chosen = np.append(np.flatnonzero(inner), len(inner) - 1)
 
-    def fall(profile: Profile) -> float:
-        return float(weights @ profile.value[chosen])
-
-    found = [fall(radial_profile(x, y, effect, spacing=width)) for effect in map_.effects]
+    fall, *found = rings.value[:, chosen] @ weights
     noise = map_.noise * np.linalg.norm(weights / np.sqrt(rings.points[chosen]))
-    return UncertainValue(fall(rings), float(np.hypot(noise, np.linalg.norm(found))))
+    return UncertainValue(float(fall), float(np.hypot(noise, np.linalg.norm(found))))
 
 
 def _ring(x: FloatArray, y: FloatArray, *radii: float) -> float:
@@ -484,12 +508,17 @@ def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) 
     def mean(values: FloatArray) -> FloatArray:
         return np.asarray(np.bincount(place, values, count)[filled] / points[filled])
 
-    return Profile(position=mean(angle), value=mean(deviation[outer]), points=points[filled])
+    values = np.array([mean(row) for row in deviation[:, outer]])
+    return Profile(position=mean(angle), value=values, points=points[filled])
+
+
+def _with_effects(map_: DeviationMap) -> FloatArray:
+    return np.concatenate([map_.deviation[np.newaxis], map_.effects])
 
 
 def _curve(map_: DeviationMap, average: Averaging) -> UncertainCurve:
-    profile = average(map_.deviation)
-    variance = map_.noise**2 / np.maximum(profile.points, 1)
-    for effect in map_.effects:
-        variance = variance + average(effect).value ** 2
-    return UncertainCurve(profile.position, profile.value, np.sqrt(variance))
+    profile = average(_with_effects(map_))
+    variance = map_.noise**2 / np.maximum(profile.points, 1) + np.sum(
+        profile.value[1:] ** 2, axis=0
+    )
+    return UncertainCurve(profile.position, profile.value[0], np.sqrt(variance))

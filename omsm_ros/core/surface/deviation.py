@@ -48,7 +48,7 @@ class Profile:
     """Mean deviation in successive intervals, without empty ones; k = 0 if all are empty.
 
     position: mean position of the points of an interval [m], increasing, (k,)
-    value: their mean [m], (k,);  points: their number, (k,)
+    value: their mean [m], (k,), or of each of several deviations (e, k);  points: their number (k,)
     """
 
     position: FloatArray
@@ -167,12 +167,13 @@ def line_profile(
     """Return the profile through the origin at ``angle`` [rad] from x: 0 is along x, π/2 along y.
 
     Points within ``half_width`` [m] of the line are averaged over every ``spacing`` [m].
+    deviation: (n,), or several (e, n) [m]
     """
-    _check(x=x, y=y, deviation=deviation)
+    _check_all(x, y, deviation)
     along = x * np.cos(angle) + y * np.sin(angle)
     across = y * np.cos(angle) - x * np.sin(angle)
     near = np.abs(across) <= half_width
-    return _averaged(along[near], deviation[near], spacing)
+    return _averaged(along[near], deviation[..., near], spacing)
 
 
 def radial_profile(
@@ -182,21 +183,22 @@ def radial_profile(
 
     Each of 12 sectors has equal weight, and a ring without points in all of them is left out, so
     that other orders average to zero. ``spacing`` should exceed the feed per turn.
+    deviation: (n,), or several (e, n) [m]
     """
-    _check(x=x, y=y, deviation=deviation)
+    _check_all(x, y, deviation)
     radius = np.hypot(x, y)
     ring = _intervals(radius, spacing)
     sector = np.floor(np.arctan2(y, x) / (2 * np.pi) * _SECTORS).astype(np.int64) % _SECTORS
     cell = ring * _SECTORS + sector
     shape = (int(ring.max()) + 1, _SECTORS)
-    points, radii, values = (
-        np.bincount(cell, part, shape[0] * shape[1]).reshape(shape)
-        for part in (None, radius, deviation)
+    points, radii = (
+        np.bincount(cell, part, shape[0] * shape[1]).reshape(shape) for part in (None, radius)
     )
     whole = np.all(points > 0, axis=1)
+    values = _sums(cell, deviation, shape[0] * shape[1]).reshape(*deviation.shape[:-1], *shape)
     return Profile(
         position=np.mean(radii[whole] / points[whole], axis=1),
-        value=np.mean(values[whole] / points[whole], axis=1),
+        value=np.mean(values[..., whole, :] / points[whole], axis=-1),
         points=np.sum(points[whole], axis=1).astype(np.int64),
     )
 
@@ -206,9 +208,15 @@ def _averaged(position: FloatArray, value: FloatArray, spacing: float) -> Profil
     filled, index, points = np.unique(interval, return_inverse=True, return_counts=True)
     return Profile(
         position=np.bincount(index, position, len(filled)) / points,
-        value=np.bincount(index, value, len(filled)) / points,
+        value=_sums(index, value, len(filled)) / points,
         points=points.astype(np.int64),
     )
+
+
+def _sums(cell: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Return the sums of ``values`` (…, n) over ``count`` cells (…, c)."""
+    found = [np.bincount(cell, row, count) for row in np.atleast_2d(values)]
+    return np.reshape(found, (*values.shape[:-1], count))
 
 
 def _intervals(position: FloatArray, spacing: float) -> IntArray:
@@ -218,6 +226,11 @@ def _intervals(position: FloatArray, spacing: float) -> IntArray:
     if extent > _MOST_INTERVALS:
         raise DataError("surface.intervals", spacing=spacing, intervals=extent)
     return np.asarray(np.floor(position / spacing), np.int64)
+
+
+def _check_all(x: FloatArray, y: FloatArray, deviations: FloatArray) -> None:
+    for deviation in np.atleast_2d(deviations):
+        _check(x=x, y=y, deviation=deviation)
 
 
 def _check(**arrays: FloatArray) -> None:

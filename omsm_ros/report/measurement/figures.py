@@ -442,7 +442,8 @@ def areal_density(areal: Mapping[str, Any]) -> Figure:
     )
     ax.set_aspect("equal")
     ax.set_position(_AREAL_PLACE)
-    bar = made.colorbar(shown, cax=made.add_axes(_AREAL_BAR_PLACE))
+    bar = made.colorbar(shown, cax=made.add_axes(_AREAL_BAR_PLACE), format="%g")
+    bar.minorticks_off()
     bar.ax.tick_params(labelsize=style.TEXT_PT)
     style.label(ax, x="f_x [1/mm]", y="f_y [1/mm]", title="Areal density [nm² mm²]")
     return made

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.core.form.deviation_map import GridCells, UncertainValue, gaussian_weights
-from omsm_ros.core.form.texture import bands_of, power_density, slopes, texture
+from omsm_ros.core.form.texture import bands_of, power_density, texture
 
 RNG = np.random.default_rng(12)
 
@@ -78,7 +78,7 @@ def test_slopes_of_a_plane_are_its_own_whatever_cells_are_missing():
     plane = 1e-4 * (3e-6 * columns - 4e-6 * rows)
     holed = cells_of(plane, RNG.random((20, 30)) > 0.1)
     for cells in (cells_of(plane), holed):
-        found = slopes(cells, bands_of(cells))
+        found = texture(cells, cells, bands_of(cells))
         assert found["slope_rms"].value == pytest.approx(5e-6, rel=1e-4)
         assert found["slope_largest"].value == pytest.approx(5e-6, rel=1e-3)
 
