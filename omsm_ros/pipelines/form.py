@@ -220,7 +220,8 @@ def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:
             "bands": {name: list(ends) for name, ends in form.bands.rms_bands.items()},
             "zernike": "each term is 1 at the rim; cos for m >= 0, sin for m < 0, from x to y",
         },
-        "points": _counts(form, measured.missing),
+        "points": form.counts
+        | {name: form.counts[name] + measured.missing for name in ("read", "not_finite")},
         "left_out": {
             "largest": float(np.max(np.abs(form.dust[2]), initial=0.0)),
             **dict(zip("xyz", form.dust[:, :_MOST_LISTED].tolist(), strict=True)),
@@ -230,24 +231,16 @@ def form_facts(form: FormResult, measured: OpenedMeasurement) -> dict[str, Any]:
 
 def _notes(form: FormResult, measured: OpenedMeasurement) -> list[str]:
     noise = [] if form.map.noise_known else [_NO_NOISE.format(quantity(form.map.noise, "m"))]
-    doubts = (str(d.reason) for d in form.doubts(decided=True))
-    return [*measured.notes, *_mismatch_text(form), *_advice(form), *noise, *doubts]
+    x, y, nominal = form.map.x, form.map.y, form.registration.surface
+    unlike = mismatch(x, y, nominal.height(x, y) + form.map.deviation, nominal)
+    more = map(str, (*unlike, *(d.reason for d in form.doubts(decided=True))))
+    return [*measured.notes, *_advice(form), *noise, *more]
 
 
 def _shares(found: Registration, shares: FloatArray) -> dict[str, float]:
     """Return the standard uncertainties of the fitted parameters themselves."""
     named = zip(found.dofs.fitted, map(float, shares), strict=True)
     return {n: external(n, found.placement.value(n), share)[1] or 0.0 for n, share in named}
-
-
-def _mismatch_text(form: FormResult) -> list[str]:
-    x, y, nominal = form.map.x, form.map.y, form.registration.surface
-    return [*map(str, mismatch(x, y, nominal.height(x, y) + form.map.deviation, nominal))]
-
-
-def _counts(form: FormResult, missing: int) -> dict[str, int]:
-    added = {name: form.counts[name] + missing for name in ("read", "not_finite")}
-    return form.counts | added
 
 
 def _advice(form: FormResult) -> list[str]:

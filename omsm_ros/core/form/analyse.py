@@ -45,7 +45,6 @@ from omsm_ros.core.form.texture import (
     profiles,
     texture,
 )
-from omsm_ros.core.form.zernike_fit import CHUNK as ZERNIKE_FIT_CHUNK
 from omsm_ros.core.form.zernike_fit import ZernikeFit, fit_zernikes
 from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.registration.isolated_points import ISOLATED, DustRule
@@ -130,7 +129,7 @@ def optical_terms(map_: DeviationMap, fit: ZernikeFit) -> dict[str, UncertainVal
         noise=0.0,
     )
     return {
-        "iso10110_A": _sagitta(map_, fit),
+        "iso10110_A": _sagitta(map_, fit, float(best_sphere[-1, 0])),
         "iso10110_C": extents_of_parts([rings], fit.disc)[0][0],
         "iso10110_RMSt": rms_of_part(without_terms(map_, fit.disc, TILT)),
         "iso10110_RMSi": rms_of_part(less(map_, columns[power], best_sphere)),
@@ -150,27 +149,22 @@ def _noise_of_rings(noise: float, weighted: FloatArray, gram: FloatArray) -> Flo
     return np.concatenate([-fitted(gram[power, power], gram[power, own]) @ root, root])
 
 
-def _sagitta(map_: DeviationMap, fit: ZernikeFit) -> UncertainValue:
-    """Return twice the power fitted together with piston and tilts, over the area.
+def _sagitta(map_: DeviationMap, fit: ZernikeFit, power: float) -> UncertainValue:
+    """Return twice the ``power`` that was fitted together with piston and tilts, over the area.
 
     On a whole disc that is the term of the fit. On a strip or a ring several terms of the fit
-    share the power, and the residual of the fit has none: the sum of their shares is the power.
+    share the power, and with them its uncertainty.
     """
     if ZernikeIndex(2, 0) not in fit.terms:
         return UncertainValue(None, None)
-    places = [fit.terms.index(term) for term in POWER]
-    gram, right = np.zeros((len(POWER), len(POWER))), np.zeros((len(POWER), len(fit.terms)))
-    for begin in range(0, len(map_), ZERNIKE_FIT_CHUNK):
-        chunk = slice(begin, begin + ZERNIKE_FIT_CHUNK)
-        columns = zernike_values(*fit.disc.scaled(map_.x[chunk], map_.y[chunk]), fit.terms)
-        chosen = columns[places] * map_.area[chunk]
-        right += chosen @ columns.T
-        gram += chosen @ columns[places].T
-    shares = np.linalg.solve(gram, right)[POWER.index(ZernikeIndex(2, 0))]
+    few, places = map_.every(_MOST_POINTS), [fit.terms.index(term) for term in POWER]
+    columns = zernike_values(*fit.disc.scaled(few.x, few.y), fit.terms)
+    chosen = columns[places] * few.area
+    shares = fitted(chosen @ columns[places].T, chosen @ columns.T)[-1]
     variance = shares @ fit.covariance @ shares + np.sum(np.square(shares @ fit.effects))
     # For heights that are metres off, the variance is rounding and may be negative.
     uncertainty = float(2 * np.sqrt(variance)) if variance >= 0 else None
-    return UncertainValue(float(2 * np.abs(shares @ fit.coefficients)), uncertainty)
+    return UncertainValue(2 * abs(power), uncertainty)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

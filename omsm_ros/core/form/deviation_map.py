@@ -273,12 +273,10 @@ class GridCells:
             right = _blurred(basis[:, np.newaxis] * images, narrow)
             for k, axis in enumerate(ways, 1):
                 right[k] -= middle[axis] * right[0]
-            found = np.zeros((3, *images.shape))
-            # Rows are along y, the second of the axes.
-            for row, place, unit in [(0, 0, 1.0)] + [
-                (2 - axis, k, self.steps[1 - axis]) for k, axis in enumerate(ways, 1)
-            ]:
-                found[row] = sum(s * r for s, r in zip(solve[place], right, strict=True)) / unit
+            planes = [np.sum(row[:, np.newaxis] * right, axis=0) for row in solve]
+            found = np.stack([planes[0], *2 * [np.zeros(images.shape)]])
+            for k, axis in enumerate(ways, 1):
+                found[2 - axis] = planes[k] / self.steps[1 - axis]
             return found
 
         return fitted

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -95,22 +94,14 @@ _Measure = Callable[[FloatArray], FloatArray]
 class _FilteredBand:
     """One band of the cells after each cutoff of the S-filter, to extrapolate to none.
 
-    values: (levels, …);  noisy: with noise added anew (draws, levels, …)
+    levels: the values, and draws of their noise, for each cutoff (1 + draws, …)
     effects: of the error sources, after the first cutoff (e, …)
     noise_known: that the values contain this noise
     """
 
-    values: FloatArray
-    noisy: FloatArray
+    levels: Sequence[FloatArray]
     effects: FloatArray
     noise_known: bool
-
-    @classmethod
-    def of(cls, made: list[FloatArray], effects: FloatArray, cells: GridCells) -> _FilteredBand:
-        """Return a band of images of the values and draws of their noise, one for each cutoff."""
-        values = np.stack([m[0] for m in made])
-        noisy = np.stack([m[0] + m[1:] for m in made], axis=1)
-        return cls(values, noisy, effects, cells.noise_known)
 
     def figures(self, of: _Measure, sizes: int) -> list[UncertainValue]:
         """Return figures of the values, without noise and without loss by the S-filter.
@@ -123,23 +114,23 @@ class _FilteredBand:
         of: the figures of one image, of which the first ``sizes`` are sizes
         """
 
-        def measure(levels: FloatArray) -> FloatArray:
-            found = np.array([of(v) for v in levels])
-            return np.where(np.arange(found.shape[1]) < sizes, found**2, found)
+        def measure(k: int) -> FloatArray:
+            found = np.array([of(v[0] + v[k] if k else v[0]) for v in self.levels])
+            found[:, :sizes] **= 2
+            return np.asarray(weights @ found)
 
-        weights = _EXTRAPOLATED[: len(self.values), : len(self.values)]
-        here = weights @ measure(self.values)
-        again = np.array([weights @ measure(levels) for levels in self.noisy])
-        added = again.mean(axis=0) - here
+        weights = _EXTRAPOLATED[: len(self.levels), : len(self.levels)]
+        here, *again = map(measure, range(len(self.levels[0])))
+        added = np.mean(again, axis=0) - here
         values = here - added if self.noise_known else here
         steps = np.diff(values, axis=0)
         steps = np.concatenate([steps, steps[-1:] if len(steps) else np.zeros_like(values)])
-        of_noise = np.hypot(again.std(axis=0), added * (_UNSURE if self.noise_known else 1.0))
+        of_noise = np.hypot(np.std(again, axis=0), added * (_UNSURE if self.noise_known else 1.0))
         spread = np.hypot(of_noise, steps)
-        first = self.values[0]
+        first = self.levels[0][0]
         shares = [(of(first + e) - of(first - e)) / 2 for e in self.effects]
-        shares.append(of(first) - of(first[..., ::2]))
-        systematic, found = np.sqrt(np.sum(np.square(shares), axis=0)), []
+        every_other = of(first) - of(first[..., ::2])
+        systematic, found = np.linalg.norm([every_other, *shares], axis=0), []
         for k, best in enumerate(np.argmin(spread, axis=0)):
             value, deviation = float(values[best, k]), float(spread[best, k])
             one = of_square(value, deviation) if k < sizes else UncertainValue(value, deviation)
@@ -165,13 +156,13 @@ def texture(
     images = [np.concatenate([c.mean[np.newaxis], c.effects]) for c in shown]
     cutoffs = _cutoffs(cells, bands.s_filter)
     *steep, levels = _planes(cells, [*images, formless.mean[np.newaxis]], cutoffs)
-    waves = _waves(formless, bands.s_filter, levels)
-    surface = waves.without(bands.l_filter) if points is None else _of_points(points)
+    between = (bands.s_filter, bands.l_filter)
+    surface = _band(formless, *between, levels) if points is None else _of_points(points)
     found = dict(zip(("Sa", "Sq", "Sz", "Ssk", "Sku"), surface.figures(_moments, 3), strict=True))
     for name, (long, short) in bands.rms_bands.items():
         same = long and short in (None, bands.s_filter)
-        band = waves if same else _waves(formless if long else cells, short)
-        found[f"rms_{name}"] = band.without(long).figures(lambda v: np.array([_rms(v)]), 1)[0]
+        band = _band(formless if long else cells, short, long, levels if same else None)
+        found[f"rms_{name}"] = band.figures(lambda v: _moments(v)[1:2], 1)[0]
     found["slope_rms"], found["slope_largest"] = _slopes(cells, steep[0])
     if rest is not None:
         found["slope_rms_without_second_order"] = _slopes(rest, steep[1])[0]
@@ -183,9 +174,8 @@ def _of_points(map_: DeviationMap) -> _FilteredBand:
     ends = np.cumsum(map_.area)
     even = np.searchsorted(ends, (np.arange(len(map_)) + 0.5) / len(map_) * ends[-1])
     noise = np.random.default_rng(_NOISE_SEED).normal(0, map_.noise, (_DRAWS, len(map_)))
-    noisy = (map_.deviation + noise)[:, np.newaxis, even]
-    values = map_.deviation[np.newaxis, even]
-    return _FilteredBand(values, noisy, map_.effects[:, even], map_.noise_known)
+    level = np.concatenate([map_.deviation[np.newaxis], noise])[:, even]
+    return _FilteredBand([level], map_.effects[:, even], map_.noise_known)
 
 
 # Of one image: level and slopes along x and y (3, 1 + draws + e, r, c), for each cutoff.
@@ -212,13 +202,13 @@ def _slopes(cells: GridCells, planes: _Planes) -> list[UncertainValue]:
     if not np.any(chosen):
         return 2 * [UncertainValue(None, None)]
     steep = [np.moveaxis(p[1:, :, chosen], 0, 1) for p in planes]
-    band = _FilteredBand.of([s[: 1 + _DRAWS] for s in steep], steep[0][1 + _DRAWS :], cells)
+    levels, effects = [s[: 1 + _DRAWS] for s in steep], steep[0][1 + _DRAWS :]
 
     def sizes(values: FloatArray) -> FloatArray:
         square = values[0] ** 2 + values[1] ** 2
         return np.sqrt([np.mean(square), np.max(square)])
 
-    return band.figures(sizes, 2)
+    return _FilteredBand(levels, effects, cells.noise_known).figures(sizes, 2)
 
 
 def _noise(cells: GridCells) -> FloatArray:
@@ -235,34 +225,28 @@ def _cutoffs(cells: GridCells, short: float | None) -> list[tuple[float, float]]
     return [(many * cells.steps[0], many * cells.steps[1]) for many in cutoffs]
 
 
-class _Waves(NamedTuple):
-    """Cells after each cutoff of the S-filter, each (1 + draws, r, c), and effects (e, r, c)."""
+def _band(
+    cells: GridCells, short: float | None, long: float | None, planes: _Planes | None = None
+) -> _FilteredBand:
+    """Return the present cells between an S- and an L-filter (ISO 25178-2).
 
-    cells: GridCells
-    levels: list[FloatArray]
-    effects: FloatArray
+    planes: of their mean, if they are known
+    """
+    images, effects = np.concatenate([cells.mean[np.newaxis], _noise(cells)]), cells.effects
+    if short is None and cells.width == 0:
+        levels = [images]
+    elif short is not None and short > _MANY_CELLS * cells.pitch:
+        levels, effects = [cells.smoothed(images, short)], cells.smoothed(effects, short)
+    else:
+        # The effects of systematic errors have no short waves.
+        own = planes or _planes(cells, [images[:1]], _cutoffs(cells, short))[0]
+        levels = [p[0] for p in own]
 
-    def without(self, long: float | None) -> _FilteredBand:
-        """Return the present cells, less what an L-filter passes (ISO 25178-2)."""
+    def kept(images: FloatArray) -> FloatArray:
+        rest = images if long is None else images - cells.smoothed(images, long)
+        return np.asarray(rest[:, cells.present])
 
-        def kept(images: FloatArray) -> FloatArray:
-            rest = images if long is None else images - self.cells.smoothed(images, long)
-            return np.asarray(rest[:, self.cells.present])
-
-        return _FilteredBand.of([*map(kept, self.levels)], kept(self.effects), self.cells)
-
-
-def _waves(cells: GridCells, short: float | None, planes: _Planes | None = None) -> _Waves:
-    """Return the cells after an S-filter;  planes: of their mean, if they are known."""
-    mean, effects = cells.mean[np.newaxis], cells.effects
-    if (short is None and cells.width == 0) or (short or 0.0) > _MANY_CELLS * cells.pitch:
-        images = np.concatenate([mean, _noise(cells)])
-        if short is None:
-            return _Waves(cells, [images], effects)
-        return _Waves(cells, [cells.smoothed(images, short)], cells.smoothed(effects, short))
-    # The effects of systematic errors have no short waves.
-    [planes] = [planes] if planes else _planes(cells, [mean], _cutoffs(cells, short))
-    return _Waves(cells, [p[0] for p in planes], effects)
+    return _FilteredBand([*map(kept, levels)], kept(effects), cells.noise_known)
 
 
 def _neighboured(present: BoolArray) -> BoolArray:
@@ -273,10 +257,6 @@ def _neighboured(present: BoolArray) -> BoolArray:
         size = present.shape[axis]
         found &= pad.take(range(size), axis) | pad.take(range(2, size + 2), axis)
     return found
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean((values - values.mean()) ** 2)))
 
 
 def _moments(values: FloatArray) -> FloatArray:
@@ -364,7 +344,7 @@ def power_density(cells: GridCells) -> PowerDensity:
     areal = content * np.prod(cells.steps) / np.sum(window**2) / passed
     white = np.sum((window * cells.noise) ** 2) / np.sum(window**2) * np.prod(cells.steps)
     of_noise = white / passed
-    mean_square = float(areal.sum()) * abs(_steps(x, y)[0] * _steps(x, y)[1])
+    mean_square = float(areal.sum()) * float(np.prod(_steps(x, y)))
     radial, step = _over_frequency(x, y, areal, of_noise, cells.noise_known)
     band = (step / 2, float(radial.position[-1]) + step / 2)
     inside = float(np.sum(2 * np.pi * radial.position * radial.value) * step)
@@ -426,17 +406,14 @@ def _over_direction(
     steps = _steps(x, y)
     angle = np.arctan2(y[:, np.newaxis] + 0 * x, x[np.newaxis] + 0 * y[:, np.newaxis]).ravel()
     sector = np.floor((angle % np.pi) / np.pi * _SECTORS).astype(np.int64) % _SECTORS
-    per_angle = abs(steps[0] * steps[1]) * _SECTORS / np.pi
-    content, of_noise = (
+    per_angle = steps[0] * steps[1] * _SECTORS / np.pi
+    content, of_noise, square = (
         np.asarray(np.bincount(sector, v.ravel(), _SECTORS) * per_angle, np.float64)
-        for v in (areal, noise)
+        for v in (areal, noise, areal**2)
     )
-    scatter = np.sqrt(np.bincount(sector, areal.ravel() ** 2, _SECTORS)) * per_angle
+    scatter = np.sqrt(square * per_angle)
     directions = np.asarray((np.arange(_SECTORS) + 0.5) * np.pi / _SECTORS, np.float64)
     return _without_noise(directions, content, scatter, of_noise, known)
-
-
-Averaging = Callable[[FloatArray], Profile]
 
 
 def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
@@ -447,7 +424,7 @@ def profiles(map_: DeviationMap, disc: Aperture) -> dict[str, UncertainCurve]:
     """
     x, y = map_.x - disc.x, map_.y - disc.y
     band = {"half_width": _HALF_WIDTH * disc.radius, "spacing": _SPACING * disc.radius}
-    made: dict[str, Averaging] = {
+    made: dict[str, Callable[[FloatArray], Profile]] = {
         name: lambda d, angle=angle: line_profile(x, y, d, angle=angle, **band)  # type: ignore[misc]
         for name, angle in (("x", 0.0), ("y", np.pi / 2), ("diagonal", np.pi / 4))
     }
@@ -505,18 +482,16 @@ def _around(x: FloatArray, y: FloatArray, deviation: FloatArray, radius: float) 
     points = np.bincount(place, minlength=count)
     filled = points > 0
 
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.bincount(place, values, count)[filled] / points[filled])
-
-    values = np.array([mean(row) for row in deviation[:, outer]])
-    return Profile(position=mean(angle), value=values, points=points[filled])
+    rows = [np.bincount(place, v, count)[filled] for v in (angle, *deviation[:, outer])]
+    position, *values = np.array(rows) / points[filled]
+    return Profile(position, np.array(values), points[filled])
 
 
 def _with_effects(map_: DeviationMap) -> FloatArray:
     return np.concatenate([map_.deviation[np.newaxis], map_.effects])
 
 
-def _curve(map_: DeviationMap, average: Averaging) -> UncertainCurve:
+def _curve(map_: DeviationMap, average: Callable[[FloatArray], Profile]) -> UncertainCurve:
     profile = average(_with_effects(map_))
     variance = map_.noise**2 / np.maximum(profile.points, 1) + np.sum(
         profile.value[1:] ** 2, axis=0

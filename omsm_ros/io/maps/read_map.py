@@ -61,46 +61,33 @@ def _head(path: Path) -> bytes:
 
 
 def _read(path: Path, units: LengthUnits | None, channel: str | None) -> MeasuredPoints:
-    head = _head(path)
-    if (found := _of_channels(path, head, channel)) is not None:
-        return replace(found, notes=(*found.notes, *([NOT_USED] if units else ())))
-    text, suffix = b"\0" not in head, path.suffix.lower()
-    points = _of_one(path, head, units)
-    if points is None and not (text and suffix in _TEXT_SUFFIXES):
+    head, suffix = _head(path), path.suffix.lower()
+    text = b"\0" not in head
+    if head.startswith(instrument_files.MAGIC):
+        return _in_own_units(instrument_files.read_hdf5(path, channel), units)
+    if suffix == ".x3p":
+        return _in_own_units(read_x3p(path, channel), units)
+    points = None
+    if head.startswith((b"ply\n", b"ply\r\n")):
+        points = read_ply(path, units)
+    elif head.startswith((b"# .PCD", b"VERSION")):
+        points = read_pcd(path, units)
+    elif head.startswith(instrument_files.METROPRO_MAGIC):
+        points = _in_own_units(instrument_files.read_metropro(path), units)
+    elif has_dabam_header(path):
+        points = _in_own_units(read_dabam(path), units)
+    elif text and suffix in _GRID_SAG_SUFFIXES and is_grid_sag(*_first_lines(head)):
+        points = read_grid_sag(path, units).points()
+    elif not (text and suffix in _TEXT_SUFFIXES):
         return read_foreign(path, units, channel)
     if channel is not None:
         raise FileError(f"{str(path)!r} has no channels; leave out --channel")
     return read_columns(path, units) if points is None else points
 
 
-def _of_channels(path: Path, head: bytes, channel: str | None) -> MeasuredPoints | None:
-    """Read a file of a format with channels that fixes its units; None for any other."""
-    if head.startswith(instrument_files.MAGIC):
-        return instrument_files.read_hdf5(path, channel)
-    return read_x3p(path, channel) if path.suffix.lower() == ".x3p" else None
-
-
-def _of_one(path: Path, head: bytes, units: LengthUnits | None) -> MeasuredPoints | None:
-    """Read a file of a format of one map or cloud; None for any other."""
-    if head.startswith((b"ply\n", b"ply\r\n")):
-        return read_ply(path, units)
-    if head.startswith((b"# .PCD", b"VERSION")):
-        return read_pcd(path, units)
-    if (found := _in_metres(path, head)) is not None:
-        # These formats fix the units, so ``units`` are not used.
-        unasked = (NOT_USED,) if units else ()
-        return replace(found, notes=(*found.notes, *unasked))
-    grid = b"\0" not in head and path.suffix.lower() in _GRID_SAG_SUFFIXES
-    return (
-        read_grid_sag(path, units).points() if grid and is_grid_sag(*_first_lines(head)) else None
-    )
-
-
-def _in_metres(path: Path, head: bytes) -> MeasuredPoints | None:
-    """Read a file of a format that fixes its units; None for any other."""
-    if head.startswith(instrument_files.METROPRO_MAGIC):
-        return instrument_files.read_metropro(path)
-    return read_dabam(path) if has_dabam_header(path) else None
+def _in_own_units(found: MeasuredPoints, units: LengthUnits | None) -> MeasuredPoints:
+    """Return points of a format that fixes its units, with a note if others were stated."""
+    return replace(found, notes=(*found.notes, *([NOT_USED] if units else ())))
 
 
 def _first_lines(head: bytes) -> tuple[str, str]:
