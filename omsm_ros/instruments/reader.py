@@ -13,7 +13,7 @@ from omsm_ros.instruments.blocks import BlockPair
 # Requests of other threads wait for a read to end, so it is short [s].
 _READ_S = 0.05
 # The pause before connecting again doubles from the first to the second [s].
-BACK_OFF_S = (0.25, 1.5)
+BACK_OFF_S = (0.25, 1.0)
 
 
 class State(Enum):

@@ -5,6 +5,7 @@ Constructors open nothing. A lost connection raises ``DeviceError``; ``open`` co
 
 from __future__ import annotations
 
+import math
 import re
 import socket
 import termios
@@ -66,6 +67,29 @@ class Transport(Protocol):
 
     def close(self) -> None:
         """Disconnect; does nothing when not connected."""
+
+
+# An answer comes within this and the multiple of the time of the slowest one before [s].
+_QUICK_S, _SEVERAL_TIMES = 0.5, 2.0
+
+
+class Patience:
+    """How long to wait for an answer [s]: at first as long as stated, then by those that came.
+
+    A device that is silent at a reconnection must not be waited for, since it may be switched off.
+    """
+
+    def __init__(self, stated: float) -> None:
+        self._stated, self._slowest = stated, math.nan
+
+    def seconds(self) -> float:
+        """Return the time to wait for the next answer [s]."""
+        known = _QUICK_S + _SEVERAL_TIMES * self._slowest
+        return self._stated if math.isnan(known) else min(self._stated, known)
+
+    def note(self, took: float) -> None:
+        """Enter the time that an answer took [s]."""
+        self._slowest = took if math.isnan(self._slowest) else max(self._slowest, took)
 
 
 # How long a command port waits for more of an answer at a time [s].
@@ -209,10 +233,10 @@ class CommandPort:
         self,
         transport: Transport,
         prompt: bytes,
-        patience: float,
+        patience: Patience,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """prompt: regular expression of the end of an answer;  patience: for an answer [s]."""
+        """prompt: regular expression of the end of an answer."""
         self._transport = transport
         self._prompt = re.compile(prompt)
         self._patience = patience
@@ -236,16 +260,18 @@ class CommandPort:
             belongs to an earlier answer. If it never comes, the last prompt ends the answer.
         """
         self._transport.write((text + end).encode())
-        said, deadline = b"", self._monotonic() + self._patience
+        said, asked = b"", self._monotonic()
         while not self._complete(said, sign):
             said = (said + self._transport.read(_ANSWER_POLL_S))[-_MAX_ANSWER_BYTES:]
-            if self._monotonic() > deadline:
+            if self._monotonic() - asked > self._patience.seconds():
                 if self._complete(said, b""):
                     break
                 raise DeviceTimeoutError(
                     f"{self._transport.name} did not answer {text!r} (received {said[-32:]!r}); "
                     "check that the controller's command port is open and no other client uses it"
                 )
+        else:
+            self._patience.note(self._monotonic() - asked)
         return said.decode("latin-1")
 
     def _complete(self, said: bytes, sign: bytes) -> bool:

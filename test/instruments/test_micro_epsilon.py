@@ -25,6 +25,7 @@ from omsm_ros.instruments.micro_epsilon.emulator import (
 )
 
 from . import with_commands
+from .conftest import Bench
 from .faulty import Faulty
 from .with_commands import WithCommands
 
@@ -119,6 +120,20 @@ def test_a_silent_command_port_is_named() -> None:
     run.emulator.stall(10.0)
     with pytest.raises(DeviceTimeoutError, match=r"did not answer 'GETINFO'.*no other client"):
         run.device.open()
+
+
+@pytest.mark.parametrize("lasts", [2.2, 2.9, 3.6, 4.3, 5.0, 5.7])
+def test_it_returns_within_two_seconds_after_a_silence_of_both_ports(lasts: float) -> None:
+    wanted = ConfocalDtSettings()
+    ports = WithCommands(with_commands.ConfocalDtEmulator, ConfocalDtEthernetDevice, wanted)
+    run = Bench(ports.data, ports.emulator, ports.device)
+    run.run(1.0)
+    ports.emulator.stall(lasts)
+    run.run(lasts)
+    before = run.delivered
+    run.run(2.0)
+    assert run.delivered > before
+    run.end()
 
 
 # ConfocalDT, RS-422.

@@ -40,7 +40,7 @@ from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
 from omsm_ros.instruments.parameters import Values, axes_of, block_settings, probe_reading_of
 from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
 from omsm_ros.instruments.stream import StreamDevice
-from omsm_ros.instruments.transport import Transport
+from omsm_ros.instruments.transport import Patience, Transport
 from omsm_ros.units import MICROMETRE_M
 
 TRIGGERS = {"free_run": "CTN", "each": "TRE", "once": "TRG", "window": "TRW"}
@@ -130,6 +130,7 @@ class Chrocodile(StreamDevice):
         self._probe = settings.probe
         self._identity: dict[str, str] = {}
         self._asked = 0.0
+        self._answers = Patience(settings.patience)
         self._ever_set_up = False
         self._exposures = 1  # averaged into a sample by the device
         self._slowed_by_averaging = True

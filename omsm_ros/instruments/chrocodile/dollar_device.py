@@ -111,7 +111,7 @@ class ChrocodileDevice(Chrocodile):
     def _exchange(self, wire: bytes, patience: float = 0.0) -> Answer:
         self._stream.expect(wire)
         self._transport.write(wire)
-        deadline = self._monotonic() + (patience or self._wanted.patience)
+        asked = self._monotonic()
         unanswered = partial(self._unanswered, wire.decode("latin-1").strip())
         while True:
             data = self._read_answer(self._stream.last_outside, unanswered)
@@ -119,9 +119,12 @@ class ChrocodileDevice(Chrocodile):
             if not data:
                 self._stream.settle_answer()
             answer = self._stream.take_answer()
+            took = self._monotonic() - asked
             if answer is not None:
+                if not patience:
+                    self._answers.note(took)
                 return answer
-            if self._monotonic() > deadline:
+            if took > (patience or self._answers.seconds()):
                 raise unanswered(self._stream.last_outside)
 
     def _decode(self, data: bytes) -> Samples:

@@ -62,10 +62,10 @@ class ChrocodilePacketDevice(Chrocodile):
         """Wait for the configuration, which a device sends to a new client, or request it."""
         configured = partial(self._await, "CONF", lambda c: c.name == CONFIGURED)
         try:
-            configured(self._wanted.patience / 2)
+            configured(self._answers.seconds() / 2)
         except DeviceTimeoutError:
             self._transport.write(encode_command(PacketCommand(CONFIGURED, (), 0, 0)))
-            configured(self._wanted.patience)
+            configured()
 
     def _finish(self) -> None:
         self._early.clear()  # measured before the device was set up
@@ -81,7 +81,7 @@ class ChrocodilePacketDevice(Chrocodile):
         answer = self._await(
             name,
             lambda c: c.name == name and c.ticket == asked.ticket and not c.flags & UPDATE,
-            patience or self._wanted.patience,
+            patience,
         )
         text = " ".join(
             value if isinstance(value, str) else f"{value:.9g}"
@@ -99,9 +99,9 @@ class ChrocodilePacketDevice(Chrocodile):
         return Answer(encode_command(asked), text)
 
     def _await(
-        self, what: str, wanted: Callable[[PacketCommand], bool], patience: float
+        self, what: str, wanted: Callable[[PacketCommand], bool], patience: float = 0.0
     ) -> PacketCommand:
-        deadline = self._monotonic() + patience
+        asked = self._monotonic()
         while True:
             data = self._read_answer(self._said, partial(self._unanswered, what))
             self._said = (self._said + data)[-64:]
@@ -109,8 +109,10 @@ class ChrocodilePacketDevice(Chrocodile):
             commands, self._commands = self._commands, []
             for command in commands:
                 if wanted(command):
+                    if not patience:
+                        self._answers.note(self._monotonic() - asked)
                     return command
-            if self._monotonic() > deadline:
+            if self._monotonic() - asked > (patience or self._answers.seconds()):
                 understood = self._decoder.statistics.packets > 0
                 raise self._unanswered(what, b"" if understood else self._said)
 

@@ -43,7 +43,7 @@ from omsm_ros.instruments.parameters import (
 )
 from omsm_ros.instruments.scaling import AxisScaling, ProbeReading
 from omsm_ros.instruments.stream import UNREADABLE_S, StreamDevice
-from omsm_ros.instruments.transport import CommandPort, Transport
+from omsm_ros.instruments.transport import CommandPort, Patience, Transport
 from omsm_ros.units import NANOMETRE_M
 
 SERIAL_VALUES = ("distance", "intensity", "counter")
@@ -93,7 +93,8 @@ class BlockStreamDevice(StreamDevice):
         self._next: int | None = None  # counter of the next block
         self._doubtful: list[MeasurementBlock] = []  # a block whose counter is not the next one
         self._latest: tuple[int, bytes] | None = None  # counter and frames
-        self._commands, self._answers_within, self._period = commands, patience, period
+        self._commands, self._period, self._patience = commands, period, patience
+        self._answers = Patience(patience)
         self._identity: dict[str, str] = {}
 
     @property
@@ -107,8 +108,7 @@ class BlockStreamDevice(StreamDevice):
         self._undescribed = False
         if self._commands is None:
             return
-        within = self._answers_within
-        with CommandPort(self._commands, self.prompt, within, self._monotonic) as port:
+        with CommandPort(self._commands, self.prompt, self._answers, self._monotonic) as port:
             self._identity = self._set_up(port)
 
     def _decode(self, data: bytes) -> Samples:
@@ -176,7 +176,7 @@ class BlockStreamDevice(StreamDevice):
                 "describe their content; read this controller over RS-422 (device: confocaldt)"
             )
         super()._listen_in(silent)
-        _check_not_silent(self._transport.name, self._period, self._answers_within, silent)
+        _check_not_silent(self._transport.name, self._period, self._patience, silent)
 
     def _frame(self, kind: tuple[int, int]) -> np.dtype[np.void]:
         """Return the fields of a frame, by the flags in the block's header."""
