@@ -9,6 +9,7 @@ import math
 from collections import deque
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import ConfigurationError
@@ -185,9 +186,11 @@ _LATE_PERIODS, _AGE_PERIODS = 0.75, 0.25
 _WINDOW, _USUAL = 4, 2.0
 # This number of spans without a confirming arrival shows how many triggers were missed.
 _SHOWING = 3
-# That is certain if the latest spans, of one of these numbers, agree with those before: in each
-# window, a third of them but at most so long, the earliest arrival is this near a line [period].
-_LATEST, _LONGEST, _EVEN_PERIODS = (12, 24, 48, 96), 16, 0.3
+# It is certain if it is likelier than any other by this (log), by the latest spans of one of these
+# numbers; earlier ones may be from before the missed triggers.
+_CERTAIN, _LATEST = 12.0, (12, 16, 20, 24, 32, 48, 64, 96)
+# Resolution of arrivals [period].
+_NARROWEST = 0.01
 # The true number is searched within this distance of the one that the old line shows [periods].
 _NEAR = 4
 
@@ -281,18 +284,14 @@ class MissedTriggerDetector:
     def _missed_between(self, before: FloatArray, since: FloatArray) -> int | None:
         """Return by how many periods spans ``since`` (n, 2) are later; None if not certain.
 
-        With the true number, one line is below all arrivals and close to them in every window;
-        with all others it is not.
+        With the true number, both lie at one edge, with another only one of them.
         """
-        uneven, length = {}, min(len(since) // 3, _LONGEST)
+        likely = {}
         for missed in range(max(self.missed - _NEAR, 0), self.missed + _NEAR):
             begin, late = np.concatenate([before, since - [0.0, missed * self._period]]).T
-            rest = _line_below(begin - begin[-1], late)[2] / self._period
-            windows = rest[len(before) :].reshape(-1, length).min(axis=1)
-            uneven[missed] = max(_least_in_windows(rest[: len(before)], length).max(), *windows)
-        best, other = sorted(uneven, key=uneven.__getitem__)[:2]
-        certain = uneven[best] < _EVEN_PERIODS and uneven[other] > 2 * _EVEN_PERIODS
-        return best if certain else None
+            likely[missed] = _edge(_line_below(begin - begin[-1], late)[2] / self._period)
+        other, best = sorted(likely, key=likely.__getitem__)[-2:]
+        return best if likely[best] - likely[other] > _CERTAIN else None
 
     def _spans(self) -> tuple[FloatArray, FloatArray]:
         """Return the spans (n, 2) before and after the last confirmation."""
@@ -311,13 +310,18 @@ class MissedTriggerDetector:
         self._line = (least - drift * float(begin[-1]), drift)
         # All arrivals count, or the limit would fall by leaving late ones out.
         rest = late - least - drift * (begin - begin[-1])
-        usual = _USUAL * float(np.median(_least_in_windows(rest)))
+        windows = sliding_window_view(rest, min(_WINDOW, len(rest)))
+        usual = _USUAL * float(np.median(windows.min(axis=1)))
         limit = max(_LATE_PERIODS * self._period, usual + _AGE_PERIODS * self._period)
         self._limit = limit if learning else min(self._limit, limit)
         self.seen_from = math.ceil(self._limit / self._period)
 
 
-def _least_in_windows(values: FloatArray, length: int = _WINDOW) -> FloatArray:
-    """Return the least of each ``length`` consecutive values, at most all of them."""
-    windows = np.lib.stride_tricks.sliding_window_view(values, min(length, len(values)))
-    return np.asarray(windows.min(axis=1))
+def _edge(rest: FloatArray) -> float:
+    """Return how likely arrivals with these rests (n,) above a line [period] lie at an edge (log).
+
+    If there is no edge, each of k arrivals is within a width w of the line by a chance of w, so the
+    log likelihood is -k log w for the likeliest k. The two that define the line do not count.
+    """
+    width = np.maximum(np.sort(rest)[2:], _NARROWEST)
+    return float(np.max(-np.arange(1, len(width) + 1) * np.log(width)))

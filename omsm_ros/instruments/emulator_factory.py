@@ -174,14 +174,13 @@ class Pty:
         os.set_blocking(self._master, False)
         try:
             self._make_link()
-        except OSError as err:
+        except (OSError, ConfigurationError) as err:
             self.unplug()
+            if isinstance(err, ConfigurationError):
+                raise
             raise DeviceError(
                 f"cannot create link {str(self._link)!r}: {err}; choose another"
             ) from err
-        except ConfigurationError:
-            self.unplug()
-            raise
 
     def __exit__(self, *_: object) -> None:
         self.unplug()

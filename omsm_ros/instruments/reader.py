@@ -109,24 +109,20 @@ class DeviceReader:
                 blocks = self._device.poll(_READ_S)
                 any_came |= bool(blocks)
                 self._deliver_blocks(blocks)
-        except (DeviceError, ConfigurationError) as err:
-            self._unproven = isinstance(err, NoSamplesError)
-            self.state = State.LOST
-            self._tell(str(err))
         except Exception as err:  # an internal error must not end the reading
-            self.state = State.LOST
-            self._tell(defect(err))
-        self._disconnect()
+            if isinstance(err, DeviceError | ConfigurationError):
+                self._unproven = isinstance(err, NoSamplesError)
+            self._lose(err)
+        try:  # hand over the partial block, whatever state the device is in
+            self._deliver_blocks(self._device.close())
+        except Exception as err:
+            self._lose(err)
         return any_came
 
-    def _disconnect(self) -> None:
-        """Disconnect and hand over the partial block, whatever state the device is in."""
-        try:
-            self._deliver_blocks(self._device.close())
-        except (DeviceError, ConfigurationError) as err:
-            self._tell(str(err))
-        except Exception as err:  # an internal error must not end the reading
-            self._tell(defect(err))
+    def _lose(self, err: Exception) -> None:
+        self.state = State.LOST
+        known = isinstance(err, DeviceError | ConfigurationError)
+        self._tell(str(err) if known else defect(err))
 
     def _connected(self) -> None:
         self.connections += 1

@@ -5,7 +5,6 @@ Constructors open nothing. A lost connection raises ``DeviceError``; ``open`` co
 
 from __future__ import annotations
 
-import math
 import re
 import socket
 import termios
@@ -74,22 +73,16 @@ _QUICK_S, _SEVERAL_TIMES = 0.5, 2.0
 
 
 class Patience:
-    """How long to wait for an answer [s]: at first as long as stated, then by those that came.
-
-    A device that is silent at a reconnection must not be waited for, since it may be switched off.
-    """
+    """How long to wait for an answer, ``seconds``: as stated, then by the slowest one so far."""
 
     def __init__(self, stated: float) -> None:
-        self._stated, self._slowest = stated, math.nan
-
-    def seconds(self) -> float:
-        """Return the time to wait for the next answer [s]."""
-        known = _QUICK_S + _SEVERAL_TIMES * self._slowest
-        return self._stated if math.isnan(known) else min(self._stated, known)
+        self.seconds = self._stated = stated
+        self._slowest = 0.0
 
     def note(self, took: float) -> None:
         """Enter the time that an answer took [s]."""
-        self._slowest = took if math.isnan(self._slowest) else max(self._slowest, took)
+        self._slowest = max(self._slowest, took)
+        self.seconds = min(self._stated, _QUICK_S + _SEVERAL_TIMES * self._slowest)
 
 
 # How long a command port waits for more of an answer at a time [s].
@@ -263,7 +256,7 @@ class CommandPort:
         said, asked = b"", self._monotonic()
         while not self._complete(said, sign):
             said = (said + self._transport.read(_ANSWER_POLL_S))[-_MAX_ANSWER_BYTES:]
-            if self._monotonic() - asked > self._patience.seconds():
+            if self._monotonic() - asked > self._patience.seconds:
                 if self._complete(said, b""):
                     break
                 raise DeviceTimeoutError(

@@ -243,7 +243,7 @@ def test_probe_nanometres_survive(nanometres: list[int], polarity: int) -> None:
     probe = ProbeScaling(full_scale=1e-3, polarity=polarity)
     frames = np.zeros(len(nanometres), FRAME)
     frames["distance"] = probe.counts(np.array(nanometres) * 1e-9)
-    distance, status = probe.readings(frames)
+    distance, status = probe.readings(frames["distance"].astype(float), frames["status"])
     np.testing.assert_allclose(distance, np.array(nanometres) * 1e-9, atol=1e-18, rtol=1e-12)
     assert (frames["distance"] == polarity * np.array(nanometres)).all()
     assert (status == Status.OK).all()
@@ -267,7 +267,9 @@ def test_probe_nanometres_survive(nanometres: list[int], polarity: int) -> None:
 def test_verdict_on_a_reading(raw: int, sent_status: int, expected: Status, finite: bool) -> None:
     frames = np.zeros(1, FRAME)
     frames["distance"], frames["status"] = raw, sent_status
-    distance, status = ProbeScaling(full_scale=100e-6).readings(frames)
+    distance, status = ProbeScaling(full_scale=100e-6).readings(
+        frames["distance"].astype(float), frames["status"]
+    )
     assert status.tolist() == [expected]
     assert status.dtype == np.uint8
     assert np.isfinite(distance).tolist() == [finite]

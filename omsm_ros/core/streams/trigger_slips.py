@@ -181,12 +181,10 @@ class TriggerSlipDetector:
         """The last verdict."""
         if self._state.samples:
             return self._state
-        window = self._window()
-        return (
-            TriggerSlip()
-            if window is None
-            else TriggerSlip(seen_from=math.ceil(self._limit(window)))
-        )
+        rows = self._recent()
+        if rows is None or not self._seen.stamps_follow_counts(self._period_ns):
+            return TriggerSlip()
+        return TriggerSlip(seen_from=math.ceil(self._limit(rows[:, 1] / self._period_ns)))
 
     def settled(
         self, sessions: tuple[int, int], first: int, end: int, period_ns: float
@@ -356,15 +354,6 @@ class TriggerSlipDetector:
 
     def _first_judged(self) -> float:
         return self._start + _FIRST_S * NANOSECONDS_PER_S / self._period_ns
-
-    def _window(self) -> FloatArray | None:
-        """Return the skews to be judged [samples]; None if too few or in time lapse."""
-        rows = self._recent()
-        return (
-            None
-            if rows is None or not self._seen.stamps_follow_counts(self._period_ns)
-            else rows[:, 1] / self._period_ns
-        )
 
     def _steady(self) -> float:
         return _steady(self._trigger, self._period_ns / NANOSECONDS_PER_S)

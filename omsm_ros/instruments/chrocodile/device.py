@@ -190,7 +190,8 @@ class Chrocodile(StreamDevice):
     def _prepare(self) -> None:
         wanted, before = self._wanted, self._identity
         self._begin()
-        self._identity = {"model": _version(self._try("VER").text)}
+        model = self._try("VER").text  # a refusal has no digits
+        self._identity = {"model": model if any(map(str.isdigit, model)) else "CHRocodile"}
         intact = self._ever_set_up and self._is_unchanged(before)
         self._measure_distance()
         if wanted.head is not None:
@@ -351,11 +352,6 @@ class Chrocodile(StreamDevice):
             self.triggers_lost += int(np.sum((flags & TRIGGER_LOST) > 0))
             self.triggers_delayed += int(np.sum((flags & TRIGGER_DELAYED) > 0))
         return samples
-
-
-def _version(text: str) -> str:
-    """Return the model in an answer to VER; a refusal has no digits."""
-    return text if any(map(str.isdigit, text)) else "CHRocodile"
 
 
 def _value(text: str) -> object:

@@ -124,7 +124,7 @@ class ChrocodileDevice(Chrocodile):
                 if not patience:
                     self._answers.note(took)
                 return answer
-            if took > (patience or self._answers.seconds()):
+            if took > (patience or self._answers.seconds):
                 raise unanswered(self._stream.last_outside)
 
     def _decode(self, data: bytes) -> Samples:

@@ -85,19 +85,15 @@ class RequestParser:
     def feed(self, data: bytes) -> list[Request]:
         """Return the commands completed by ``data``."""
         *lines, rest = (self._buffer + data).split(b"\r")
-        found = [request for line in lines if (request := _request(line)) is not None]
+        found = []
+        for line in lines:
+            wire = line[line.rfind(b"$") :][:MAX_COMMAND_BYTES]
+            if match := _COMMAND.fullmatch(wire):
+                words = (match[2] or b"").decode("latin-1").split()
+                found.append(Request(wire + b"\r", match[1].decode(), tuple(words)))
         start = rest.rfind(b"$")
         self._buffer = rest[start:][:MAX_COMMAND_BYTES] if start >= 0 else b""
         return found
-
-
-def _request(line: bytes) -> Request | None:
-    """Return the command at the end of ``line``; None without one."""
-    match = _COMMAND.fullmatch(line[line.rfind(b"$") :][:MAX_COMMAND_BYTES])
-    if match is None:
-        return None
-    words = (match[2] or b"").decode("latin-1").split()
-    return Request(match[0] + b"\r", match[1].decode(), tuple(words))
 
 
 def answer_wire(wire: bytes, text: str) -> bytes:

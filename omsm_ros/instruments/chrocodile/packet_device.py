@@ -62,7 +62,7 @@ class ChrocodilePacketDevice(Chrocodile):
         """Wait for the configuration, which a device sends to a new client, or request it."""
         configured = partial(self._await, "CONF", lambda c: c.name == CONFIGURED)
         try:
-            configured(self._answers.seconds() / 2)
+            configured(self._answers.seconds / 2)
         except DeviceTimeoutError:
             self._transport.write(encode_command(PacketCommand(CONFIGURED, (), 0, 0)))
             configured()
@@ -74,7 +74,7 @@ class ChrocodilePacketDevice(Chrocodile):
     def _ask(self, name: str, *arguments: str | float, patience: float = 0.0) -> Answer:
         self._ticket = (self._ticket + 1) % _TICKETS
         query = arguments == ("?",)
-        values = () if query else tuple(map(_value, arguments))
+        values: tuple[Value, ...] = () if query else arguments
         asked = PacketCommand(name, values, QUERY if query else 0, self._ticket)
         self._commands.clear()
         self._transport.write(encode_command(asked))
@@ -112,7 +112,7 @@ class ChrocodilePacketDevice(Chrocodile):
                     if not patience:
                         self._answers.note(self._monotonic() - asked)
                     return command
-            if self._monotonic() - asked > (patience or self._answers.seconds()):
+            if self._monotonic() - asked > (patience or self._answers.seconds):
                 understood = self._decoder.statistics.packets > 0
                 raise self._unanswered(what, b"" if understood else self._said)
 
@@ -150,10 +150,6 @@ class ChrocodilePacketDevice(Chrocodile):
         samples = self._convert(message.records)
         samples["time"] = message.times_ns
         return samples
-
-
-def _value(argument: str | float) -> Value:
-    return argument if isinstance(argument, str | int) else float(argument)
 
 
 def make(values: Values, transport: Transport, now_ns: NowNs) -> ChrocodilePacketDevice:

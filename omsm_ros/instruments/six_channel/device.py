@@ -8,12 +8,11 @@ from urllib.parse import parse_qs
 
 import numpy as np
 
-from omsm_ros.core.streams.blocks import Status
 from omsm_ros.errors import ConfigurationError, DeviceError
 from omsm_ros.instruments.blocks import BlockSettings, Channels
 from omsm_ros.instruments.counting import SAMPLE, Counting, Samples
 from omsm_ros.instruments.parameters import NowNs, Values, axes_of, block_settings
-from omsm_ros.instruments.scaling import AXES, AxisScaling
+from omsm_ros.instruments.scaling import AXES
 from omsm_ros.instruments.six_channel.protocol import (
     BODY_SIZE,
     COLUMNS,
@@ -29,7 +28,6 @@ from omsm_ros.instruments.six_channel.protocol import (
 )
 from omsm_ros.instruments.stream import StreamDevice
 from omsm_ros.instruments.transport import Transport, parts_of
-from omsm_ros.units import NANOMETRE_M
 
 _SEQUENCE_RANGE = 2**32
 
@@ -70,7 +68,7 @@ class GenericStreamDevice(StreamDevice):
         frames = self._decoder.feed(data)
         # Zeros mark an idle line.
         self._unread = 0 if len(frames) else self._unread + len(data) - data.count(0)
-        self.unknown_status += int(np.sum(~known_status(frames)))
+        self.unknown_status += int(np.sum(~known_status(frames["status"])))
         return samples_of(frames, self._scaling)
 
 
@@ -79,7 +77,9 @@ def samples_of(frames: FrameArray, scaling: StreamScaling) -> Samples:
     samples = np.zeros(len(frames), SAMPLE)
     samples["counter"] = frames["sequence"]
     samples["time"] = frames["device_time"].astype(np.int64)
-    samples["distance"], samples["status"] = scaling.probe.readings(frames)
+    samples["distance"], samples["status"] = scaling.probe.readings(
+        frames["distance"].astype(float), frames["status"]
+    )
     samples["intensity"] = np.nan
     samples["counts"] = frames["counts"]
     return samples
@@ -119,7 +119,11 @@ class CsvStreamDevice(StreamDevice):
         self._parts = settings.parts
         timed = "device_time" in settings.columns
         has_axes = bool(set(AXES) & set(settings.columns))
-        in_parts = (_in_parts(axis, settings.parts) for axis in settings.scaling.axes)
+        n = settings.parts
+        in_parts = (
+            replace(axis, counts_per_unit=axis.counts_per_unit * n, wrap=axis.wrap * n)
+            for axis in settings.scaling.axes
+        )
         axes = tuple(in_parts) if has_axes else None
         channels = Channels("distance" in settings.columns, axes, timed, settings.homed)
         counting = Counting(settings.modulus, timed=timed, checked=False)
@@ -135,24 +139,13 @@ class CsvStreamDevice(StreamDevice):
         if self.channels.timed:
             samples["time"] = rows["device_time"]
         if "distance" in self._columns:
-            measured = rows["distance"] != self._probe.invalid
-            raw = np.where(measured, rows["distance"], np.nan)
-            samples["distance"] = self._probe.polarity * NANOMETRE_M * raw
-            given = rows["status"] if "status" in self._columns else Status.OK
-            known = np.where((given >= 0) & (given <= max(Status)), given, Status.LOST)
-            good = known == Status.OK
-            beyond = good & (abs(samples["distance"]) > self._probe.full_scale)
-            known = np.where(beyond, Status.OUT_OF_RANGE, known)
-            samples["status"] = np.where(good & ~measured, Status.NO_TARGET, known)
+            given = rows["status"] if "status" in self._columns else np.zeros(len(rows), int)
+            found = self._probe.readings(rows["distance"], given)
+            samples["distance"], samples["status"] = found
         for index, name in enumerate(AXES):
             if name in self._columns:
                 samples["counts"][:, index] = np.rint(rows[name] * self._parts).astype(np.int64)
         return samples
-
-
-def _in_parts(axis: AxisScaling, parts: int) -> AxisScaling:
-    """Return the same axis, counted in parts of a count."""
-    return replace(axis, counts_per_unit=axis.counts_per_unit * parts, wrap=axis.wrap * parts)
 
 
 def _stream_settings(values: Values) -> dict[str, Any]:

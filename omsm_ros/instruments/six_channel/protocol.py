@@ -15,7 +15,7 @@ import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from cobs import cobs
@@ -120,15 +120,17 @@ class ProbeScaling:
     polarity: int = 1
     invalid: int = -(2**31)
 
-    def readings(self, frames: FrameArray) -> tuple[FloatArray, NDArray[np.uint8]]:
+    def readings(
+        self, raw: FloatArray, given: NDArray[np.integer[Any]]
+    ) -> tuple[FloatArray, NDArray[np.uint8]]:
         """Return the distance [m], NaN where there is none, and status, each of shape (n,).
 
-        A status other than OK is kept; one that this package does not know becomes LOST.
+        raw: reading [nm];  given: status by the device: one other than OK is kept, one that this
+            package does not know becomes LOST
         """
-        raw = frames["distance"]
         nothing = raw == self.invalid
-        distance = np.where(nothing, np.nan, self.polarity * NANOMETRE_M * raw.astype(float))
-        status = np.where(known_status(frames), frames["status"], Status.LOST)
+        distance = np.where(nothing, np.nan, self.polarity * NANOMETRE_M * raw)
+        status = np.where(known_status(given), given, Status.LOST)
         good = status == Status.OK
         status = np.where(good & nothing, Status.NO_TARGET, status)
         beyond = good & (abs(distance) > self.full_scale)
@@ -141,9 +143,9 @@ class ProbeScaling:
         return whole_counts("probe distance", sent, np.int32).astype(np.int32)
 
 
-def known_status(frames: FrameArray) -> NDArray[np.bool_]:
-    """Return True where the device's status is one of ``Status``, shape (n,)."""
-    return np.asarray(frames["status"] <= max(Status))
+def known_status(given: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
+    """Return True where the device's status ``given`` (n,) is one of ``Status``."""
+    return np.asarray((given >= 0) & (given <= max(Status)))
 
 
 LINEAR = AxisScaling(counts_per_unit=1e10)  # 0.1 nm a count
