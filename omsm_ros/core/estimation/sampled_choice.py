@@ -246,11 +246,11 @@ def _with_delays(problem: SectionsProblem, most: int) -> tuple[SectionsProblem, 
     return best.problem, best
 
 
-def _late(problem: SectionsProblem, late: FloatArray, order: int) -> SectionsFit:
-    """Return a fit with delays ``late`` [samples]; those of a held input stay."""
+def _late(problem: SectionsProblem, late: FloatArray, order: int, *more: FloatArray) -> SectionsFit:
+    """Return a fit with delays ``late`` [samples], and ``more`` starts; those of held ones stay."""
     if problem.hold != BAND_LIMITED:
         problem = replace(problem, delays=late.astype(np.int64))
-    return problem.fit(order, [problem.spread_start(order, late)], _EXPLORING)
+    return problem.fit(order, [problem.spread_start(order, late), *more], _EXPLORING)
 
 
 def _better(found: SectionsFit, other: SectionsFit) -> bool:
@@ -268,16 +268,17 @@ def _confirmed(problem: SectionsProblem, order: int) -> SectionsProblem:
 
     Where poles are too few, a delay imitates the others; no poles make up for one that is too long.
     """
+    if not np.any(problem.delays):
+        return problem
+    found = _late(problem, problem.delays.astype(np.float64), order)
     for input in np.flatnonzero(problem.delays):
-        found = _late(problem, problem.delays.astype(np.float64), order)
-        while found.problem.delays[input]:
-            late = found.problem.delays - np.eye(problem.inputs)[input]
-            shorter = _late(problem, late, order)
-            if not _better(shorter, found):
-                break
-            found = shorter
-        problem = found.problem
-    return problem
+        late = found.problem.delays.astype(np.float64)
+        for delay in range(problem.delays[input]):
+            late[input] = delay
+            shorter = _late(problem, late, order, found.nonlinear)
+            if _better(shorter, found):
+                found = shorter
+    return found.problem
 
 
 def _explore(

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
+from scipy import ndimage, special
 
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.core.estimation.impulse_response import impulse_response
@@ -42,6 +42,7 @@ from omsm_ros.linear_algebra import one_blas_thread
 
 # Limits of the band, a tenth of gain and of a radian: for a process, not a measuring machine.
 SAMPLED_LIMITS = ResponseLimits(gain=0.1, phase=0.1)
+_LIMIT = min(SAMPLED_LIMITS.gain, SAMPLED_LIMITS.phase)
 # Least share of the variance of held-out parts that free runs predict.
 _LEAST_PREDICTED = 0.5
 # Least p-value of a residual that is independent of the input.
@@ -52,6 +53,8 @@ _FREQUENCIES = 400
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
 # Power of a line over the largest nearby, and over the largest of all, below which it is left out.
 _NEARBY, _LEAST_POWER = 1e-3, 1e-8
+# Share of lines without excitation in a block that is enough to know the noise of the others.
+_QUIET = 0.25
 # Singular value of unit columns below which inputs are not distinguished.
 _COLLINEAR = 1e-3
 # Power of a line over the largest of its block from which it counts for the range of the block.
@@ -188,11 +191,14 @@ class _Block:
 
     frequency: lowest and highest at which they have power [Hz]
     difference, uncertainty: of the response from the model, relative to that, (m,)
+    off: share of the excited lines at which a difference beyond the limit is not noise, (m,);
+        NaN where too few other lines show the noise
     """
 
     frequency: tuple[float, float]
     difference: FloatArray
     uncertainty: FloatArray
+    off: FloatArray
 
 
 def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
@@ -216,9 +222,8 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         lines = np.flatnonzero(ndimage.binary_dilation(excited, iterations=_LINES // 2))
         residual = np.asarray(np.fft.rfft(grid), np.complex128)
         for part in _neighbours(lines, _LINES + _LINES_PER_INPUT * len(spectra)):
-            found.append(
-                _compared(frequency[part] / period, driven[:, part], residual[part], power[part])
-            )
+            spans, own = frequency[part] / period, driven[:, part]
+            found.append(_compared(spans, own, residual[part], power[part], excited[part]))
     return sorted(found, key=lambda block: block.frequency)
 
 
@@ -236,9 +241,18 @@ def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
 
 
 def _compared(
-    frequency: FloatArray, driven: ComplexArray, residual: ComplexArray, power: FloatArray
+    frequency: FloatArray,
+    driven: ComplexArray,
+    residual: ComplexArray,
+    power: FloatArray,
+    excited: BoolArray,
 ) -> _Block:
-    """Fit the residual of one block by the responses ``driven`` (m, k) and a transient."""
+    """Fit the residual of one block by the responses ``driven`` (m, k) and a transient.
+
+    Lines of a periodic input also count one by one: what is left there beyond the noise of those
+    between is distortion, or dynamics narrower than the block. Of the inputs that could account
+    for it together, each is taken to differ least.
+    """
     place = np.linspace(-1.0, 1.0, len(residual))
     columns = np.concatenate([driven, [np.ones(len(place)), place]]).T
     scale = np.linalg.norm(columns, axis=0)
@@ -253,7 +267,12 @@ def _compared(
     inputs = len(driven)
     strong = frequency[power > _STRONG * np.max(power)]
     ends = float(strong[0]), float(strong[-1])
-    return _Block(ends, np.abs(solved / scale)[:inputs], spread[:inputs])
+    off, apart = np.full(inputs, np.nan), np.abs(residual)
+    if np.sum(~excited) >= _QUIET * len(excited):
+        noise = np.sqrt(np.mean(apart[~excited] ** 2))
+        beyond = np.abs(driven) * apart > _LIMIT * np.sum(np.abs(driven) ** 2, axis=0)
+        off = np.mean((beyond & (apart > _SIGNIFICANT * noise))[:, excited], axis=1)
+    return _Block(ends, np.abs(solved / scale)[:inputs], spread[:inputs], off)
 
 
 def valid_range(
@@ -276,25 +295,30 @@ def valid_range(
     lowest, highest = np.array([block.frequency for block in blocks]).T
     difference = np.array([block.difference[input] for block in blocks])
     spread = np.array([block.uncertainty[input] for block in blocks])
-    limit = min(SAMPLED_LIMITS.gain, SAMPLED_LIMITS.phase)
     lines, near_ratio = frequency[:, np.newaxis], 2**_NEAR_OCTAVES
     near = ((lines >= lowest / near_ratio) & (lines <= highest * near_ratio)).astype(np.float64)
     count = np.maximum(np.sum(near, axis=1), 1.0)
-    off = (difference > limit) & (difference > _SIGNIFICANT * spread)
-    differs = near @ off / count > _MAY_DIFFER
+    off = np.array([block.off[input] for block in blocks])
+    lined = near * np.isfinite(off)
+    differs = lined @ np.nan_to_num(off) > _MAY_DIFFER * np.sum(lined, axis=1)
     own = sections.response(frequency)[input]
-    biased = (np.abs(missed) > limit * np.abs(own)).astype(np.float64)
+    biased = (np.abs(missed) > _LIMIT * np.abs(own)).astype(np.float64)
     nearby = round(2 * _NEAR_OCTAVES / np.log2(frequency[1] / frequency[0])) + 1
     differs |= ndimage.uniform_filter1d(biased, nearby, mode="nearest") > _MAY_DIFFER
     # One difference over a wide block does not show modes inside it.
     close = near * (highest <= _BLOCK_RATIO * lowest)
-    agreeing = close @ (difference + COVERAGE_FACTOR * spread <= limit)
-    agrees = (agreeing > 0) & (agreeing >= (1 - _MAY_DIFFER) * np.sum(close, axis=1))
+    within = difference + COVERAGE_FACTOR * spread <= _LIMIT
+    agrees = (close @ within > 0) & (close @ ~within <= _MAY_DIFFER * np.sum(close, axis=1))
     with np.errstate(divide="ignore"):
-        shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / limit) ** 2
+        shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / _LIMIT) ** 2
     excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
-    alike = np.all(np.abs(others - own) <= limit * np.abs(own), axis=0)
-    inside = (_narrow(sections.band(frequency, input)) & alike) | agrees
+    alike = np.all(np.abs(others - own) <= _LIMIT * np.abs(own), axis=0)
+    # The narrow band of a model of too few poles is contradicted by differences beyond chance.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        excess = near @ np.nan_to_num((difference / spread) ** 2)
+    upheld = special.gammaincc(count, excess) > np.exp(-(_SIGNIFICANT**2))
+    upheld |= near @ ~within <= _MAY_DIFFER * count
+    inside = (_narrow(sections.band(frequency, input)) & alike & upheld) | agrees
     return _widest(frequency, inside & excited & ~differs)
 
 

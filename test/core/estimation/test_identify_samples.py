@@ -20,6 +20,7 @@ from omsm_ros.core.estimation.sampled_choice import (
 )
 from omsm_ros.core.estimation.sampled_fit import SampledRecord, SectionsProblem
 from omsm_ros.core.estimation.sampled_model import free_run
+from omsm_ros.core.identification import sampled_identification
 from omsm_ros.core.identification.sampled_identification import (
     identify_samples,
     sampled_certificate,
@@ -297,6 +298,7 @@ def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, r
             frequency=(0.5, 0.5 * ratio),
             difference=np.full(1, 0.3 * (k < different)),
             uncertainty=known,
+            off=np.full(1, np.nan),
         )
         for k in range(20)
     ]
@@ -304,6 +306,58 @@ def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, r
     none = np.zeros((0, len(lines)), complex)
     low, high = valid_range(sections, blocks, lines, 0, none, np.zeros(len(lines)))
     assert (low < 0.5 < high) if valid else low == high
+
+
+@pytest.mark.parametrize(
+    ("difference", "spread", "off", "valid"),
+    [
+        (0.0, 0.01, 0.05, True),
+        (0.0, 0.01, 0.2, False),  # distortion of single lines
+        (0.09, 0.06, np.nan, True),  # chance, in each of two blocks
+        (0.14, 0.05, np.nan, False),  # none is beyond chance, but both together are
+        (0.02, 1e-4, np.nan, True),  # beyond chance, but within the limit
+    ],
+)
+def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
+    difference, spread, off, valid
+):
+    sections = from_polynomials("zero-order", PERIOD, *polynomials("zero-order"), 0)
+    size = 2 + 4 * len(sections.denominators)
+    sections = replace(sections, covariance=1e-20 * np.eye(size))
+    blocks = [
+        SimpleNamespace(
+            frequency=(0.4, 0.6),
+            difference=np.full(1, difference),
+            uncertainty=np.full(1, spread),
+            off=np.full(1, off),
+        )
+        for _ in range(2)
+    ]
+    lines = np.geomspace(0.05, 10, 400)
+    none = np.zeros((0, len(lines)), complex)
+    low, high = valid_range(sections, blocks, lines, 0, none, np.zeros(len(lines)))
+    assert (low < 0.5 < high) if valid else low == high
+
+
+def test_distortion_of_lines_is_told_from_noise_by_those_between(monkeypatch):
+    rng, period, lines = np.random.default_rng(4), 200, np.arange(1, 90)
+    turned = np.exp(2j * np.pi * rng.random(len(lines)))
+    distorted = lines > 50
+    given = turned / (1 + 0.1j * lines) * (1 + 0.4 * distorted * turned**2)
+    u, y = (
+        np.tile(np.fft.irfft(np.concatenate([[0], values]), period), 3)
+        for values in (turned, given)
+    )
+    found = []
+
+    def keep(_, blocks, *__):
+        found.extend(blocks)
+        return 0.1, 0.2
+
+    monkeypatch.setattr(sampled_identification, "valid_range", keep)
+    identified(u, y + rng.normal(0, 0.01 * np.std(y), len(y)), 1.0, order=1)
+    assert np.mean([b.off[0] for b in found if b.frequency[0] * period > 50]) > 0.9
+    assert np.mean([b.off[0] for b in found if b.frequency[1] * period < 50]) < 0.1
 
 
 @pytest.mark.parametrize(("lines", "order"), [([16.0], 0), ([16.0, 40.0], 2)])
