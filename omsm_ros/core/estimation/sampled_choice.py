@@ -85,17 +85,15 @@ class SampledChoice:
 
     chosen: of the order asked for, or the free choice;  free: the free choice
     alternatives: larger models that predict about as well, in sample periods
-    orders: explored;  by_order: share of the variance over the last part that each explains
-    comparator: share that an impulse response explains there at the frequencies of the inputs, and
-        ``compared`` that of the model of the chosen order; None where the records are too short
+    comparator: share of the variance over the last part that an impulse response explains at the
+        frequencies of the inputs, and ``compared`` that of the model of the chosen order; None
+        where the records are too short
     worse: the model is worse by more than the uncertainty of the comparison
     """
 
     chosen: SampledCandidate
     free: SampledCandidate
     alternatives: Sequence[ParallelSections]
-    orders: Sequence[int]
-    by_order: FloatArray
     comparator: float | None
     compared: float | None
     worse: bool
@@ -135,7 +133,7 @@ def choose_sampled(
     bound = _ALIKE * np.mean(chosen.held_out)
     alike = [c for c in judged if c.fit.order > chosen.fit.order and np.mean(c.held_out) <= bound]
     larger = [c.fit.model(float(every)) for c in alike]
-    return SampledChoice(finished, other, larger, orders, by_order, *comparison)
+    return SampledChoice(finished, other, larger, *comparison)
 
 
 def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsProblem, int, int]:

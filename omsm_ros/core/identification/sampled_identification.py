@@ -8,10 +8,10 @@
 | zero-order | constant from sample to sample, as a command | H(z), and its equivalent G(s) |
 | first-order | linear from sample to sample | the same H(z), another G(s) |
 
-The response is valid where the inputs excite it and the data support it. They do where the band of
-the model is narrow, or where a response without a model agrees with it: within blocks of
+The response is valid where the inputs excite it and the data support it. They do where a response
+without a model agrees with it, or does not contradict a narrow band of the model: within blocks of
 neighbouring lines, the residual is fitted by the inputs and the transient of the record (local
-polynomial method, Pintelon et al. 2010). Where that finds a difference, the model is not valid.
+polynomial method, Pintelon et al. 2010). Lines of a periodic input also count one by one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,8 +53,6 @@ _FREQUENCIES = 400
 _LINES, _LINES_PER_INPUT, _BLOCK_RATIO = 12, 8, 1.5
 # Power of a line over the largest nearby, and over the largest of all, below which it is left out.
 _NEARBY, _LEAST_POWER = 1e-3, 1e-8
-# Share of lines without excitation in a block that is enough to know the noise of the others.
-_QUIET = 0.25
 # Singular value of unit columns below which inputs are not distinguished.
 _COLLINEAR = 1e-3
 # Power of a line over the largest of its block from which it counts for the range of the block.
@@ -92,13 +90,12 @@ def identify_samples(
     frequency = np.geomspace(1 / max(len(record) for record in records), 0.5, _FREQUENCIES) / period
     sections, factor = _inflated_to_free_choice(sections, choice, frequency)
     blocks = _blocks(choice.chosen, period)
-    missed = _missed_responses(choice.chosen, frequency * period)
-    others = np.array(
-        [other.response(frequency * period) for other in choice.alternatives], np.complex128
-    ).reshape(-1, sections.inputs, _FREQUENCIES)
+    corrected = sections.response(frequency) + _missed(choice.chosen, frequency * period)
+    others = [other.response(frequency * period) for other in choice.alternatives]
+    others_of = np.array([corrected, *others], np.complex128).transpose(1, 0, 2)
     valid = [
-        valid_range(sections, blocks, frequency, input, others[:, input], missed[input])
-        for input in range(sections.inputs)
+        valid_range(sections, blocks, frequency, input, each)
+        for input, each in enumerate(others_of)
     ]
     entries = _entries(choice, sections, valid)
     first = records[0]
@@ -120,27 +117,24 @@ def identify_samples(
 
 def _independence(chosen: SampledCandidate) -> float:
     """Return the p-value of a residual that is independent of changes of the inputs."""
-    problem = chosen.fit.problem
-    drive = np.concatenate(
-        [
-            np.gradient(np.sum(r.record.inputs / np.std(r.record.inputs, axis=0), axis=1))[r.places]
-            for r in problem.spectra
-        ]
-    )
-    return independence(chosen.fit.residual, drive)
+    drives = [
+        np.gradient(np.sum(r.record.inputs / np.std(r.record.inputs, axis=0), axis=1))[r.places]
+        for r in chosen.fit.problem.spectra
+    ]
+    return independence(chosen.fit.residual, np.concatenate(drives))
 
 
-def _missed_responses(chosen: SampledCandidate, cycles: FloatArray) -> ComplexArray:
+def _missed(chosen: SampledCandidate, cycles: FloatArray) -> ComplexArray:
     """Return what the model misses at ``cycles`` (f,) a sample, (m, f): the residual without model.
 
     An impulse response from the inputs to the residual of the first record resolves modes that are
     narrower than a block of lines.
     """
-    one, fitted = chosen.fit.problem.spectra[0], chosen.fit
-    grid, used = np.zeros(len(one.record)), np.zeros(len(one.record), np.bool_)
-    grid[one.places], used[one.places] = fitted.residual[: len(one.places)], True
+    fitted, one = chosen.fit, chosen.fit.problem.spectra[0]
+    grid = np.zeros(len(one.record))
+    grid[one.places] = fitted.residual[: len(one.places)]
     inputs = one.record.inputs - np.mean(one.record.inputs, axis=0)
-    taps = impulse_response(inputs, grid, used)
+    taps = impulse_response(inputs, grid, one.record.used)
     if taps is None:
         return np.zeros((inputs.shape[1], len(cycles)), np.complex128)
     turned = np.exp(-2j * np.pi * np.outer(np.arange(taps.shape[1]), cycles))
@@ -180,9 +174,7 @@ def _inflated_to_free_choice(
 
 
 def _narrow(band: Band) -> BoolArray:
-    limits = SAMPLED_LIMITS
-    gain, phase = COVERAGE_FACTOR * band.gain, COVERAGE_FACTOR * band.phase
-    return np.asarray((gain <= limits.gain) & (phase <= limits.phase))
+    return np.asarray(COVERAGE_FACTOR * np.maximum(band.gain, band.phase) <= _LIMIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +183,7 @@ class _Block:
 
     frequency: lowest and highest at which they have power [Hz]
     difference, uncertainty: of the response from the model, relative to that, (m,)
-    off: share of the excited lines at which a difference beyond the limit is not noise, (m,);
-        NaN where too few other lines show the noise
+    off: share of lines that differ beyond limit and noise, (m,); NaN where none shows the noise
     """
 
     frequency: tuple[float, float]
@@ -218,12 +209,14 @@ def _blocks(candidate: SampledCandidate, period: float) -> list[_Block]:
         power[0] = 0.0
         nearby = ndimage.maximum_filter1d(power, _LINES)
         excited = (power > _NEARBY * nearby) & (power > _LEAST_POWER * power.max())
+        power *= excited
         # Lines near an excited one show the noise.
         lines = np.flatnonzero(ndimage.binary_dilation(excited, iterations=_LINES // 2))
         residual = np.asarray(np.fft.rfft(grid), np.complex128)
         for part in _neighbours(lines, _LINES + _LINES_PER_INPUT * len(spectra)):
-            spans, own = frequency[part] / period, driven[:, part]
-            found.append(_compared(spans, own, residual[part], power[part], excited[part]))
+            found.append(
+                _compared(frequency[part] / period, driven[:, part], residual[part], power[part])
+            )
     return sorted(found, key=lambda block: block.frequency)
 
 
@@ -241,37 +234,32 @@ def _neighbours(lines: IntArray, size: int) -> list[IntArray]:
 
 
 def _compared(
-    frequency: FloatArray,
-    driven: ComplexArray,
-    residual: ComplexArray,
-    power: FloatArray,
-    excited: BoolArray,
+    frequency: FloatArray, driven: ComplexArray, residual: ComplexArray, power: FloatArray
 ) -> _Block:
     """Fit the residual of one block by the responses ``driven`` (m, k) and a transient.
 
-    Lines of a periodic input also count one by one: what is left there beyond the noise of those
-    between is distortion, or dynamics narrower than the block. Of the inputs that could account
-    for it together, each is taken to differ least.
+    Beyond the noise of lines that are not excited, the residual of each other one is distortion, or
+    dynamics narrower than the block. It may be of all inputs: each is taken to differ least.
     """
     place = np.linspace(-1.0, 1.0, len(residual))
     columns = np.concatenate([driven, [np.ones(len(place)), place]]).T
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv(columns / scale)
+    scale = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+    columns /= scale
+    inverse = np.linalg.pinv(columns)
     solved = inverse @ residual
-    left = residual - columns / scale @ solved
+    left = residual - columns @ solved
     variance = float(np.sum(np.abs(left) ** 2)) / max(len(residual) - columns.shape[1], 1)
     spread = np.sqrt(variance * np.sum(np.abs(inverse) ** 2, axis=1)) / scale
-    if np.linalg.matrix_rank(columns / scale, tol=_COLLINEAR) < columns.shape[1]:
+    if np.linalg.matrix_rank(columns, tol=_COLLINEAR) < columns.shape[1]:
         spread[:] = np.inf
     inputs = len(driven)
     strong = frequency[power > _STRONG * np.max(power)]
     ends = float(strong[0]), float(strong[-1])
-    off, apart = np.full(inputs, np.nan), np.abs(residual)
-    if np.sum(~excited) >= _QUIET * len(excited):
-        noise = np.sqrt(np.mean(apart[~excited] ** 2))
+    off, apart, quiet = np.full(inputs, np.nan), np.abs(residual), power == 0
+    if np.sum(quiet) > columns.shape[1]:
         beyond = np.abs(driven) * apart > _LIMIT * np.sum(np.abs(driven) ** 2, axis=0)
-        off = np.mean((beyond & (apart > _SIGNIFICANT * noise))[:, excited], axis=1)
+        beyond &= apart > _SIGNIFICANT * np.sqrt(np.mean(apart[quiet] ** 2))
+        off = np.mean(beyond[:, ~quiet], axis=1)
     return _Block(ends, np.abs(solved / scale)[:inputs], spread[:inputs], off)
 
 
@@ -281,13 +269,11 @@ def valid_range(
     frequency: FloatArray,
     input: int,
     others: ComplexArray,
-    missed: ComplexArray,
 ) -> tuple[float, float]:
     """Return the widest range [Hz], in octaves, that the data support for one input.
 
-    others: responses (a, k) of models that predict about as well; where they differ, the model is
-        not known unless the data show it
-    missed: response (k,) from the input to the residual, if that follows the input
+    others: responses (a, k) of models that predict about as well, and without a model; where they
+        differ, the model is not known unless the data show it
     Both ends are the lowest of ``frequency`` if there is no such range.
     """
     if not blocks:
@@ -301,21 +287,16 @@ def valid_range(
     off = np.array([block.off[input] for block in blocks])
     lined = near * np.isfinite(off)
     differs = lined @ np.nan_to_num(off) > _MAY_DIFFER * np.sum(lined, axis=1)
-    own = sections.response(frequency)[input]
-    biased = (np.abs(missed) > _LIMIT * np.abs(own)).astype(np.float64)
-    nearby = round(2 * _NEAR_OCTAVES / np.log2(frequency[1] / frequency[0])) + 1
-    differs |= ndimage.uniform_filter1d(biased, nearby, mode="nearest") > _MAY_DIFFER
     # One difference over a wide block does not show modes inside it.
     close = near * (highest <= _BLOCK_RATIO * lowest)
     within = difference + COVERAGE_FACTOR * spread <= _LIMIT
     agrees = (close @ within > 0) & (close @ ~within <= _MAY_DIFFER * np.sum(close, axis=1))
-    with np.errstate(divide="ignore"):
-        shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / _LIMIT) ** 2
-    excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
-    alike = np.all(np.abs(others - own) <= _LIMIT * np.abs(own), axis=0)
-    # The narrow band of a model of too few poles is contradicted by differences beyond chance.
     with np.errstate(divide="ignore", invalid="ignore"):
+        shown = near @ (1 / spread**2) >= (COVERAGE_FACTOR / _LIMIT) ** 2
+        alike = np.all(np.abs(others / sections.response(frequency)[input] - 1) <= _LIMIT, axis=0)
         excess = near @ np.nan_to_num((difference / spread) ** 2)
+    excited = np.logical_or.accumulate(shown) & np.logical_or.accumulate(shown[::-1])[::-1]
+    # The narrow band of a model of too few poles is contradicted by differences beyond chance.
     upheld = special.gammaincc(count, excess) > np.exp(-(_SIGNIFICANT**2))
     upheld |= near @ ~within <= _MAY_DIFFER * count
     inside = (_narrow(sections.band(frequency, input)) & alike & upheld) | agrees
@@ -336,17 +317,12 @@ def _entries(
 ) -> dict[str, object]:
     chosen = choice.chosen
     problem, residual = chosen.fit.problem, chosen.fit.residual
-    outputs = [one.output for one in problem.spectra]
-    variance = float(np.mean(np.concatenate(outputs) ** 2)) or 1.0
+    variance = float(np.mean(np.concatenate([one.output for one in problem.spectra]) ** 2)) or 1.0
     return {
         "delay_samples": (sections.delays / sections.period).tolist(),
         "residual_rms": float(np.sqrt(np.mean(residual**2))),
         "explained": 1 - float(np.mean(residual**2)) / variance,
         "predicted": 1 - float(np.mean(chosen.held_out)),
-        "last_part_by_order": {
-            str(order): float(share) if np.isfinite(share) else None
-            for order, share in zip(choice.orders, choice.by_order, strict=True)
-        },
         "impulse_response": {"comparator": choice.comparator, "model": choice.compared},
         "whiteness_p": whiteness(residual),
         "independence_p": _independence(chosen),

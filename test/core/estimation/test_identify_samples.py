@@ -304,7 +304,7 @@ def test_most_narrow_blocks_must_agree_where_the_model_is_uncertain(different, r
     ]
     lines = np.geomspace(0.05, 10, 400)
     none = np.zeros((0, len(lines)), complex)
-    low, high = valid_range(sections, blocks, lines, 0, none, np.zeros(len(lines)))
+    low, high = valid_range(sections, blocks, lines, 0, none)
     assert (low < 0.5 < high) if valid else low == high
 
 
@@ -335,7 +335,7 @@ def test_a_narrow_band_of_the_model_counts_where_nothing_contradicts_it(
     ]
     lines = np.geomspace(0.05, 10, 400)
     none = np.zeros((0, len(lines)), complex)
-    low, high = valid_range(sections, blocks, lines, 0, none, np.zeros(len(lines)))
+    low, high = valid_range(sections, blocks, lines, 0, none)
     assert (low < 0.5 < high) if valid else low == high
 
 
