@@ -13,6 +13,7 @@ from omsm_ros.core.adjustment.source_evaluation import KINDS, evaluate_sources
 from omsm_ros.core.surface.nominal import Flat
 from omsm_ros.errors import DataError
 from omsm_ros.io.descriptions import load_sources
+from omsm_ros.pipelines.adjust import priors_of
 
 from .written import facts
 
@@ -110,3 +111,16 @@ def test_the_twin_makes_recordings_of_which_the_command_writes_the_sources(
         assert "UTC" in item["date"]
         assert item["command"].startswith("omsm sources ")
     assert {s.source: s.how for s in load_sources(out).stated}["centre_y"] == "evaluated"
+
+
+def test_a_stated_linearity_counts_for_the_square_of_the_distance_too(tmp_path):
+    """A file of sources knows one linearity error; the adjustment has two shapes of it."""
+    (tmp_path / "sources.yaml").write_text(
+        "schema: omsm-sources/1\nsources:\n  - {source: probe_linearity, value: 3.0e-9, unit: m, "
+        "half_range: 5.0e-5, how: evaluated, reason: five stand-offs}\n", encoding="utf-8",
+    )  # fmt: skip
+    priors = priors_of(load_sources(tmp_path / "sources.yaml"))
+    assert {(p.name, p.uncertainty, p.evaluated) for p in priors} == {
+        ("probe_linearity", 3e-9, True),
+        ("probe_square", 3e-9, True),
+    }

@@ -306,16 +306,12 @@ def _findings(
                 declared=stated.get(base_name(family.name)),
                 found=values,
                 uncertainty=np.sqrt(np.maximum(np.diag(covariance), 0.0)),
-                effect=effect,
-                effect_uncertainty=spread,
+                effect=effect, effect_uncertainty=spread,
                 possible=effects.get(family.name, NO_EFFECT).left,
-                shown=evidence.shown,
-                shown_by=family.shown_by,
-                deviate=evidence.deviate,
-                refuted=family.name in alike,
-                alike=alike.get(family.name, ()),
+                shown=evidence.shown, shown_by=family.shown_by, deviate=evidence.deviate,
+                refuted=family.name in alike, alike=alike.get(family.name, ()),
             )
-        )
+        )  # fmt: skip
     return tuple(found)
 
 
