@@ -11,6 +11,7 @@ import numpy as np
 
 from omsm_ros.core.kinematics.kinematics import Geometry
 from omsm_ros.core.kinematics.trajectories import AxisPositions
+from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.twin.part import PartPose
 from omsm_ros.twin.plant import Trajectory
@@ -68,13 +69,10 @@ class Harmonic(CheckedNumbers):
     per_turn: int
     phase_rad: float = 0.0
 
-    def along(self, c: FloatArray) -> FloatArray:
-        """Return the first component at spindle angle ``c`` [rad], of its shape."""
-        return np.asarray(self.amplitude * np.cos(self.per_turn * c + self.phase_rad), np.float64)
-
-    def across(self, c: FloatArray) -> FloatArray:
-        """Return the second component at spindle angle ``c`` [rad], of its shape."""
-        return np.asarray(self.amplitude * np.sin(self.per_turn * c + self.phase_rad), np.float64)
+    def vector(self, c: FloatArray) -> ComplexArray:
+        """Return the vector as x + iy at spindle angle ``c`` [rad], of its shape."""
+        turned = np.exp(1j * (self.per_turn * c + self.phase_rad))
+        return np.asarray(self.amplitude * turned, np.complex128)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,18 +99,17 @@ class SpindleError(CheckedNumbers):
 
     def shift(self, time: FloatArray, slides: AxisPositions, noise: list[Trajectory]) -> Shift:
         """Return the shift of the workpiece; ``noise``: five signals of variance one."""
-        c = slides.c
-        axial, radial, tilt = self.axial_m, self.radial_m, self.tilt_rad
-        z = sum((h.along(c) for h in axial), np.zeros(1))
-        x, slope_x = (sum((h.along(c) for h in hs), np.zeros(1)) for hs in (radial, tilt))
-        y, slope_y = (sum((h.across(c) for h in hs), np.zeros(1)) for hs in (radial, tilt))
+        axial, radial, tilt = (
+            sum((h.vector(slides.c) for h in harmonics), np.zeros(1, np.complex128))
+            for harmonics in (self.axial_m, self.radial_m, self.tilt_rad)
+        )
         if noise:
-            random = [n.at(time) for n in noise]
-            z = z + self.axial_noise_m * random[0]
-            x, y = (p + self.radial_noise_m * r for p, r in zip((x, y), random[1:3], strict=True))
-            slope_x = slope_x + self.tilt_noise_rad * random[3]
-            slope_y = slope_y + self.tilt_noise_rad * random[4]
-        return Shift(x, y, z + slope_x * slides.x + slope_y * slides.y)
+            first, *others = (n.at(time) for n in noise)
+            axial = axial + self.axial_noise_m * first
+            radial = radial + self.radial_noise_m * (others[0] + 1j * others[1])
+            tilt = tilt + self.tilt_noise_rad * (others[2] + 1j * others[3])
+        z = axial.real + tilt.real * slides.x + tilt.imag * slides.y
+        return Shift(radial.real, radial.imag, z)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

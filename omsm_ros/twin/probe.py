@@ -163,20 +163,14 @@ def read(
     )
 
 
-def _error(
-    probe: Probe, errors: ProbeErrors, distance: FloatArray, slope: Slope
-) -> FloatArray | float:
+def _error(probe: Probe, errors: ProbeErrors, distance: FloatArray, slope: Slope) -> FloatArray:
     """Return the error of the optics at ``distance`` (n,) [m]."""
-    error: FloatArray | float = 0.0
-    if errors.cubic_m:
-        error = error + errors.cubic_m * (distance / probe.half_range) ** 3
-    if errors.periodic_m:
-        error = error + errors.periodic_m * np.sin(2 * np.pi * distance / errors.period_m)
-    if errors.slope_error_m_per_rad:
-        error = error + errors.slope_error_m_per_rad * slope.x
-    if errors.slope_error_m_per_rad2:
-        error = error + errors.slope_error_m_per_rad2 * slope.steepness**2
-    return error
+    return np.asarray(
+        errors.cubic_m * (distance / probe.half_range) ** 3
+        + errors.periodic_m * np.sin(2 * np.pi * distance / errors.period_m)
+        + errors.slope_error_m_per_rad * slope.x
+        + errors.slope_error_m_per_rad2 * slope.steepness**2
+    )
 
 
 def _intensity(errors: ProbeErrors, slope: Slope) -> FloatArray:

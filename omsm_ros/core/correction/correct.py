@@ -37,7 +37,6 @@ from omsm_ros.core.streams.blocks import (
     Account,
     AxisBlock,
     Block,
-    BoolArray,
     DistanceBlock,
     FloatArray,
     RejectionReason,
@@ -252,7 +251,7 @@ class Corrector:
         sample = np.arange(axes.first, axes.end)
         axis_values, probe_values = axes.values, distance.values
         if axes.reasons.any() or distance.reasons.any():
-            good = _as_slice((axes.reasons | distance.reasons) == RejectionReason.NONE)
+            good = (axes.reasons | distance.reasons) == RejectionReason.NONE
             sample = sample[good]
             axis_values, probe_values = axis_values[:, good], probe_values[:, good]
         x, y, b, c, dynamic_error, moved = axis_values[:RATE]
@@ -299,12 +298,6 @@ class Corrector:
             common = isinstance(variance, float)
             self._variance[name] += float(np.sum(variance)) * (len(reading) if common else 1)
         return np.sqrt(sum(variances.values()))
-
-
-def _as_slice(chosen: BoolArray) -> BoolArray | slice:
-    """Return ``chosen`` (n,) as a slice if it is one, so that nothing is copied."""
-    first, last = int(np.argmax(chosen)), len(chosen) - int(np.argmax(chosen[::-1]))
-    return slice(first, last) if np.sum(chosen) == last - first else chosen
 
 
 def latency_in_use(calibration: Calibration, options: CorrectionOptions) -> float:

@@ -192,11 +192,10 @@ def sampling_over(signal: ScanSignal, places: int = 5) -> list[Sampling]:
     distance = abs(np.diff(signal.path)) / samples
     middle = 0.5 * (signal.radius[1:] + signal.radius[:-1])
     low, high = float(middle.min()), float(middle.max())
-    if high - low < 0.01 * max(high, 1e-12):
-        return [_sampling(middle, distance)]
+    count = 1 if high - low < 0.01 * max(high, 1e-12) else places
     rings = [
         (middle <= outer) & (middle >= inner)
-        for outer, inner in pairwise(np.linspace(high, low, places + 1))
+        for outer, inner in pairwise(np.linspace(high, low, count + 1))
     ]
     return [_sampling(middle[ring], distance[ring]) for ring in rings if ring.any()]
 
