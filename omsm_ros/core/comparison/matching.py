@@ -15,6 +15,7 @@ from omsm_ros.core.comparison.resampling import LocalHeights, LocalQuadratic
 from omsm_ros.core.streams.blocks import BoolArray, FloatArray
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import ConfigurationError, DataError, Notice
+from omsm_ros.linear_algebra import least_squares, unit_columns
 
 MATCHING_PARAMETERS = ("piston", "tip", "tilt", "power", "x", "y", "clocking")
 """Pose parameters in this order, with the signs of a pose: tip raises the side of +y, tilt
@@ -34,6 +35,8 @@ _LEAST_OWN_SHARE = 1e-3
 _LEAST_RELIABLE = 0.7
 # Clocking by which an undetermined rotation is tested [rad].
 _TESTED_RAD = 1e-2
+# Combinations of columns weaker than this part of the strongest are rounding.
+_SINGULAR = 1e-10
 # Heights below this are not measured [m].
 _LEAST_EFFECT_M = 1e-10
 
@@ -73,8 +76,7 @@ class Matched:
 
     def step(self) -> dict[str, float]:
         """Return the least-squares step of each pose parameter."""
-        scale = np.linalg.norm(self.columns, axis=1)
-        solved = np.linalg.lstsq(self.columns.T / scale, self.difference, rcond=1e-10)[0] / scale
+        solved = least_squares(self.columns.T, self.difference, _SINGULAR)
         return dict(zip(self.dofs, map(float, solved), strict=True))
 
     def levelled(self, step: Mapping[str, float]) -> Matched:
@@ -92,8 +94,8 @@ class Matched:
 
     def without_fit(self, values: FloatArray) -> FloatArray:
         """Return values (…, m) without their fit by the fitted pose parameters."""
-        design = self.columns.T / np.linalg.norm(self.columns, axis=1)
-        solved = np.linalg.lstsq(design, values.T, rcond=1e-10)[0]
+        design, _ = unit_columns(self.columns.T)
+        solved = np.linalg.lstsq(design, values.T, rcond=_SINGULAR)[0]
         return np.asarray(values - (design @ solved).T, np.float64)
 
 
@@ -209,8 +211,8 @@ def _independent_part(column: FloatArray, others: Sequence[FloatArray]) -> Float
     """Return the part of a column (n,) that is independent of the ``others``."""
     if not others:
         return column
-    design = np.stack(others, axis=1) / [float(np.linalg.norm(c)) for c in others]
-    return np.asarray(column - design @ np.linalg.lstsq(design, column, rcond=1e-10)[0])
+    design = np.stack(others, axis=1)
+    return np.asarray(column - design @ least_squares(design, column, _SINGULAR))
 
 
 def _is_converged(lateral_step: dict[str, float], place: float, extent: float) -> bool:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.streams.blocks import AxisBlock, DistanceBlock, FloatArray
 from omsm_ros.errors import DataError
+from omsm_ros.linear_algebra import unit_columns
 
 # Range of g before a fixed target; it has any value while the probe follows a surface.
 _GAIN = (0.8, 1.25)
@@ -136,15 +137,15 @@ def _refined(
     index = index[(index + samples >= 1) & (index + samples < len(z) - 1)]
     here = index + samples
     speed = (z[here + 1] - z[here - 1]) / 2
-    columns = np.stack([np.ones(len(here)), index - index.mean(), z[here], speed], axis=1)
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0] = 1.0
-    solved, *_ = np.linalg.lstsq(columns / scale, distance[index], rcond=None)
-    residual = distance[index] - columns / scale @ solved
+    columns, scale = unit_columns(
+        np.stack([np.ones(len(here)), index - index.mean(), z[here], speed], axis=1)
+    )
+    solved, *_ = np.linalg.lstsq(columns, distance[index], rcond=None)
+    residual = distance[index] - columns @ solved
     gain, moved = -solved[2] / scale[2], -solved[3] / scale[3]
     if not _GAIN[0] < abs(gain) < _GAIN[1]:
         raise DataError("correction.gain", gain=float(gain), least=_GAIN[0], most=_GAIN[1])
-    inverse = np.linalg.pinv((columns / scale).T @ (columns / scale))
+    inverse = np.linalg.pinv(columns.T @ columns)
     # Residuals are correlated, which reduces the number of independent samples.
     alike = _correlation_length(residual)
     spread = math.sqrt(float(residual @ residual) / max(len(here) - 4, 1) * alike * inverse[3, 3])
