@@ -26,10 +26,6 @@ _SPIN_UP_S = 4.0
 _RELAXATIONS_PER_DECADE = 2
 # Shortest time constant of creep [s].
 _SHORTEST_RELAXATION_S = 1e-4
-# Largest step for creep and soft modes, absolute and over their time constant: linear
-# interpolation is then exact to 1e-4 of these effects.
-_LONGEST_SLOW_STEP_S = 0.25e-3
-_SLOW_STEPS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,27 +198,15 @@ def _slow_parts(errors: StructureErrors, probe: Trajectory) -> FloatArray:
     """Return the effect of creep and soft modes on the motion of the probe (n,) [m]."""
     if not errors.lead_s:
         return np.zeros(1)
-    every = max(int(_slow_step(errors) / probe.step), 1)
-    coarse = Trajectory(probe.start, probe.step * every, probe.values[::every])
-    moving = _with_spin_up(coarse)
+    moving = _with_spin_up(probe)
     added = np.zeros_like(moving)
     for creep in errors.relaxations:
-        filtered = _through(([1.0], [creep.time_constant_s, 1.0]), moving, coarse.step)
+        filtered = _through(([1.0], [creep.time_constant_s, 1.0]), moving, probe.step)
         added += creep.fraction * (filtered - moving)
     for mode in errors.soft_modes:
-        omega = mode.omega
-        ratio = ([omega**2], [1.0, 2 * mode.damping_ratio * omega, omega**2])
-        added += mode.participation * (_through(ratio, moving, coarse.step) - moving)
-    if every == 1:
-        return added
-    return np.asarray(np.interp(probe.times, coarse.times, added), np.float64)
-
-
-def _slow_step(errors: StructureErrors) -> float:
-    """Return the step [s] for creep and soft modes."""
-    times = [1 / mode.omega for mode in errors.soft_modes]
-    times += [creep.time_constant_s for creep in errors.relaxations]
-    return min(_LONGEST_SLOW_STEP_S, min(times) / _SLOW_STEPS)
+        ratio = ([mode.omega**2], [1.0, 2 * mode.damping_ratio * mode.omega, mode.omega**2])
+        added += mode.participation * (_through(ratio, moving, probe.step) - moving)
+    return added
 
 
 def _with_spin_up(probe: Trajectory) -> FloatArray:
