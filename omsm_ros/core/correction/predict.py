@@ -54,9 +54,6 @@ DEFAULT_BUDGET_M = 50 * NANOMETRE_M
 DYNAMICS = "dynamics"
 """Name of the limit that the calibration sets."""
 
-# The speed is searched on the worst stretches of this length and verified on the whole path.
-_STRETCH_SAMPLES = 8192
-
 
 class Residual:
     """Residual after the correction of motions sampled every ``sample_period`` [s].
@@ -245,33 +242,12 @@ def _dynamics_limit(
     """Return the limit set by the residual, and its part from undetected model error [m]."""
     z, period, allowed = path.z, path.sample_period, budget / 2
     known, undetected = Residual(calibration, period).variances(z)
-    here = np.sqrt(known + undetected)
-    residual = float(np.max(here))
-    stretches = _worst_stretches(z, here)
-
-    def worst(factor: float) -> float:
-        faster = Residual(calibration, period / factor)
-        return max(map(faster.largest, stretches))
-
-    factor = highest_factor(worst, allowed, residual)
-    if 0 < factor < FASTEST or (factor == FASTEST and residual > 0):
-        # The stretches are within the budget, but the whole path need not be.
-        whole = Residual(calibration, period / factor).largest(z)
-        factor *= min(allowed / whole, 1.0) if whole > 0 else 1.0
-    limit = SpeedLimit(DYNAMICS, residual, allowed, "m", float(factor))
+    residual = float(np.sqrt(np.max(known + undetected)))
+    factor = highest_factor(
+        lambda factor: Residual(calibration, period / factor).largest(z), allowed, residual
+    )
+    limit = SpeedLimit(DYNAMICS, residual, allowed, "m", factor)
     return limit, float(np.sqrt(undetected[np.argmax(known + undetected)]))
-
-
-def _worst_stretches(z: FloatArray, residual: FloatArray) -> list[FloatArray]:
-    """Return the parts of ``z`` around its largest residual, its fastest and its most curved."""
-    if len(z) <= 2 * _STRETCH_SAMPLES:
-        return [z]
-    starts = set()
-    for series in (residual, np.abs(np.diff(z)), np.abs(np.diff(z, 2))):
-        level = running_mean(series, _STRETCH_SAMPLES // 8)
-        middle = int(np.argmax(level)) + len(z) - len(series)
-        starts.add(int(np.clip(middle - _STRETCH_SAMPLES // 2, 0, len(z) - _STRETCH_SAMPLES)))
-    return [z[start : start + _STRETCH_SAMPLES] for start in sorted(starts)]
 
 
 def _outside_band(calibration: Calibration, path: ScanPath) -> tuple[float, float]:
