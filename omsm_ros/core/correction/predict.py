@@ -8,7 +8,6 @@ The residual consists of the calibration's covariance below that frequency, the 
 above it, and non-linear errors everywhere.
 """
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,59 +54,42 @@ DYNAMICS = "dynamics"
 """Name of the limit that the calibration sets."""
 
 
-class Residual:
-    """Residual after the correction of motions sampled every ``sample_period`` [s].
+def residual_variances(
+    calibration: Calibration, sample_period: float, z: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the variance of the residual of ``z`` (n,) after settling [m²], in two parts.
 
-    Within the valid band it follows from the calibration's covariance; above it it is the whole
+    The second part is that of undetected model error, the first that of all other sources. Within
+    the valid band they follow from the calibration's covariance; above it the residual is the whole
     (1 - G) z, as rms over a tenth of a second. Near the ends of the record, at most a quarter of
     its length, the value next to them is used.
-
-    One instance serves many stretches, because designing the filters takes time.
     """
+    digital = discretise(calibration.dynamics, sample_period)
+    noise, undetected = (
+        _variance(part, sample_period, z) for part in covariance_parts(calibration)
+    )
+    known = noise + ErrorSources.of(calibration).motion_error ** 2
+    known += _missed_above(calibration.valid_up_to, digital, z)
+    settling = max(digital.settling_samples(SETTLED), START_SAMPLES)
+    settling = min(settling, len(z) // 4)
+    return known[settling:], undetected[settling:]
 
-    def __init__(self, calibration: Calibration, sample_period: float) -> None:
-        self._trusted = calibration.valid_up_to
-        self._linear = ErrorSources.of(calibration).motion_error ** 2
-        self._digital = discretise(calibration.dynamics, sample_period)
-        self._parts = [
-            (
-                [row["z"] for row in sensitivity_filters(part, sample_period) if "z" in row],
-                filter_history(part),
-            )
-            for part in covariance_parts(calibration)
-        ]
 
-    def variances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the variance of the residual of ``z`` (n,) after settling [m²], in two parts.
+def largest_residual(calibration: Calibration, sample_period: float, z: FloatArray) -> float:
+    """Return the largest standard uncertainty of the residual of ``z`` (n,) [m]."""
+    return float(np.sqrt(np.max(sum(residual_variances(calibration, sample_period, z)))))
 
-        The second part is that of undetected model error, the first that of all other sources.
-        """
-        noise, undetected = (self._variance(*part, z) for part in self._parts)
-        known = noise + self._linear
-        known += _missed_above(self._trusted, self._digital, z)
-        settling = max(self._digital.settling_samples(SETTLED), START_SAMPLES)
-        settling = min(settling, len(z) // 4)
-        return known[settling:], undetected[settling:]
 
-    def largest(self, z: FloatArray) -> float:
-        """Return the largest standard uncertainty of the residual of ``z`` [m]."""
-        known, undetected = self.variances(z)
-        return float(np.sqrt(np.max(known + undetected)))
-
-    @staticmethod
-    def _variance(
-        filters: Sequence[DigitalFilter], past: Callable[[FloatArray], FloatArray], z: FloatArray
-    ) -> FloatArray:
-        """Return the variance of G z [m²] from one part of the covariance, (n,)."""
-        variance = np.zeros(len(z))
-        if not filters:
-            return variance
-        before = past(z[:START_SAMPLES])
-        for digital in filters:
-            recursion = Recursion(digital)
+def _variance(part: Calibration, sample_period: float, z: FloatArray) -> FloatArray:
+    """Return the variance of G z [m²] by the covariance of ``part``, (n,)."""
+    variance = np.zeros(len(z))
+    before = filter_history(part)(z[:START_SAMPLES])
+    for row in sensitivity_filters(part, sample_period):
+        if "z" in row:
+            recursion = Recursion(row["z"])
             recursion.start(before)
             variance += recursion.run(z) ** 2
-        return variance
+    return variance
 
 
 def _missed_above(up_to: float, digital: DigitalFilter, z: FloatArray) -> FloatArray:
@@ -241,10 +223,10 @@ def _dynamics_limit(
 ) -> tuple[SpeedLimit, float]:
     """Return the limit set by the residual, and its part from undetected model error [m]."""
     z, period, allowed = path.z, path.sample_period, budget / 2
-    known, undetected = Residual(calibration, period).variances(z)
+    known, undetected = residual_variances(calibration, period, z)
     residual = float(np.sqrt(np.max(known + undetected)))
     factor = highest_factor(
-        lambda factor: Residual(calibration, period / factor).largest(z), allowed, residual
+        lambda factor: largest_residual(calibration, period / factor, z), allowed, residual
     )
     limit = SpeedLimit(DYNAMICS, residual, allowed, "m", factor)
     return limit, float(np.sqrt(undetected[np.argmax(known + undetected)]))

@@ -10,7 +10,12 @@ from scipy import interpolate, signal
 from soaked import soaked
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.predict import Prediction, Residual, dynamic_error, predict_error
+from omsm_ros.core.correction.predict import (
+    Prediction,
+    dynamic_error,
+    largest_residual,
+    predict_error,
+)
 from omsm_ros.core.kinematics.limits import FASTEST, MachineLimits
 from omsm_ros.core.kinematics.scan_path import ScanPath
 from omsm_ros.core.kinematics.trajectories import Chirp, Spiral
@@ -189,7 +194,7 @@ def test_residual_is_the_error_of_a_wrong_calibration(path) -> None:
     calibration = late_probe(lag_uncertainty=off)
     wrong = replace(calibration.dynamics, delay=calibration.dynamics.delay + off)
     difference = dynamic_error(wrong, z, PERIOD) - dynamic_error(calibration.dynamics, z, PERIOD)
-    stated = Residual(calibration, PERIOD).largest(z)
+    stated = largest_residual(calibration, PERIOD, z)
     assert stated == pytest.approx(np.max(np.abs(difference)), rel=0.02)
 
 
@@ -200,7 +205,7 @@ def test_a_speed_called_safe_stays_within_the_budget(path) -> None:
     factor = predicted(calibration, z).speed_factor
     assert 1 < factor < FASTEST
     for speed, safe in ((0.98 * factor, True), (1.05 * factor, False)):
-        assert (Residual(calibration, PERIOD / speed).largest(z) < 25e-9) == safe
+        assert (largest_residual(calibration, PERIOD / speed, z) < 25e-9) == safe
 
 
 def test_the_limit_that_binds_is_the_headline() -> None:

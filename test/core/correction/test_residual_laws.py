@@ -11,7 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from omsm_ros.core.calibration.calibration import Calibration
-from omsm_ros.core.correction.predict import Residual, dynamic_error, predict_error, running_mean
+from omsm_ros.core.correction.predict import (
+    dynamic_error,
+    largest_residual,
+    predict_error,
+    residual_variances,
+    running_mean,
+)
 from omsm_ros.core.correction.source_kinds import components, fading, random_walk, smooth
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.kinematics.scan_path import ScanPath
@@ -49,7 +55,7 @@ def sine(hertz: float) -> FloatArray:
 
 def left(known: Calibration, z: FloatArray) -> FloatArray:
     """Variance of the residual away from the record's ends [m²]."""
-    variance = sum(Residual(known, PERIOD).variances(z))
+    variance = sum(residual_variances(known, PERIOD, z))
     return np.asarray(variance)[1000:-1000]
 
 
@@ -79,7 +85,7 @@ def test_a_response_that_is_trusted_everywhere_leaves_nothing_beyond() -> None:
 @pytest.mark.parametrize("factor", [0.1, -3.0])
 def test_the_residual_is_in_proportion_to_the_motion(factor: float) -> None:
     z = sine(3.0) + 0.1 * sine(90.0)
-    plain, larger = (Residual(calibration(), PERIOD).variances(x) for x in (z, factor * z))
+    plain, larger = (residual_variances(calibration(), PERIOD, x) for x in (z, factor * z))
     assert np.size(plain) > 0
     for one, other in zip(plain, larger, strict=True):
         np.testing.assert_allclose(other, factor**2 * one, rtol=1e-6, atol=1e-24)
@@ -87,14 +93,14 @@ def test_the_residual_is_in_proportion_to_the_motion(factor: float) -> None:
 
 def test_where_the_slide_stands_does_not_matter() -> None:
     z = sine(3.0) + 0.1 * sine(90.0)
-    near, far = (Residual(calibration(), PERIOD).variances(x)[0] for x in (z, z + 0.25))
+    near, far = (residual_variances(calibration(), PERIOD, x)[0] for x in (z, z + 0.25))
     np.testing.assert_allclose(far, near, rtol=1e-3, atol=1e-22)
 
 
 def test_what_does_not_follow_linearly_is_left_at_rest_too() -> None:
     backlash = replace(EXACT, certificate=certified_by({"motion_error_m": 7e-9}))
-    assert Residual(backlash, PERIOD).largest(np.zeros(COUNT)) == pytest.approx(7e-9)
-    assert Residual(EXACT, PERIOD).largest(np.zeros(COUNT)) == 0.0
+    assert largest_residual(backlash, PERIOD, np.zeros(COUNT)) == pytest.approx(7e-9)
+    assert largest_residual(EXACT, PERIOD, np.zeros(COUNT)) == 0.0
 
 
 def test_noise_and_undetected_error_are_kept_separate() -> None:
@@ -103,9 +109,9 @@ def test_noise_and_undetected_error_are_kept_separate() -> None:
     reported = calibration(
         certificate=certified_by({"noise_covariance": [float(v) for v in noise.ravel()]})
     )
-    known, undetected = Residual(reported, PERIOD).variances(sine(5.0))
+    known, undetected = residual_variances(reported, PERIOD, sine(5.0))
     np.testing.assert_allclose(undetected[1000:-1000], 3 * known[1000:-1000], rtol=1e-3, atol=1e-24)
-    both = Residual(calibration(), PERIOD).variances(sine(5.0))
+    both = residual_variances(calibration(), PERIOD, sine(5.0))
     np.testing.assert_allclose(known + undetected, both[0] + both[1], rtol=1e-6, atol=1e-24)
     assert not np.any(both[1])
 
@@ -119,12 +125,12 @@ def test_the_largest_is_where_the_motion_is_fastest() -> None:
         calibration(),
         calibration(certificate=certified_by({"noise_covariance": noise})),
     ):
-        assert Residual(known, PERIOD).largest(z) == pytest.approx(expected, rel=0.02)
+        assert largest_residual(known, PERIOD, z) == pytest.approx(expected, rel=0.02)
 
 
 def test_the_same_path_in_a_tenth_of_the_time_is_ten_times_as_uncertain() -> None:
     """Where all poles are far above the motion, its residual is the rate times the lag's."""
-    slow, fast = (Residual(calibration(), p).largest(sine(0.5)) for p in (PERIOD, PERIOD / 10))
+    slow, fast = (largest_residual(calibration(), p, sine(0.5)) for p in (PERIOD, PERIOD / 10))
     assert fast == pytest.approx(10 * slow, rel=0.01)
 
 

@@ -8,7 +8,7 @@ from certified import certified_by
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions, Corrector
-from omsm_ros.core.correction.predict import Residual, predict_error
+from omsm_ros.core.correction.predict import predict_error, residual_variances
 from omsm_ros.core.correction.uncertainty import ErrorSources
 from omsm_ros.core.kinematics.limits import MachineLimits
 from omsm_ros.core.kinematics.scan_path import ScanPath
@@ -139,5 +139,5 @@ def test_uncertainty_of_a_sine_is_the_open_share_of_its_swing(phase):
 
 def test_the_prediction_says_the_same():
     z = AMPLITUDE * np.sin(2 * np.pi * 1.0 * TIME)
-    residual = np.sqrt(np.sum(Residual(calibration(), PERIOD).variances(z), axis=0))
+    residual = np.sqrt(np.sum(residual_variances(calibration(), PERIOD, z), axis=0))
     assert np.max(residual[-10_000:]) == pytest.approx(OPEN * AMPLITUDE, rel=0.02)
