@@ -1,6 +1,7 @@
 """Commands for recordings: record a device; inspect or repair a bag; import other recordings."""
 
 import argparse
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -164,7 +165,7 @@ def _declare_record(add: Arguments) -> None:
     add("--port", str, "its address, such as tcp://127.0.0.1:7010", required=True)
     add("--out", "BAG.mcap", required=True)
     add("--seconds", DURATION, "duration in samples [s]; 0: until Ctrl+C", default=0.0)
-    add("--silence", SILENCE, "end when no sample came for so long [s]; 0: never", default=0.0)
+    add("--silence", SILENCE, "end this long after the last sample [s]; 0: never", default=0.0)
     add("--set", str, nargs="+", default=[], metavar="NAME=VALUE")
 
 
@@ -182,8 +183,11 @@ def _record(args: argparse.Namespace) -> Facts:
             return True
         return bool(args.seconds and samples * period >= args.seconds)
 
+    def waits(reason: str) -> None:
+        print(f"omsm: {reason}; waiting for the first, Ctrl+C ends it", file=sys.stderr)
+
     with progress_bar("recording", args.json, " samples") as progress:
-        return record_device(given, args.out, ended, progress)
+        return record_device(given, args.out, ended, progress, waits)
 
 
 def _show_record(facts: Facts) -> None:

@@ -171,7 +171,7 @@ class CalibratorNode(ManagedNode):
                 self._last += said
         except OmsmError as err:
             response.success, self._last = False, f"identification failed: {one_line(err)}"
-        if response.success:
+        if response.success or (goal is not None and goal.cancelled):
             self.get_logger().info(self._last)
         else:
             self.get_logger().error(self._last)

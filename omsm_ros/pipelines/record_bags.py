@@ -42,6 +42,8 @@ from omsm_ros.twin.scenario import (
 _LOOK_S = 0.05
 # Interval of writing to the disk; a killed recording loses no more than this [s].
 _FLUSH_S = 0.5
+# Before it is said that no sample has come yet [s].
+_PATIENCE_S = 3.0
 
 
 def record_device(
@@ -49,10 +51,12 @@ def record_device(
     out: Path,
     ended: Callable[[int, float], bool],
     progress: Progress = no_progress,
+    waits: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Write the samples of the device that parameters ``given`` describe into the bag ``out``.
 
     ended: returns True at the end, by the number of samples and the seconds since the last one
+    waits: called once with the reason if no sample comes for some seconds; it waits for the first
 
     Returns all counts. Raises ConfigurationError for a parameter, DeviceError if no sample came.
     """
@@ -62,7 +66,7 @@ def record_device(
     device = make_device(values)
     axes, distance = device.channels.axes is not None, device.channels.distance
     topics = [AXES_TOPIC] * axes + [DISTANCE_TOPIC] * distance
-    stop, samples = threading.Event(), 0
+    stop, samples, patient = threading.Event(), 0, True
     last = flushed = time.monotonic()
     with BagWriter(out, topics) as bag:
 
@@ -84,6 +88,9 @@ def record_device(
         with suppress(KeyboardInterrupt):  # the usual end of a recording
             while not ended(samples, time.monotonic() - last):
                 progress(samples, 0)
+                if not samples and patient and time.monotonic() - last > _PATIENCE_S:
+                    patient = False
+                    waits(f"no sample yet from {values['port']!r}: {reader.trouble or 'silence'}")
                 time.sleep(_LOOK_S)
         stop.set()
         thread.join()

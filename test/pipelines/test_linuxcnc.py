@@ -25,7 +25,7 @@ from omsm_ros.core.kinematics.trajectories import (
 )
 from omsm_ros.core.streams.blocks import AxisBlock
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, Flat
-from omsm_ros.errors import DataError
+from omsm_ros.errors import DataError, DeviceError
 from omsm_ros.io.bag_writer import AXES_TOPIC
 from omsm_ros.io.bags import BagReader
 from omsm_ros.io.gcode_file import steps_gcode
@@ -100,6 +100,18 @@ def recorder(port, bag):
             yield process
         finally:
             process.kill()
+
+
+def test_a_recording_says_once_what_it_waits_for(tmp_path, monkeypatch):
+    monkeypatch.setattr("omsm_ros.pipelines.record_bags._PATIENCE_S", 0.1)
+    given = {"device": "linuxcnc", "port": f"tcp://127.0.0.1:{free_port()}"}
+    said = []
+    with pytest.raises(DeviceError, match="no sample came"):
+        record_device(
+            given, tmp_path / "1.mcap", lambda n, silent: n > 0 or silent > 1.0, waits=said.append
+        )
+    assert len(said) == 1
+    assert said[0].startswith("no sample yet from 'tcp://127.0.0.1:")
 
 
 @pytest.mark.soak
