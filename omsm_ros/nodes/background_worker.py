@@ -8,13 +8,13 @@ from contextlib import ExitStack
 from typing import Any, TypeVar
 
 from rclpy.action import ActionServer, CancelResponse
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.task import Future
 
 from omsm_ros.errors import OmsmError
 from omsm_ros.nodes.memory import return_free_memory
 from omsm_ros.nodes.running import offer, refusing
+from omsm_ros.nodes.topics import every
 
 T = TypeVar("T")
 
@@ -110,26 +110,21 @@ class BackgroundWorker:
         self.waiting += 1
         done = Future()
         self._work.put((work, done))
-        timer = self._watched(done, goal) if goal else None
-        try:
-            return await done  # type: ignore[no-any-return]
-        finally:
-            self.waiting -= 1
-            if timer is not None:
-                self._node.destroy_timer(timer)
-
-    def _watched(self, done: Future, goal: Goal) -> Any:
-        """Return a timer that ends the wait of a goal for its turn, too."""
 
         def look() -> None:
+            """End the wait of a goal for its turn, too."""
             try:
-                goal.attend()
+                goal.attend()  # type: ignore[union-attr]
             except Cancelled as err:
                 done.set_exception(err)
 
-        return self._node.create_timer(
-            _FEEDBACK_S, look, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        with ExitStack() as undo:
+            if goal is not None:
+                every(self._node, undo, _FEEDBACK_S, look)
+            try:
+                return await done  # type: ignore[no-any-return]
+            finally:
+                self.waiting -= 1
 
     def serve(
         self, undo: ExitStack, kind: Any, name: str, answer: Callable[[Any, Any], Awaitable[None]]

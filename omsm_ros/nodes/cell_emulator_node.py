@@ -8,7 +8,6 @@ from typing import Any
 
 from omsm_msgs.action import Scan
 from omsm_msgs.msg import AccelerationBlock
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -29,6 +28,7 @@ from omsm_ros.nodes.background_worker import Cancelled, Goal, serve_action
 from omsm_ros.nodes.diagnostics import StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
+from omsm_ros.nodes.topics import every
 from omsm_ros.quantities import Parameter
 from omsm_ros.twin.disturbances import NOTHING
 from omsm_ros.twin.scenario import Scenario, planned_test_of, scan_of, verifying_scan_of
@@ -133,9 +133,7 @@ class CellEmulatorNode(ManagedNode):
     def activate(self, undo: ExitStack) -> None:
         """Accept requests for motions."""
         undo.callback(self._player.halt)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(_ACCELERATION_PERIOD_S, self._publish_acceleration, clock=steady)
-        undo.callback(self.destroy_timer, timer)
+        every(self, undo, _ACCELERATION_PERIOD_S, self._publish_acceleration)
 
     def _publish_acceleration(self) -> None:
         block = self._feed.due(self._player.played) if self._feed else None
@@ -173,12 +171,11 @@ class CellEmulatorNode(ManagedNode):
             if not self._player.playing and not over.done():
                 over.set_result(None)
 
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(_FEEDBACK_PERIOD_S, look, clock=steady)
         try:
-            await over
+            with ExitStack() as undo:
+                every(self, undo, _FEEDBACK_PERIOD_S, look)
+                await over
         finally:
-            self.destroy_timer(timer)
             result.samples = self._player.played
         result.success = result.samples == samples
         result.message = f"{result.samples} of {samples} samples played"

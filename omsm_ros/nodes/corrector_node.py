@@ -11,7 +11,6 @@ from omsm_msgs import action
 from omsm_msgs.msg import Account as AccountMessage
 from omsm_msgs.msg import AxisBlock, DistanceBlock, Verdict
 from omsm_msgs.srv import LoadCalibration, PredictError
-from rclpy.clock import Clock, ClockType
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
@@ -38,7 +37,7 @@ from omsm_ros.nodes.correction_parameters import PARAMETERS, accuracy_of, option
 from omsm_ros.nodes.diagnostics import ERROR, STALE, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, settings_of
-from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, listen, take_rest
+from omsm_ros.nodes.topics import LATCHED_BY_MANY_QOS, MessageInfo, every, listen, take_rest
 from omsm_ros.pipelines.measure import live_verdict, with_sources
 from omsm_ros.report.verdict import next_steps
 
@@ -248,9 +247,7 @@ class CorrectorNode(ManagedNode):
         """Begin to correct."""
         undo.callback(self._publish_rest)
         heard: list[Any] = []
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = self.create_timer(PAUSE_S / 2, self._settle, clock=steady)
-        undo.callback(self.destroy_timer, timer)
+        every(self, undo, PAUSE_S / 2, self._settle)
         for stream, (topic, kind) in _STREAMS.items():
             self._waiting[stream] = []
             take, push = partial(self._take, stream), partial(self._push, stream)

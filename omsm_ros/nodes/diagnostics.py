@@ -6,13 +6,14 @@ work. Faults that are over are only counted.
 
 import os
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from omsm_ros.errors import DEBUG, defect
+from omsm_ros.nodes.topics import every
 
 PERIOD_S = 1.0
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -57,9 +58,7 @@ class Diagnostics:
         """report, hardware_id: called from the node's executor."""
         self._node, self._report, self._hardware_id = node, report, hardware_id
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # A steady clock, since simulated time may stand still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(PERIOD_S, self.publish, clock=steady)
+        every(node, ExitStack(), PERIOD_S, self.publish)
 
     def publish(self) -> None:
         """Publish now."""

@@ -25,7 +25,6 @@ from rcl_interfaces.msg import (
     SetParametersResult,
 )
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -205,9 +204,7 @@ class ManagedNode(LifecycleNode):  # type: ignore[misc]
         self._answer_impossible_transitions()
         self.diagnostics = Diagnostics(self, self._report, self.hardware_id)
         self.create_service(Trigger, f"~/{topics.PROCESSED}", topics.answer_processed_counts)
-        self.create_timer(
-            RETURN_PERIOD_S, return_free_memory, clock=Clock(clock_type=ClockType.STEADY_TIME)
-        )
+        topics.every(self, ExitStack(), RETURN_PERIOD_S, return_free_memory)
 
     def configure(self, undo: ExitStack) -> None:
         """Make the objects that ``self.values`` describe; raises OmsmError."""

@@ -18,7 +18,6 @@ from typing import Any
 from builtin_interfaces.msg import Time
 from omsm_msgs.msg import AxisBlock, Calibration, DistanceBlock
 from rclpy.client import Client
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
@@ -36,7 +35,7 @@ from omsm_ros.io.topics import CellBag, relative
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run, serve
-from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, publish_on
+from omsm_ros.nodes.topics import LATCHED_QOS, PROCESSED, SAMPLES_QOS, every, publish_on
 from omsm_ros.quantities import Parameter
 from omsm_ros.units import NANOSECONDS_PER_S
 
@@ -330,8 +329,7 @@ class PlayerNode(ManagedNode):
             ("pause", self._on_pause), ("resume", self._on_resume), ("step", self._on_step)
         ):  # fmt: skip
             serve(self, undo, Trigger, f"~/{name}", answer)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        undo.callback(self.destroy_timer, self.create_timer(_TICK_S, self._tick, clock=steady))
+        every(self, undo, _TICK_S, self._tick)
 
     def _begin(self) -> None:
         self._playback = Playback(self._span[0], self.values["rate"])

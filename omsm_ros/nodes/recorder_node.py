@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from omsm_msgs.msg import AccelerationBlock, AxisBlock, Calibration, DistanceBlock
-from rclpy.clock import Clock, ClockType
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2, Temperature
 from std_msgs.msg import String
@@ -18,7 +17,7 @@ from omsm_ros.io.bag_writer import BagWriter, next_free
 from omsm_ros.nodes.diagnostics import ERROR, WARN, StateReport
 from omsm_ros.nodes.managed import ManagedNode
 from omsm_ros.nodes.running import run
-from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, listen, take_rest
+from omsm_ros.nodes.topics import LATCHED_QOS, SAMPLES_QOS, MessageInfo, every, listen, take_rest
 from omsm_ros.quantities import Parameter
 
 PARAMETERS = (
@@ -83,9 +82,7 @@ class RecorderNode(ManagedNode):
                 raw=True,
                 lost=partial(self._lost.__setitem__, topic),
             )
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        flush = partial(self._written, self._bag.flush)
-        undo.callback(self.destroy_timer, self.create_timer(_FLUSH_PERIOD_S, flush, clock=steady))
+        every(self, undo, _FLUSH_PERIOD_S, partial(self._written, self._bag.flush))
         undo.callback(self._heard.clear)
         undo.callback(self._take_rest)
 

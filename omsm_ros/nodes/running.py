@@ -17,7 +17,6 @@ from typing import Any
 
 import rclpy
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -37,7 +36,7 @@ from omsm_ros.nodes.diagnostics import log_internal_error
 from omsm_ros.nodes.managed import LifecycleStage, ManagedNode
 from omsm_ros.nodes.memory import freeze_garbage_collector
 from omsm_ros.nodes.start import ENDING
-from omsm_ros.nodes.topics import REQUESTS_QOS
+from omsm_ros.nodes.topics import REQUESTS_QOS, every
 
 _BAD_INPUT, _DEFECT = 2, 70  # exit codes, as of the commands
 # After this time since the first signal, the next one ends the process at once [s].
@@ -197,10 +196,8 @@ class PacedService(ReentrantCallbackGroup):  # type: ignore[misc]
     def __init__(self, node: Node, undo: ExitStack) -> None:
         super().__init__()
         self._ready = True
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._pause = node.create_timer(_PACE_S, self._go_on, clock=steady)
+        self._pause = every(node, undo, _PACE_S, self._go_on)
         self._pause.cancel()
-        undo.callback(node.destroy_timer, self._pause)
 
     def can_execute(self, entity: Any) -> bool:
         """Return whether the next request may be taken; called by the executor."""

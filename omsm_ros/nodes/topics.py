@@ -1,4 +1,4 @@
-"""Publishers and subscriptions of the nodes, and their quality of service."""
+"""Publishers and subscriptions of the nodes, their quality of service, and timers."""
 
 import time
 from collections import Counter
@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
@@ -16,6 +17,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -53,6 +55,13 @@ _processed: Counter[str] = Counter()
 
 # Most messages taken in a row, so that timers and services are not delayed.
 _BULK = 500
+
+
+def every(node: Node, undo: ExitStack, period_s: float, do: Callable[[], object]) -> Timer:
+    """Call ``do`` at each period of a steady clock until ``undo``; simulated time may stand."""
+    made = node.create_timer(period_s, do, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    undo.callback(node.destroy_timer, made)
+    return made
 
 
 def publish_on(

@@ -21,6 +21,8 @@ class FakeNode:
     def create_publisher(self, *_):
         return SimpleNamespace(publish=self.published.append)
 
+    def destroy_timer(self, _): ...
+
     def create_timer(self, *_, **__):
         return None
 
