@@ -44,7 +44,8 @@ _APART_BINS = 8
 _SEPARATE = 2.0
 # Samples between the places at which the rings are evaluated.
 _STRIDE = 50
-# Share of power and distance in resolutions of the image of a line in another coordinate.
+# Share of power and distance in resolutions of the image of a line in another coordinate. With
+# images, 5 of 104 lines found in six random mixtures are none.
 _IMAGE_SHARE, _IMAGE_BINS = 0.3, 30
 # Loss of log-likelihood (5 σ) and of power (more than jitter and encoders cause) from which a line
 # is excluded in another coordinate.

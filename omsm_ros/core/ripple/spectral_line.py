@@ -19,7 +19,8 @@ _FITTING_STEPS = 4
 _MOST_TRIED = 200
 # Samples at a time: forty lines of three columns are 31 MB.
 _CHUNK = 32_768
-# Share of power in another coordinate from which that coordinate is tried.
+# Share of power in another coordinate from which that coordinate is tried. Without the trial, 2 of
+# 113 lines of six random mixtures are classified wrongly and 5 are none.
 _LIKE = 0.25
 
 
