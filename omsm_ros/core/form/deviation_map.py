@@ -72,11 +72,6 @@ class DeviationMap:
         return replace(self, **{name: getattr(self, name)[..., chosen] for name in names})
 
 
-def root_mean_square(map_: DeviationMap) -> float:
-    """Return the area-weighted rms of the deviations about zero, noise included [m]."""
-    return float(np.sqrt(np.average(map_.deviation**2, weights=map_.area)))
-
-
 # Neighbours whose plane predicts a point, and points that are predicted.
 _NEIGHBOURS, _MOST_PREDICTED = 6, 6000
 # Least singular value of a plane through neighbours; those of one track determine no slope across.

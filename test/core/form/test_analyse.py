@@ -47,6 +47,20 @@ def test_any_arrangement_of_points_is_judged(arrangement):
         assert min(angle, np.pi - angle) < 0.2
 
 
+def test_the_noise_is_not_the_least_of_what_estimates_of_it_are_by_chance():
+    """Of 3 maps whose form is far below the noise; about zero by area is the rms of the points."""
+    x, y = (v.ravel() for v in np.meshgrid(*(np.linspace(-0.01, 0.01, 60),) * 2))
+    true, found = [], []
+    for seed in range(3):
+        noise = np.random.default_rng(seed).normal(0, 8e-9, len(x))
+        figures = form(x, y, 1e-9 * (x * y / 1e-4) + noise, even=True).deviation
+        true.append(np.std(noise))
+        found.append(figures["point_noise"].value)
+        whole = np.hypot(np.std(noise), 1e-9 / 3)
+        assert figures["rms_of_points"].value == pytest.approx(whole, rel=0.01)
+    assert np.mean(np.divide(found, true)) == pytest.approx(1, abs=0.006)
+
+
 def test_a_map_reaches_to_the_rim_between_its_pixels():
     """An edge −r¹²: its peak to valley and rms over the disc, in closed form."""
     radius, size = 0.01, 200e-9

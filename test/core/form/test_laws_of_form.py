@@ -13,7 +13,6 @@ from omsm_ros.core.form.deviation_map import (
     GridCells,
     UncertainValue,
     neighbour_noise,
-    root_mean_square,
 )
 from omsm_ros.core.form.part_extents import extents_of_parts
 from omsm_ros.core.form.part_figures import (
@@ -64,13 +63,6 @@ def test_a_map_of_every_kth_point_keeps_what_belongs_to_each():
     assert len(whole.every(1001)) == 1000
     assert len(whole.every(2999)) == 1500
     assert len(whole.every(3000)) == 3000
-
-
-def test_the_rms_is_by_area_and_about_zero():
-    error = term(2, 2) + 20e-9
-    expected = np.sqrt(sum(a * d * d for a, d in zip(AREA, error, strict=True)) / AREA.sum())
-    assert root_mean_square(map_of(error)) == pytest.approx(expected)
-    assert root_mean_square(map_of(error, area=1e-6 * AREA)) == pytest.approx(expected)
 
 
 def test_neighbour_noise_is_independent_of_order_and_unit():
