@@ -12,7 +12,8 @@ adjustment.remounted_part: a part that was mounted again is turned by an unknown
 adjustment.equal_speeds: the scans all run at {speeds:list} rpm, so that a lag is the same in each
     and looks like the surface; scan at another speed, or in the other direction
 adjustment.symmetric_surface: the scans at {speeds:list} rpm do not show a lag: the surface does not
-    change along the path; scan a surface that is not symmetric about the spindle
+    change along the path; scan a surface that is not symmetric about the spindle, and check that
+    the spindle turned
 adjustment.no_noise: the scans agree to the last digit, without any noise, so that the uncertainty
     of a lag is unknown; check that the probe was connected and measured the part
 adjustment.one_direction: both scans turn in the same direction; reverse the spindle for one of them
