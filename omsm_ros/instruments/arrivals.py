@@ -20,7 +20,7 @@ WINDOW_S = 30.0
 # Only the earliest arrival in this time counts, which bounds the fit to 150 points [s].
 _SPAN_S = 0.2
 # Crystals differ by some tens of ppm: the standard uncertainty of the drift before any arrival.
-_DRIFT_SIGMA = 100 * PPM
+_DRIFT_SIGMA = 50 * PPM
 # A drift beyond this by five of its standard uncertainties is not that of a crystal: the device
 # is played faster than it was recorded, or set to another rate.
 _LARGEST_CRYSTAL_DRIFT = 1000 * PPM
@@ -112,7 +112,7 @@ class DeviceClock:
             while device + late - sum(self._spans[0][1:]) > WINDOW_S:
                 self._spans.popleft()
             _, x, y = np.array(self._spans).T
-            self._offset, self._slope, rest = _line_below(x, y)
+            self._offset, self._slope, rest, _ = _line_below(x, y)
             self._usual = float(np.median(rest))
         self._offset += min(late - self._offset - self._slope * device, 0.0)
 
@@ -128,19 +128,21 @@ class DeviceClock:
         return min(device - since, device + late - arrived) > _STEP_AFTER_S
 
 
-def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray]:
+def _line_below(x: FloatArray, y: FloatArray) -> tuple[float, float, FloatArray, float]:
     """Return offset, slope and rests (n,) of the likeliest line below the points.
 
-    The rests are exponentially distributed, with an unknown mean, the slopes normally. A busy host
-    delays all arrivals of about a second, so only one rest a second counts.
+    The last value is how unlikely its slope is by itself (log). The rests are exponentially
+    distributed, with an unknown mean, the slopes normally. A busy host delays all arrivals of about
+    a second, so only one rest a second counts.
     """
     drift, uncertainty = _expected_drift(x, y)
     slopes = np.append(_slopes_below(x, y), drift)
     offsets = np.min(y - slopes[:, np.newaxis] * x, axis=1)
     mean = np.maximum(y.mean() - offsets - slopes * x.mean(), _LEAST_DELAY_S)
-    best = np.argmin(len(x) * _SPAN_S * np.log(mean) + ((slopes - drift) / uncertainty) ** 2 / 2)
+    unlikely = ((slopes - drift) / uncertainty) ** 2 / 2
+    best = np.argmin(len(x) * _SPAN_S * np.log(mean) + unlikely)
     offset, slope = float(offsets[best]), float(slopes[best])
-    return offset, slope, y - slope * x - offset
+    return offset, slope, y - slope * x - offset, float(unlikely[best])
 
 
 def _slopes_below(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -226,8 +228,9 @@ class MissedTriggerDetector:
         due: count times period [s];  arrival: monotonic [s]
         """
         late, excess = arrival - due, self.excess(due, arrival)
-        # A line that is not confirmed any more is uncertain by the drift of crystals.
-        confirmed = excess <= self._limit - _DRIFT_SIGMA * (arrival - self._confirmed)
+        # The drift of crystals makes a line uncertain that is not confirmed any more.
+        limit = self._limit - 2 * _DRIFT_SIGMA * (arrival - self._confirmed)
+        confirmed = limit > 0 and excess <= limit
         if confirmed:
             self._confirmed = arrival
             if self._line is not None and excess < 0:
@@ -289,7 +292,8 @@ class MissedTriggerDetector:
         likely = {}
         for missed in range(max(self.missed - _NEAR, 0), self.missed + _NEAR):
             begin, late = np.concatenate([before, since - [0.0, missed * self._period]]).T
-            likely[missed] = _edge(_line_below(begin - begin[-1], late)[2] / self._period)
+            *_, rest, unlikely = _line_below(begin - begin[-1], late)
+            likely[missed] = _edge(rest / self._period) - unlikely
         other, best = sorted(likely, key=likely.__getitem__)[-2:]
         return best if likely[best] - likely[other] > _CERTAIN else None
 
@@ -306,7 +310,7 @@ class MissedTriggerDetector:
         sure = begin <= (math.inf if learning else self._confirmed)
         if np.sum(sure) < _LEAST_SPANS:
             return
-        least, drift, _ = _line_below((begin - begin[-1])[sure], late[sure])
+        least, drift, *_ = _line_below((begin - begin[-1])[sure], late[sure])
         self._line = (least - drift * float(begin[-1]), drift)
         # All arrivals count, or the limit would fall by leaving late ones out.
         rest = late - least - drift * (begin - begin[-1])

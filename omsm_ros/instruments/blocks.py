@@ -183,7 +183,8 @@ class BlockCutter:
         # After a pause of the trigger, but not of the host, the samples are late by it.
         paused = after_silence and abs(self._detector.excess(due, now)) > self._settings.pause / 2
         if paused or restarted:
-            self._lost = (self._lost or self._detector.missed > 0) and not restarted
+            self._lost |= self.unconfirmed or self._detector.missed > 0
+            self._lost &= not restarted
             self._missed_before = self.missed
             self._withhold(np.inf)
             self._detector.restart()

@@ -68,11 +68,8 @@ class TracedTransport:
         self._transport.close()
         if self._file is not None:
             file, self._file = self._file, None
-            with self._telling():
-                try:
-                    file.write(self._line("!", CLOSED))
-                finally:
-                    file.close()
+            with self._telling(), file:
+                file.write(self._line("!", CLOSED))
 
     def _note(self, sign: str, text: str) -> None:
         if self._file is not None:
