@@ -57,10 +57,11 @@ _FREE_DELAYS = (0.0, 1.0, 4.0, 15.0)
 _LEAST_SAMPLES_EACH = 3
 # Sixty columns of a record then take half a gigabyte.
 _MOST_SAMPLES = 1_000_000
-# Used samples on which orders are explored.
+# Used samples of all records on which orders are explored.
 EXPLORED_ON = 8000
-# Iterations of an explored fit, of one without a held-out part, and of the final one.
-_EXPLORING, _REFITTED, _FINAL = 12, 4, 30
+# Iterations of each start in a race, of an explored fit, of one without a held-out part, and of the
+# final one.
+_RACE, _EXPLORING, _REFITTED, _FINAL = 3, 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
 # The comparator's record: half its sampling rate over the frequency below which this share of the
@@ -113,7 +114,8 @@ def choose_sampled(
     none = np.zeros(records[0].inputs.shape[1], np.int64)
     whole = SectionsProblem(records, hold, none)
     if hold != BAND_LIMITED and max_delay:
-        parts = replace(whole, records=[_exciting_part(record) for record in records])
+        each = EXPLORED_ON // len(records)
+        parts = replace(whole, records=[_exciting_part(record, each) for record in records])
         late = _confirmed(_with_delays(parts, max_delay)[0], min(_CONFIRMING_ORDER, most))
         whole = replace(whole, delays=late.delays)
     explored, every, most = _explored(whole, order, most)
@@ -143,7 +145,8 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     """
     every = min(_decimation(record) for record in whole.records)
     while True:
-        records = [_exciting_part(_thinned(record, every)) for record in whole.records]
+        each = EXPLORED_ON // len(whole.records)
+        records = [_exciting_part(_thinned(record, every), each) for record in whole.records]
         try:
             most = min(most, check_records(records, order))
         except IdentificationError:
@@ -208,13 +211,13 @@ def excited_parameters(input: FloatArray, most: int) -> int:
     return int(np.sum(power > _UNEXCITED * power[-1]))
 
 
-def _exciting_part(record: SampledRecord) -> SampledRecord:
-    """Return the part with EXPLORED_ON used samples in which the inputs vary most."""
+def _exciting_part(record: SampledRecord, most: int) -> SampledRecord:
+    """Return the part with ``most`` used samples in which the inputs vary most."""
     places = np.flatnonzero(record.used)
-    count = len(places) // EXPLORED_ON
+    count = len(places) // most
     if count < 2:
         return record
-    ends = places[: count * EXPLORED_ON].reshape(count, -1)[:, [0, -1]].tolist()
+    ends = places[: count * most].reshape(count, -1)[:, [0, -1]].tolist()
     parts = [record.part(slice(first, last + 1)) for first, last in ends]
     return max(parts, key=lambda part: float(np.var(part.inputs, axis=0).sum()))
 
@@ -290,13 +293,18 @@ def _explore(
     explained: list[float] = []
     best = 0
     late = lag.problem.late(lag.nonlinear, lag.order)
+
+    def missed(fitted: SectionsFit) -> float:
+        return float(np.mean(_relative(validation_residual(fitted, whole))))
+
     for order in sorted({*_ORDERS, asked}):
         if order > most:
             break
-        found = _next_fits(early, fits, best, order, late)
-        missed = [np.mean(_relative(validation_residual(one, whole))) for one in found]
-        fits.append(found[int(np.argmin(missed))])
-        explained.append(1 - float(np.min(missed)))
+        starts = _starts(early, fits, best, order, late)
+        raced = [early.fit(order, [start], _RACE) for start in starts]
+        chosen = min(raced, key=missed)
+        fits.append(early.fit(order, [chosen.nonlinear], _EXPLORING))
+        explained.append(1 - missed(fits[-1]))
         if explained[-1] > 1 - _NO_GAIN * (1 - explained[best]):
             best = len(explained) - 1
         if len(explained) - 1 - best >= _FRUITLESS and order >= asked:
@@ -304,21 +312,20 @@ def _explore(
     return fits, np.nan_to_num(np.array(explained), nan=-np.inf)
 
 
-def _next_fits(
+def _starts(
     problem: SectionsProblem, fits: Sequence[SectionsFit], best: int, order: int, late: FloatArray
-) -> list[SectionsFit]:
-    """Return fits of ``order``: from spread poles, from the largest of ``fits``, from the best.
+) -> list[FloatArray]:
+    """Return starts of ``order``: spread poles, those of the largest of ``fits``, of the best.
 
     The best is the one that predicts best: poles of a larger one may follow noise.
     """
     if order == 0:
-        return [problem.fit(0, [problem.nonlinear_of(np.empty(0, np.complex128), late)])]
-    found = [problem.fit(order, [problem.spread_start(order, late)], _EXPLORING)]
+        return [problem.nonlinear_of(np.empty(0, np.complex128), late)]
+    found = [problem.spread_start(order, late)]
     for smaller in {fits[-1], fits[best]}:
         own = smaller.problem.late(smaller.nonlinear, smaller.order)
         grown = grown_starts(problem, smaller, order)
-        starts = [problem.nonlinear_of(poles, own) for poles in grown]
-        found.append(problem.fit(order, starts, _EXPLORING))
+        found += [problem.nonlinear_of(poles, own) for poles in grown]
     return found
 
 

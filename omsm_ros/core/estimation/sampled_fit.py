@@ -197,11 +197,14 @@ class SectionsProblem:
 
     @cached_property
     def spectra(self) -> list[_Spectra]:
-        """The records as spectra, without the samples that answer to inputs before the record."""
+        """The records up to their last used sample, as spectra.
+
+        Samples that answer to inputs before the record do not count.
+        """
         first = int(np.max(self.delays)) + 1 if self.hold != BAND_LIMITED else 0
+        counted = [replace(r, used=r.used & (np.arange(len(r)) >= first)) for r in self.records]
         return [
-            _Spectra(replace(r, used=r.used & (np.arange(len(r)) >= first)), self.hold)
-            for r in self.records
+            _Spectra(r.part(slice(int(np.flatnonzero(r.used)[-1]) + 1)), self.hold) for r in counted
         ]
 
     @property
@@ -243,14 +246,11 @@ class SectionsProblem:
             targets.append(one.output - free @ (free.T @ one.output))
             frees.append(free)
         every, target = np.concatenate(rows, axis=1), np.concatenate(targets)
-        scale = np.sqrt(np.einsum("cn,cn->c", every, every))
-        scale[scale == 0] = 1.0
-        every /= scale[:, np.newaxis]
         inverse = _inverse(every @ every.T)
         linear = inverse @ (every @ target)
         # Refined once, because the inverse has the squared condition of the columns.
         linear += inverse @ (every @ (target - linear @ every))
-        found = (linear / scale).reshape(self.inputs, -1)
+        found = linear.reshape(self.inputs, -1)
 
         def derivative() -> FloatArray:
             parts = zip(self.spectra, frees, strict=True)
@@ -423,26 +423,33 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
     power, shown = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, 15), one.excited[0][[0, -1]]
     power[(one.angle < shown[0]) | (one.angle > shown[1])] = 0.0
     drives = problem._inputs(one, fitted.nonlinear, fitted.order)[0][:, np.newaxis]
-    tried: list[tuple[complex, FloatArray]] = []
+    tried: list[tuple[complex, FloatArray, FloatArray]] = []
     while count and len(tried) < _TRIED_LINES * len(_ADDED_DAMPINGS) and np.any(power > 0):
         line = int(np.argmax(power))
         power[max(line - 10, 0) : line + 11], rate = 0.0, abs(one.w[line])
         for damping in _ADDED_DAMPINGS:
             basis = basis_of(np.array([[2 * damping / rate, 1 / rate**2]]), one.w)[1:]
-            columns = _stacked((drives * basis).reshape(-1, len(one.w)))
-            tried.append((rate * (1j - damping), np.linalg.qr(columns.T)[0]))
+            rows = _stacked((drives * basis).reshape(-1, len(one.w)))
+            tried.append((rate * (1j - damping), rows, _inverse(rows @ rows.T)))
     left, found = _stacked(spectrum[np.newaxis])[0], []
     for _ in range(count if tried else 0):
-        pole, response = max(tried, key=lambda one: float(np.sum((one[1].T @ left) ** 2)))
-        left = left - response @ (response.T @ left)
+        along = [rows @ left for _, rows, _ in tried]
+        shares = [a @ one[2] @ a for a, one in zip(along, tried, strict=True)]
+        best = int(np.argmax(shares))
+        pole, rows, inverse = tried[best]
+        left = left - (inverse @ along[best]) @ rows
         found.append(pole)
     return np.array(found, np.complex128)
 
 
 def _inverse(gram: FloatArray) -> FloatArray:
-    values, directions = np.linalg.eigh(gram)
+    """Return the inverse of the products of columns, without directions that are rounding."""
+    scale = np.sqrt(np.diag(gram))
+    scale[scale == 0] = 1.0
+    values, directions = np.linalg.eigh(gram / np.outer(scale, scale))
     kept = values > _RANK_TOLERANCE * values[-1]
-    return np.asarray((directions[:, kept] / values[kept]) @ directions[:, kept].T)
+    root = directions[:, kept] / np.sqrt(values[kept]) / scale[:, np.newaxis]
+    return np.asarray(root @ root.T)
 
 
 def _sandwich(gram: FloatArray, score: FloatArray) -> FloatArray:
@@ -462,22 +469,20 @@ def _relocate(
 ) -> ComplexArray:
     """Return the zeros of σ with σ Y ≈ Σ_j N_j U_j + transients, all over ``poles`` (n,)."""
     upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
-    rows, targets = [], []
+    grams = []
     for w, inputs, output in data:
         pairs = [np.array([1 / (w - p), 1 / (w - np.conj(p))]) for p in upper]
         basis = [b for one, other in pairs for b in (one + other, 1j * (one - other))]
         fractions = np.reshape([*basis, *(1 / (w - p) for p in real)], (-1, len(w)))
         direct = np.concatenate([fractions, np.ones((1, len(w)))])
-        shared = np.concatenate([*(direct * one for one in inputs), -fractions * output])
-        free = np.concatenate([direct, w[np.newaxis]])
-        orthogonal = np.linalg.qr(_stacked(free).T)[0]
-        columns, target = _stacked(shared).T, _stacked(output[np.newaxis])[0]
-        rows.append(columns - orthogonal @ (orthogonal.T @ columns))
-        targets.append(target - orthogonal @ (orthogonal.T @ target))
-    every = np.concatenate(rows)
-    scale = np.linalg.norm(every, axis=0)
-    scale[scale == 0] = 1.0
-    solved = np.linalg.lstsq(every / scale, np.concatenate(targets), rcond=1e-13)[0] / scale
+        free, driven = [*direct, w], (direct * inputs[:, np.newaxis]).reshape(-1, len(w))
+        rows = _stacked(np.concatenate([free, driven, -fractions * output, output[np.newaxis]]))
+        products, own = rows @ rows.T, slice(len(free))
+        cross = products[own, len(free) :]
+        shared = products[len(free) :, len(free) :]
+        grams.append(shared - cross.T @ _inverse(products[own, own]) @ cross)
+    gram = np.sum(grams, axis=0)
+    solved = _inverse(gram[:-1, :-1]) @ gram[:-1, -1]
     blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in upper]
     a = linalg.block_diag(*blocks, *([[p]] for p in real))
     b = np.concatenate([np.tile([2.0, 0.0], len(upper)), np.ones(len(real))])
