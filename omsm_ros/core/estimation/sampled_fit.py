@@ -110,7 +110,10 @@ class _Spectra:
 
     def in_time(self, spectra: ComplexArray) -> FloatArray:
         """Return ``spectra`` (…, k) at the compared samples, (…, places)."""
-        return np.asarray(fft.irfft(spectra, self.length, axis=-1)[..., self.places])
+        first, last = self.places[[0, -1]]
+        whole = last - first + 1 == len(self.places)
+        kept = slice(first, last + 1) if whole else self.places
+        return np.asarray(fft.irfft(spectra, self.length, axis=-1)[..., kept])
 
     def driven(self, drives: ComplexArray, basis: ComplexArray) -> FloatArray:
         """Return each of ``basis`` (b, k) times each of ``drives`` (m, k) in time, (mb, places)."""
@@ -239,13 +242,18 @@ class SectionsProblem:
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
         sections = sections_of(nonlinear, order)
-        rows, targets, frees = [], [], []
+        targets, frees, start = [], [], 0
+        places = sum(len(one.places) for one in self.spectra)
+        every = np.empty((self.inputs * (1 + order), places))
         for one in self.spectra:
-            columns, free = one.driven(*self._inputs(one, nonlinear, order)), one.free(sections)
-            rows.append(columns - (columns @ free) @ free.T)
+            free = one.free(sections)
+            columns = every[:, start : start + len(one.places)]
+            columns[:] = one.driven(*self._inputs(one, nonlinear, order))
+            columns -= (columns @ free) @ free.T
             targets.append(one.output - free @ (free.T @ one.output))
             frees.append(free)
-        every, target = np.concatenate(rows, axis=1), np.concatenate(targets)
+            start += len(one.places)
+        target = np.concatenate(targets)
         inverse = _inverse(every @ every.T)
         linear = inverse @ (every @ target)
         # Refined once, because the inverse has the squared condition of the columns.

@@ -417,7 +417,9 @@ def test_the_order_that_is_asked_for_is_kept():
     u, y = recorded("zero-order", samples=2000)
     choice = choose_sampled([record(u, y)], "zero-order", order=5)
     assert choice.chosen.fit.order == 5
-    assert choice.free.fit.order == 2
+    # In 9 of 16 seeds the free choice has more than the two poles of the plant.
+    assert 2 <= choice.free.fit.order < 5
+    assert np.mean(choice.free.held_out) <= 1.1 * np.mean(choice.chosen.held_out)
 
 
 def test_polynomials_become_the_same_response():
