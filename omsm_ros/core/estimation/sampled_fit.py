@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import fft, linalg, ndimage
+from scipy import fft, linalg, ndimage, signal
 
 from omsm_ros.core.estimation.covariance import noise_spectrum, weighted_gram
 from omsm_ros.core.estimation.impulse_response import AVERAGED_LINES, coherent_power
@@ -111,8 +111,7 @@ class _Spectra:
     def in_time(self, spectra: ComplexArray) -> FloatArray:
         """Return ``spectra`` (…, k) at the compared samples, (…, places)."""
         first, last = self.places[[0, -1]]
-        whole = last - first + 1 == len(self.places)
-        kept = slice(first, last + 1) if whole else self.places
+        kept = slice(first, last + 1) if last - first < len(self.places) else self.places
         return np.asarray(fft.irfft(spectra, self.length, axis=-1)[..., kept])
 
     def driven(self, drives: ComplexArray, basis: ComplexArray) -> FloatArray:
@@ -311,28 +310,21 @@ class SectionsProblem:
 
         late: delays [samples]
         """
-        data, poles = [], self._spread_poles(order)
+        data = []
         for one in self.spectra:
             angle, drives, output = one.excited
             w = variable(self.hold, angle / (2 * np.pi)) / RATE
             data.append((w, drives * np.exp(-1j * angle * late[:, np.newaxis]), output))
+        # Lightly damped pairs over the excited lines.
+        low = min(abs(w[0]) for w, *_ in data)
+        high = min(max(abs(w[-1]) for w, *_ in data), 8 / RATE)
+        even, ratios = (make(low, high, order // 2 + 2) for make in (np.linspace, np.geomspace))
+        upper = np.sqrt(even * ratios)[1:-1] * (1j - _START_DAMPING)
+        single = np.full(order % 2, -np.sqrt(low * high))
+        poles = np.concatenate([upper, np.conj(upper), single])
         for _ in range(_RELOCATIONS):
             poles = _stable(_relocate(poles, data))
         return self.nonlinear_of(poles, late)
-
-    def _spread_poles(self, order: int) -> ComplexArray:
-        """Return lightly damped pairs over the excited lines, in w, scaled."""
-        ends = [
-            np.abs(variable(self.hold, one.excited[0][[0, -1]] / (2 * np.pi))) / RATE
-            for one in self.spectra
-        ]
-        low, high = min(e[0] for e in ends), min(max(e[1] for e in ends), 8 / RATE)
-        pairs = order // 2
-        even = np.linspace(low, high, pairs + 2)[1:-1]
-        rates = np.sqrt(even * np.geomspace(low, high, pairs + 2)[1:-1])
-        upper = rates * (1j - _START_DAMPING)
-        single = np.full(order % 2, -np.sqrt(low * high), np.complex128)
-        return np.concatenate([upper, np.conj(upper), single])
 
     def covariance(self, fitted: SectionsFit, period: float) -> FloatArray:
         """Return the covariance (p, p) of the parameters of ``fitted.model(period)``.
@@ -431,10 +423,9 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
     power, shown = ndimage.uniform_filter1d(np.abs(spectrum) ** 2, 15), one.excited[0][[0, -1]]
     power[(one.angle < shown[0]) | (one.angle > shown[1])] = 0.0
     drives = problem._inputs(one, fitted.nonlinear, fitted.order)[0][:, np.newaxis]
-    tried: list[tuple[complex, FloatArray, FloatArray]] = []
-    while count and len(tried) < _TRIED_LINES * len(_ADDED_DAMPINGS) and np.any(power > 0):
-        line = int(np.argmax(power))
-        power[max(line - 10, 0) : line + 11], rate = 0.0, abs(one.w[line])
+    peaks, tried = signal.find_peaks(power, distance=10)[0], []
+    for line in peaks[np.argsort(power[peaks])[::-1][:_TRIED_LINES]] if count else ():
+        rate = abs(one.w[line])
         for damping in _ADDED_DAMPINGS:
             basis = basis_of(np.array([[2 * damping / rate, 1 / rate**2]]), one.w)[1:]
             rows = _stacked((drives * basis).reshape(-1, len(one.w)))
@@ -442,8 +433,7 @@ def _missing_pairs(problem: SectionsProblem, fitted: SectionsFit, count: int) ->
     left, found = _stacked(spectrum[np.newaxis])[0], []
     for _ in range(count if tried else 0):
         along = [rows @ left for _, rows, _ in tried]
-        shares = [a @ one[2] @ a for a, one in zip(along, tried, strict=True)]
-        best = int(np.argmax(shares))
+        best = int(np.argmax([a @ one[2] @ a for a, one in zip(along, tried, strict=True)]))
         pole, rows, inverse = tried[best]
         left = left - (inverse @ along[best]) @ rows
         found.append(pole)
@@ -485,10 +475,10 @@ def _relocate(
         direct = np.concatenate([fractions, np.ones((1, len(w)))])
         free, driven = [*direct, w], (direct * inputs[:, np.newaxis]).reshape(-1, len(w))
         rows = _stacked(np.concatenate([free, driven, -fractions * output, output[np.newaxis]]))
-        products, own = rows @ rows.T, slice(len(free))
-        cross = products[own, len(free) :]
-        shared = products[len(free) :, len(free) :]
-        grams.append(shared - cross.T @ _inverse(products[own, own]) @ cross)
+        (own, cross), (_, shared) = (
+            np.split(p, [len(free)], 1) for p in np.split(rows @ rows.T, [len(free)])
+        )
+        grams.append(shared - cross.T @ _inverse(own) @ cross)
     gram = np.sum(grams, axis=0)
     solved = _inverse(gram[:-1, :-1]) @ gram[:-1, -1]
     blocks = [[[p.real, p.imag], [-p.imag, p.real]] for p in upper]
