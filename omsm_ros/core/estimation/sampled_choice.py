@@ -57,7 +57,7 @@ _FREE_DELAYS = (0.0, 1.0, 4.0, 15.0)
 _LEAST_SAMPLES_EACH = 3
 # Sixty columns of a record then take half a gigabyte.
 _MOST_SAMPLES = 1_000_000
-# Used samples of all records on which orders are explored.
+# Used samples on which orders are explored.
 EXPLORED_ON = 8000
 # Iterations of each start in a race, of an explored fit, of one without a held-out part, and of the
 # final one.
@@ -114,8 +114,7 @@ def choose_sampled(
     none = np.zeros(records[0].inputs.shape[1], np.int64)
     whole = SectionsProblem(records, hold, none)
     if hold != BAND_LIMITED and max_delay:
-        each = EXPLORED_ON // len(records)
-        parts = replace(whole, records=[_exciting_part(record, each) for record in records])
+        parts = replace(whole, records=[_exciting_part(record) for record in records])
         late = _confirmed(_with_delays(parts, max_delay)[0], min(_CONFIRMING_ORDER, most))
         whole = replace(whole, delays=late.delays)
     explored, every, most = _explored(whole, order, most)
@@ -145,8 +144,7 @@ def _explored(whole: SectionsProblem, order: int, most: int) -> tuple[SectionsPr
     """
     every = min(_decimation(record) for record in whole.records)
     while True:
-        each = EXPLORED_ON // len(whole.records)
-        records = [_exciting_part(_thinned(record, every), each) for record in whole.records]
+        records = [_exciting_part(_thinned(record, every)) for record in whole.records]
         try:
             most = min(most, check_records(records, order))
         except IdentificationError:
@@ -211,13 +209,13 @@ def excited_parameters(input: FloatArray, most: int) -> int:
     return int(np.sum(power > _UNEXCITED * power[-1]))
 
 
-def _exciting_part(record: SampledRecord, most: int) -> SampledRecord:
-    """Return the part with ``most`` used samples in which the inputs vary most."""
+def _exciting_part(record: SampledRecord) -> SampledRecord:
+    """Return the part with EXPLORED_ON used samples in which the inputs vary most."""
     places = np.flatnonzero(record.used)
-    count = len(places) // most
+    count = len(places) // EXPLORED_ON
     if count < 2:
         return record
-    ends = places[: count * most].reshape(count, -1)[:, [0, -1]].tolist()
+    ends = places[: count * EXPLORED_ON].reshape(count, -1)[:, [0, -1]].tolist()
     parts = [record.part(slice(first, last + 1)) for first, last in ends]
     return max(parts, key=lambda part: float(np.var(part.inputs, axis=0).sum()))
 
@@ -297,9 +295,7 @@ def _explore(
     def missed(fitted: SectionsFit) -> float:
         return float(np.mean(_relative(validation_residual(fitted, whole))))
 
-    for order in sorted({*_ORDERS, asked}):
-        if order > most:
-            break
+    for order in sorted(n for n in {*_ORDERS, asked} if n <= most):
         starts = _starts(early, fits, best, order, late)
         raced = [early.fit(order, [start], _RACE) for start in starts]
         chosen = min(raced, key=missed)
@@ -324,8 +320,7 @@ def _starts(
     found = [problem.spread_start(order, late)]
     for smaller in {fits[-1], fits[best]}:
         own = smaller.problem.late(smaller.nonlinear, smaller.order)
-        grown = grown_starts(problem, smaller, order)
-        found += [problem.nonlinear_of(poles, own) for poles in grown]
+        found += [problem.nonlinear_of(p, own) for p in grown_starts(problem, smaller, order)]
     return found
 
 

@@ -241,17 +241,15 @@ class SectionsProblem:
     def project(self, nonlinear: FloatArray, order: int) -> Projection:
         """Return the residual after the linear parameters are eliminated."""
         sections = sections_of(nonlinear, order)
-        targets, frees, start = [], [], 0
-        places = sum(len(one.places) for one in self.spectra)
-        every = np.empty((self.inputs * (1 + order), places))
-        for one in self.spectra:
+        targets, frees = [], []
+        ends = np.cumsum([len(one.places) for one in self.spectra])
+        every = np.empty((self.inputs * (1 + order), ends[-1]))
+        for one, columns in zip(self.spectra, np.split(every, ends[:-1], axis=1), strict=True):
             free = one.free(sections)
-            columns = every[:, start : start + len(one.places)]
             columns[:] = one.driven(*self._inputs(one, nonlinear, order))
             columns -= (columns @ free) @ free.T
             targets.append(one.output - free @ (free.T @ one.output))
             frees.append(free)
-            start += len(one.places)
         target = np.concatenate(targets)
         inverse = _inverse(every @ every.T)
         linear = inverse @ (every @ target)
