@@ -59,8 +59,7 @@ _LEAST_SAMPLES_EACH = 3
 _MOST_SAMPLES = 1_000_000
 # Used samples on which orders are explored.
 EXPLORED_ON = 8000
-# Iterations of each start in a race, of an explored fit, of one without a held-out part, and of the
-# final one.
+# Iterations of a start in a race, of an explored, of a refitted and of the final fit.
 _RACE, _EXPLORING, _REFITTED, _FINAL = 3, 12, 4, 30
 # Directions weaker than this part of the power of the strongest are rounding of six digits.
 _UNEXCITED = 1e-12
@@ -291,16 +290,12 @@ def _explore(
     explained: list[float] = []
     best = 0
     late = lag.problem.late(lag.nonlinear, lag.order)
-
-    def missed(fitted: SectionsFit) -> float:
-        return float(np.mean(_relative(validation_residual(fitted, whole))))
-
     for order in sorted(n for n in {*_ORDERS, asked} if n <= most):
         starts = _starts(early, fits, best, order, late)
         raced = [early.fit(order, [start], _RACE) for start in starts]
-        chosen = min(raced, key=missed)
+        chosen = min(raced, key=lambda one: _missed(one, whole))
         fits.append(early.fit(order, [chosen.nonlinear], _EXPLORING))
-        explained.append(1 - missed(fits[-1]))
+        explained.append(1 - _missed(fits[-1], whole))
         if explained[-1] > 1 - _NO_GAIN * (1 - explained[best]):
             best = len(explained) - 1
         if len(explained) - 1 - best >= _FRUITLESS and order >= asked:
@@ -340,11 +335,11 @@ def validation_residual(fitted: SectionsFit, whole: SectionsProblem) -> list[Flo
     return found
 
 
-def _relative(residuals: Sequence[FloatArray]) -> FloatArray:
-    """Return the squares of all counted residuals, (k,); infinite where one is not finite."""
-    every = np.concatenate([one[~np.isnan(one)] for one in residuals])
+def _missed(fitted: SectionsFit, whole: SectionsProblem) -> float:
+    """Return the mean square of all counted residuals; infinite where one is not finite."""
+    every = np.concatenate([one[~np.isnan(one)] for one in validation_residual(fitted, whole)])
     with np.errstate(over="ignore"):
-        return np.nan_to_num(every**2, nan=np.inf) if len(every) else np.full(1, np.inf)
+        return float(np.mean(np.nan_to_num(every**2, nan=np.inf))) if len(every) else np.inf
 
 
 def _finalists(orders: Sequence[int], explained: FloatArray, asked: int) -> list[int]:
@@ -373,7 +368,7 @@ def validation_errors(fitted: SectionsFit, evaluations: int = _REFITTED) -> Floa
         ]
         counted.append(np.all(_variation(rest) > _STILL * _variation(problem.records)))
         found = replace(problem, records=rest).fit(fitted.order, [fitted.nonlinear], evaluations)
-        errors.append(float(np.mean(_relative(validation_residual(found, problem)))))
+        errors.append(_missed(found, problem))
     return np.array(errors)[counted if sum(counted) > 1 else slice(None)]
 
 
@@ -413,7 +408,7 @@ def _finished(whole: SectionsProblem, candidate: SampledCandidate, every: int) -
         return replace(candidate, fit=found)
     part = replace(whole, records=[_early(record) for record in whole.records])
     rest = part.fit(fitted.order, [found.nonlinear], _REFITTED)
-    return SampledCandidate(found, np.array([np.mean(_relative(validation_residual(rest, whole)))]))
+    return SampledCandidate(found, np.array([_missed(rest, whole)]))
 
 
 def _against_impulse_response(
