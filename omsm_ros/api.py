@@ -144,15 +144,7 @@ def correct(
         corrector.push_distance(distance)
         parts.append(corrector.take())
     made = join_points([*parts, corrector.finish()])
-    return Points(
-        x=made.x,
-        y=made.y,
-        height=made.height,
-        uncertainty=made.uncertainty,
-        dynamic_error=made.dynamic_error,
-        sample=made.sample,
-        counted=corrector.account.as_dict(),
-    )
+    return Points.of(made, counted=corrector.account.as_dict())
 
 
 def form(
@@ -198,13 +190,9 @@ def form(
     terms = zip(
         found.zernike.terms, found.zernike.coefficients, found.zernike.uncertainty, strict=True
     )
-    return Form(
-        figures={name: (v.value, v.uncertainty) for name, v in found.deviation.items()},
-        zernike={f"Z({t.n}, {t.m})": (float(c), float(u)) for t, c, u in terms},
-        x=found.map.x,
-        y=found.map.y,
-        deviation=found.map.deviation,
-    )
+    figures = {name: (v.value, v.uncertainty) for name, v in found.deviation.items()}
+    zernike = {f"Z({t.n}, {t.m})": (float(c), float(u)) for t, c, u in terms}
+    return Form.of(found.map, figures=figures, zernike=zernike)
 
 
 def adjust(
@@ -260,13 +248,8 @@ def adjust(
             clockings=clocking,
             accuracy=accuracy,
         )
-    return Adjusted(
-        facts=adjustment_facts(found, read_scans, calibration.core, tolerance),
-        x=found.form.x,
-        y=found.form.y,
-        height=found.form.height,
-        uncertainty=found.form.uncertainty,
-    )
+    facts = adjustment_facts(found, read_scans, calibration.core, tolerance)
+    return Adjusted.of(found.form, facts=facts)
 
 
 def _bag_of(scan: Recording | Path | str, place: Path) -> Path:
@@ -339,13 +322,8 @@ def difference(
     found = compare_measurements_of_part(measured[0], measured[1], fit)
     matched = found.matched
     unknown = np.full(len(matched.x), np.nan)
-    return Difference(
-        facts=facts_of(found),
-        x=matched.x,
-        y=matched.y,
-        difference=matched.difference,
-        uncertainty=unknown if found.agreement is None else found.agreement.uncertainty,
-    )
+    spread = unknown if found.agreement is None else found.agreement.uncertainty
+    return Difference.of(matched, facts=facts_of(found), uncertainty=spread)
 
 
 def plan(
@@ -452,14 +430,8 @@ def predict(
 
     path = ScanPath(z=motion.z, sample_period=motion.period, x=motion.x, c=motion.c)
     found = predict_error(calibration.core, path, accuracy)
-    return Prediction(
-        error=dynamic_error(calibration.core.dynamics, motion.z, motion.period),
-        period=motion.period,
-        residual=found.residual,
-        speed_factor=found.speed_factor,
-        binding=found.binding,
-        advice=found.advice,
-    )
+    error = dynamic_error(calibration.core.dynamics, motion.z, motion.period)
+    return Prediction.of(found, error=error, period=motion.period)
 
 
 def spectrum(values: ArrayLike, step: float) -> Spectrum:

@@ -113,13 +113,12 @@ def _points_of(file: Path) -> Points:
 
     found = read_points(file)
     zero = np.zeros(len(found), np.int64)
-    return Points(
-        x=found.x,
-        y=found.y,
-        height=found.height,
+    return Points.of(
+        found,
         uncertainty=zero * np.nan if found.uncertainty is None else found.uncertainty,
         dynamic_error=zero.astype(np.float64),
         sample=zero if found.sample is None else found.sample,
+        counted={},
     )
 
 

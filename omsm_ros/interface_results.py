@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from omsm_ros.core.kinematics.kinematics import Surface
 
+_Made = TypeVar("_Made", bound="Result")
 _BLOCK = 20_000
 _ORIGIN = "omsm_ros result"
 
@@ -39,6 +40,12 @@ class Result:
     """Base of all results: text, tables, axes and files."""
 
     _along = "sample"
+
+    @classmethod
+    def of(cls: type[_Made], record: object, **more: Any) -> _Made:
+        """Return the result with the values of ``record`` of the same names, and ``more``."""
+        names = {f.name for f in fields(cls)} - set(more)  # type: ignore[arg-type]
+        return cls(**more, **{name: getattr(record, name) for name in names})
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Yield name and value of each printed line, at most 15."""

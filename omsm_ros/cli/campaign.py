@@ -107,8 +107,8 @@ def run_campaign(
         with _executor(jobs or os.cpu_count() or 1, scheduler) as executor:
             asked = {executor.submit(correct_one, task): task for task in waiting}
             for future in as_completed(asked):
-                entry = _task_result(future, asked[future])
-                entries[entry.bag] = entry
+                task = asked[future]
+                entries[task.bag] = Entry(task.bag, task.folder, task.fingerprint, *_result(future))
                 _save(out, entries)
                 progress(len(entries), len(tasks))
         _save(out, entries)
@@ -157,9 +157,9 @@ class Task:
     command: tuple[str, ...]
 
 
-def correct_one(task: Task) -> Entry:
-    """Correct one bag in a process of its own; return its state."""
-    found = REFUSED, "not started"
+def correct_one(task: Task) -> tuple[str, str, int | None]:
+    """Correct one bag in a process of its own; return its state, why, and when it was recorded."""
+    found = REFUSED, "not started", None
     for _ in range(_ATTEMPTS):
         try:
             done = subprocess.run(
@@ -167,25 +167,23 @@ def correct_one(task: Task) -> Entry:
                 stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False,
             )  # fmt: skip
         except OSError as err:
-            found = CRASHED, exception_text(err)
+            found = CRASHED, exception_text(err), None
             continue
         if done.returncode == 0:
-            return Entry(task.bag, task.folder, task.fingerprint, DONE, "", _recorded(task.path))
+            return DONE, "", _recorded(task.path)
         last = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
         if done.returncode > 0:
-            found = REFUSED, last.removeprefix("omsm: ")
-            break
-        found = CRASHED, f"ended by {signal.Signals(-done.returncode).name}"
-    return Entry(task.bag, task.folder, task.fingerprint, *found)
+            return REFUSED, last.removeprefix("omsm: "), None
+        found = CRASHED, f"ended by {signal.Signals(-done.returncode).name}", None
+    return found
 
 
-def _task_result(future: Future[Entry], task: Task) -> Entry:
-    """Return the state of a bag, also if every worker died that tried it."""
+def _result(future: Future[tuple[str, str, int | None]]) -> tuple[str, str, int | None]:
+    """Return the result of :func:`correct_one`, also if every worker died that tried it."""
     try:
         return future.result()
     except Exception as err:  # a scheduler raises errors of many kinds for lost workers
-        why = f"no worker finished it ({type(err).__name__})"
-        return Entry(task.bag, task.folder, task.fingerprint, CRASHED, why)
+        return CRASHED, f"no worker finished it ({type(err).__name__})", None
 
 
 def _state(file: Path) -> tuple[str, int, int]:

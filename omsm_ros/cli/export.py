@@ -16,10 +16,9 @@ from omsm_ros.errors import DataError, FileError
 from omsm_ros.io.files import CLOUD
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.grid_sag_file import write_grid_sag
-from omsm_ros.io.maps.instrument_files import write_hdf5
+from omsm_ros.io.maps.instrument_files import write_hdf5, write_sdf, write_x3p
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
-from omsm_ros.io.maps.x3p_file import write_sdf, write_x3p
 from omsm_ros.io.results import CloudFile
 from omsm_ros.quantities import SPACING
 from omsm_ros.readable import count, quantity

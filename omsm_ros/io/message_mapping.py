@@ -104,6 +104,11 @@ distance_block = partial(block_of, DistanceBlock)
 acceleration_block = partial(block_of, AccelerationBlock)
 
 
+# Fields of the message of a calibration that its file has, too.
+_CALIBRATION_ARRAYS = ("numerator", "denominator", "covariance")
+_CALIBRATION_NUMBERS = ("delay", "static_gain", "sample_period", "valid_up_to")
+
+
 def calibration(message: Any) -> Calibration:
     """Return the record of an ``omsm_msgs/Calibration``; CalibrationError if malformed or altered.
 
@@ -115,13 +120,8 @@ def calibration(message: Any) -> Calibration:
     if isinstance(content := certificate.get(_SET), dict):
         return calibration_of({**content, "id": message.id}, "calibration message")
     content = {
-        "numerator": list(message.numerator),
-        "denominator": list(message.denominator),
-        "delay": float(message.delay),
-        "static_gain": float(message.static_gain),
-        "sample_period": float(message.sample_period),
-        "valid_up_to": float(message.valid_up_to),
-        "covariance": list(message.covariance),
+        **{name: list(getattr(message, name)) for name in _CALIBRATION_ARRAYS},
+        **{name: float(getattr(message, name)) for name in _CALIBRATION_NUMBERS},
         "settings": _json_object("settings", message.settings),
         "certificate": certificate,
         **further,
@@ -209,24 +209,19 @@ def block_message(messages: Messages, block: Block, frame: str | None = None) ->
 
 def calibration_message(messages: Messages, record: Calibration, stamp_ns: int) -> Any:
     """Return ``omsm_msgs/Calibration`` of a record, or of a set, see :func:`calibration`."""
-    certificate = record.certificate.content()
-    content = record.content()
+    own: dict[str, Any] = Calibration.content(record)
+    certificate = own["certificate"]
     if isinstance(record, CalibrationSet):
-        certificate[_SET] = content
-    elif FURTHER in content:
-        certificate[FURTHER] = content[FURTHER]
+        certificate[_SET] = record.content()
+    elif FURTHER in own:
+        certificate[FURTHER] = own[FURTHER]
     return messages.make(
         "Calibration",
         header=header(messages, stamp_ns, "machine"),
         id=record.id,
-        numerator=messages.sequence(record.dynamics.numerator, np.float64),
-        denominator=messages.sequence(record.dynamics.denominator, np.float64),
-        delay=record.dynamics.delay,
-        static_gain=record.static_gain,
-        sample_period=record.sample_period,
-        valid_up_to=record.valid_up_to,
-        covariance=messages.sequence(record.covariance.ravel(), np.float64),
-        settings=json.dumps(dict(record.settings), sort_keys=True),
+        **{n: messages.sequence(own[n], np.float64) for n in _CALIBRATION_ARRAYS},
+        **{name: own[name] for name in _CALIBRATION_NUMBERS},
+        settings=json.dumps(own["settings"], sort_keys=True),
         certificate=json.dumps(certificate, sort_keys=True),
     )
 

@@ -87,7 +87,7 @@ _RESULTS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@dataclass
 class Demonstration:
     """Folder of the results and settings of the twin.
 
@@ -96,6 +96,9 @@ class Demonstration:
     device: model of the emulated probe
     disturbance_file: errors of the machine, None for none
     view: show the scan in a browser
+
+    The calibrator node writes ``calibration_file``, the recorder node ``bag`` and ``second_bag``:
+    the second scan runs outward at twice the speed; ``nominal_file`` has the mirror's surface.
     """
 
     out: Path
@@ -106,6 +109,11 @@ class Demonstration:
     disturbance_file: Path | None = None
     view: bool = False
     sample_period: float = field(default=1e-3, init=False)
+
+    def __post_init__(self) -> None:
+        self.calibration_file = self.out / "calibration.json"
+        self.bag, self.second_bag = self.out / "scan.mcap", self.out / "scan_outward.mcap"
+        self.nominal_file = self.out / NOMINAL
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -127,21 +135,6 @@ class Demonstration:
     def disturbances(self) -> Disturbances:
         """Errors of the emulated machine."""
         return load_disturbances(self.disturbance_file) if self.disturbance_file else NOTHING
-
-    @property
-    def calibration_file(self) -> Path:
-        """File that the calibrator node writes."""
-        return self.out / "calibration.json"
-
-    @property
-    def bag(self) -> Path:
-        """Bag that the recorder node writes."""
-        return self.out / "scan.mcap"
-
-    @property
-    def second_bag(self) -> Path:
-        """The second scan: outward at twice the speed, written by the recorder node."""
-        return self.out / "scan_outward.mcap"
 
     @property
     def link(self) -> str:
@@ -206,11 +199,6 @@ class Demonstration:
             "seed": self.seed,
         }
 
-    @property
-    def nominal_file(self) -> Path:
-        """File of the mirror's nominal surface."""
-        return self.out / NOMINAL
-
     def prepare(self) -> None:
         """Make the folder without earlier results; OmsmError if it is not of a demonstration."""
         _ = self.disturbances  # report an unreadable file before removing anything
@@ -222,13 +210,8 @@ class Demonstration:
                 "that is empty or does not exist yet"
             )
         save_text(mark, "The next demonstration replaces the files in this folder.\n")
-        stale = (
-            self.calibration_file,
-            self.bag,
-            self.second_bag,
-            *(self.out / name for name in _RESULTS),
-        )
-        for path in stale:
+        results = (self.out / name for name in _RESULTS)
+        for path in (self.calibration_file, self.bag, self.second_bag, *results):
             if path.is_dir():
                 raise OmsmError(f"{str(path)!r} is a folder and stands in the way; remove it")
             path.unlink(missing_ok=True)
@@ -296,16 +279,11 @@ def _adjusted(plan: Demonstration, calibration: Calibration) -> dict[str, Any]:
 
 def twin_sources() -> MachineSources:
     """Return the sources that two scans do not show; the twin is built without them."""
+    why = {"how": EVALUATED, "reason": "the twin is built without this error"}
+    known = _EVALUATED.items()
     return MachineSources(
         tuple(
-            StatedSource(
-                source=name,
-                value=size,
-                how=EVALUATED,
-                reason="the twin is built without this error",
-                parameters=_LENGTHS.get(name, {}),
-            )
-            for name, size in _EVALUATED.items()
+            StatedSource(source=n, value=v, **why, parameters=_LENGTHS.get(n, {})) for n, v in known
         )
     )
 

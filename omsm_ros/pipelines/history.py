@@ -209,9 +209,14 @@ _CALIBRATION_FIGURES = (
     "static_gain", "static_gain_uncertainty", "delay", "delay_uncertainty", "valid_up_to",
     "sample_period",
 )  # fmt: skip
-_MEASUREMENT_FIGURES = (
-    "deviation_rms", "deviation_peak_to_valley", "dynamic_error_rms", "uncertainty_median",
-)  # fmt: skip
+# Column, and place of its value in the summary.
+_MEASUREMENT_FIGURES = {
+    "deviation_rms": ("figures", "rms", "value"),
+    "deviation_peak_to_valley": ("figures", "peak_to_valley", "value"),
+    "dynamic_error_rms": ("dynamic_error_before", "rms"),
+    "uncertainty_median": ("uncertainty", "median"),
+}
+_COUNTS = ("received", "corrected")
 
 
 def _tables(sql: Any) -> dict[str, Any]:
@@ -234,10 +239,9 @@ def _tables(sql: Any) -> dict[str, Any]:
         "calibrations", ("verdict", "path", "source", "settings"), _CALIBRATION_FIGURES
     )
     measurements = table(
-        "measurements", ("bag", "folder", "version", "settings"), _MEASUREMENT_FIGURES,
+        "measurements", ("bag", "folder", "version", "settings"), [*_MEASUREMENT_FIGURES],
         sql.Column("calibration", sql.String(64), index=True),
-        sql.Column("received", sql.BigInteger),
-        sql.Column("corrected", sql.BigInteger),
+        *(sql.Column(name, sql.BigInteger) for name in _COUNTS),
     )  # fmt: skip
     return {"calibrations": calibrations, "measurements": measurements}
 
@@ -297,12 +301,8 @@ def keep_measurement(address: str, folder: Path, bag: Path | None = None) -> boo
         "version": str(part(summary, "versions", "omsm_ros") or ""),
         "settings": json_and_yaml.text_of(settings),
         "calibration": str(summary.get("calibration", "")),
-        "received": _count(part(summary, "samples", "distance", "received")),
-        "corrected": _count(part(summary, "samples", "distance", "corrected")),
-        "deviation_rms": _number(part(summary, "figures", "rms", "value")),
-        "deviation_peak_to_valley": _number(part(summary, "figures", "peak_to_valley", "value")),
-        "dynamic_error_rms": _number(part(summary, "dynamic_error_before", "rms")),
-        "uncertainty_median": _number(part(summary, "uncertainty", "median")),
+        **{name: _count(part(summary, "samples", "distance", name)) for name in _COUNTS},
+        **{name: _number(part(summary, *at)) for name, at in _MEASUREMENT_FIGURES.items()},
     }
     with Catalogue(address) as catalogue:
         return catalogue.add("measurements", row)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from omsm_ros.cli import campaign, main
-from omsm_ros.cli.campaign import DONE, Entry, bags_below, load_campaign, run_campaign
+from omsm_ros.cli.campaign import DONE, bags_below, load_campaign, run_campaign
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io.calibration_file import save_calibration
 
@@ -41,7 +41,7 @@ def corrected(monkeypatch, tmp_path):
         place = tmp_path / "out" / task.folder
         place.mkdir(parents=True, exist_ok=True)
         (place / "summary.json").write_text(json.dumps({"bag": task.bag}))
-        return Entry(task.bag, task.folder, task.fingerprint, DONE, "", 7)
+        return DONE, "", 7
 
     monkeypatch.setattr(campaign, "correct_one", correct)
     return met

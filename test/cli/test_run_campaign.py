@@ -13,7 +13,7 @@ import pytest
 
 from omsm_ros import cli
 from omsm_ros.cli import campaign
-from omsm_ros.cli.campaign import CRASHED, DONE, REFUSED, Entry, load_campaign, run_campaign
+from omsm_ros.cli.campaign import CRASHED, DONE, REFUSED, load_campaign, run_campaign
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags, calibration_file
 from omsm_ros.io.bag_writer import BagWriter
@@ -73,7 +73,7 @@ def test_what_is_done_is_not_done_again(shop, finished, tmp_path, monkeypatch):
 
     def note(task):
         started.append(task.bag)
-        return campaign.Entry(task.bag, task.folder, task.fingerprint, REFUSED, "still torn")
+        return REFUSED, "still torn", None
 
     monkeypatch.setattr(campaign, "correct_one", note)
     run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS)
@@ -110,7 +110,7 @@ def test_a_bag_with_which_every_worker_died_costs_no_other(shop, tmp_path, monke
     def corrected(task):
         if task.bag == "a.mcap":
             raise KilledWorker("Attempted to run task 'a' on 4 different workers")
-        return Entry(task.bag, task.folder, task.fingerprint, DONE, "")
+        return DONE, "", None
 
     monkeypatch.setattr(campaign, "correct_one", corrected)
     entries = run_campaign(shop / "bags", shop / "cal.json", tmp_path, OPTIONS, jobs=1)

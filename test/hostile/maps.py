@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.grid_sag_file import write_grid_sag
-from omsm_ros.io.maps.instrument_files import write_hdf5
+from omsm_ros.io.maps.instrument_files import write_hdf5, write_x3p
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
-from omsm_ros.io.maps.x3p_file import write_x3p
 
 ACROSS = 19
 _NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?![\w.])")

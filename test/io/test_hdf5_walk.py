@@ -9,7 +9,7 @@ import pytest
 
 from omsm_ros.errors import FileError
 from omsm_ros.io import child_process
-from omsm_ros.io.optional_libraries import walk_in_child
+from omsm_ros.io.child_process import walk_in_child
 
 h5py = pytest.importorskip("h5py", reason="h5py is an optional package")
 

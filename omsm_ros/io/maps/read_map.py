@@ -10,9 +10,8 @@ from omsm_ros.io.files import CLOUD, exception_text, open_regular
 from omsm_ros.io.maps import instrument_files
 from omsm_ros.io.maps.columns_file import has_dabam_header, read_columns, read_dabam
 from omsm_ros.io.maps.grid_sag_file import is_grid_sag, read_grid_sag
-from omsm_ros.io.maps.instrument_files import read_foreign
+from omsm_ros.io.maps.instrument_files import read_foreign, read_x3p
 from omsm_ros.io.maps.vertex_file import read_pcd, read_ply
-from omsm_ros.io.maps.x3p_file import read_x3p
 from omsm_ros.units import NOT_USED, LengthUnits
 
 _HEAD_BYTES = 4096

@@ -21,9 +21,8 @@ import numpy as np
 
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.errors import FileError
-from omsm_ros.io.child_process import read_in_child
+from omsm_ros.io.child_process import import_optional, read_in_child, walk_in_child
 from omsm_ros.io.files import library_errors, open_regular
-from omsm_ros.io.optional_libraries import import_optional, walk_in_child
 from omsm_ros.io.tables.table import PIECE_ROWS, ForeignTable, micro_sign
 from omsm_ros.units import NANOSECONDS_PER_S
 

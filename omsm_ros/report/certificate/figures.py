@@ -179,12 +179,7 @@ def order(candidates: Sequence[CandidateFit], chosen: Structure | None) -> Figur
 
 _LINES = 400
 _LOWEST_SHARE = 1e-3
-_SPAN_MODEL_FIGURES: dict[str, Any] = {
-    "color": style.AFTER,
-    "alpha": 0.22,
-    "linewidth": 0,
-    "label": "95 % band",
-}
+_SPAN_OF_MODEL = _SPAN | {"alpha": 0.22, "label": "95 % band"}
 
 
 def response(model: SampledModel) -> Figure:
@@ -194,14 +189,14 @@ def response(model: SampledModel) -> Figure:
     made, axes = style.figure(7.4, 4.6, rows=2, sharex=True)
     upper, lower = axes[:, 0]
     gain, spread = np.abs(value), np.exp(COVERAGE_FACTOR * np.minimum(band.gain, 5.0))
-    upper.fill_between(frequency, gain / spread, gain * spread, **_SPAN_MODEL_FIGURES)
+    upper.fill_between(frequency, gain / spread, gain * spread, **_SPAN_OF_MODEL)
     upper.plot(frequency, gain, color=style.AFTER, linewidth=1.6, label="identified")
     style.logarithmic(upper.yaxis)
     # A band that is open somewhere must not flatten the curve.
     upper.set_ylim(0.3 * float(gain.min()), 3 * float(gain.max()))
     phase = np.unwrap(np.angle(value)) / DEGREE_RAD
     off = COVERAGE_FACTOR * np.minimum(band.phase, np.pi) / DEGREE_RAD
-    lower.fill_between(frequency, phase - off, phase + off, **_SPAN_MODEL_FIGURES)
+    lower.fill_between(frequency, phase - off, phase + off, **_SPAN_OF_MODEL)
     lower.plot(frequency, phase, color=style.AFTER, linewidth=1.6)
     low, high = model.valid[0]
     for axes_ in (upper, lower):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.maps import vertex_file, x3p_file
+from omsm_ros.io.maps import instrument_files, vertex_file
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.units import units_of
 
@@ -189,13 +189,13 @@ def test_an_x3p_cloud_and_an_x3p_of_integers(tmp_path):
     steps = x3pio.Axis(x3pio.AxisType.ABSOLUTE, x3pio.DataType.INT16, 1.0)
     header = SimpleNamespace(x=steps, y=steps, z=steps)
     with pytest.raises(ValueError, match="whole numbers without an increment"):
-        x3p_file._places(x3pio, SimpleNamespace(layers=[made], header=header))
+        instrument_files._places(x3pio, SimpleNamespace(layers=[made], header=header))
 
 
 def test_our_x3p_is_of_the_revision_that_all_take(tmp_path):
     pytest.importorskip("x3pio", reason="the extra 'formats' is not installed")
     made = grid()
-    x3p_file.write_x3p(tmp_path / "a.x3p", made, "a comment")
+    instrument_files.write_x3p(tmp_path / "a.x3p", made, "a comment")
     with zipfile.ZipFile(tmp_path / "a.x3p") as archive:
         text = archive.read("main.xml").decode()
     assert "<Revision>ISO5436 - 2000</Revision>" in text
@@ -206,8 +206,8 @@ def test_our_x3p_is_of_the_revision_that_all_take(tmp_path):
 
 def test_an_x3p_bomb_and_an_x3p_of_nothing_are_refused(tmp_path, monkeypatch):
     pytest.importorskip("x3pio", reason="the extra 'formats' is not installed")
-    x3p_file.write_x3p(tmp_path / "a.x3p", grid(), "")
-    monkeypatch.setattr(x3p_file, "MAX_UNPACKED_BYTES", 100)
+    instrument_files.write_x3p(tmp_path / "a.x3p", grid(), "")
+    monkeypatch.setattr(instrument_files, "MAX_UNPACKED_BYTES", 100)
     with pytest.raises(FileError, match="at most 100 are read"):
         read_points(tmp_path / "a.x3p")
     monkeypatch.undo()

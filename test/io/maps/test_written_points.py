@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
 from omsm_ros.io.maps.columns_file import write_columns
-from omsm_ros.io.maps.instrument_files import write_hdf5
+from omsm_ros.io.maps.instrument_files import write_hdf5, write_sdf
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.maps.vertex_file import write_pcd, write_ply
-from omsm_ros.io.maps.x3p_file import write_sdf
 from omsm_ros.units import units_of
 
 # Any bits that a place on a machine can have, the sign of zero and the smallest numbers too.

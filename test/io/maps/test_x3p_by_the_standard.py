@@ -11,8 +11,8 @@ import pytest
 
 from omsm_ros.core.surface.height_grid import HeightGrid
 from omsm_ros.errors import FileError
+from omsm_ros.io.maps.instrument_files import write_x3p
 from omsm_ros.io.maps.read_map import read_points
-from omsm_ros.io.maps.x3p_file import write_x3p
 
 from .surfaces import by_place, grid
 

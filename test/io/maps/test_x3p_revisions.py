@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omsm_ros.errors import FileError
-from omsm_ros.io.maps import x3p_file
+from omsm_ros.io.maps import instrument_files
 from omsm_ros.io.maps.read_map import read_points
 
 from .surfaces import by_place, grid
@@ -32,14 +32,14 @@ def respelled(source, target, text):
 )  # fmt: skip
 def test_every_spelling_of_a_revision_is_read(tmp_path, text):
     made = grid()
-    x3p_file.write_x3p(tmp_path / "a.x3p", made, "")
+    instrument_files.write_x3p(tmp_path / "a.x3p", made, "")
     respelled(tmp_path / "a.x3p", tmp_path / "b.x3p", text)
     expected = by_place(read_points(tmp_path / "a.x3p"))
     np.testing.assert_array_equal(by_place(read_points(tmp_path / "b.x3p")), expected)
 
 
 def test_a_revision_that_nobody_knows_is_refused(tmp_path):
-    x3p_file.write_x3p(tmp_path / "a.x3p", grid(), "")
+    instrument_files.write_x3p(tmp_path / "a.x3p", grid(), "")
     respelled(tmp_path / "a.x3p", tmp_path / "b.x3p", "ISO9999 - 2040")
     with pytest.raises(FileError, match="ISO9999"):
         read_points(tmp_path / "b.x3p")
