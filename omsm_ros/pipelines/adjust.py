@@ -90,8 +90,7 @@ def read_scan(
         how = admission or Admission()
         scan = CorrectedScan(recording, calibration, options, admission=how)
         axes, parts = scan.read()
-    if not any(map(len, parts)):
-        raise BagError(f"{str(bag)!r} gives no surface point; look at it with 'omsm inspect'")
+    scan.check_points()
     data, made = scan_data(axes, parts, scan.sample_period, clocking, clamping)
     return AdjustedScan(
         bag=str(bag),

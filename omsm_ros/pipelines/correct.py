@@ -41,7 +41,7 @@ from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording, scan_data
 from omsm_ros.quantities import TIME_LAPSE
-from omsm_ros.readable import quantity
+from omsm_ros.readable import counts_text, quantity
 from omsm_ros.units import MICROMETRE_M
 
 # Samples by which one stream may be recorded ahead of the other: a quarter of a gigabyte.
@@ -146,6 +146,16 @@ class CorrectedScan:
     def account(self) -> Account:
         """Account of every sample read so far."""
         return self.corrector.account
+
+    def check_points(self) -> None:
+        """Raise BagError if the scan gave no surface point."""
+        axes, distance = self.account.axes, self.account.distance
+        if not axes.corrected:
+            raise BagError(
+                f"{str(self.path)!r} gives no surface point: of {distance.received} readings "
+                f"{counts_text(distance.counted)}, of {axes.received} axis samples "
+                f"{counts_text(axes.counted)}; check the bag with 'omsm inspect'"
+            )
 
     def _check_complete(self) -> None:
         name = RejectionReason.OVERDUE.name.lower()

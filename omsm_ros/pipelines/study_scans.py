@@ -1,7 +1,6 @@
 """Determine dynamics, latency and probe position from whole scans."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 
 from omsm_ros.core.adjustment.resolved_calibration import (
@@ -13,7 +12,6 @@ from omsm_ros.core.adjustment.resolved_calibration import (
     unit_calibration,
     without_step_test,
 )
-from omsm_ros.core.adjustment.scan_data import ScanData
 from omsm_ros.core.adjustment.self_calibration import SelfCalibration, self_calibrate
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.correction.correct import CorrectionOptions
@@ -25,12 +23,11 @@ from omsm_ros.core.registration.probe_alignment import (
     align_on_sphere,
 )
 from omsm_ros.core.streams.blocks import Account
-from omsm_ros.errors import BagError
 from omsm_ros.io.topics import AnyBag
+from omsm_ros.pipelines.adjust import read_scan
 from omsm_ros.pipelines.correct import CorrectedScan
 from omsm_ros.pipelines.progress import Progress, no_progress
-from omsm_ros.pipelines.recording import Recording, scan_data
-from omsm_ros.readable import counts_text
+from omsm_ros.pipelines.recording import Recording
 
 # The probe latency is what these tasks estimate, so it must not be corrected before.
 _UNCORRECTED_LAG = CorrectionOptions(probe_latency=0.0)
@@ -43,10 +40,8 @@ def reversal_of(
 
     Also return the account of the samples of each scan.
     """
-    with ExitStack() as opened:
-        recordings = [opened.enter_context(Recording(path, progress)) for path in bag_paths]
-        scans, accounts = _read_scans(recordings, calibration, _UNCORRECTED_LAG)
-    return reversal(scans, calibration), accounts
+    scans = [read_scan(p, calibration, _UNCORRECTED_LAG, progress=progress) for p in bag_paths]
+    return reversal([s.data for s in scans], calibration), [s.account for s in scans]
 
 
 def self_calibration_of(
@@ -70,30 +65,19 @@ def self_calibration_of(
         the uncertainty is relative to the gain
     Also return the account of the samples of each scan.
     """
-    with ExitStack() as opened:
-        recordings = [opened.enter_context(Recording(path, progress)) for path in bag_paths]
-        period = recordings[0].sample_period()
-        base = step_test or unit_calibration(period, static_gain)
-        how = replace(_UNCORRECTED_LAG, polarity=polarity)
-        scans, accounts = _read_scans(recordings, base, how)
+    with Recording(bag_paths[0]) as first:
+        period = first.sample_period()
+    base = step_test or unit_calibration(period, static_gain)
+    how = replace(_UNCORRECTED_LAG, polarity=polarity)
+    scans = [read_scan(path, base, how, progress=progress) for path in bag_paths]
+    accounts = [scan.account for scan in scans]
     prior = after_step_test(base) if step_test else without_step_test(gain_uncertainty)
-    found = self_calibrate(scans, replace(prior, clocking=clocking), harmonics)
+    found = self_calibrate(
+        [scan.data for scan in scans], replace(prior, clocking=clocking), harmonics
+    )
     if step_test:
         return found, resolved(step_test, found), accounts
     return found, from_scans_alone(found, period, static_gain, settings), accounts
-
-
-def _read_scans(
-    recordings: Sequence[Recording], calibration: Calibration, options: CorrectionOptions
-) -> tuple[list[ScanData], list[Account]]:
-    scans, accounts = [], []
-    for recording in recordings:
-        scan = CorrectedScan(recording, calibration, options)
-        axes, parts = scan.read()
-        _check_points(scan)
-        scans.append(scan_data(axes, parts, scan.sample_period)[0])
-        accounts.append(scan.account)
-    return scans, accounts
 
 
 def alignment_of(
@@ -111,17 +95,7 @@ def alignment_of(
         scan = CorrectedScan(recording, calibration, _UNCORRECTED_LAG, most_traced=MOST_POINTS)
         for _ in scan.steps():
             pass
-        _check_points(scan)
+        scan.check_points()
         return align_on_sphere(
             SphereScan.of(scan.corrector.trace.points()), radius, geometry
         ), scan.account
-
-
-def _check_points(scan: CorrectedScan) -> None:
-    if not scan.account.axes.corrected:
-        raise BagError(
-            f"{str(scan.path)!r} gives no surface point: of {scan.account.distance.received} "
-            f"readings {counts_text(scan.account.distance.counted)}, of "
-            f"{scan.account.axes.received} axis samples {counts_text(scan.account.axes.counted)}; "
-            "check the bag with 'omsm inspect'"
-        )
