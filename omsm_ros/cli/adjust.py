@@ -3,7 +3,7 @@
 import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.io.calibration_file import load_calibration
@@ -46,20 +46,18 @@ def _adjust(args: argparse.Namespace) -> Facts:
     if args.geometry:
         options = CorrectionOptions(polarity=args.polarity, geometry=load_geometry(args.geometry))
     calibration = load_calibration(args.calibration)
-    with progress_bar("reading", args.json) as progress:
-        found, scans = adjust_bags(
-            [cell_of(path, args) for path in args.scans],
-            calibration,
-            nominal=load_surface(args.nominal) if args.nominal else None,
-            options=options,
-            stated=load_sources(args.sources) if args.sources else NOTHING_STATED,
-            clockings=args.clocking,
-            clampings=args.clamping,
-            accuracy=args.accuracy,
-            accepted=args.accept,
-            admission=Admission(override=args.override),
-            progress=progress,
-        )
+    found, scans = adjust_bags(
+        [cell_of(path, args) for path in args.scans],
+        calibration,
+        nominal=load_surface(args.nominal) if args.nominal else None,
+        options=options,
+        stated=load_sources(args.sources) if args.sources else NOTHING_STATED,
+        clockings=args.clocking,
+        clampings=args.clamping,
+        accuracy=args.accuracy,
+        accepted=args.accept,
+        admission=Admission(override=args.override),
+    )
     facts = adjustment_facts(found, scans, calibration, args.tolerance)
     if args.origin:
         facts["origin"] = args.origin

@@ -12,7 +12,6 @@ from omsm_ros.cli.command import (
     CliCommand,
     Facts,
     output_path_for,
-    progress_bar,
     rejected,
     say,
     say_lines,
@@ -46,11 +45,10 @@ def _declare_verify(add: Arguments) -> None:
 def _verify(args: argparse.Namespace) -> Facts:
     calibration, bag = load_calibration(args.calibration), cell_of(args.bag, args)
     trigger, established = trigger_of(args), None
-    with progress_bar("reading", args.json) as progress:
-        if args.find_offset:
-            established = established_offset(bag, calibration, progress)
-            trigger = replace(trigger, counter_offset=established.samples)
-        check = path_check_of(bag, calibration, progress, trigger, args.by_stamps)
+    if args.find_offset:
+        established = established_offset(bag, calibration)
+        trigger = replace(trigger, counter_offset=established.samples)
+    check = path_check_of(bag, calibration, trigger, args.by_stamps)
     bands = [
         {
             "from": low,

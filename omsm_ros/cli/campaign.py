@@ -16,7 +16,7 @@ from urllib.parse import quote, urlsplit
 
 from omsm_ros import __version__
 from omsm_ros.cli.arguments import ADDRESS, Arguments
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.errors import ConfigurationError, FileError
 from omsm_ros.io import bags
 from omsm_ros.io.calibration_file import load_calibration
@@ -32,7 +32,7 @@ from omsm_ros.io.files import (
 from omsm_ros.io.folders import locked_folder
 from omsm_ros.io.json_and_yaml import TEXT, group, or_none, ranged
 from omsm_ros.io.results import read_summary
-from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.progress import Progress, state_progress
 from omsm_ros.quantities import PROCESSES, STAMP, shown
 
 DONE, REFUSED, CRASHED = "done", "refused", "crashed"
@@ -81,7 +81,7 @@ def run_campaign(
     *,
     jobs: int = 0,
     scheduler: str = "",
-    progress: Progress = no_progress,
+    progress: Progress = state_progress,
 ) -> list[Entry]:
     """Correct every bag below ``folder`` into ``out``; return the state of each, by name.
 
@@ -316,11 +316,10 @@ def _declare_batch(add: Arguments) -> None:
 
 
 def _batch(args: argparse.Namespace) -> Facts:
-    with progress_bar("correcting", args.json, " bags") as progress:
-        entries = run_campaign(
-            args.folder, args.calibration, args.out, _options(args),
-            jobs=args.jobs, scheduler=args.scheduler, progress=progress,
-        )  # fmt: skip
+    entries = run_campaign(
+        args.folder, args.calibration, args.out, _options(args),
+        jobs=args.jobs, scheduler=args.scheduler,
+    )  # fmt: skip
     _write_index(args.out, args.folder.name, entries, args.calibration)
     return {"out": str(args.out), "entries": [asdict(entry) for entry in entries]}
 

@@ -1,9 +1,7 @@
 """The parts of a command: arguments, an action that returns facts, and how they are printed."""
 
 import argparse
-import sys
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -11,7 +9,6 @@ from typing import Any, TypeAlias
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.core.calibration.certificate import REJECTED
 from omsm_ros.errors import printable
-from omsm_ros.pipelines.progress import Progress, no_progress
 
 Facts: TypeAlias = dict[str, Any]
 
@@ -30,24 +27,6 @@ class CliCommand:
     act: Callable[[argparse.Namespace], Facts]
     show: Callable[[Facts], None]
     refusal: Callable[[Facts], str] = lambda facts: ""
-
-
-@contextmanager
-def progress_bar(title: str, quiet: bool, unit: str = " messages") -> Iterator[Progress]:
-    """Show a bar on stderr that counts messages or ``unit``; none without a terminal."""
-    if quiet or not sys.stderr.isatty():
-        yield no_progress
-        return
-    # Imported on demand, because most commands run without a terminal.
-    from tqdm import tqdm
-
-    with tqdm(desc=title, unit=unit, leave=False) as bar:
-
-        def advance(done: int, total: int) -> None:
-            bar.total = total or None
-            bar.update(done - bar.n)
-
-        yield advance
 
 
 def output_path_for(out: Path, verdict: str) -> Path:

@@ -36,7 +36,7 @@ from omsm_ros.errors import (
 )
 from omsm_ros.io import json_and_yaml
 from omsm_ros.messages import COMMAND, written_for
-from omsm_ros.pipelines.progress import refresh_in_thread, tick
+from omsm_ros.pipelines.progress import refresh_in_thread, state_progress, stated_progress, tick
 from omsm_ros.quantities import SEED, TIME_LAPSE, shown
 
 if TYPE_CHECKING:
@@ -44,14 +44,22 @@ if TYPE_CHECKING:
 
 # Commands that end sooner show no elapsed time.
 _DELAY_S = 1.0
+_ELAPSED = "{desc}: {elapsed} so far"
+# Whether something is done, and not yet all of a known number.
+_LAYOUTS = {
+    (False, False): _ELAPSED,
+    (True, False): "{desc}: {n} done, {elapsed} so far",
+    (True, True): "{desc}: {percentage:3.0f} % |{bar:24}| {elapsed} so far, {remaining} left",
+}
 
 
 @contextmanager
 def progress_in_background(title: str, quiet: bool) -> Iterator[None]:
-    """Show the elapsed seconds on stderr, with ``title``; nothing if quiet or without a terminal.
+    """Show elapsed seconds and stated progress on stderr, with ``title``.
 
-    Progress bars stand below it.
+    Nothing is shown if quiet or without a terminal.
     """
+    state_progress(0, 0)
     if quiet or not sys.stderr.isatty():
         yield
         return
@@ -64,9 +72,14 @@ def _show(title: str, done: Event) -> None:
         return
     from tqdm import tqdm
 
-    with tqdm(desc=title, bar_format="{desc}: {elapsed} so far", leave=False) as line:
+    def refresh() -> None:
+        line.n, line.total = stated_progress()
+        line.bar_format = _LAYOUTS[line.n > 0, 0 < line.n < line.total]
+        line.refresh()
+
+    with tqdm(desc=title, bar_format=_ELAPSED, leave=False) as line:
         line.start_t -= _DELAY_S
-        tick(line, done)
+        tick(refresh, done)
 
 
 # Sent by "kill", "systemctl stop", a batch system, or a terminal that is closed.

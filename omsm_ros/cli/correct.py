@@ -15,7 +15,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.correction.correct import CorrectionOptions
 from omsm_ros.core.correction.machine_sources import MachineSources, declared_sources
@@ -122,10 +122,7 @@ def _correct(args: argparse.Namespace) -> Facts:
         raise ConfigurationError(
             "--pitch has no effect without an Abbe arm; give abbe_arm in --geometry GEOMETRY.yaml"
         )
-    with (
-        result_folder(args.out, MEASUREMENT_FILES) as out,
-        progress_bar("correcting", args.json) as progress,
-    ):
+    with result_folder(args.out, MEASUREMENT_FILES) as out:
         summary = measure(
             cell_of(args.bag, args),
             calibration,
@@ -140,7 +137,6 @@ def _correct(args: argparse.Namespace) -> Facts:
             register=registration_of(args) if args.fit else None,
             report=not args.no_report,
             origin=args.origin,
-            progress=progress,
         )
     warnings = record_in_catalogue(args.catalogue, lambda: _keep(args))
     warnings = [*summary["warnings"], *warnings]
@@ -186,10 +182,7 @@ def _predict(args: argparse.Namespace) -> Facts:
         z, period = load_motion(args.motion)
         path = ScanPath(z=z, sample_period=period)
     else:
-        with (
-            progress_bar("reading", args.json) as progress,
-            Recording(cell_of(args.motion, args), progress) as recording,
-        ):
+        with Recording(cell_of(args.motion, args)) as recording:
             path = recording.scan_path()
     limits = load_limits(args.limits) if args.limits else MachineLimits()
     return asdict(predict_error(calibration, path, args.budget, limits))
@@ -247,9 +240,7 @@ def _align(args: argparse.Namespace) -> Facts:
 
     calibration = load_calibration(args.calibration)
     known = geometry_of(args.geometry)
-    with progress_bar("correcting", args.json) as progress:
-        scan = cell_of(args.bag, args)
-        found, account = alignment_of(scan, calibration, args.radius, known, progress)
+    found, account = alignment_of(cell_of(args.bag, args), calibration, args.radius, known)
     save_geometry(args.out, found.geometry)
     names = ("centre_x", "centre_y", "beam_x", "beam_y")
     # JSON has no infinity, so the uncertainty of an unidentifiable beam direction is null.

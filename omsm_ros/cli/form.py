@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from omsm_ros.cli.arguments import Arguments, cell_of, refuse_cell
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.cli.fit_option import declare_fit, declare_tolerance, form_rows, registration_of
 from omsm_ros.core.form.compensation import (
     CutSurface,
@@ -299,9 +299,7 @@ def _form(args: argparse.Namespace) -> Facts:
             from omsm_ros.pipelines.measure import measure
 
             calibration = load_calibration(args.calibration)
-            with progress_bar("correcting", args.json) as progress:
-                bag = cell_of(source, args)
-                measure(bag, calibration, out, nominal=surface, report=False, progress=progress)
+            measure(cell_of(source, args), calibration, out, nominal=surface, report=False)
             source = out
         else:
             refuse_cell(source, args)

@@ -18,15 +18,7 @@ from omsm_ros.cli.arguments import (
     refuse_cell,
     trigger_of,
 )
-from omsm_ros.cli.command import (
-    CliCommand,
-    Facts,
-    output_path_for,
-    progress_bar,
-    rejected,
-    table,
-    written,
-)
+from omsm_ros.cli.command import CliCommand, Facts, output_path_for, rejected, table, written
 from omsm_ros.core.calibration.calibration import FURTHER_AXES, Calibration
 from omsm_ros.core.calibration.certificate import NOTE, Origin, from_json, of_severity
 from omsm_ros.core.estimation.equivalent_time import fast_mode
@@ -161,8 +153,7 @@ def _with_multisine(
 ) -> tuple[Identification, Facts]:
     """Return the identification with the findings of the multisine, and its lines."""
     plan = load_multisine(args.plan)
-    bag = cell_of(args.multisine, args)
-    with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
+    with Recording(cell_of(args.multisine, args)) as recording:
         motion = recording.motion(trigger=trigger_of(args), by_stamps=args.by_stamps)
     found = best_linear_approximation(motion, plan)
     calibration = identified.calibration
@@ -197,8 +188,7 @@ def _motions(
     """
     motions, stated, recorded = [], args.settings or {}, []
     for path in args.recordings:
-        bag = cell_of(path, args)
-        with progress_bar("reading", args.json) as progress, Recording(bag, progress) as recording:
+        with Recording(cell_of(path, args)) as recording:
             motions.append(
                 recording.motion(
                     duration=args.duration,

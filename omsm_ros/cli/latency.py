@@ -5,15 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object
-from omsm_ros.cli.command import (
-    CliCommand,
-    Facts,
-    output_path_for,
-    progress_bar,
-    rejected,
-    table,
-    written,
-)
+from omsm_ros.cli.command import CliCommand, Facts, output_path_for, rejected, table, written
 from omsm_ros.core.adjustment.resolved_calibration import undetermined
 from omsm_ros.core.adjustment.self_calibration import (
     DEFAULT_CLOCKING_RAD,
@@ -54,9 +46,8 @@ def _selfcal(args: argparse.Namespace) -> Facts:
     step_test = load_calibration(args.calibration) if args.calibration else None
     names = ("harmonics", "clocking", "polarity", "static_gain", "gain_uncertainty", "settings")
     options = {name: getattr(args, name) for name in names}
-    with progress_bar("reading", args.json) as progress:
-        bags = [cell_of(path, args) for path in args.scans]
-        found, made, accounts = self_calibration_of(bags, step_test, progress, **options)
+    bags = [cell_of(path, args) for path in args.scans]
+    found, made, accounts = self_calibration_of(bags, step_test, **options)
     path = _kept(args.out, made)
     return {
         **_resolved_facts(made),
@@ -130,9 +121,8 @@ def _declare_reversal(add: Arguments) -> None:
 
 def _reversal(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
-    with progress_bar("correcting", args.json) as progress:
-        bags = [cell_of(path, args) for path in (args.clockwise, args.counterclockwise)]
-        found, accounts = reversal_of(bags, calibration, progress)
+    bags = [cell_of(path, args) for path in (args.clockwise, args.counterclockwise)]
+    found, accounts = reversal_of(bags, calibration)
     facts = {
         name: getattr(found, name)
         for name in ("lag", "uncertainty", "lag_of_z", "residual", "used", "latency")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.core.streams.stream_faults import StreamWatch, counter_skew, skew_fault
 from omsm_ros.errors import ConfigurationError, Notice
 from omsm_ros.io import bags
@@ -16,7 +16,6 @@ from omsm_ros.io.json_and_yaml import mapping_of
 from omsm_ros.io.tables.table import load_column_map
 from omsm_ros.io.topics import AnyBag, relative
 from omsm_ros.pipelines.importing import import_recording
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording
 from omsm_ros.quantities import DURATION, SILENCE
 from omsm_ros.readable import quantity
@@ -27,13 +26,13 @@ _NO_INDEX = (
 )
 
 
-def inspect_bag(path: AnyBag, progress: Progress = no_progress) -> Facts:
+def inspect_bag(path: AnyBag) -> Facts:
     """Return the topics of a bag, its faults as text, and its vibration levels.
 
     topics: messages and samples of each; ``gaps`` of the trigger counter with the ``missing``
     samples; ``restarts`` of the counter; ``invalid`` readings of the probe or axes
     """
-    with Recording(path, progress) as recording:
+    with Recording(path) as recording:
         bag = recording.bag
         topics = bag.topics()
         present = [t.role for t in topics if t.role in bags.BLOCK_TOPICS and t.messages]
@@ -110,8 +109,7 @@ def _declare_inspect(add: Arguments) -> None:
 def _inspect(args: argparse.Namespace) -> Facts:
     if args.repair:
         return _repaired(args.bag)
-    with progress_bar("reading", args.json) as progress:
-        return {"bag": str(args.bag), **inspect_bag(cell_of(args.bag, args), progress)}
+    return {"bag": str(args.bag), **inspect_bag(cell_of(args.bag, args))}
 
 
 def _repaired(bag: Path) -> Facts:
@@ -186,8 +184,7 @@ def _record(args: argparse.Namespace) -> Facts:
     def waits(reason: str) -> None:
         print(f"omsm: {reason}; waiting for the first, Ctrl+C ends it", file=sys.stderr)
 
-    with progress_bar("recording", args.json, " samples") as progress:
-        return record_device(given, args.out, ended, progress, waits)
+    return record_device(given, args.out, ended, waits)
 
 
 def _show_record(facts: Facts) -> None:
@@ -203,8 +200,7 @@ def _declare_import(add: Arguments) -> None:
 
 def _import(args: argparse.Namespace) -> Facts:
     mapped, form = load_column_map(args.map)
-    with progress_bar("importing", args.json, " samples") as progress:
-        found = import_recording(args.files, mapped, form, args.out, progress)
+    found = import_recording(args.files, mapped, form, args.out)
     return {"bag": str(args.out), "files": [asdict(file) for file in found]}
 
 

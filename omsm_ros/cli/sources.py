@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from omsm_ros.cli.arguments import Arguments, cell_of
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, table, written
+from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.adjustment.source_evaluation import (
     KINDS,
     FoundSource,
@@ -51,19 +51,18 @@ def _declare(add: Arguments) -> None:
 def _sources(args: argparse.Namespace) -> Facts:
     calibration = load_calibration(args.calibration)
     geometry = load_geometry(args.geometry) if args.geometry else Geometry()
-    with progress_bar("reading", args.json) as progress:
-        bag = cell_of(args.bag, args)
-        options = CorrectionOptions(polarity=args.polarity, geometry=geometry)
-        scan = read_scan(bag, calibration, options, progress=progress)
-        if args.kind == _SPHERE:
-            if args.radius is None:
-                raise ConfigurationError("a sphere needs its radius; give --radius")
-            aligned, _ = alignment_of(bag, calibration, args.radius, geometry)
-            drift = _drift(load_sources(args.out) if args.out.exists() else NOTHING_STATED)
-            found, missing = sources_of_alignment(aligned, geometry, scan.data, drift)
-        else:
-            nominal = load_surface(args.nominal) if args.nominal else Flat()
-            found, missing = evaluate_sources(args.kind, scan.data, nominal)
+    bag = cell_of(args.bag, args)
+    options = CorrectionOptions(polarity=args.polarity, geometry=geometry)
+    scan = read_scan(bag, calibration, options)
+    if args.kind == _SPHERE:
+        if args.radius is None:
+            raise ConfigurationError("a sphere needs its radius; give --radius")
+        aligned, _ = alignment_of(bag, calibration, args.radius, geometry)
+        drift = _drift(load_sources(args.out) if args.out.exists() else NOTHING_STATED)
+        found, missing = sources_of_alignment(aligned, geometry, scan.data, drift)
+    else:
+        nominal = load_surface(args.nominal) if args.nominal else Flat()
+        found, missing = evaluate_sources(args.kind, scan.data, nominal)
     began = scan.began_ns
     date = date_text_of_stamp(began) if began else date_text(datetime.now(timezone.utc))
     entries = [_entry(one, args.kind, args.bag, date) for one in found]

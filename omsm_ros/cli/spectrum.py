@@ -3,7 +3,7 @@
 import argparse
 
 from omsm_ros.cli.arguments import Arguments, cell_of, json_object
-from omsm_ros.cli.command import CliCommand, Facts, progress_bar, say, table, written
+from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.core.ripple.lines import MOST_LINES
 from omsm_ros.io.calibration_file import load_calibration
 from omsm_ros.io.descriptions import load_surface
@@ -40,11 +40,8 @@ def _spectrum(args: argparse.Namespace) -> Facts:
         exposure=args.exposure,
         spot=args.spot,
     )
-    with progress_bar("reading", args.json) as progress:
-        bags = [cell_of(path, args) for path in args.scans]
-        facts = publish_spectra(
-            bags, options, args.out, report=not args.no_report, progress=progress
-        )
+    bags = [cell_of(path, args) for path in args.scans]
+    facts = publish_spectra(bags, options, args.out, report=not args.no_report)
     return {**facts, "out": str(args.out)}
 
 

@@ -223,7 +223,7 @@ class DemoStage:
         silent = self._quiet or plain
         with (
             tqdm(desc=title, total=total or None, disable=silent, bar_format=layout) as bar,
-            refresh_in_thread(partial(tick, bar)),
+            refresh_in_thread(partial(tick, bar.refresh)),
         ):
             yield lambda done: bar.update(done - bar.n)  # type: ignore[misc]
             bar.update((total or bar.n) - bar.n)

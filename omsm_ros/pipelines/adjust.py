@@ -41,7 +41,6 @@ from omsm_ros.io.topics import AnyBag
 from omsm_ros.messages import sentence
 from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording, scan_data
 from omsm_ros.readable import date_text, number
 from omsm_ros.report.tables import sized
@@ -79,14 +78,13 @@ def read_scan(
     clocking: float = 0.0,
     clamping: int = 0,
     admission: Admission | None = None,
-    progress: Progress = no_progress,
 ) -> AdjustedScan:
     """Correct a bag, and return its points with the motion of the axes, time from zero.
 
     clocking: angle by which the part is turned on the chuck [rad];  clamping: its number
     Raises BagError for a bag without a surface point.
     """
-    with Recording(bag, progress) as recording:
+    with Recording(bag) as recording:
         how = admission or Admission()
         scan = CorrectedScan(recording, calibration, options, admission=how)
         axes, parts = scan.read()
@@ -184,7 +182,6 @@ def adjust_bags(
     accuracy: float | None = None,
     accepted: Collection[str] = (),
     admission: Admission | None = None,
-    progress: Progress = no_progress,
 ) -> tuple[Adjustment, list[AdjustedScan]]:
     """Return ``bags``, scans of one part, adjusted together, and the scans as they were read.
 
@@ -209,7 +206,6 @@ def adjust_bags(
             clocking=clockings[k] if clockings else 0.0,
             clamping=clampings[k] if clampings else 0,
             admission=admission,
-            progress=progress,
         )
         for k, bag in enumerate(bags)
     ]

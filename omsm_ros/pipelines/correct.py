@@ -38,7 +38,6 @@ from omsm_ros.core.surface.deviation import FormStatistics, RunningStatistics, d
 from omsm_ros.errors import BagError, ConfigurationError, DataError, Notice
 from omsm_ros.io.results import MOST_DRAWN, PlyWriter, with_added_variance
 from omsm_ros.io.topics import AnyBag
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import MAX_PATH_SAMPLES, SCAN_TOPICS, Recording, scan_data
 from omsm_ros.quantities import TIME_LAPSE
 from omsm_ros.readable import counts_text, quantity
@@ -292,7 +291,6 @@ def correct_bag(
     nominal: Surface | None = None,
     lateral: float = 0.0,
     by_stamps: StampJoining | None = None,
-    progress: Progress = no_progress,
 ) -> Correction:
     """Correct a bag into ``cloud`` (PLY).
 
@@ -303,7 +301,7 @@ def correct_bag(
     Memory is bounded, except with ``by_stamps``. If the correction fails, no cloud remains.
     Raises CalibrationError for a calibration that does not match the scan, unless overridden.
     """
-    with Recording(path, progress) as recording:
+    with Recording(path) as recording:
         scan = CorrectedScan(
             recording,
             calibration,

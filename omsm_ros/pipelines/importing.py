@@ -30,7 +30,7 @@ from omsm_ros.errors import DataError, FileError, named_errors
 from omsm_ros.io import bags
 from omsm_ros.io.bag_writer import atomic_bag
 from omsm_ros.io.tables.table import ForeignTable, TableForm, stated_unit
-from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.quantities import shown
 from omsm_ros.units import DATE
 
@@ -122,11 +122,7 @@ class ImportedFile:
 
 
 def import_recording(
-    files: Sequence[Path],
-    mapped: ColumnMap,
-    written: TableForm,
-    out: Path,
-    progress: Progress = no_progress,
+    files: Sequence[Path], mapped: ColumnMap, written: TableForm, out: Path
 ) -> list[ImportedFile]:
     """Write the bag ``out`` from ``files``; each has the axes, the probe, or both.
 
@@ -140,13 +136,11 @@ def import_recording(
             for table in open_tables(path, written, mapped.names((*AXES, *PROBE))):
                 opened.callback(table.close)
                 sources.append(_Source(table, mapped))
-        _write_bag(sources, mapped, out, progress)
+        _write_bag(sources, mapped, out)
         return [source.found for source in sources]
 
 
-def _write_bag(
-    sources: Sequence[_Source], mapped: ColumnMap, out: Path, progress: Progress
-) -> None:
+def _write_bag(sources: Sequence[_Source], mapped: ColumnMap, out: Path) -> None:
     chains: dict[tuple[str, ...], list[_Source]] = {}
     for source in sources:
         chains.setdefault(source.channels, []).append(source)
@@ -162,7 +156,7 @@ def _write_bag(
         for block in merged:
             bag.write_block(block)
             done += len(block)
-            progress(done, 0)
+            state_progress(done, 0)
         _check_counted(streams)
 
 

@@ -46,7 +46,6 @@ from omsm_ros.io.results import save_fields
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.adjust import conformity_entry, figures_entry, priors_of, verdict_entry
 from omsm_ros.pipelines.correct import Admission, Correction, StampJoining, correct_bag
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.report.verdict import registered_figures
 
@@ -271,7 +270,6 @@ def measure(
     register: RegistrationOptions | None = None,
     report: bool = True,
     origin: Mapping[str, Any] = MappingProxyType({}),
-    progress: Progress = no_progress,
 ) -> dict[str, Any]:
     """Correct ``bag`` into ``out``: cloud.ply, summary.json, report.html; return the summary.
 
@@ -288,7 +286,7 @@ def measure(
     used = with_sources(options or CorrectionOptions(), calibration, stated, nominal)
     done = correct_bag(
         bag, calibration, out / CLOUD, options=used, admission=admission, nominal=nominal,
-        lateral=lateral, by_stamps=by_stamps, progress=progress,
+        lateral=lateral, by_stamps=by_stamps,
     )  # fmt: skip
     judgement = Judgement(used, stated, accuracy, out)
     summary = summarise(bag, done, calibration, judgement)

@@ -1,25 +1,25 @@
-"""Report the progress of a task."""
+"""State and show the progress of a task."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import Event, Thread
-from typing import Protocol
 
 Progress = Callable[[int, int], None]
-"""Function of the number done and the total: messages, lines or bags."""
+"""Function of the number done and the total: messages, samples or bags."""
 
 _TICK_S = 0.5
+_stated = 0, 0
 
 
-def no_progress(done: int, total: int) -> None:
-    """Ignore the progress."""
+def state_progress(done: int, total: int) -> None:
+    """State how much of the process's task is done, and of how much; total 0: not known."""
+    global _stated
+    _stated = done, total
 
 
-class ProgressLine(Protocol):
-    """A line on the terminal with the elapsed time, such as a bar of ``tqdm``."""
-
-    def refresh(self) -> object:
-        """Draw the line again."""
+def stated_progress() -> tuple[int, int]:
+    """Return what was stated last."""
+    return _stated
 
 
 @contextmanager
@@ -35,7 +35,7 @@ def refresh_in_thread(show: Callable[[Event], object]) -> Iterator[None]:
         shown.join()
 
 
-def tick(line: ProgressLine, done: Event) -> None:
-    """Refresh ``line`` twice per second until ``done``."""
+def tick(refresh: Callable[[], object], done: Event) -> None:
+    """Call ``refresh``, which draws a line again, twice per second until ``done``."""
     while not done.wait(_TICK_S):
-        line.refresh()
+        refresh()

@@ -25,7 +25,7 @@ from omsm_ros.io.bag_writer import BagWriter
 from omsm_ros.io.descriptions import load_disturbances
 from omsm_ros.io.files import save_text
 from omsm_ros.io.topics import AXES_TOPIC, DISTANCE_TOPIC
-from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.readable import count, quantity
 from omsm_ros.twin.cell import Recording, blocks_of, pieces
 from omsm_ros.twin.disturbances import NOTHING
@@ -50,7 +50,6 @@ def record_device(
     given: dict[str, Any],
     out: Path,
     ended: Callable[[int, float], bool],
-    progress: Progress = no_progress,
     waits: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Write the samples of the device that parameters ``given`` describe into the bag ``out``.
@@ -87,7 +86,7 @@ def record_device(
         thread.start()
         with suppress(KeyboardInterrupt):  # the usual end of a recording
             while not ended(samples, time.monotonic() - last):
-                progress(samples, 0)
+                state_progress(samples, 0)
                 if not samples and patient and time.monotonic() - last > _PATIENCE_S:
                     patient = False
                     waits(f"no sample yet from {values['port']!r}: {reader.trouble or 'silence'}")

@@ -18,7 +18,7 @@ from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import BagError, ConfigurationError
 from omsm_ros.io import bags
 from omsm_ros.io.topics import AnyBag
-from omsm_ros.pipelines.progress import Progress, no_progress
+from omsm_ros.pipelines.progress import state_progress
 from omsm_ros.quantities import TIME_LAPSE
 
 MAX_PATH_SAMPLES = 2**20
@@ -36,9 +36,8 @@ class Recording:
     Raises BagError for a path that is no bag.
     """
 
-    def __init__(self, path: AnyBag, progress: Progress = no_progress) -> None:
+    def __init__(self, path: AnyBag) -> None:
         self.path, self.bag = path, bags.BagReader(path)
-        self._progress = progress
 
     def __enter__(self) -> Recording:
         self.bag.__enter__()
@@ -57,7 +56,7 @@ class Recording:
         total = self.bag.count(topics)
         for done, topic, block in self.bag.blocks(*topics):
             yield topic, block
-            self._progress(done, total)
+            state_progress(done, total)
 
     def blocks(self, *topics: str) -> dict[str, list[Block]]:
         """Return all blocks by topic, as they were recorded; BagError if a topic is absent."""
@@ -65,7 +64,7 @@ class Recording:
         total = self.bag.count(topics)
         for done, (topic, block) in enumerate(self.bag.records(*topics), start=1):
             found[topic].append(block)
-            self._progress(done, total)
+            state_progress(done, total)
         return found
 
     def sample_period(self) -> float:

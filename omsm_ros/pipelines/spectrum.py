@@ -49,7 +49,6 @@ from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.results import PlyWriter
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.correct import Admission, CorrectedScan
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording
 
 SCHEMA = "omsm-spectrum/1"
@@ -121,16 +120,14 @@ class SpectrumOfScan:
         return np.asarray(sum(parts, np.zeros(len(self.studied.signal))))
 
 
-def spectra_of(
-    paths: Sequence[AnyBag], options: SpectrumOptions, progress: Progress = no_progress
-) -> list[SpectrumOfScan]:
+def spectra_of(paths: Sequence[AnyBag], options: SpectrumOptions) -> list[SpectrumOfScan]:
     """Analyse all scans, and classify each spectral line.
 
     Raises BagError for a bag without samples, CalibrationError for a calibration of another
     machine, DataError for a scan that is too short.
     """
     names = _names(paths)
-    read = [_read(path, name, options, progress) for path, name in zip(paths, names, strict=True)]
+    read = [_read(path, name, options) for path, name in zip(paths, names, strict=True)]
     shaken = [
         acceleration_lines(*accelerations_of(r.acceleration)) if r.acceleration else None
         for r in read
@@ -160,9 +157,9 @@ def _names(paths: Sequence[AnyBag]) -> list[str]:
     return [stem if stems.count(stem) == 1 else f"{stem} ({k + 1})" for k, stem in enumerate(stems)]
 
 
-def _read(path: AnyBag, name: str, options: SpectrumOptions, progress: Progress) -> ReadScan:
+def _read(path: AnyBag, name: str, options: SpectrumOptions) -> ReadScan:
     how = CorrectionOptions(polarity=options.polarity, accept_other_rate=options.admission.override)
-    with Recording(path, progress) as recording:
+    with Recording(path) as recording:
         calibration = options.calibration or unit_calibration(recording.sample_period())
         scan = CorrectedScan(recording, calibration, how, admission=options.admission)
         axes, parts = scan.read()

@@ -26,7 +26,6 @@ from omsm_ros.core.streams.blocks import Account
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.adjust import read_scan
 from omsm_ros.pipelines.correct import CorrectedScan
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import Recording
 
 # The probe latency is what these tasks estimate, so it must not be corrected before.
@@ -34,20 +33,19 @@ _UNCORRECTED_LAG = CorrectionOptions(probe_latency=0.0)
 
 
 def reversal_of(
-    bag_paths: Sequence[AnyBag], calibration: Calibration, progress: Progress = no_progress
+    bag_paths: Sequence[AnyBag], calibration: Calibration
 ) -> tuple[Reversal, list[Account]]:
     """Return the lag of the probe against X and C from scans with opposite spindle directions.
 
     Also return the account of the samples of each scan.
     """
-    scans = [read_scan(p, calibration, _UNCORRECTED_LAG, progress=progress) for p in bag_paths]
+    scans = [read_scan(p, calibration, _UNCORRECTED_LAG) for p in bag_paths]
     return reversal([s.data for s in scans], calibration), [s.account for s in scans]
 
 
 def self_calibration_of(
     bag_paths: Sequence[AnyBag],
     step_test: Calibration | None,
-    progress: Progress = no_progress,
     *,
     harmonics: int,
     clocking: float,
@@ -69,7 +67,7 @@ def self_calibration_of(
         period = first.sample_period()
     base = step_test or unit_calibration(period, static_gain)
     how = replace(_UNCORRECTED_LAG, polarity=polarity)
-    scans = [read_scan(path, base, how, progress=progress) for path in bag_paths]
+    scans = [read_scan(path, base, how) for path in bag_paths]
     accounts = [scan.account for scan in scans]
     prior = after_step_test(base) if step_test else without_step_test(gain_uncertainty)
     found = self_calibrate(
@@ -81,17 +79,13 @@ def self_calibration_of(
 
 
 def alignment_of(
-    path: AnyBag,
-    calibration: Calibration,
-    radius: float,
-    geometry: Geometry,
-    progress: Progress = no_progress,
+    path: AnyBag, calibration: Calibration, radius: float, geometry: Geometry
 ) -> tuple[Alignment, Account]:
     """Estimate spindle centre and beam direction from a scan of a sphere of ``radius`` [m].
 
     Also return the account of the samples of the scan.
     """
-    with Recording(path, progress) as recording:
+    with Recording(path) as recording:
         scan = CorrectedScan(recording, calibration, _UNCORRECTED_LAG, most_traced=MOST_POINTS)
         for _ in scan.steps():
             pass

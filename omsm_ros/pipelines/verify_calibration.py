@@ -19,7 +19,6 @@ from omsm_ros.core.streams.trigger_slips import EQUAL_COUNTS, CommonTrigger
 from omsm_ros.errors import CalibrationError, DataError
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.linear_algebra import least_squares
-from omsm_ros.pipelines.progress import Progress, no_progress
 from omsm_ros.pipelines.recording import SCAN_TOPICS, Recording
 from omsm_ros.quantities import POSITION, SAMPLE_PERIOD
 from omsm_ros.units import NANOSECONDS_PER_S
@@ -28,7 +27,6 @@ from omsm_ros.units import NANOSECONDS_PER_S
 def path_check_of(
     path: AnyBag,
     calibration: Calibration,
-    progress: Progress = no_progress,
     trigger: CommonTrigger = EQUAL_COUNTS,
     by_stamps: bool = False,
 ) -> PathCheck:
@@ -37,7 +35,7 @@ def path_check_of(
     trigger: what is stated of the counters of axes and distance
     by_stamps: join both by their stamps, not by their counters
     """
-    with Recording(path, progress) as recording:
+    with Recording(path) as recording:
         record = recording.motion(trigger=trigger, by_stamps=by_stamps)
     check_usable(record)
     predicted = through(discretise(calibration.dynamics, record.sample_period), record.z)
@@ -68,9 +66,7 @@ _STAMP_ERROR_S = 0.25
 _MOST_SAMPLES = 4_000_000
 
 
-def established_offset(
-    path: AnyBag, calibration: Calibration, progress: Progress = no_progress
-) -> CounterOffset:
+def established_offset(path: AnyBag, calibration: Calibration) -> CounterOffset:
     """Return the counter offset for which the distance follows Z, on a fixed target.
 
     calibration: the distance is expected to follow by its lag
@@ -78,7 +74,7 @@ def established_offset(
     The search covers a quarter of a second around the offset of the stamps. Raises DataError if
     the motion does not determine the offset.
     """
-    with Recording(path, progress) as recording:
+    with Recording(path) as recording:
         blocks = recording.blocks(*SCAN_TOPICS)
     return offset_in(path, blocks, calibration)
 

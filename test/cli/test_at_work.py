@@ -47,6 +47,17 @@ def test_long_work_counts_its_seconds_and_leaves_nothing_behind(terminal):
     assert stderr.getvalue().split("\r")[-2].strip() == ""
 
 
+def test_stated_progress_stands_in_the_line(terminal):
+    stderr = terminal()
+    with progress_in_background("omsm form", quiet=False):
+        progress.state_progress(30, 0)
+        assert stderr.pending_listeners("omsm form: 30 done, 00:00 so far")
+        progress.state_progress(30, 120)
+        assert stderr.pending_listeners("omsm form:  25 % |")
+        progress.state_progress(120, 120)
+        assert stderr.pending_listeners("omsm form: 120 done, ")
+
+
 def test_a_fault_finds_the_line_gone(terminal):
     stderr = terminal()
 

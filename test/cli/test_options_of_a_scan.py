@@ -174,7 +174,7 @@ def test_what_is_known_of_the_geometry_is_kept_by_align(
 
     asked = []
 
-    def refuse(bag, known_calibration, radius, known, progress):
+    def refuse(bag, known_calibration, radius, known):
         asked.append((radius, known))
         raise DataError("enough")
 
