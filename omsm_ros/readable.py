@@ -262,6 +262,11 @@ def date_text(when: datetime) -> str:
     return when.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
 
 
+def now_text() -> str:
+    """Return the present date and time as :func:`date_text` does."""
+    return date_text(datetime.now(timezone.utc))
+
+
 def date_text_of_stamp(stamp_ns: object) -> str:
     """Return a ROS time [ns] as :func:`date_text` does."""
     known = number(stamp_ns)

@@ -122,6 +122,11 @@ def _asked_for(args: argparse.Namespace) -> bool:
     return bool(args.namespace or args.topics)
 
 
+def values_of(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the arguments ``names`` by their names."""
+    return {name: getattr(args, name) for name in names}
+
+
 def trigger_of(args: argparse.Namespace) -> CommonTrigger:
     """Return what is stated of the counters; ConfigurationError together with --by-stamps."""
     stated = (args.counter_offset, args.stamp_tolerance) != (0, TWO_DRIVERS_S)

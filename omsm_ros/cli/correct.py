@@ -289,13 +289,11 @@ def _report(args: argparse.Namespace) -> Facts:
     return {"report": str(page)}
 
 
-def _show_report(facts: Facts) -> None:
-    table([written([facts["report"]])])
-
-
 COMMANDS = (
     CliCommand("predict", _declare_predict, _predict, _show_predict),
     CliCommand("correct", _declare_correct, _correct, _show_correct),
     CliCommand("align", _declare_align, _align, _show_align),
-    CliCommand("report", _declare_report, _report, _show_report),
+    CliCommand(
+        "report", _declare_report, _report, lambda facts: table([written([facts["report"]])])
+    ),
 )

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.arguments import Arguments, values_of
 from omsm_ros.cli.command import CliCommand, Facts, table, written
 from omsm_ros.core.comparison.matching import MATCHING_PARAMETERS, SEATED, ordered_dofs
 from omsm_ros.core.registration.pose_parameters import parse_dofs
@@ -54,12 +54,9 @@ def _difference(args: argparse.Namespace) -> Facts:
         raise ConfigurationError("--register needs the surface; give --nominal SURFACE.yaml")
     options = ComparisonOptions(
         dofs=args.fit,
-        uncertainty=args.uncertainty,
-        drift=args.drift,
         units=args.unit,
-        spacing=args.spacing,
         length=args.correlation_length,
-        register=args.register,
+        **values_of(args, "uncertainty", "drift", "spacing", "register"),
     )
     nominal = load_surface(args.nominal) if args.nominal else None
     found, facts = compare_measurements(args.a, args.b, options, nominal)

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from omsm_ros.cli.arguments import Arguments, cell_of, json_object
+from omsm_ros.cli.arguments import Arguments, cell_of, json_object, values_of
 from omsm_ros.cli.command import CliCommand, Facts, output_path_for, rejected, table, written
 from omsm_ros.core.adjustment.resolved_calibration import undetermined
 from omsm_ros.core.adjustment.self_calibration import (
@@ -45,9 +45,8 @@ def _declare_selfcal(add: Arguments) -> None:
 def _selfcal(args: argparse.Namespace) -> Facts:
     step_test = load_calibration(args.calibration) if args.calibration else None
     names = ("harmonics", "clocking", "polarity", "static_gain", "gain_uncertainty", "settings")
-    options = {name: getattr(args, name) for name in names}
     bags = [cell_of(path, args) for path in args.scans]
-    found, made, accounts = self_calibration_of(bags, step_test, **options)
+    found, made, accounts = self_calibration_of(bags, step_test, **values_of(args, *names))
     path = _kept(args.out, made)
     return {
         **_resolved_facts(made),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from omsm_ros.cli.arguments import Arguments
+from omsm_ros.cli.arguments import Arguments, values_of
 from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.core.correction.machine_sources import NOTHING_STATED
 from omsm_ros.core.kinematics.kinematics import Surface
@@ -86,14 +86,10 @@ def _declare_multisine(add: Arguments) -> None:
         add(name, kind, meaning, default=default)
 
 
-def _plan(args: argparse.Namespace) -> Facts:
-    return _PLANS[args.what](args)
-
-
 def _plan_multisine(args: argparse.Namespace) -> Facts:
     names = ("sample_period", "resolution", "up_to", "periods", "realisations", "half_range",
              "speed", "acceleration", "seed")  # fmt: skip
-    plan = plan_multisine(**{name: getattr(args, name) for name in names})
+    plan = plan_multisine(**values_of(args, *names))
     csv, description = args.out / "multisine.csv", args.out / "multisine.json"
     save_text(csv, plan_csv(plan, args.sample_period))
     save_json(description, {"schema": MULTISINE_SCHEMA, **asdict(plan)})
@@ -107,14 +103,8 @@ def _plan_multisine(args: argparse.Namespace) -> Facts:
 
 def _plan_steps(args: argparse.Namespace) -> Facts:
     plan = plan_steps(
-        sample_period=args.sample_period,
-        step=args.step,
         second_step=args.second_step or SECOND_SHARE * args.step,
-        count=args.count,
-        dwell=args.dwell,
-        rise=args.rise,
-        sharp=args.sharp,
-        half_range=args.half_range,
+        **values_of(args, "sample_period", "step", "count", "dwell", "rise", "sharp", "half_range"),
     )
     csv, gcode = args.out / "steps.csv", args.out / "steps.nc"
     save_text(csv, plan_csv(plan, args.sample_period))
@@ -317,4 +307,4 @@ _PLANS = {
     "scans": _plan_scans,
     "motion": _plan_motion,
 }
-COMMANDS = (CliCommand("plan", _declare_plan, _plan, _show_plan),)
+COMMANDS = (CliCommand("plan", _declare_plan, lambda args: _PLANS[args.what](args), _show_plan),)

@@ -1,7 +1,6 @@
 """The command sources: evaluate error sources of a machine from recordings made for it."""
 
 import argparse
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from omsm_ros.messages.verdict import source_name
 from omsm_ros.pipelines.adjust import read_scan
 from omsm_ros.pipelines.study_scans import alignment_of
 from omsm_ros.quantities import RADIUS
-from omsm_ros.readable import date_text, date_text_of_stamp, measured
+from omsm_ros.readable import date_text_of_stamp, measured, now_text
 
 _SPHERE = "sphere"
 _HOW = """\
@@ -64,7 +63,7 @@ def _sources(args: argparse.Namespace) -> Facts:
         nominal = load_surface(args.nominal) if args.nominal else Flat()
         found, missing = evaluate_sources(args.kind, scan.data, nominal)
     began = scan.began_ns
-    date = date_text_of_stamp(began) if began else date_text(datetime.now(timezone.utc))
+    date = date_text_of_stamp(began) if began else now_text()
     entries = [_entry(one, args.kind, args.bag, date) for one in found]
     add_sources(args.out, entries)
     return {"sources": entries, "not_shown": list(missing), "file": str(args.out)}

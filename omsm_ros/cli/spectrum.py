@@ -2,7 +2,7 @@
 
 import argparse
 
-from omsm_ros.cli.arguments import Arguments, cell_of, json_object
+from omsm_ros.cli.arguments import Arguments, cell_of, json_object, values_of
 from omsm_ros.cli.command import CliCommand, Facts, say, table, written
 from omsm_ros.core.ripple.lines import MOST_LINES
 from omsm_ros.io.calibration_file import load_calibration
@@ -35,10 +35,7 @@ def _spectrum(args: argparse.Namespace) -> Facts:
         admission=Admission(args.settings, args.override),
         nominal=load_surface(args.nominal) if args.nominal else None,
         stop=tuple((low, high) for low, high in args.stop),
-        polarity=args.polarity,
-        remove_vibration=args.remove_vibration,
-        exposure=args.exposure,
-        spot=args.spot,
+        **values_of(args, "polarity", "remove_vibration", "exposure", "spot"),
     )
     bags = [cell_of(path, args) for path in args.scans]
     facts = publish_spectra(bags, options, args.out, report=not args.no_report)

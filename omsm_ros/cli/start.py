@@ -83,11 +83,9 @@ def _prepare(parser: argparse.ArgumentParser, files: object) -> None:
             action.complete = files  # type: ignore[attr-defined]
 
 
-def _show_completion(facts: Facts) -> None:
-    say_lines(facts["script"])
-
-
 COMMANDS = (
     CliCommand("twin", _declare_twin, _twin, _show_twin),
-    CliCommand("completion", _declare_completion, _completion, _show_completion),
+    CliCommand(
+        "completion", _declare_completion, _completion, lambda facts: say_lines(facts["script"])
+    ),
 )

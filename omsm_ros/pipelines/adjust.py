@@ -3,7 +3,6 @@
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -40,9 +39,9 @@ from omsm_ros.io.results import PlyWriter
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.messages import sentence
 from omsm_ros.messages.verdict import source_name
-from omsm_ros.pipelines.correct import Admission, CorrectedScan
+from omsm_ros.pipelines.correct import STRICT, Admission, CorrectedScan
 from omsm_ros.pipelines.recording import Recording, scan_data
-from omsm_ros.readable import date_text, number
+from omsm_ros.readable import now_text, number
 from omsm_ros.report.tables import sized
 from omsm_ros.units import RPM_RAD_S
 
@@ -77,7 +76,7 @@ def read_scan(
     *,
     clocking: float = 0.0,
     clamping: int = 0,
-    admission: Admission | None = None,
+    admission: Admission = STRICT,
 ) -> AdjustedScan:
     """Correct a bag, and return its points with the motion of the axes, time from zero.
 
@@ -85,8 +84,7 @@ def read_scan(
     Raises BagError for a bag without a surface point.
     """
     with Recording(bag) as recording:
-        how = admission or Admission()
-        scan = CorrectedScan(recording, calibration, options, admission=how)
+        scan = CorrectedScan(recording, calibration, options, admission=admission)
         axes, parts = scan.read()
     scan.check_points()
     data, made = scan_data(axes, parts, scan.sample_period, clocking, clamping)
@@ -181,7 +179,7 @@ def adjust_bags(
     clampings: Sequence[int] = (),
     accuracy: float | None = None,
     accepted: Collection[str] = (),
-    admission: Admission | None = None,
+    admission: Admission = STRICT,
 ) -> tuple[Adjustment, list[AdjustedScan]]:
     """Return ``bags``, scans of one part, adjusted together, and the scans as they were read.
 
@@ -259,7 +257,7 @@ def write_adjustment(
         # Here, because drawing takes longer to load than scans to adjust.
         from omsm_ros.report.adjustment import render
 
-        date = date_text(datetime.now(timezone.utc))
+        date = now_text()
         save_text(out / REPORT, render(title, facts, found, date))
 
 

@@ -59,6 +59,10 @@ class Admission:
     override: bool = False
 
 
+STRICT = Admission()
+"""Nothing is known of the settings of the scan, and a mismatch is refused."""
+
+
 @dataclass(frozen=True)
 class StampJoining:
     """Parameters to join probe and axes by their stamps instead of a common trigger counter.
@@ -93,7 +97,7 @@ class CorrectedScan:
         calibration: Calibration,
         options: CorrectionOptions,
         *,
-        admission: Admission = Admission(),
+        admission: Admission = STRICT,
         by_stamps: StampJoining | None = None,
         most_traced: int = MOST_TRACED,
     ) -> None:
@@ -287,7 +291,7 @@ def correct_bag(
     cloud: Path,
     *,
     options: CorrectionOptions | None = None,
-    admission: Admission | None = None,
+    admission: Admission = STRICT,
     nominal: Surface | None = None,
     lateral: float = 0.0,
     by_stamps: StampJoining | None = None,
@@ -306,7 +310,7 @@ def correct_bag(
             recording,
             calibration,
             options or CorrectionOptions(),
-            admission=admission or Admission(),
+            admission=admission,
             by_stamps=by_stamps,
         )
         overridden = "; ".join(["OVERRIDDEN", *map(str, scan.reasons)]) if scan.reasons else ""

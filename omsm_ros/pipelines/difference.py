@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ from omsm_ros.io.folders import read_result
 from omsm_ros.io.maps.columns_file import write_columns
 from omsm_ros.io.maps.read_map import read_points
 from omsm_ros.io.results import load_fields
-from omsm_ros.readable import date_text
+from omsm_ros.readable import now_text
 from omsm_ros.units import LengthUnits
 
 MAP = "difference.csv"
@@ -151,7 +150,7 @@ def write_difference(out: Path, found: Comparison, facts: dict[str, Any]) -> Non
     # Imported on demand, because loading the figures takes a second.
     from omsm_ros.report.difference import render
 
-    date = date_text(datetime.now(timezone.utc))
+    date = now_text()
     names = [Path(facts[key]["file"]).name for key in ("a", "b")]
     save_text(out / REPORT, render(" and ".join(names), date, facts, found))
     save_json(out / DIFFERENCE, facts)

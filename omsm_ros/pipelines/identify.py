@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from omsm_ros.io.folders import result_folder
 from omsm_ros.io.json_and_yaml import NUMBER, check_form, form
 from omsm_ros.io.tables.text_table import PLAIN, TextTable, load_columns
 from omsm_ros.pipelines.recording import Recording
-from omsm_ros.readable import date_text, quantity
+from omsm_ros.readable import now_text, quantity
 from omsm_ros.units import seconds_of
 
 
@@ -122,7 +121,7 @@ def write_certificate(out: Path, identified: Identification, *, source: str = ""
 
     calibration = identified.calibration
     figures = certificate_figures_of(calibration, fitted_record(identified))
-    issue = Issue(date=_today(), source=source, version=__version__, figures=figures)
+    issue = Issue(date=now_text(), source=source, version=__version__, figures=figures)
     with result_folder(out, (PAGE, DCC)) as folder:
         save_bytes(folder / DCC, render_dcc(calibration, __version__).encode("utf-8", "replace"))
         save_bytes(folder / PAGE, render(calibration, issue).encode("utf-8", "replace"))
@@ -141,14 +140,10 @@ def write_model_page(
     from omsm_ros.report.page_parts import Issue
 
     figures = model_figures_of(model, record.inputs, record.output, run)
-    issue = Issue(date=_today(), source=source, version=__version__, figures=figures)
+    issue = Issue(date=now_text(), source=source, version=__version__, figures=figures)
     with result_folder(out, (MODEL_PAGE,)) as folder:
         save_bytes(folder / MODEL_PAGE, render_model(model, run, issue).encode("utf-8", "replace"))
     return out / MODEL_PAGE
-
-
-def _today() -> str:
-    return date_text(datetime.now(timezone.utc))
 
 
 _MAX_BYTES = 8_000_000

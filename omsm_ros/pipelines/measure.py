@@ -45,7 +45,7 @@ from omsm_ros.io.files import CLOUD, DEVIATION, FORM, REPORT, SUMMARY, SYSTEMATI
 from omsm_ros.io.results import save_fields
 from omsm_ros.io.topics import AnyBag
 from omsm_ros.pipelines.adjust import conformity_entry, figures_entry, priors_of, verdict_entry
-from omsm_ros.pipelines.correct import Admission, Correction, StampJoining, correct_bag
+from omsm_ros.pipelines.correct import STRICT, Admission, Correction, StampJoining, correct_bag
 from omsm_ros.quantities import TEMPERATURE
 from omsm_ros.report.verdict import registered_figures
 
@@ -262,7 +262,7 @@ def measure(
     *,
     nominal: Surface | None = None,
     options: CorrectionOptions | None = None,
-    admission: Admission | None = None,
+    admission: Admission = STRICT,
     lateral: float = 0.0,
     by_stamps: StampJoining | None = None,
     stated: MachineSources = NOTHING_STATED,
@@ -290,7 +290,7 @@ def measure(
     )  # fmt: skip
     judgement = Judgement(used, stated, accuracy, out)
     summary = summarise(bag, done, calibration, judgement)
-    summary["settings"] |= (admission and admission.settings) or {}
+    summary["settings"] |= admission.settings or {}
     if done.statistics:
         if register is not None and nominal is not None:
             add_form(out, summary, nominal, register)
@@ -333,11 +333,15 @@ def summarise(
     bag: AnyBag, done: Correction, calibration: Calibration, judgement: Judgement
 ) -> dict[str, Any]:
     """Return the content of ``summary.json``; lengths in metres."""
+    places: dict[str, Any] = {}
+    if isinstance(calibration, CalibrationSet):
+        at = {"along": calibration.along, "positions": list(calibration.positions)}
+        places = {"calibration_set": at}
     summary: dict[str, Any] = {
         "schema": "omsm-summary/2",
         "bag": str(bag),
         "calibration": calibration.id,
-        **_places(calibration),
+        **places,
         "samples": done.account,
         "uncertainty_budget": done.budget,
         "sample_period": done.sample_period,
@@ -395,13 +399,6 @@ def _implausible(temperatures: FloatArray) -> list[str]:
         f"{TEMPERATURE.range_text}; {TEMPERATURE.remedy}"
     )
     return [said] * bool(lost)
-
-
-def _places(calibration: Calibration) -> dict[str, Any]:
-    if not isinstance(calibration, CalibrationSet):
-        return {}
-    places = {"along": calibration.along, "positions": list(calibration.positions)}
-    return {"calibration_set": places}
 
 
 def _motion_judged(done: Correction, calibration: Calibration) -> dict[str, Any]:

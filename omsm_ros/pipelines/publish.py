@@ -1,7 +1,6 @@
 """Write the report of a measurement or of a registered part."""
 
 from collections.abc import Mapping
-from datetime import datetime, timezone
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -23,7 +22,7 @@ from omsm_ros.io.results import (
     read_summary,
     summary_of_points,
 )
-from omsm_ros.readable import date_text, quantity
+from omsm_ros.readable import now_text, quantity
 from omsm_ros.report import style
 from omsm_ros.report.measurement.figures import (
     form_figures,
@@ -127,7 +126,7 @@ def publish(
             part = read_points(out / DEVIATION)
             drawn = registered_map(part.x, part.y, part.height, form)
             figures["form_map"] = style.png(drawn)
-    date = date_text(datetime.now(timezone.utc))
+    date = now_text()
     block = origin or summary.get("origin") or {}
     page = render(Report(title, date, summary, calibration, figures, form, curves, surface, block))
     save_text(out / REPORT, page)

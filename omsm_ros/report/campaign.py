@@ -86,7 +86,7 @@ def render(title: str, measurements: Sequence[CampaignEntry], calibration: Calib
         remarks=remarks(measurements, judged),
         figure=picture(_figure(measurements, judged)) if judged else "",
         names=[series.name for series in SERIES],
-        rows=[_row(i, m, judged, calibration) for i, m in enumerate(measurements)],
+        rows=[_row(i, m, judged) for i, m in enumerate(measurements)],
         calibration=calibration.id,
     )
 
@@ -178,9 +178,7 @@ def _headlines(measurements: Sequence[CampaignEntry]) -> list[tuple[str, str]]:
     return [(state, count(states.count(state))) for state in ("done", "refused", "crashed")]
 
 
-def _row(
-    place: int, measurement: CampaignEntry, judged: Sequence[JudgedSeries], calibration: Calibration
-) -> dict[str, Any]:
+def _row(place: int, measurement: CampaignEntry, judged: Sequence[JudgedSeries]) -> dict[str, Any]:
     known = {one.series: one for one in judged}
     cells = []
     for series in SERIES:

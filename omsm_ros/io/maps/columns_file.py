@@ -66,6 +66,8 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         stream.seek(0)
         body = io.TextIOWrapper(stream, encoding="utf-8-sig", errors="replace")
         table = _numbers(body, len(header), first, cells, sorted(names.values()), what)
+    unused = cells - len(names)
+    notes = [f"{unused} other columns were left out"] if unused > 0 else []
     at = {name: sorted(names.values()).index(place) for name, place in names.items()}
     column = {name: table[:, place] * scales[name] for name, place in at.items()}
     profile = "y" not in column
@@ -74,7 +76,7 @@ def read_columns(path: Path, units: LengthUnits | None) -> MeasuredPoints:
         np.zeros_like(column["x"]) if profile else column["y"],
         column["height"],
         column.get("uncertainty"),
-        (*_notes(names, cells), *(["a profile along x"] if profile else [])),
+        (*notes, *(["a profile along x"] if profile else [])),
         sample=column.get("sample"),
     )
 
@@ -277,30 +279,19 @@ def _numbers(
     return rows_in(lines, what, remedy, above=above, cells=cells, **layout)
 
 
-def _notes(names: Mapping[str, int], count: int) -> tuple[str, ...]:
-    return (f"{count - len(names)} other columns were left out",) if count > len(names) else ()
-
-
 def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]], *, csv: bool) -> None:
     """Write columns (n,) of one length by their names, as CSV or, for xyz, after a ``#`` line."""
     mark = "," if csv else " "
     with atomic_file(path, "w") as stream:
         stream.write(("" if csv else "# ") + mark.join(columns) + "\n")
-        for portion in _portions(columns):
-            np.savetxt(stream, portion, fmt=_formats(columns), delimiter=mark)
-
-
-def _formats(columns: Mapping[str, NDArray[np.generic]]) -> list[str]:
-    return [
-        "%d" if part.dtype.kind in "iu" else "%.9g" if part.dtype.itemsize <= 4 else "%.17g"
-        for part in columns.values()
-    ]
-
-
-def _portions(columns: Mapping[str, NDArray[np.generic]]) -> Iterator[NDArray[np.float64]]:
-    count = len(next(iter(columns.values())))
-    for start in range(0, count, _PORTION):
-        yield np.column_stack([part[start : start + _PORTION] for part in columns.values()])
+        formats = [
+            "%d" if part.dtype.kind in "iu" else "%.9g" if part.dtype.itemsize <= 4 else "%.17g"
+            for part in columns.values()
+        ]
+        for start in range(0, len(next(iter(columns.values()))), _PORTION):
+            rows = slice(start, start + _PORTION)
+            portion = np.column_stack([part[rows] for part in columns.values()])
+            np.savetxt(stream, portion, fmt=formats, delimiter=mark)
 
 
 # A profile of the DABAM collection has its columns in ``NAME.dat`` and a description in
