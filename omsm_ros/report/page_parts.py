@@ -2,12 +2,11 @@
 
 import re
 from base64 import b64encode
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import jinja2
 
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.tables import Table
 from omsm_ros.report.verdict import PageVerdict
 
@@ -48,15 +47,6 @@ def title_block(origin: Mapping[str, object], *more: tuple[str, str]) -> list[tu
     named = [(name, origin[name]) for name in _ORIGINS if origin.get(name) is not None]
     rows = [(name.removesuffix("_c").replace("_", " "), name, value) for name, value in named]
     return [*((text, f"{v} °C" if n == "temperature_c" else str(v)) for text, n, v in rows), *more]
-
-
-def check_places(figures: Iterable[str], places: Iterable[str]) -> None:
-    """Raise ConfigurationError for a figure whose name is not in ``places``."""
-    unknown = sorted(set(figures) - set(places))
-    if unknown:
-        raise ConfigurationError(
-            f"figures {unknown!r} are unknown on this page, expected one of {[*places]}"
-        )
 
 
 def picture(png: bytes) -> str:

@@ -10,7 +10,6 @@ from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.lti.frequency_response import COVERAGE_FACTOR, Band, response_band
 from omsm_ros.core.lti.transfer_function import ComplexArray
 from omsm_ros.core.streams.blocks import FloatArray
-from omsm_ros.errors import DataError
 from omsm_ros.report import style
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLISECOND_S, NANOMETRE_M
 
@@ -40,8 +39,6 @@ def bode(identified: Calibration, true: HasResponse | None, sample_period: float
     true: the twin's G_m, None if unknown
     sample_period: of the scan that is corrected [s]; its Nyquist frequency ends the axes
     """
-    if not (np.isfinite(sample_period) and sample_period > 0):
-        raise DataError(f"sample_period {sample_period!r} s, expected a positive number")
     frequency = np.geomspace(_LOWEST_HZ, 0.5 / sample_period, 600)
     made, axes = style.figure(6.1, 5.6, rows=3, sharex=True, height_ratios=(1, 1, 1.15))
     gain, phase, error = axes[:, 0]
@@ -165,10 +162,6 @@ def step_response(
     probe: motion by the probe, -distance / static gain on a fixed target, with any offset
     predicted: encoder through the identified G_m
     """
-    given = [part for part in (time, encoder, probe, predicted) if part is not None]
-    lengths = {len(part) for part in given}
-    if len(lengths) != 1 or len(time) < 3:
-        raise DataError(f"step response of {sorted(lengths)!r} samples, expected one length of 3+")
     speed = np.abs(np.diff(encoder))
     middle = int(np.argmax(speed > 0.9 * speed.max()))
     period = float(np.median(np.diff(time)))

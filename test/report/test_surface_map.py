@@ -15,7 +15,6 @@ import pytest
 from matplotlib import colormaps
 from matplotlib.image import imread
 
-from omsm_ros.errors import DataError
 from omsm_ros.report.measurement.page import Report, render
 from omsm_ros.report.measurement.surface_map import Layer, embedded, policy_of, script
 from omsm_ros.report.style import MAP_COLOURS
@@ -71,11 +70,6 @@ def test_a_map_of_any_cloud_is_small():
     noisy = layer(400_000)
     noisy = Layer("n", noisy.x, noisy.y, np.random.default_rng(1).normal(0, 1e-8, 400_000), "nm")
     assert len(embedded([noisy]).data) < 0.5e6
-
-
-def test_an_unknown_unit_is_refused():
-    with pytest.raises(DataError, match="unit 'ell' of a map is unknown"):
-        embedded([layer(unit="ell")])
 
 
 def page(layers=None):

@@ -18,7 +18,6 @@ from omsm_ros.core.kinematics.kinematics import Surface
 from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.core.surface import deviation as form
 from omsm_ros.core.surface.deviation import Profile
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.report import style
 from omsm_ros.report.measurement.surface_map import CloudView, Raster, rasterise
 from omsm_ros.units import DEGREE_RAD, MICROMETRE_M, MILLIMETRE_M, NANOMETRE_M
@@ -109,7 +108,7 @@ def _draw_map(
     limits: Limits | None = None,
     quantity: str = "deviation",
 ) -> None:
-    scale = _unit(unit)
+    scale = UNITS_M[unit]
     # Fixed positions, so that maps side by side have equal size.
     axes, bar = part.add_axes(_MAP_PLACE), part.add_axes(_BAR_PLACE)
     style.quiet(axes)
@@ -205,12 +204,6 @@ def _draw_envelope(
     axes.fill_between(at, low / scale, high / scale, color=colour, linewidth=0.6)
     axes.axhline(0.0, color=style.MUTED, linewidth=0.6)
     axes.margins(x=0.01)
-
-
-def _unit(name: str) -> float:
-    if name not in UNITS_M:
-        raise ConfigurationError(f"unit {name!r} of a map is unknown, expected one of {[*UNITS_M]}")
-    return UNITS_M[name]
 
 
 # Width of a profile's band relative to the aperture, and number of its segments across it.

@@ -19,7 +19,7 @@ from omsm_ros.readable import (
 )
 from omsm_ros.report import tables
 from omsm_ros.report.measurement.surface_map import EmbeddedMap, policy_of, script
-from omsm_ros.report.page_parts import Headline, check_places, fill, picture, title_block
+from omsm_ros.report.page_parts import Headline, fill, picture, title_block
 from omsm_ros.report.tables import Table, part, unit_of_parameter
 from omsm_ros.report.verdict import PageVerdict, covered, registered_figures, verdict_on_measurement
 from omsm_ros.units import MILLIMETRE_M
@@ -265,8 +265,6 @@ class Report:
     figures: PNG files by the names in :data:`CAPTIONS`
     form: the content of ``form.json``, if the part was registered;  curves: of ``curves.json``
     map: zoomable map;  origin: entries of the title block, as ``--origin`` gives them
-
-    Raises ConfigurationError for a figure of another name.
     """
 
     title: str
@@ -278,9 +276,6 @@ class Report:
     curves: Mapping[str, Any] = field(default_factory=dict)
     map: EmbeddedMap | None = None
     origin: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_places(self.figures, CAPTIONS)
 
 
 def render(report: Report) -> str:

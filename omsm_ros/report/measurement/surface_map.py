@@ -4,7 +4,7 @@ import io
 import json
 from base64 import b64encode
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from hashlib import sha256
 from importlib import resources
@@ -112,11 +112,6 @@ class CloudView:
     dynamic_error: FloatArray
     uncertainty: FloatArray
 
-    def __post_init__(self) -> None:
-        lengths = {name: len(getattr(self, name)) for name in (f.name for f in fields(self))}
-        if len(set(lengths.values())) != 1 or not len(self.x):
-            raise DataError(f"cloud of {lengths!r} values, expected one length, 1 or more")
-
     def __len__(self) -> int:
         return len(self.x)
 
@@ -183,8 +178,6 @@ def policy_of(text: str) -> str:
 
 def _entry(layer: Layer) -> dict[str, object]:
     units = {"nm": NANOMETRE_M, "µm": MICROMETRE_M, "1": 1.0}
-    if layer.unit not in units:
-        raise DataError(f"unit {layer.unit!r} of a map is unknown, expected one of {[*units]}")
     raster = _on_its_grid(layer) if layer.pitch else rasterise(layer.x, layer.y, layer.heights)
     heights = raster.image / units[layer.unit]
     known = heights[np.isfinite(heights)]

@@ -13,7 +13,7 @@ from parsed_page import Page
 
 from omsm_ros.core.calibration.certificate import Certificate
 from omsm_ros.core.lti.transfer_function import TransferFunction
-from omsm_ros.errors import CalibrationError, ConfigurationError
+from omsm_ros.errors import CalibrationError
 from omsm_ros.report import style
 from omsm_ros.report.certificate import figures as certificate_figures
 from omsm_ros.report.certificate.page import CAPTIONS, render, sections, verdict_on_calibration
@@ -78,10 +78,6 @@ class TestPage:
         assert not {"script", "img"} & set(page.tags)
         assert not any(key.startswith("on") for key, _ in page.attributes)
         assert "<script>alert('x')</script>" in page.text
-
-    def test_a_figure_without_a_place_is_refused(self, calibration):
-        with pytest.raises(ConfigurationError, match="'selfie'"):
-            render(calibration, Issue(date="today", figures={"selfie": b""}))
 
 
 class TestOlderCertificates:

@@ -10,7 +10,6 @@ from omsm_ros.core.surface.aperture import Aperture
 from omsm_ros.core.surface.area_weights import area_weights
 from omsm_ros.core.surface.deviation import Profile
 from omsm_ros.core.surface.nominal import PAPER_MIRROR
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.measurement import figures
 
 
@@ -92,10 +91,6 @@ class TestDeviationMap:
 
     def test_a_perfect_surface_is_drawn(self, cloud):
         assert figures.symmetric_limits(cloud.x, cloud.y, np.zeros(len(cloud)))[1] > 0
-
-    def test_an_unknown_unit_is_refused(self, cloud):
-        with pytest.raises(ConfigurationError, match="unit 'inch'"):
-            figures.deviation_map(cloud.x, cloud.y, cloud.x, unit="inch", title="")
 
 
 class TestProfile:

@@ -9,10 +9,8 @@ import pytest
 from soaked import soaked
 
 from omsm_ros.core.surface.nominal import PAPER_MIRROR, PAPER_MIRROR_RADIUS_M
-from omsm_ros.errors import DataError
 from omsm_ros.report.measurement.figures import levelled, surface_figures
 from omsm_ros.report.measurement.page import CAPTIONS, MAPS, PROFILES
-from omsm_ros.report.measurement.surface_map import CloudView
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -69,14 +67,3 @@ def test_a_piece_off_the_axes_has_a_map_but_not_all_profiles(cloud):
     assert "corrected_map" in made
     assert "profile_x" not in made
     assert "profile_radius" not in made
-
-
-def test_a_cloud_of_unequal_columns_is_refused(cloud):
-    with pytest.raises(DataError, match="'x': 3"):
-        replace(cloud, x=np.zeros(3))
-
-
-def test_an_empty_cloud_is_refused():
-    empty = np.empty(0)
-    with pytest.raises(DataError, match="1 or more"):
-        CloudView(**{f.name: empty for f in fields(CloudView)})

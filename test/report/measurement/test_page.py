@@ -10,7 +10,6 @@ import pytest
 from certified import certified_by
 from parsed_page import Page
 
-from omsm_ros.errors import ConfigurationError
 from omsm_ros.report.measurement.page import CAPTIONS, Report, headlines, render
 from omsm_ros.report.page_parts import typeset
 
@@ -119,8 +118,3 @@ def test_headlines_are_the_numbers_of_the_summary(summary):
     # Twice the standard uncertainty.
     assert found["Expanded uncertainty"].startswith("22.0 nm")
     assert found["Surface points"] == "40 000 | of 40 040 samples received"
-
-
-def test_a_figure_without_a_place_is_refused(summary):
-    with pytest.raises(ConfigurationError, match="'selfie'"):
-        Report("a", "b", summary, None, {"selfie": b""})
