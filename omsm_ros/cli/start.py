@@ -1,7 +1,6 @@
 """Commands to begin with: twin, completion."""
 
 import argparse
-from dataclasses import asdict
 
 from omsm_ros.cli.arguments import Arguments
 from omsm_ros.cli.command import CliCommand, Facts, say, say_lines
@@ -36,7 +35,7 @@ def _twin(args: argparse.Namespace) -> Facts:
     if args.recordings is not None:
         kinds = args.recordings or (SPHERE, STILL, TURNED, PASSES, STAND_OFFS)
         return {"recordings": record_sources(args.out, scenario, kinds, args.disturbances)}
-    return asdict(record_twin(args.out, scenario, args.disturbances))
+    return record_twin(args.out, scenario, args.disturbances)
 
 
 def _show_twin(facts: Facts) -> None:

@@ -4,7 +4,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +103,7 @@ _BLOCK_SAMPLES = 1000
 # Bounds memory to half a gigabyte with all disturbances.
 _MOST_SAMPLES = 1_000_000
 STEPS, SCAN, NOMINAL = "steps.mcap", "scan.mcap", "mirror.yaml"
+_FILES = {"steps": STEPS, "scan": SCAN, "nominal": NOMINAL}
 
 
 def write_recording(path: Path, recording: Recording) -> Path:
@@ -122,29 +122,21 @@ def write_recording(path: Path, recording: Recording) -> Path:
     return path
 
 
-@dataclass(frozen=True, slots=True)
-class TwinBags:
-    """Paths and numbers of samples of the recordings."""
-
-    steps: str
-    scan: str
-    nominal: str
-    step_samples: int
-    scan_samples: int
-
-
-def record_twin(out: Path, scenario: Scenario, disturbance_file: Path | None = None) -> TwinBags:
+def record_twin(
+    out: Path, scenario: Scenario, disturbance_file: Path | None = None
+) -> dict[str, Any]:
     """Write ``steps.mcap``, ``scan.mcap`` and the nominal ``mirror.yaml`` into ``out``.
 
-    Raises BagError if a bag of that name exists, ConfigurationError for a scan beyond the mirror
-    or too long for memory.
+    Return their paths and numbers of samples. Raises BagError if a bag of that name exists,
+    ConfigurationError for a scan beyond the mirror or too long for memory.
     """
     _check(scenario)
     wrong = NOTHING if disturbance_file is None else load_disturbances(disturbance_file)
     steps = _write(out / STEPS, planned_test_of(scenario, wrong))
     scan = _write(out / SCAN, scan_of(scenario, wrong))
     write_nominal(out / NOMINAL, scenario.start_radius > PAPER_MIRROR_RADIUS_M)
-    return TwinBags(str(out / STEPS), str(out / SCAN), str(out / NOMINAL), steps, scan)
+    paths = {name: str(out / f) for name, f in _FILES.items()}
+    return {**paths, "step_samples": steps, "scan_samples": scan}
 
 
 def record_sources(

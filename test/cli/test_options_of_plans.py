@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -176,18 +175,12 @@ def test_doctor_looks_for_the_port_that_is_named(capsys, monkeypatch):
     assert asked == [("/data", "/dev/ttyNONE")]
 
 
-@dataclass
-class Made:
-    steps: str = "s"
-    step_samples: int = 1
-    scan: str = "b"
-    scan_samples: int = 2
-    nominal: str = "n"
+MADE = {"steps": "s", "step_samples": 1, "scan": "b", "scan_samples": 2, "nominal": "n"}
 
 
 def test_the_twin_is_made_as_its_options_say(capsys, monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(start, "record_twin", lambda *given: asked.append(given) or Made())
+    monkeypatch.setattr(start, "record_twin", lambda *given: asked.append(given) or MADE)
     words = ["twin", "--out", tmp_path, "--seed", 7, "--part", 3, "--rpm", 45, "--feed", 2e-4]
     run(capsys, *words, "--radius", 1e-3, "--disturbances", "bad.yaml")
     run(capsys, *words[:5])
