@@ -11,7 +11,6 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor, as_complete
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote, urlsplit
 
 from omsm_ros import __version__
@@ -139,11 +138,6 @@ def load_campaign(out: Path) -> list[Entry]:
     content = load_object(path, "campaign", _MAX_STATE_BYTES, _STATE_FORM)
     known = Entry.__dataclass_fields__
     return [Entry(**{k: v for k, v in e.items() if k in known}) for e in content["entries"]]
-
-
-def load_summary(out: Path, entry: Entry) -> dict[str, Any]:
-    """Return the summary of a bag that is done; FileError if it is gone or damaged."""
-    return read_summary(out / entry.folder / SUMMARY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,7 +346,7 @@ def _write_index(out: Path, title: str, entries: list[Entry], calibration: Path)
     measurements = [
         CampaignEntry(
             e.bag, e.state, e.said, e.recorded_ns,
-            _link(out, e), load_summary(out, e) if e.state == DONE else {},
+            _link(out, e), read_summary(out / e.folder / SUMMARY) if e.state == DONE else {},
         )
         for e in entries
     ]  # fmt: skip

@@ -63,7 +63,8 @@ def repair(path: Path) -> Repair:
             f"{str(path)!r} holds no .mcap file; only MCAP is repaired, "
             "for sqlite3 use 'ros2 bag reindex'"
         )
-    made = Repair(_sibling(path))
+    whole = Path(os.path.abspath(path))
+    made = Repair(whole.with_name(f"{whole.stem}.repaired.mcap"))
     with open_regular(parts[0], BagError, "bag") as stream:
         _check_magic(stream, parts[0])
     file = new_bag_file(made.path)
@@ -90,11 +91,6 @@ def _copy(parts: list[Path], file: GrowingFile, made: Repair) -> None:
     if not made.messages:
         why = made.lost[0] if made.lost else "nothing was recorded"
         raise BagError(f"{str(parts[0])!r} has no whole message to save ({why}); record it again")
-
-
-def _sibling(path: Path) -> Path:
-    whole = Path(os.path.abspath(path))
-    return whole.with_name(f"{whole.stem}.repaired.mcap")
 
 
 def _number(part: Path) -> tuple[int, str]:

@@ -39,11 +39,14 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment, date: str) -
     if found.agreement:
         figures["agreement"] = agreement(found)
     reasons = [(reason,) for reason in verdict.reasons]
+    subtitle = [*map(_scan_text, facts["scans"])]
+    if (truth := facts.get("truth")) is not None:
+        subtitle.append(f"truth of the twin: PV {quantity(truth[_PV], 'm')}")
     return fill_study(
         StudyPage(
             title=f"{origin.get('title') or title}: {headline(facts)}",
             block=title_block(origin),
-            subtitle="; ".join([*map(_scan_text, facts["scans"]), *_true_figure(facts)]),
+            subtitle="; ".join(subtitle),
             verdict=replace(verdict, reasons=verdict.reasons[:1]),
             sections=(
                 Section("Form", ("map",)),
@@ -68,11 +71,6 @@ def render(title: str, facts: Mapping[str, Any], found: Adjustment, date: str) -
 def _scan_text(scan: Mapping[str, Any]) -> str:
     way = "outward" if scan["outward"] else "inward"
     return f"{plain(scan['speed_rpm'])} rpm {way}, {count(scan['points'])} points"
-
-
-def _true_figure(facts: Mapping[str, Any]) -> list[str]:
-    truth = facts.get("truth")
-    return [] if truth is None else [f"truth of the twin: PV {quantity(truth[_PV], 'm')}"]
 
 
 def _truth(facts: Mapping[str, Any]) -> Table:

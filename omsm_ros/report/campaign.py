@@ -9,7 +9,7 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from omsm_ros.core.calibration.calibration import Calibration
 from omsm_ros.core.calibration.repeatability import FEWEST, LinearTrend, outliers, trend
-from omsm_ros.core.streams.blocks import BoolArray, FloatArray
+from omsm_ros.core.streams.blocks import FloatArray
 from omsm_ros.readable import NOTHING, count, date_text_of_stamp, days, percent, quantity
 from omsm_ros.report import style
 from omsm_ros.report.page_parts import fill, picture
@@ -78,11 +78,11 @@ class CampaignEntry:
 
 def render(title: str, measurements: Sequence[CampaignEntry], calibration: Calibration) -> str:
     """Return the page as HTML; all text from outside is escaped."""
-    judged = judge(measurements)
+    judged, states = judge(measurements), [m.state for m in measurements]
     return fill(
         "campaign.html",
         title=title,
-        headlines=_headlines(measurements),
+        headlines=[(s, count(states.count(s))) for s in ("done", "refused", "crashed")],
         remarks=remarks(measurements, judged),
         figure=picture(_figure(measurements, judged)) if judged else "",
         names=[series.name for series in SERIES],
@@ -109,14 +109,11 @@ def judge(measurements: Sequence[CampaignEntry]) -> list[JudgedSeries]:
         values = np.array([_value(m, series) for m in measurements])
         if np.any(np.isfinite(values)):
             drift = trend(times, values) if series.judged else None
-            outlying = outliers(values) & _differs(values, np.nanmedian(values)) & series.judged
+            usual = np.nanmedian(values)
+            differs = np.abs(values - usual) > _VISIBLE_CHANGE * abs(usual)
+            outlying = outliers(values) & differs & series.judged
             found.append(JudgedSeries(series, values, outlying, _seen(drift, times, values)))
     return found
-
-
-def _differs(values: FloatArray, usual: float) -> BoolArray:
-    """Return which values (n,) differ from ``usual`` at three digits."""
-    return np.asarray(np.abs(values - usual) > _VISIBLE_CHANGE * abs(usual))
 
 
 def _seen(slope: LinearTrend | None, over: FloatArray, values: FloatArray) -> LinearTrend | None:
@@ -171,11 +168,6 @@ def _value(measurement: CampaignEntry, series: Series) -> float:
 def _times(measurements: Sequence[CampaignEntry]) -> FloatArray:
     """Return the time of each recording [s], NaN if unknown."""
     return np.array([m.recorded_ns for m in measurements], np.float64) / NANOSECONDS_PER_S
-
-
-def _headlines(measurements: Sequence[CampaignEntry]) -> list[tuple[str, str]]:
-    states = [m.state for m in measurements]
-    return [(state, count(states.count(state))) for state in ("done", "refused", "crashed")]
 
 
 def _row(place: int, measurement: CampaignEntry, judged: Sequence[JudgedSeries]) -> dict[str, Any]:

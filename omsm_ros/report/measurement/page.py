@@ -45,8 +45,8 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
         return None
     open_ = covered(form or part(summary, "form"))
     words = [
-        f"{name} {_expanded(figures[key])}{open_}"
-        for key, name in (("peak_to_valley", "PV"), ("rms", "rms"))
+        f"{name} {expanded(found['value'], found['standard_uncertainty'], 'm')}{open_}"
+        for name, found in (("PV", figures["peak_to_valley"]), ("rms", figures["rms"]))
     ]
     words.append(f"removed: {', '.join(figures['removed'])}")
     words += part(form, "removed", "notes") or ()
@@ -60,10 +60,6 @@ def verdict_on_part(summary: Mapping[str, Any], form: Mapping[str, Any]) -> Page
         level, word = "care", f"Not verified: {word[0].lower()}{word[1:]}"
     tolerance = quantity(held["tolerance"], "m")
     return PageVerdict(level, f"{word} of {tolerance} on the peak to valley", tuple(words))
-
-
-def _expanded(figure: Mapping[str, Any]) -> str:
-    return expanded(figure["value"], figure["standard_uncertainty"], "m")
 
 
 def verdict_on_points(form: Mapping[str, Any]) -> PageVerdict:
@@ -287,7 +283,9 @@ def render(report: Report) -> str:
         heading=str(report.origin.get("title") or report.title),
         block=title_block(report.origin),
         on_part=verdict_on_part(report.summary, report.form),
-        verdict=_trust_section(report),
+        verdict=verdict_on_points(report.form)
+        if report.form and not report.summary
+        else verdict_on_measurement(report.summary),
         removed=removed_table(report.form),
         script=drawing,
         script_policy=policy_of(drawing),
@@ -298,12 +296,6 @@ def render(report: Report) -> str:
         caption=CAPTIONS.__getitem__,
         maps=MAPS,
     )
-
-
-def _trust_section(report: Report) -> PageVerdict:
-    if report.form and not report.summary:
-        return verdict_on_points(report.form)
-    return verdict_on_measurement(report.summary)
 
 
 def headlines(summary: Mapping[str, Any]) -> list[Headline]:
